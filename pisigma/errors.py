@@ -1,0 +1,64 @@
+"""Every exception that pisigma raises on purpose.
+
+A message says what was wanted, what came, where, and what to do about it. The command line turns any
+`PisigmaError` into one line on stderr and exit status 2; everything else is a defect of ours.
+"""
+
+import difflib
+from collections.abc import Iterable
+
+
+class PisigmaError(Exception):
+    """Base of every error that pisigma raises on purpose."""
+
+
+class RobotError(PisigmaError, ValueError):
+    """A robot description cannot be used."""
+
+
+class UnknownRobotError(RobotError):
+    """A robot is neither in the catalogue nor a file."""
+
+
+class RecipeError(PisigmaError, ValueError):
+    """A recipe cannot be used."""
+
+
+class MeasurementError(PisigmaError, ValueError):
+    """A measurement file or data set cannot be used."""
+
+
+class ModelError(PisigmaError, ValueError):
+    """A model folder cannot be used."""
+
+
+class PoseError(PisigmaError, ValueError):
+    """A wanted pose is no pose, or joint values do not fit the robot."""
+
+
+class UnreachablePoseError(PisigmaError, ValueError):
+    """The robot cannot take a wanted pose as asked; the message gives the status."""
+
+
+class IdentificationError(PisigmaError, ValueError):
+    """The measurements do not determine what is asked for."""
+
+
+class OutputError(PisigmaError, ValueError):
+    """An output cannot be written where it was asked for."""
+
+
+class TrainingError(PisigmaError, RuntimeError):
+    """A training cannot go on, for example because it diverged."""
+
+
+def nearest_choice(given: str, choices: Iterable[str]) -> str:
+    """Say which choices there are and which is nearest to `given`.
+
+    Returns:
+        For example ``"did you mean 'epochs'? Valid: epochs, seed."``.
+    """
+    names = sorted(choices)
+    close = difflib.get_close_matches(given, names, n=1)
+    hint = f"did you mean '{close[0]}'? " if close else ""
+    return f"{hint}Valid: {', '.join(names)}."

@@ -1,0 +1,1 @@
+"""Forward kinematics, Jacobians and inverse kinematics of serial robots."""

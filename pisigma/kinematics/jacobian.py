@@ -1,0 +1,58 @@
+"""Joint Jacobian of the tool pose, batched and in closed form."""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pisigma.kinematics.components import IDENTITY, Frame, as_transform, cross, follow_xyzrpy, product, subtract
+from pisigma.kinematics.forward import CHUNK, Geometry, iterate_rows
+from pisigma.robot.description import Robot
+
+
+def joint_jacobian(
+    robot: Robot, q: Float[Tensor, "*batch dof"]
+) -> tuple[Float[Tensor, "*batch 4 4"], Float[Tensor, "*batch 6 dof"]]:
+    """Tool pose and geometric Jacobian, in the base frame and at the tool's origin.
+
+    Column j is `direction_j · [z × (p_tool - p); z]` for a revolute and `direction_j · [z; 0]` for a prismatic
+    joint, with z and p the axis and origin of the frame before the joint's row (Siciliano et al. 2009, eq. 3.30).
+
+    Args:
+        robot: the robot.
+        q: joint values [rad or m].
+
+    Returns:
+        T_base_tool, and J with `J @ dq` = [translation [m]; rotation vector [rad]] of the tool, both in the base frame.
+
+    Raises:
+        PoseError: q has another number of columns than the robot has joints.
+    """
+    robot.check_joint_count(q.shape[-1])
+    geometry = Geometry.of(robot)
+    chunks = [_jacobian_chunk(robot, geometry, chunk) for chunk in q.reshape(-1, robot.dof).split(CHUNK)]
+    batch = q.shape[:-1]
+    T = torch.cat([T for T, _ in chunks]) if len(chunks) > 1 else chunks[0][0]
+    J = torch.cat([J for _, J in chunks]) if len(chunks) > 1 else chunks[0][1]
+    return T.reshape(*batch, 4, 4), J.reshape(*batch, 6, robot.dof)
+
+
+def _jacobian_chunk(
+    robot: Robot, geometry: Geometry, q: Float[Tensor, "poses dof"]
+) -> tuple[Float[Tensor, "poses 4 4"], Float[Tensor, "poses 6 dof"]]:
+    columns = q.t().contiguous().unbind(0)
+    joints: list[Frame] = []
+    frame = IDENTITY
+    for row, frames in zip(robot.rows, iterate_rows(robot, geometry, columns), strict=True):
+        if row.type != "fixed":
+            joints.append(frames.before)
+        frame = frames.after
+    tool = follow_xyzrpy(frame, geometry.tool)
+    J = columns[0].new_zeros((columns[0].shape[0], 6, robot.dof))
+    for index, (joint, before) in enumerate(zip(robot.joints, joints, strict=True)):
+        axis, origin = before[2], before[3]
+        linear = axis if joint.type == "prismatic" else cross(axis, subtract(tool[3], origin))
+        angular = (0.0, 0.0, 0.0) if joint.type == "prismatic" else axis
+        for component, value in enumerate((*linear, *angular)):
+            if isinstance(value, Tensor) or value != 0.0:
+                J[:, component, index] = product(float(joint.direction), value)
+    return as_transform(tool, like=columns[0]), J

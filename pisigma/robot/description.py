@@ -1,0 +1,171 @@
+"""What a robot is: DH + Hayati rows, joints, base and tool, in SI units."""
+
+import os
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float64
+
+from pisigma.errors import PoseError, RobotError
+
+JointType = Literal["revolute", "prismatic", "fixed"]
+
+DH_COLUMNS = ("theta", "d", "a", "alpha", "beta")
+"""Order of the parameters of a row, everywhere; theta, alpha, beta [rad], d, a [m]."""
+
+FRAME_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Order of the parameters of base and tool, everywhere; x, y, z [m], roll, pitch, yaw [rad]."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One DH + Hayati row `RotZ(theta + q) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`.
+
+    A prismatic joint adds q to d instead; a fixed row has no joint (an end effector, for example).
+
+    Attributes:
+        name: unique in the robot, such as "theta_1".
+        type: "revolute", "prismatic" or "fixed".
+        direction: +1 or -1: how the controller counts; the joint moves by `direction · q`.
+        lower: smallest joint value [rad or m], as the controller counts; -inf where there is no limit.
+        upper: largest joint value [rad or m].
+    """
+
+    name: str
+    type: JointType
+    direction: int = 1
+    lower: float = -np.inf
+    upper: float = np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Robot:
+    """A serial robot: `T_base_tool(q) = base · A_1(q_1) ... A_n(q_n) · tool`.
+
+    "base" is the frame that poses are given in; `base` maps the frame of the first row into it.
+
+    Attributes:
+        name: short name, as in the catalogue.
+        maker: who builds it.
+        source: where the figures come from.
+        rows: joints and fixed rows, from the base to the tool.
+        dh: `(rows, 5)`: theta [rad], d [m], a [m], alpha [rad], beta [rad].
+        base: x, y, z [m], roll, pitch, yaw [rad] of `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
+        tool: the same for the tool behind the last row.
+    """
+
+    name: str
+    maker: str
+    source: str
+    rows: tuple[Row, ...]
+    dh: Float64[np.ndarray, " rows 5"]
+    base: Float64[np.ndarray, " 6"] = field(default_factory=lambda: np.zeros(6))
+    tool: Float64[np.ndarray, " 6"] = field(default_factory=lambda: np.zeros(6))
+
+    def __post_init__(self) -> None:
+        """Check that the parts fit together and make the arrays read-only."""
+        if self.dh.shape != (len(self.rows), 5):
+            raise RobotError(f"robot '{self.name}': {len(self.rows)} DH rows were wanted, got {self.dh.shape[0]}.")
+        for name in ("dh", "base", "tool"):
+            values = np.array(getattr(self, name), dtype=np.float64)
+            if not np.isfinite(values).all():
+                raise RobotError(f"robot '{self.name}': {name} has an entry that is not finite; correct it.")
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+        if self.dof == 0:
+            raise RobotError(f"robot '{self.name}': it has no joint that moves; add a revolute or prismatic one.")
+        names = [row.name for row in self.rows]
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise RobotError(f"robot '{self.name}': the row name '{twice[0]}' stands twice; names must differ.")
+        for row in self.rows:
+            if row.direction not in (1, -1):
+                raise RobotError(f"robot '{self.name}', row '{row.name}': direction is +1 or -1, got {row.direction}.")
+            if not row.lower < row.upper:
+                raise RobotError(
+                    f"robot '{self.name}', row '{row.name}': the lower limit {row.lower:g} is not below "
+                    f"the upper limit {row.upper:g}; swap or correct them."
+                )
+
+    @staticmethod
+    def load(robot: str | os.PathLike[str]) -> "Robot":
+        """Load a robot by catalogue name or from a YAML file.
+
+        Raises:
+            UnknownRobotError: neither a catalogue name nor a file; the message lists the catalogue.
+            RobotError: the file does not describe a robot.
+        """
+        from pisigma.robot.loading import load_robot
+
+        return load_robot(robot)
+
+    @property
+    def joints(self) -> tuple[Row, ...]:
+        """The rows that move, in order."""
+        return tuple(row for row in self.rows if row.type != "fixed")
+
+    @property
+    def dof(self) -> int:
+        """Number of joints that move."""
+        return len(self.joints)
+
+    @property
+    def joint_rows(self) -> tuple[int, ...]:
+        """Index of the row of every joint."""
+        return tuple(i for i, row in enumerate(self.rows) if row.type != "fixed")
+
+    @property
+    def limits(self) -> Float64[np.ndarray, " dof 2"]:
+        """Lower and upper limit of every joint [rad or m], as the controller counts."""
+        return np.array([[joint.lower, joint.upper] for joint in self.joints])
+
+    @property
+    def directions(self) -> Float64[np.ndarray, " dof"]:
+        """+1 or -1 for every joint."""
+        return np.array([float(joint.direction) for joint in self.joints])
+
+    @property
+    def revolute(self) -> tuple[bool, ...]:
+        """For every joint, whether it turns."""
+        return tuple(joint.type == "revolute" for joint in self.joints)
+
+    @property
+    def reach(self) -> float:
+        """A length [m] that no tool position can be farther than from the first row's origin.
+
+        Prismatic joints count with their farthest limit, or not at all where they have none.
+        """
+        strokes = sum(
+            max(abs(bound) for bound in (joint.lower, joint.upper) if np.isfinite(bound))
+            for joint in self.joints
+            if joint.type == "prismatic" and np.isfinite([joint.lower, joint.upper]).any()
+        )
+        links = float(np.hypot(self.dh[:, 1], self.dh[:, 2]).sum())
+        return links + float(np.linalg.norm(self.tool[:3])) + float(strokes)
+
+    def with_geometry(
+        self,
+        dh: Float64[np.ndarray, " rows 5"] | None = None,
+        base: Float64[np.ndarray, " 6"] | None = None,
+        tool: Float64[np.ndarray, " 6"] | None = None,
+    ) -> "Robot":
+        """The same robot with other geometric parameters; what is not given stays."""
+        return replace(
+            self,
+            dh=self.dh if dh is None else dh,
+            base=self.base if base is None else base,
+            tool=self.tool if tool is None else tool,
+        )
+
+    def check_joint_count(self, count: int) -> None:
+        """Refuse joint values whose last axis does not fit the robot.
+
+        Raises:
+            PoseError: `count` is not the number of joints.
+        """
+        if count != self.dof:
+            names = ", ".join(joint.name for joint in self.joints)
+            raise PoseError(
+                f"robot '{self.name}' has {self.dof} joints ({names}), but the joint values have {count} columns."
+            )

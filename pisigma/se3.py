@@ -1,0 +1,186 @@
+"""Rotations and rigid transforms, batched: leading dimensions are batch everywhere.
+
+Angles are in rad, lengths in m. `T_a_b` maps coordinates in b to coordinates in a.
+"""
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pisigma.errors import PoseError
+
+
+def rotation_from_rpy(rpy: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation `RotZ(roll) · RotY(pitch) · RotX(yaw)`, the order of the three papers.
+
+    Args:
+        rpy: roll, pitch, yaw [rad].
+    """
+    cos, sin = torch.cos(rpy), torch.sin(rpy)
+    cz, cy, cx = cos.unbind(-1)
+    sz, sy, sx = sin.unbind(-1)
+    rows = [
+        torch.stack([cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx], -1),
+        torch.stack([sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx], -1),
+        torch.stack([-sy, cy * sx, cy * cx], -1),
+    ]
+    return torch.stack(rows, -2)
+
+
+def rpy_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Roll, pitch, yaw [rad] of a rotation; at pitch = ±90 deg yaw is taken as 0.
+
+    Inverse of `rotation_from_rpy` for pitch within ±90 deg.
+    """
+    horizontal = torch.hypot(R[..., 0, 0], R[..., 1, 0])
+    regular = horizontal > 1e-12
+    pitch = torch.atan2(-R[..., 2, 0], horizontal)
+    roll = torch.where(
+        regular, torch.atan2(R[..., 1, 0], R[..., 0, 0]), torch.atan2(-R[..., 0, 1], R[..., 1, 1])
+    )
+    yaw = torch.where(regular, torch.atan2(R[..., 2, 1], R[..., 2, 2]), torch.zeros_like(roll))
+    return torch.stack([roll, pitch, yaw], -1)
+
+
+def rotation_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation of a quaternion (x, y, z, w), which is normalised first."""
+    x, y, z, w = (quaternion / quaternion.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        torch.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1),
+        torch.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], -1),
+        torch.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], -1),
+    ]
+    return torch.stack(rows, -2)
+
+
+def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Rotation of a rotation vector [rad] (Rodrigues), with finite gradients at zero."""
+    square = (vector * vector).sum(-1)
+    small = square < 1e-8
+    safe = torch.where(small, torch.ones_like(square), square)
+    angle = safe.sqrt()
+    first = torch.where(small, 1 - square / 6, torch.sin(angle) / angle)
+    second = torch.where(small, 0.5 - square / 24, (1 - torch.cos(angle)) / safe)
+    K = skew(vector)
+    eye = torch.eye(3, dtype=vector.dtype, device=vector.device)
+    return eye + first[..., None, None] * K + second[..., None, None] * (K @ K)
+
+
+def rotation_vector(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
+    """Rotation vector [rad] of a rotation: axis times angle in [0, pi].
+
+    Near the identity the vector part of `R - R^T` is used as it is; near pi the axis comes from `R + R^T`.
+    """
+    twice_sine_axis = torch.stack(
+        [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
+    )
+    cosine = (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1) / 2
+    sine_square = (twice_sine_axis * twice_sine_axis).sum(-1) / 4
+    regular = sine_square > 1e-14
+    sine = torch.where(regular, sine_square, torch.ones_like(sine_square)).sqrt()
+    angle = torch.atan2(torch.where(regular, sine, torch.zeros_like(sine)), cosine)
+    factor = torch.where(regular, angle / (2 * sine), torch.full_like(sine, 0.5))
+    ordinary = factor[..., None] * twice_sine_axis
+    near_pi = (cosine < -0.99)[..., None]
+    return torch.where(near_pi, _rotation_vector_near_pi(R, twice_sine_axis, angle), ordinary)
+
+
+def _rotation_vector_near_pi(
+    R: Float[Tensor, "*batch 3 3"], twice_sine_axis: Float[Tensor, "*batch 3"], angle: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 3"]:
+    """Axis from the symmetric part, whose largest column is `axis · axis_k (1 - cos)`; sign from `R - R^T`."""
+    symmetric = (R + R.mT) / 2 + torch.eye(3, dtype=R.dtype, device=R.device)
+    trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
+    # (R + R^T)/2 = cos·I + (1 - cos)·n n^T, so subtracting (1 + cos)·I from the sum above leaves (1 - cos)·n n^T.
+    cosine = (trace - 1) / 2
+    outer = symmetric - (1 + cosine)[..., None, None] * torch.eye(3, dtype=R.dtype, device=R.device)
+    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    column = torch.take_along_dim(outer, largest[..., None, None], -1)[..., 0]
+    column = torch.where((column * column).sum(-1, keepdim=True) > 0, column, torch.ones_like(column))
+    axis = column / column.norm(dim=-1, keepdim=True)
+    sign = torch.where((axis * twice_sine_axis).sum(-1) < 0, -1.0, 1.0).to(R.dtype)
+    return (sign * angle)[..., None] * axis
+
+
+def skew(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """Matrix of the cross product: `skew(a) @ b = a × b`."""
+    x, y, z = vector.unbind(-1)
+    zero = torch.zeros_like(x)
+    rows = [torch.stack([zero, -z, y], -1), torch.stack([z, zero, -x], -1), torch.stack([-y, x, zero], -1)]
+    return torch.stack(rows, -2)
+
+
+def transform(
+    rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """Homogeneous transform of a rotation and a translation [m]; both broadcast."""
+    batch = torch.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    T = rotation.new_zeros((*batch, 4, 4))
+    T[..., :3, :3] = rotation
+    T[..., :3, 3] = translation
+    T[..., 3, 3] = 1
+    return T
+
+
+def transform_from_xyzrpy(xyzrpy: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
+    """`Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`; x, y, z [m], roll, pitch, yaw [rad]."""
+    return transform(rotation_from_rpy(xyzrpy[..., 3:]), xyzrpy[..., :3])
+
+
+def xyzrpy_from_transform(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
+    """x, y, z [m] and roll, pitch, yaw [rad] of a transform; inverse of `transform_from_xyzrpy`."""
+    return torch.cat([T[..., :3, 3], rpy_from_rotation(T[..., :3, :3])], -1)
+
+
+def invert(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """Inverse of rigid transforms, by transposition."""
+    R_inverse = T[..., :3, :3].mT
+    return transform(R_inverse, -(R_inverse @ T[..., :3, 3:])[..., 0])
+
+
+def pose_error(
+    T_a_wanted: Float[Tensor, "*batch 4 4"], T_a_actual: Float[Tensor, "*batch 4 4"]
+) -> Float[Tensor, "*batch 6"]:
+    """What moves the actual pose onto the wanted one, in frame a.
+
+    Returns:
+        Translation wanted - actual [m] and the rotation vector of `R_wanted · R_actual^T` [rad].
+    """
+    translation = T_a_wanted[..., :3, 3] - T_a_actual[..., :3, 3]
+    rotation = T_a_wanted[..., :3, :3] @ T_a_actual[..., :3, :3].mT
+    return torch.cat([translation, rotation_vector(rotation)], -1)
+
+
+def wrap_to_pi(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
+    """The same angle [rad] in (-pi, pi]."""
+    wrapped = torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
+    return torch.where(wrapped <= -torch.pi, torch.full_like(wrapped, torch.pi), wrapped)
+
+
+def check_transforms(T: Float[Tensor, "*batch 4 4"], name: str, tolerance: float = 1e-6) -> None:
+    """Refuse matrices that are no rigid transforms.
+
+    Args:
+        T: the matrices.
+        name: what complaints call them.
+        tolerance: largest deviation of `R^T R` from the identity and of the last row from (0, 0, 0, 1).
+
+    Raises:
+        PoseError: an entry is not finite, a rotation is not orthonormal or left-handed, or the last row is wrong;
+            the message gives the index of the first such matrix.
+    """
+    finite = torch.isfinite(T).all(-1).all(-1)
+    R = torch.where(finite[..., None, None], T, torch.eye(4, dtype=T.dtype, device=T.device))[..., :3, :3]
+    skewness = (R.mT @ R - torch.eye(3, dtype=T.dtype, device=T.device)).abs().amax((-1, -2))
+    determinant = torch.linalg.det(R)
+    last_row = (T[..., 3, :] - T.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax(-1)
+    for bad, what in (
+        (~finite, "has entries that are not finite numbers; give 16 finite numbers"),
+        (last_row > tolerance, "does not end with the row 0 0 0 1; give a homogeneous transform"),
+        (skewness > tolerance, "has a rotation part that is not orthonormal; normalise it or check its source"),
+        (determinant < 0, "has a left-handed rotation part (determinant -1); a reflection is no pose, check its axes"),
+    ):
+        if bad.any():
+            index = tuple(bad.nonzero()[0].tolist())
+            place = f" at index {index if len(index) > 1 else index[0]}" if index else ""
+            raise PoseError(f"{name}{place} {what}.")
