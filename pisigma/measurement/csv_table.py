@@ -1,0 +1,93 @@
+"""A CSV file as text: a header and the fields of every row, each with its line."""
+
+import csv
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from pisigma.errors import MeasurementError
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """The fields of a CSV file, before anything is known of their meaning.
+
+    Attributes:
+        source: the file, as complaints call it.
+        header: names of the columns, without surrounding blanks.
+        header_line: where the header stands.
+        records: the fields of every row; empty where the row is no valid CSV.
+        lines: where the rows stand.
+        broken: for rows that are no valid CSV, what is wrong with them, by row.
+    """
+
+    source: str
+    header: tuple[str, ...]
+    header_line: int
+    records: list[list[str]]
+    lines: tuple[int, ...]
+    broken: dict[int, str]
+
+
+def read_table(path: str | os.PathLike[str]) -> Table:
+    """Read a CSV file: commas between fields, UTF-8 with or without byte order mark.
+
+    Blank lines and lines that begin with # are skipped. A field may stand in double quotes, but no field
+    goes on in the next line.
+
+    Raises:
+        MeasurementError: the file is missing, not UTF-8, empty, or holds nothing but a header.
+    """
+    source = str(path)
+    content = [
+        (number, line)
+        for number, line in enumerate(_read_text(path, source).split("\n"), start=1)
+        if (start := line.lstrip()) and not start.startswith("#")
+    ]
+    if not content:
+        raise MeasurementError(f"{source}: the file is empty; a header and at least one row were wanted.")
+    header_line = content[0][0]
+    header, problem = _split(content[0][1])
+    if problem:
+        raise MeasurementError(
+            f"{source}, line {header_line}: the header is no valid CSV ({problem}); check its quotes."
+        )
+    if len(content) == 1:
+        raise MeasurementError(
+            f"{source}, line {header_line}: the file ends after its header; add one row per measurement."
+        )
+    split = [_split(line) for _, line in content[1:]]
+    return Table(
+        source=source,
+        header=tuple(name.strip() for name in header),
+        header_line=header_line,
+        records=[fields for fields, _ in split],
+        lines=tuple(number for number, _ in content[1:]),
+        broken={row: problem for row, (_, problem) in enumerate(split) if problem},
+    )
+
+
+def _read_text(path: str | os.PathLike[str], source: str) -> str:
+    """The text, whose lines end with a line feed whatever they ended with."""
+    try:
+        content = Path(path).read_bytes()
+    except OSError as problem:
+        raise MeasurementError(f"{source}: cannot be read ({problem.strerror}); check the path.") from None
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as problem:
+        line = content[: problem.start].count(b"\n") + 1
+        raise MeasurementError(
+            f"{source}, line {line}: is not UTF-8 text; save the file as CSV in UTF-8."
+        ) from None
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+def _split(line: str) -> tuple[list[str], str]:
+    """The fields of a line, and what is wrong with its quotes ("" where nothing is)."""
+    if '"' not in line:
+        return line.split(","), ""
+    try:
+        return next(csv.reader([line], strict=True, skipinitialspace=True)), ""
+    except csv.Error as problem:
+        return [], str(problem)

@@ -1,0 +1,203 @@
+"""Parting measurements into training and test; rows of equal joint values always stay together."""
+
+import heapq
+from typing import Literal
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.measurement.dataset import Measurements
+
+SplitBy = Literal["joints", "time", "space"]
+"""By joints: at random; by time: blocks of the file's order; by space: blocks of the measured positions."""
+
+TrainTest = tuple[Int64[Tensor, " _train"], Int64[Tensor, " _test"]]
+"""Rows to train on and rows to test on, each in the order of the measurements."""
+
+
+def groups_of_equal_joints(q: Float64[Tensor, "rows dof"]) -> Int64[Tensor, " rows"]:
+    """Number the different joint vectors in the order of their first row.
+
+    Args:
+        q: joint values [rad or m]; two rows belong together where they are exactly equal.
+
+    Returns:
+        For every row the number of its group, from 0.
+    """
+    if q.shape[0] == 0:
+        return torch.zeros(0, dtype=torch.int64, device=q.device)
+    values, group = torch.unique(q + 0.0, dim=0, return_inverse=True)  # -0.0 becomes 0.0
+    rows = torch.arange(q.shape[0], device=q.device)
+    first = torch.full((values.shape[0],), q.shape[0], device=q.device).scatter_reduce(0, group, rows, "amin")
+    return first.argsort().argsort()[group]
+
+
+def k_folds(
+    measurements: Measurements, folds: int, seed: int | torch.Generator, by: SplitBy = "joints"
+) -> tuple[TrainTest, ...]:
+    """Part the measurements into folds, each of which is the test once.
+
+    Args:
+        measurements: what to part.
+        folds: how many, 2 or more.
+        seed: decides which rows come together by joints; unused by time and by space.
+        by: "joints": groups of equal joints, shuffled and dealt such that folds are as equal as the groups
+            allow; "time": contiguous blocks of the rows' order, a group counting where its first row stands;
+            "space": blocks from cutting the measured positions again and again across their widest axis.
+
+    Returns:
+        Per fold the rows to train on and the rows to test on.
+
+    Raises:
+        MeasurementError: there are fewer different joint vectors than folds, or positions that are needed
+            are not there.
+    """
+    group = groups_of_equal_joints(measurements.q).cpu()
+    sizes = torch.bincount(group)
+    if folds < 2 or folds > len(sizes):
+        raise MeasurementError(
+            f"{measurements.source}: {folds} folds were wanted from {len(sizes)} different joint vectors; "
+            f"ask for 2 to {len(sizes)} folds or measure more poses."
+        )
+    fold = torch.zeros(len(sizes), dtype=torch.int64)
+    if _checked(by) == "joints":
+        _deal(fold, sizes, _shuffled(len(sizes), seed), folds)
+    else:
+        positions = _group_positions(measurements, group, len(sizes)) if by == "space" else None
+        _cut_into_folds(fold, sizes, positions, torch.arange(len(sizes)), 0, folds)
+    return tuple(_train_test(measurements, fold[group] == number) for number in range(folds))
+
+
+def holdout(
+    measurements: Measurements, share: float, seed: int | torch.Generator, by: SplitBy = "joints"
+) -> TrainTest:
+    """Keep a share of the measurements for the test.
+
+    Args:
+        measurements: what to part.
+        share: of the rows for the test, between 0 and 1; met as closely as groups of equal joints allow.
+        seed: decides which rows by joints; unused by time and by space.
+        by: "joints": groups of equal joints at random; "time": the last rows; "space": the far end of the
+            widest axis of the measured positions.
+
+    Raises:
+        MeasurementError: the share is not between 0 and 1, all rows have equal joints, or positions that are
+            needed are not there.
+    """
+    if not 0 < share < 1:
+        raise MeasurementError(
+            f"{measurements.source}: a test share between 0 and 1 was wanted, got {share:g}."
+        )
+    group = groups_of_equal_joints(measurements.q).cpu()
+    sizes = torch.bincount(group)
+    if len(sizes) < 2:
+        raise MeasurementError(
+            f"{measurements.source}: {len(sizes)} different joint vectors cannot be parted into training and "
+            "test; measure more poses."
+        )
+    order = torch.arange(len(sizes))
+    if _checked(by) == "joints":
+        order = _shuffled(len(sizes), seed)
+    elif by == "space":
+        order = _along_widest_axis(_group_positions(measurements, group, len(sizes)), order)
+    cut = _cut(sizes[order], 1 - share, 1, 1)
+    is_test = torch.zeros(len(sizes), dtype=torch.bool)
+    is_test[order[cut:]] = True
+    return _train_test(measurements, is_test[group])
+
+
+def _checked(by: str) -> str:
+    if by not in ("joints", "time", "space"):
+        raise MeasurementError(
+            f"split by '{by}' is unknown; {nearest_choice(by, ('joints', 'time', 'space'))}"
+        )
+    return by
+
+
+def _shuffled(count: int, seed: int | torch.Generator) -> Int64[Tensor, " count"]:
+    generator = seed if isinstance(seed, torch.Generator) else torch.Generator().manual_seed(seed)
+    return torch.randperm(count, generator=generator, device=generator.device).cpu()
+
+
+def _deal(
+    fold: Int64[Tensor, " groups"],
+    sizes: Int64[Tensor, " groups"],
+    order: Int64[Tensor, " groups"],
+    folds: int,
+) -> None:
+    """Deal the groups, large ones first, each to the fold with the fewest rows."""
+    order = order[sizes[order].argsort(descending=True, stable=True)]
+    heap = [(0, number) for number in range(folds)]
+    for group, size in zip(order.tolist(), sizes[order].tolist(), strict=True):
+        rows, number = heap[0]
+        fold[group] = number
+        heapq.heapreplace(heap, (rows + size, number))
+
+
+def _cut_into_folds(
+    fold: Int64[Tensor, " groups"],
+    sizes: Int64[Tensor, " groups"],
+    positions: Float64[Tensor, "groups 3"] | None,
+    members: Int64[Tensor, " _members"],
+    first: int,
+    folds: int,
+) -> None:
+    """Give `members` the folds from `first` on: halve them and go on with the halves."""
+    if folds == 1:
+        fold[members] = first
+        return
+    if positions is not None:
+        members = _along_widest_axis(positions, members)
+    left = folds // 2
+    cut = _cut(sizes[members], left / folds, left, folds - left)
+    _cut_into_folds(fold, sizes, positions, members[:cut], first, left)
+    _cut_into_folds(fold, sizes, positions, members[cut:], first + left, folds - left)
+
+
+def _cut(sizes: Int64[Tensor, " _members"], share: float, least_before: int, least_after: int) -> int:
+    """Number of groups before the cut, such that they hold a share of the rows as closely as may be."""
+    rows_before = sizes.cumsum(0)
+    deviation = (rows_before - share * rows_before[-1]).abs()
+    allowed = deviation[least_before - 1 : len(sizes) - least_after]
+    return least_before + int(allowed.argmin())
+
+
+def _along_widest_axis(
+    positions: Float64[Tensor, "groups 3"], members: Int64[Tensor, " members"]
+) -> Int64[Tensor, " members"]:
+    """The members in order of the coordinate in which they are farthest apart."""
+    points = positions[members]
+    axis = int((points.amax(0) - points.amin(0)).argmax())
+    return members[points[:, axis].argsort(stable=True)]
+
+
+def _group_positions(
+    measurements: Measurements, group: Int64[Tensor, " rows"], groups: int
+) -> Float64[Tensor, "groups 3"]:
+    """Mean measured position of every group [m]."""
+    if len(set(measurements.frame)) > 1:
+        raise MeasurementError(
+            f"{measurements.source}: positions in {len(set(measurements.frame))} frames cannot be compared; "
+            "split by joints or by time."
+        )
+    position = torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
+    if measurements.position is not None:
+        position = measurements.position.detach().cpu()
+    seen = ~position.isnan().any(-1)
+    count = torch.bincount(group[seen], minlength=groups)
+    if (count == 0).any():
+        row = int((group == int((count == 0).nonzero()[0])).nonzero()[0])
+        raise MeasurementError(
+            f"{measurements.place(row)}: no position was measured, so it cannot be split by space; split by "
+            "joints or by time."
+        )
+    total = torch.zeros(groups, 3, dtype=torch.float64).index_add(0, group[seen], position[seen])
+    return total / count[:, None]
+
+
+def _train_test(measurements: Measurements, is_test: Tensor) -> TrainTest:
+    rows = torch.arange(measurements.rows)
+    device = measurements.q.device
+    return rows[~is_test].to(device), rows[is_test].to(device)

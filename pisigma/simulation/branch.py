@@ -1,0 +1,99 @@
+"""On which branch the true robot reaches wanted poses: the nominal joint values to start from."""
+
+import torch
+from jaxtyping import Float64
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from pisigma.errors import RecipeError, UnreachablePoseError, nearest_choice
+from pisigma.kinematics.closed_form import AbstractClosedForm, InverseSolutions, closed_form_solver
+from pisigma.kinematics.status import Status
+from pisigma.robot.description import Robot
+from pisigma.se3 import wrap_to_pi
+from pisigma.simulation.joint_names import joint_values
+from pisigma.yaml_file import Section
+
+
+class BranchSection(Section):
+    """Which of several solutions of the inverse kinematics is taken, the same for all poses of a simulation.
+
+    Attributes:
+        name: a branch of the nominal robot's closed form, by name; or
+        near_deg: joint values to be near to, by name of a revolute joint [deg], 0 where not stated; with a
+            closed form its nearest reachable solution is taken, without one the search for the true solution
+            starts here.
+        near_mm: the same for prismatic joints [mm].
+    """
+
+    name: str | None = None
+    near_deg: dict[str, float] | None = None
+    near_mm: dict[str, float] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "BranchSection":
+        if (self.name is None) == (self.near_deg is None):
+            raise ValueError("state either the name of the branch or near_deg (with near_mm)")
+        if self.name is not None and self.near_mm:
+            raise ValueError("near_mm goes with near_deg, not with name; remove it")
+        return self
+
+    def start(self, robot: Robot, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses dof"]:
+        """Joint values [rad or m] near which the true robot reaches the poses.
+
+        Args:
+            robot: the nominal robot.
+            T: T_base_tool wanted.
+
+        Raises:
+            RecipeError: no such branch or joint, or the robot has no closed form whose branch could be named.
+            UnreachablePoseError: the nominal robot does not reach a pose on this branch.
+        """
+        solver = closed_form_solver(robot)
+        if self.name is not None:
+            return self._named(solver, robot, T)
+        fields = ("near_deg", "near_mm")
+        stated = torch.from_numpy(joint_values(robot, self.near_deg or {}, self.near_mm, fields, "branch"))
+        near = torch.where(torch.tensor(robot.revolute), torch.deg2rad(stated), stated / 1e3).to(T.device)
+        if solver is None:
+            return near.expand(len(T), robot.dof)
+        return _nearest(solver.solve(T), robot, near)
+
+    def _named(
+        self, solver: AbstractClosedForm | None, robot: Robot, T: Float64[Tensor, "poses 4 4"]
+    ) -> Float64[Tensor, "poses dof"]:
+        if solver is None:
+            raise RecipeError(
+                f"branch: robot '{robot.name}' has no closed form and so no branch '{self.name}'; "
+                "state near_deg instead."
+            )
+        if self.name not in solver.branches:
+            raise RecipeError(
+                f"branch: robot '{robot.name}' has no branch '{self.name}'; "
+                f"{nearest_choice(str(self.name), solver.branches)}"
+            )
+        index = solver.branches.index(str(self.name))
+        solutions = solver.solve(T)
+        _refuse_unreachable(solutions.status[:, index] == Status.UNREACHABLE, f"branch '{self.name}'")
+        return solutions.q[:, index]
+
+
+def _nearest(
+    solutions: InverseSolutions, robot: Robot, near: Float64[Tensor, " dof"]
+) -> Float64[Tensor, "poses dof"]:
+    """Of each pose's solutions the nearest, by the sum of squared differences, angles wrapped."""
+    unreachable = solutions.status == Status.UNREACHABLE
+    _refuse_unreachable(unreachable.all(-1), "any branch")
+    difference = solutions.q - near
+    revolute = torch.tensor(robot.revolute, device=near.device)
+    difference = torch.where(revolute, wrap_to_pi(difference), difference)
+    distance = torch.where(unreachable, torch.inf, (difference * difference).sum(-1))
+    return torch.take_along_dim(solutions.q, distance.argmin(-1)[:, None, None], 1)[:, 0]
+
+
+def _refuse_unreachable(unreachable: Tensor, where: str) -> None:
+    if unreachable.any():
+        raise UnreachablePoseError(
+            f"wanted pose {int(unreachable.nonzero()[0])} (counted from 0; {int(unreachable.sum())} of "
+            f"{len(unreachable)} poses) cannot be reached by the nominal robot on {where}; "
+            "change the region of the poses or the branch."
+        )

@@ -1,0 +1,133 @@
+"""Joints that give way under the weight of the arm and its payload."""
+
+from typing import Annotated, Literal
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+
+from pisigma.kinematics.components import (
+    Scalar,
+    Vector,
+    add,
+    combine,
+    cross,
+    follow_xyzrpy,
+    product,
+    translate,
+)
+from pisigma.kinematics.forward import Geometry, iterate_rows
+from pisigma.robot.description import Robot
+from pisigma.simulation.joint_names import joint_values, row_index
+from pisigma.simulation.source import AbstractJointSource, JointErrorFunction
+from pisigma.yaml_file import Section
+
+Triple = tuple[float, float, float]
+
+
+class LinkMass(Section):
+    """Mass of a link or a payload.
+
+    Attributes:
+        mass_kg: mass [kg].
+        centre_mm: centre of mass [mm], in the frame of the link's own row (behind its RotY(beta)); for the
+            payload in the tool frame.
+    """
+
+    mass_kg: float = Field(ge=0)
+    centre_mm: Triple = (0.0, 0.0, 0.0)
+
+
+class JointCompliance(AbstractJointSource):
+    """Every joint gives way in proportion to the torque that gravity puts on it.
+
+    `e_j = c_j · tau_j(q)` with `tau_j = Σ_k z_j · ((r_k - p_j) x m_k g)` over all masses k beyond joint j,
+    where z_j and p_j are the joint's axis and origin and r_k the centre of mass; for a prismatic joint the
+    force `tau_j = Σ_k z_j · m_k g`. The torque is taken on the nominal geometry at the commanded joints, not
+    where they give way to: first order in the compliance.
+
+    Source: Whitney, Lozinski and Rourke, ASME Journal of Dynamic Systems, Measurement, and Control
+    108(1), 1986, 1-8; Judd and Knasinski, IEEE Transactions on Robotics and Automation 6(1), 1990, 20-30.
+    A linear spring between motor and link is the model of Spong, "Modeling and control of elastic joint
+    robots", ASME Journal of Dynamic Systems, Measurement, and Control 109(4), 1987, 310-318.
+
+    Attributes:
+        kind: "joint_compliance".
+        compliance_rad_per_Nm: by name of a revolute joint [rad/(N m)]; 1e-6 to 1e-5 for industrial arms.
+        compliance_m_per_N: by name of a prismatic joint [m/N].
+        links: mass and centre of mass by row name.
+        payload: what the tool carries.
+        gravity_m_per_s2: acceleration of free fall [m/s^2] in the frame of the first row (so without `base`).
+    """
+
+    kind: Literal["joint_compliance"]
+    compliance_rad_per_Nm: dict[str, Annotated[float, Field(ge=0)]] = Field(default_factory=dict)
+    compliance_m_per_N: dict[str, Annotated[float, Field(ge=0)]] = Field(default_factory=dict)
+    links: dict[str, LinkMass] = Field(default_factory=dict)
+    payload: LinkMass = LinkMass(mass_kg=0.0)
+    gravity_m_per_s2: Triple = (0.0, 0.0, -9.81)
+
+    def bind(self, robot: Robot, place: str) -> JointErrorFunction:
+        """The deflection as a function of the joint values. See `AbstractJointSource.bind`."""
+        fields = ("compliance_rad_per_Nm", "compliance_m_per_N")
+        stated = joint_values(robot, self.compliance_rad_per_Nm, self.compliance_m_per_N, fields, place)
+        compliance = torch.from_numpy(stated)
+        links = {row_index(robot, name, place): mass for name, mass in self.links.items()}
+
+        def error(q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+            return compliance.to(q) * gravity_load(robot, q, links, self.payload, self.gravity_m_per_s2)
+
+        return error
+
+
+def gravity_load(
+    robot: Robot,
+    q: Float[Tensor, "*batch dof"],
+    links: dict[int, LinkMass],
+    payload: LinkMass,
+    gravity: Triple,
+) -> Float[Tensor, "*batch dof"]:
+    """Torque [N m] or force [N] that gravity puts on every joint, counted as the controller counts.
+
+    It is minus the derivative of the potential energy by the joint values. The sum over the masses beyond a
+    joint is kept as their total M and first moment S = Σ m r: `tau_j = z_j · ((S - M p_j) x g)`.
+
+    Args:
+        robot: the robot; its base is left out.
+        q: joint values [rad or m].
+        links: masses by index of the row.
+        payload: mass in the tool frame.
+        gravity: acceleration of free fall [m/s^2] in the frame of the first row.
+    """
+    columns = q.reshape(-1, robot.dof).t().contiguous().unbind(0)
+    geometry = Geometry(robot.dh.tolist(), [0.0] * 6, robot.tool.tolist())
+    frames = list(iterate_rows(robot, geometry, columns))
+    total = payload.mass_kg
+    moment = _first_moment(payload, follow_xyzrpy(frames[-1].after, geometry.tool))
+    loads: list[Tensor] = []
+    for index in reversed(range(len(frames))):
+        row, frame = robot.rows[index], frames[index]
+        if index in links:
+            total += links[index].mass_kg
+            moment = combine(1.0, moment, 1.0, _first_moment(links[index], frame.after))
+        if row.type == "fixed":
+            continue
+        axis, origin = frame.before[2], frame.before[3]
+        arm = cross(combine(1.0, moment, -total, origin), gravity)
+        load = _dot(axis, arm) if row.type == "revolute" else product(total, _dot(axis, gravity))
+        loads.append(torch.zeros_like(columns[0]) + product(float(row.direction), load))
+    return torch.stack(loads[::-1], -1).reshape(q.shape)
+
+
+def _first_moment(mass: LinkMass, frame: tuple[Vector, Vector, Vector, Vector]) -> Vector:
+    """Mass times centre of mass [kg m] in the frame of the first row."""
+    x, y, z = (value / 1e3 for value in mass.centre_mm)
+    return combine(mass.mass_kg, translate(frame, x, y, z)[3], 0.0, (0.0, 0.0, 0.0))
+
+
+def _dot(u: Vector, v: Vector) -> Scalar:
+    total: Scalar = 0.0
+    for s, t in zip(u, v, strict=True):
+        total = add(total, product(s, t))
+    return total

@@ -1,0 +1,42 @@
+"""Joints whose zero is not where the drawing has it."""
+
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+
+from pisigma.robot.description import Robot
+from pisigma.simulation.joint_names import joint_values
+from pisigma.simulation.source import AbstractJointSource, JointErrorFunction
+
+
+class JointOffset(AbstractJointSource):
+    """A constant error of each joint's zero.
+
+    `e_j = offset_j`, added to the joint value as the controller counts.
+
+    Source: Whitney, Lozinski and Rourke, "Industrial robot forward calibration method and results", ASME
+    Journal of Dynamic Systems, Measurement, and Control 108(1), 1986, 1-8.
+
+    Attributes:
+        kind: "joint_offset".
+        offset_deg: by name of a revolute joint [deg].
+        offset_mm: by name of a prismatic joint [mm].
+    """
+
+    kind: Literal["joint_offset"]
+    offset_deg: dict[str, float] = Field(default_factory=dict)
+    offset_mm: dict[str, float] = Field(default_factory=dict)
+
+    def bind(self, robot: Robot, place: str) -> JointErrorFunction:
+        """The offsets as a function of the joint values. See `AbstractJointSource.bind`."""
+        stated = joint_values(robot, self.offset_deg, self.offset_mm, ("offset_deg", "offset_mm"), place)
+        offset = torch.from_numpy(np.where(robot.revolute, np.deg2rad(stated), stated / 1e3))
+
+        def error(q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+            return torch.zeros_like(q) + offset.to(q)
+
+        return error

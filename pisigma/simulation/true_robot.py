@@ -1,0 +1,192 @@
+"""The true robot of a simulation: a nominal robot with error sources that add up."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Annotated
+
+import torch
+from jaxtyping import Float
+from pydantic import Field
+from torch import Tensor
+
+from pisigma.errors import RecipeError, UnreachablePoseError
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.numeric import solve_numeric
+from pisigma.kinematics.status import Status
+from pisigma.robot.description import Robot
+from pisigma.simulation.encoder import EncoderQuantisation
+from pisigma.simulation.geometric import GeometricDeviation
+from pisigma.simulation.geometric_random import RandomGeometricDeviation
+from pisigma.simulation.joint_compliance import JointCompliance
+from pisigma.simulation.joint_offset import JointOffset
+from pisigma.simulation.source import AbstractGeometrySource, JointErrorFunction
+from pisigma.simulation.transmission import TransmissionHarmonics
+from pisigma.yaml_file import Section
+
+ErrorSource = (
+    GeometricDeviation
+    | RandomGeometricDeviation
+    | JointOffset
+    | JointCompliance
+    | TransmissionHarmonics
+    | EncoderQuantisation
+)
+
+ITERATIONS = 200
+"""Steps after which solving for the commanded joints is given up; errors of a real robot need about ten."""
+
+
+class TrueRobotSection(Section):
+    """The part of a recipe that states the true robot, completely.
+
+    Attributes:
+        robot: catalogue name or robot file of the nominal robot.
+        errors: what is wrong with the true one; they add up.
+    """
+
+    robot: str
+    errors: tuple[Annotated[ErrorSource, Field(discriminator="kind")], ...] = ()
+
+    def true_robot(self) -> "TrueRobot":
+        """The true robot.
+
+        Raises:
+            RobotError: there is no such robot.
+            RecipeError: an error source does not fit the robot.
+        """
+        return TrueRobot(Robot.load(self.robot), self.errors)
+
+
+@dataclass(frozen=True, eq=False)
+class TrueRobot:
+    """A robot as it really is: `T_base_tool = FK(q + Σ e_i(q); nominal geometry + Σ changes)`.
+
+    Every joint error e_i, the rounding of the encoder among them, is evaluated at the commanded joints q and
+    on the nominal geometry, and then all are added. So their order does not matter, and the effect of one
+    source does not depend on the others.
+
+    Attributes:
+        nominal: the robot as drawn.
+        errors: the error sources.
+        geometry: the robot with the true geometric parameters; takes actual joint values.
+    """
+
+    nominal: Robot
+    errors: Sequence[ErrorSource] = ()
+    geometry: Robot = field(init=False)
+    _joint_errors: tuple[JointErrorFunction, ...] = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Add the geometric errors up and bind the joint errors to the robot."""
+        dh, base, tool = self.nominal.dh.copy(), self.nominal.base.copy(), self.nominal.tool.copy()
+        joint_errors: list[JointErrorFunction] = []
+        quantised: set[str] = set()
+        for index, source in enumerate(self.errors):
+            place = f"errors[{index}] ({source.kind})"
+            if isinstance(source, AbstractGeometrySource):
+                change = source.change(self.nominal, place)
+                dh, base, tool = dh + change.dh, base + change.base, tool + change.tool
+                continue
+            joint_errors.append(source.bind(self.nominal, place))
+            if isinstance(source, EncoderQuantisation):
+                if twice := sorted(quantised & source.joint_names):
+                    raise RecipeError(
+                        f"{place}: joint '{twice[0]}' has an encoder already; state one of the two."
+                    )
+                quantised |= source.joint_names
+        object.__setattr__(self, "errors", tuple(self.errors))
+        object.__setattr__(self, "geometry", self.nominal.with_geometry(dh, base, tool))
+        object.__setattr__(self, "_joint_errors", tuple(joint_errors))
+
+    @property
+    def has_encoder(self) -> bool:
+        """Whether a joint moves in steps."""
+        return any(isinstance(source, EncoderQuantisation) and source.joint_names for source in self.errors)
+
+    def without_encoder(self) -> "TrueRobot":
+        """The same robot, its joints moving continuously."""
+        return replace(self, errors=[e for e in self.errors if not isinstance(e, EncoderQuantisation)])
+
+    def joint_error(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+        """How far the joints end up from where they are commanded: actual minus commanded [rad or m].
+
+        Args:
+            q: commanded joint values [rad or m], as the controller counts.
+
+        Raises:
+            PoseError: q has another number of columns than the robot has joints.
+        """
+        self.nominal.check_joint_count(q.shape[-1])
+        total = torch.zeros_like(q)
+        for error in self._joint_errors:
+            total = total + error(q)
+        return total
+
+    def actual_joints(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+        """Where the joints end up [rad or m] when commanded to q: `q + joint_error(q)`."""
+        return q + self.joint_error(q)
+
+    def forward(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch 4 4"]:
+        """T_base_tool that the robot really takes when commanded to q [rad or m]; no measurement noise."""
+        return forward_kinematics(self.geometry, self.actual_joints(q))
+
+    def commanded_joints(self, actual: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+        """What to command [rad or m] so that the joints end up at `actual`.
+
+        Solves `q + joint_error(q) = actual` by `q <- actual - joint_error(q)` until q moves less than 1e-14
+        (16 machine epsilons in lower precision). This contracts by the slope of the joint errors, a few
+        percent.
+
+        Raises:
+            PoseError: `actual` has another number of columns than the robot has joints.
+            UnreachablePoseError: the robot has encoder steps, or the errors are too steep to be undone.
+        """
+        if self.has_encoder:
+            raise UnreachablePoseError(
+                "the true robot has encoder steps and cannot end up just anywhere; take the encoder out of "
+                "its errors or use without_encoder()."
+            )
+        tolerance = max(1e-14, 16 * torch.finfo(actual.dtype).eps)
+        q, moved = actual, torch.zeros_like(actual)
+        for _ in range(ITERATIONS):
+            following = actual - self.joint_error(q)
+            moved, q = (following - q).abs(), following
+            if bool((moved < tolerance).all()):
+                return q
+        worst = self.nominal.joints[int(moved.reshape(-1, self.nominal.dof).amax(0).argmax())].name
+        raise UnreachablePoseError(
+            f"no commanded joints found for the true robot in {ITERATIONS} iterations: joint '{worst}' still "
+            f"moves by {float(moved.max()):.1e}; its error changes faster than the joint itself, so reduce "
+            "amplitudes or compliances, and check that the joint values are finite."
+        )
+
+    def inverse(
+        self, T: Float[Tensor, "*batch 4 4"], start: Float[Tensor, "*starts dof"]
+    ) -> Float[Tensor, "*batch dof"]:
+        """Joint values [rad or m] to command so that the true robot takes the poses T.
+
+        First the actual joints on the true geometry, by Newton steps from `start` (so on its branch), then
+        the commanded ones. See `commanded_joints`.
+
+        Args:
+            T: T_base_tool wanted.
+            start: joint values near the solution, for example of the nominal inverse kinematics; broadcasts.
+
+        Raises:
+            PoseError: T is no rigid transform, or `start` has another number of columns than the robot has
+                joints.
+            UnreachablePoseError: the true robot cannot take a pose, or not on this branch; or it has encoder
+                steps.
+        """
+        solution = solve_numeric(self.geometry, T, start)
+        missed = solution.status == Status.NOT_CONVERGED
+        if missed.any():
+            index = tuple(missed.nonzero()[0].tolist())
+            raise UnreachablePoseError(
+                "the true robot does not reach the wanted pose at index "
+                f"{index if len(index) != 1 else index[0]}: "
+                f"{float(solution.position_residual[index]) * 1e3:.3g} mm and "
+                f"{float(torch.rad2deg(solution.rotation_residual[index])):.3g} deg are left; "
+                f"{Status.NOT_CONVERGED.sentence}"
+            )
+        return self.commanded_joints(solution.q)

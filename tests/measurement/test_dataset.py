@@ -1,0 +1,167 @@
+"""What a data set of measurements accepts, and what it carries along."""
+
+from dataclasses import FrozenInstanceError, replace
+
+import pytest
+import torch
+from testing.closeness import assert_close
+
+from pisigma.errors import MeasurementError
+from pisigma.measurement import LeftOut, Measurements
+from pisigma.se3 import rotation_from_quaternion
+
+
+def make_measurements(rows: int = 4, dof: int = 3, seed: int = 0) -> Measurements:
+    """Measurements with every field filled."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def random(*shape: int) -> torch.Tensor:
+        return torch.rand(*shape, generator=generator, dtype=torch.float64) + 0.1
+
+    return Measurements(
+        q=random(rows, dof),
+        position=random(rows, 3),
+        rotation=rotation_from_quaternion(random(rows, 4)),
+        frame=tuple(f"frame {row}" for row in range(rows)),
+        target=tuple("ABC"[row % 3] for row in range(rows)),
+        sigma_position=random(rows),
+        sigma_rotation=random(rows),
+        split=tuple("train" if row % 2 else "test" for row in range(rows)),
+        payload=random(rows),
+        temperature=random(rows),
+        line=tuple(range(2, rows + 2)),
+        source="tracker.csv",
+        left_out=(LeftOut(9, "column 'x_mm': empty"),),
+    )
+
+
+def zeros(*shape: int) -> torch.Tensor:
+    return torch.zeros(*shape, dtype=torch.float64)
+
+
+def test_fills_in_names_that_are_not_given():
+    measurements = Measurements(q=zeros(3, 2))
+    assert (measurements.rows, measurements.dof, measurements.kind) == (3, 2, "position")
+    assert measurements.frame == measurements.target == ("", "", "")
+    assert measurements.line == (0, 0, 0)
+    assert measurements.place(1) == "memory, row 1"
+
+
+def test_no_rows_are_measurements_too():
+    measurements = Measurements(q=zeros(0, 6), position=zeros(0, 3), rotation=zeros(0, 3, 3))
+    assert measurements.T.shape == (0, 4, 4)
+    assert measurements.select(torch.zeros(0, dtype=torch.bool)).rows == 0
+
+
+def test_is_frozen():
+    with pytest.raises(FrozenInstanceError):
+        make_measurements().source = "other"
+
+
+def test_poses_hold_position_and_rotation():
+    measurements = make_measurements()
+    assert measurements.kind == "pose"
+    assert_close(measurements.T[:, :3, 3], measurements.position)
+    assert_close(measurements.T[:, :3, :3], measurements.rotation)
+    assert_close(measurements.T[:, 3], torch.eye(4, dtype=torch.float64)[3].expand(4, 4))
+
+
+@pytest.mark.parametrize(("missing", "word"), [("rotation", "orientation"), ("position", "position")])
+def test_no_poses_without_position_and_rotation(missing: str, word: str):
+    with pytest.raises(MeasurementError, match=rf"tracker\.csv.*no {word} was measured"):
+        _ = replace(make_measurements(), **{missing: None}).T
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("q", zeros(4), "shape"),
+        ("q", zeros(4, 0), "shape"),
+        ("q", zeros(4, 3).float(), "float64"),
+        ("q", torch.full((4, 3), torch.nan, dtype=torch.float64), r"line 2.*not finite"),
+        ("position", zeros(3, 3), r"'position' of shape \(4, 3\)"),
+        ("position", zeros(4, 3).float(), "float64"),
+        ("position", torch.full((4, 3), torch.inf, dtype=torch.float64), r"line 2.*infinite"),
+        ("position", torch.tensor([[0, 0, torch.nan]] * 4, dtype=torch.float64), r"line 2.*NaN in part"),
+        ("rotation", zeros(4, 3, 3), r"line 2.*not orthonormal"),
+        ("rotation", -torch.eye(3, dtype=torch.float64).repeat(4, 1, 1), r"line 2.*left-handed"),
+        ("sigma_position", zeros(4), r"line 2.*not above 0"),
+        ("sigma_rotation", zeros(4) - 1, r"line 2.*not above 0"),
+        ("payload", zeros(4) - 1, r"line 2.*below 0"),
+        ("temperature", zeros(5), "'temperature'"),
+        ("frame", ("a",), "'frame' has 1 entries for 4 rows"),
+        ("line", (1, 2), "'line' has 2 entries for 4 rows"),
+        ("split", ("train", "test", "trian", "test"), r"line 4.*did you mean 'train'"),
+    ],
+)
+@pytest.mark.usefixtures("without_type_checker")
+def test_refuses_what_does_not_fit(field: str, value: object, message: str):
+    with pytest.raises(MeasurementError, match=message) as caught:
+        replace(make_measurements(), **{field: value})
+    assert "tracker.csv" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "index", [torch.tensor([2, 0]), torch.tensor([True, False, True, False])], ids=["index", "mask"]
+)
+def test_select_carries_everything_along(index: torch.Tensor):
+    measurements = make_measurements()
+    rows = [2, 0] if index.dtype == torch.int64 else [0, 2]
+    chosen = measurements.select(index)
+    for name in ("q", "position", "rotation", "sigma_position", "sigma_rotation", "payload", "temperature"):
+        assert_close(getattr(chosen, name), getattr(measurements, name)[rows])
+    for name in ("frame", "target", "split", "line"):
+        assert getattr(chosen, name) == tuple(getattr(measurements, name)[row] for row in rows)
+    assert (chosen.source, chosen.left_out) == (measurements.source, measurements.left_out)
+
+
+def test_select_keeps_absent_what_is_absent():
+    chosen = Measurements(q=zeros(3, 2), position=zeros(3, 3)).select(torch.tensor([1]))
+    assert chosen.rotation is None
+    assert chosen.split is None
+
+
+@pytest.mark.parametrize(
+    ("index", "message"),
+    [
+        (torch.tensor([0, 4]), "rows 0 to 3"),
+        (torch.tensor([-1]), "rows 0 to 3"),
+        (torch.tensor([True]), "mask of 4 rows"),
+        (torch.tensor([[0]]), "one axis"),
+        (torch.tensor([0], dtype=torch.int32), "int64"),
+        (torch.tensor([0.0]), "int64"),
+    ],
+)
+def test_select_refuses_other_indices(index: torch.Tensor, message: str):
+    with pytest.raises(MeasurementError, match=message):
+        make_measurements().select(index)
+
+
+def test_hash_depends_on_values_and_on_nothing_else():
+    measurements = make_measurements()
+    elsewhere = replace(measurements, source="other.csv", line=(), left_out=())
+    assert measurements.content_hash() == elsewhere.content_hash() == make_measurements().content_hash()
+    assert len(measurements.content_hash()) == 64
+
+
+@pytest.mark.parametrize(
+    "name", ["q", "position", "sigma_position", "sigma_rotation", "payload", "temperature"]
+)
+def test_hash_sees_every_digit(name: str):
+    measurements = make_measurements()
+    values = getattr(measurements, name).clone()
+    values.view(-1)[-1] *= 1 + 2e-16
+    changed = replace(measurements, **{name: values})
+    assert changed.content_hash() != measurements.content_hash()
+
+
+@pytest.mark.parametrize("change", [{"target": ("A", "A", "A", "A")}, {"rotation": None}, {"split": None}])
+def test_hash_sees_names_and_what_is_absent(change: dict[str, object]):
+    measurements = make_measurements()
+    assert replace(measurements, **change).content_hash() != measurements.content_hash()
+
+
+def test_hash_takes_all_nans_and_all_zeros_as_one():
+    plain = Measurements(q=zeros(1, 1), position=torch.full((1, 3), torch.nan, dtype=torch.float64))
+    other = Measurements(q=-zeros(1, 1), position=-torch.full((1, 3), torch.nan, dtype=torch.float64))
+    assert plain.content_hash() == other.content_hash()

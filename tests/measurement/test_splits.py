@@ -1,0 +1,154 @@
+"""Folds part the rows, keep equal joints together, and are as equal as they can be."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pisigma.errors import MeasurementError
+from pisigma.measurement import Measurements, groups_of_equal_joints, holdout, k_folds
+
+WAYS = ("joints", "time", "space")
+
+
+def repeated(labels: list[int]) -> Measurements:
+    """A measurement per label; equal labels have equal joints, and positions along x as the labels."""
+    label = torch.tensor(labels, dtype=torch.float64)
+    noise = torch.linspace(0, 1e-3, len(labels), dtype=torch.float64)
+    position = torch.stack([label, noise, -noise], 1)
+    return Measurements(q=torch.stack([label, -label], 1), position=position)
+
+
+def test_groups_are_numbered_as_they_appear():
+    q = torch.tensor([[2.0, 1], [0.0, 1], [2, 1], [-0.0, 1], [2, 1.0000001]], dtype=torch.float64)
+    assert groups_of_equal_joints(q).tolist() == [0, 1, 0, 1, 2]
+    assert groups_of_equal_joints(q[:0]).tolist() == []
+
+
+def test_groups_of_a_measured_robot(shared_data: Path):
+    measurements = Measurements.read_csv(shared_data / "fanuc_r2000" / "positions.csv")
+    group = groups_of_equal_joints(measurements.q)
+    assert torch.bincount(group).tolist() == [30] * 24
+    for train, test in k_folds(measurements, 6, seed=0):
+        assert (len(train), len(test)) == (600, 120)
+        assert not set(group[train].tolist()) & set(group[test].tolist())
+
+
+@settings(deadline=None, max_examples=150)
+@given(
+    st.lists(st.integers(0, 9), min_size=2, max_size=60),
+    st.integers(2, 5),
+    st.integers(0, 3),
+    st.sampled_from(WAYS),
+)
+def test_folds_part_the_rows_and_keep_groups_whole(labels: list[int], folds: int, seed: int, by: str):
+    measurements = repeated(labels)
+    folds = min(folds, len(set(labels)))
+    if folds < 2:
+        return
+    parts = k_folds(measurements, folds, seed, by=by)
+    assert len(parts) == folds
+    assert sorted(row for _, test in parts for row in test.tolist()) == list(range(len(labels)))
+    largest = max(labels.count(label) for label in labels)
+    for train, test in parts:
+        assert sorted(train.tolist() + test.tolist()) == list(range(len(labels)))
+        assert test.tolist() == sorted(test.tolist())
+        assert len(test) > 0
+        assert not {labels[row] for row in train} & {labels[row] for row in test}
+    if by == "joints":
+        sizes = [len(test) for _, test in parts]
+        assert max(sizes) - min(sizes) <= largest
+
+
+@settings(deadline=None, max_examples=100)
+@given(st.lists(st.integers(0, 9), min_size=2, max_size=60), st.floats(0.01, 0.99), st.sampled_from(WAYS))
+def test_holdout_keeps_groups_whole_and_meets_the_share(labels: list[int], share: float, by: str):
+    if len(set(labels)) < 2:
+        return
+    train, test = holdout(repeated(labels), share, seed=0, by=by)
+    assert sorted(train.tolist() + test.tolist()) == list(range(len(labels)))
+    assert min(len(train), len(test)) > 0
+    assert not {labels[row] for row in train} & {labels[row] for row in test}
+    largest = max(labels.count(label) for label in labels)
+    assert abs(len(test) - share * len(labels)) <= largest
+
+
+def test_the_seed_decides_and_nothing_else():
+    measurements = repeated(list(range(40)))
+
+    def tests(seed: int | torch.Generator) -> list[list[int]]:
+        return [test.tolist() for _, test in k_folds(measurements, 4, seed)]
+
+    state = torch.random.get_rng_state()
+    assert tests(1) == tests(1) == tests(torch.Generator().manual_seed(1))
+    assert tests(1) != tests(2)
+    assert torch.equal(torch.random.get_rng_state(), state)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_large_groups_are_balanced_by_many_small_ones(seed: int):
+    parts = k_folds(repeated([0] * 6 + [1] * 4 + [2] * 3 + list(range(3, 8))), 3, seed)
+    assert [len(test) for _, test in parts] == [6, 6, 6]
+
+
+def test_by_time_gives_blocks_of_the_file():
+    parts = k_folds(repeated([5, 5, 3, 3, 9, 9, 1, 5]), 3, seed=0, by="time")
+    assert [test.tolist() for _, test in parts] == [[0, 1, 7], [2, 3], [4, 5, 6]]
+    train, test = holdout(repeated([5, 5, 3, 3, 9, 9, 1, 1]), 0.25, seed=0, by="time")
+    assert (train.tolist(), test.tolist()) == ([0, 1, 2, 3, 4, 5], [6, 7])
+
+
+def test_by_space_gives_boxes_that_do_not_overlap():
+    generator = torch.Generator().manual_seed(0)
+    position = (
+        torch.rand(200, 3, generator=generator, dtype=torch.float64) * torch.tensor([4.0, 2.0, 0.5]).double()
+    )
+    measurements = Measurements(
+        q=torch.rand(200, 6, generator=generator, dtype=torch.float64), position=position
+    )
+    boxes = [
+        (position[test].amin(0), position[test].amax(0))
+        for _, test in k_folds(measurements, 5, 0, by="space")
+    ]
+    for i, (low, high) in enumerate(boxes):
+        for other_low, other_high in boxes[:i]:
+            assert bool(((high < other_low) | (other_high < low)).any())
+    assert {len(test) for _, test in k_folds(measurements, 5, 0, by="space")} == {40}
+    train, test = holdout(measurements, 0.2, 0, by="space")
+    assert len(test) == 40
+    assert position[test, 0].min() > position[train, 0].max()
+
+
+@pytest.mark.parametrize("folds", [-1, 0, 1, 4])
+def test_refuses_more_folds_than_joint_vectors(folds: int):
+    with pytest.raises(
+        MeasurementError, match=rf"{folds} folds were wanted from 3 different .* 2 to 3 folds"
+    ):
+        k_folds(repeated([1, 1, 2, 3]), folds, seed=0)
+
+
+def test_refuses_to_part_a_single_pose():
+    with pytest.raises(MeasurementError, match="measure more poses"):
+        k_folds(repeated([1, 1, 1]), 2, seed=0)
+    with pytest.raises(MeasurementError, match="measure more poses"):
+        holdout(repeated([1, 1, 1]), 0.5, seed=0)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0, -0.5, float("nan")])
+def test_refuses_a_share_that_is_none(share: float):
+    with pytest.raises(MeasurementError, match="between 0 and 1"):
+        holdout(repeated([1, 2, 3]), share, seed=0)
+
+
+def test_refuses_space_without_positions_to_compare():
+    q = torch.arange(4.0).double()[:, None]
+    position = torch.ones(4, 3, dtype=torch.float64)
+    with pytest.raises(MeasurementError, match="row 0: no position was measured"):
+        k_folds(Measurements(q=q), 2, 0, by="space")
+    position[2] = torch.nan
+    with pytest.raises(MeasurementError, match="row 2: no position was measured"):
+        holdout(Measurements(q=q, position=position), 0.5, 0, by="space")
+    with pytest.raises(MeasurementError, match="2 frames cannot be compared"):
+        k_folds(Measurements(q=q, position=position, frame=("a", "a", "b", "b")), 2, 0, by="space")
