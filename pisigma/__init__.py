@@ -1,0 +1,46 @@
+"""pisigma: robot calibration and corrected inverse kinematics.
+
+Names are loaded on first use (PEP 562), so that `import pisigma` costs next to nothing.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pisigma.correction.corrected_ik import CorrectedIK as CorrectedIK
+    from pisigma.correction.corrected_ik import Solution as Solution
+    from pisigma.correction.corrected_ik import load as load
+    from pisigma.errors import PisigmaError as PisigmaError
+    from pisigma.kinematics.status import Status as Status
+    from pisigma.measurement.dataset import Measurements as Measurements
+    from pisigma.network.pi_sigma import PiSigma as PiSigma
+    from pisigma.robot.description import Robot as Robot
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "CorrectedIK": "pisigma.correction.corrected_ik",
+    "Measurements": "pisigma.measurement.dataset",
+    "PiSigma": "pisigma.network.pi_sigma",
+    "PisigmaError": "pisigma.errors",
+    "Robot": "pisigma.robot.description",
+    "Solution": "pisigma.correction.corrected_ik",
+    "Status": "pisigma.kinematics.status",
+    "load": "pisigma.correction.corrected_ik",
+}
+
+__all__ = ["CorrectedIK", "Measurements", "PiSigma", "PisigmaError", "Robot", "Solution", "Status", "load"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first asked for."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'pisigma' has no attribute '{name}'")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """List the public names without importing them."""
+    return sorted([*globals(), *_HOMES])

@@ -1,0 +1,27 @@
+"""`pisigma simulate`: the simulated measurements of a recipe as a file."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+
+def simulate(
+    recipe: Annotated[Path, typer.Argument(help="Recipe (YAML) with simulated data.")],
+    out: Annotated[Path, typer.Option(help="CSV file to write.")],
+    held_out: Annotated[bool, typer.Option(help="Write the held-out rows instead of the training rows.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Write the simulated measurements of a recipe as a CSV file."""
+    from pisigma.robot import Robot
+    from pisigma.training.recipe import read_recipe
+    from pisigma.training.run import simulate_held_out, simulate_training
+
+    stated = read_recipe(recipe)
+    rows = simulate_held_out(stated) if held_out else simulate_training(stated)
+    rows.write_csv(out, Robot.load(stated.robot))
+    if as_json:
+        typer.echo(json.dumps({"file": str(out), "rows": rows.rows, "sha256": rows.content_hash()}))
+    else:
+        typer.echo(f"{rows.rows} measurements written to {out}.")

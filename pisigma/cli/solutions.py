@@ -1,0 +1,115 @@
+"""Solutions of the corrected inverse kinematics as records, tables and files."""
+
+import csv
+import math
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pisigma.correction.corrected_ik import Solution
+from pisigma.errors import OutputError
+from pisigma.kinematics.status import Status
+from pisigma.robot.description import Robot
+
+_QUANTITIES = ("q", "q_nominal", "correction")
+_FAILURES = (Status.UNREACHABLE, Status.NOT_CONVERGED, Status.OUTSIDE_JOINT_LIMITS, Status.SINGULAR)
+
+
+def solution_records(solution: Solution, robot: Robot) -> list[dict[str, Any]]:
+    """One record per solution: status, joint values, branch.
+
+    A robot whose joints all turn gets `q_deg`, `q_nominal_deg`, `correction_deg` as lists; with a prismatic joint
+    `q`, `q_nominal`, `correction` are lists of `{"joint", "value", "unit"}`. What is not known is null.
+    """
+    records = []
+    measures = solution.domain_measure.tolist()
+    for row, status in enumerate(solution.status.tolist()):
+        record: dict[str, Any] = {"status": Status(status).name.lower(), "sentence": Status(status).sentence}
+        for name in _QUANTITIES:
+            values = [_or_none(v) for v in _in_file_units(getattr(solution, name)[row].tolist(), robot)]
+            if all(robot.revolute):
+                record[f"{name}_deg"] = values
+            else:
+                record[name] = [
+                    {"joint": joint.name, "value": value, "unit": unit}
+                    for joint, value, unit in zip(robot.joints, values, _units(robot), strict=True)
+                ]
+        record["branch"] = solution.branches[int(solution.branch[row])]
+        record["domain_measure"] = _or_none(measures[row])
+        records.append(record)
+    return records
+
+
+def print_solutions(solution: Solution, robot: Robot) -> None:
+    """Print a table per solution."""
+    from pisigma.cli.output import print_table
+
+    for row, status in enumerate(solution.status.tolist()):
+        values = [_in_file_units(getattr(solution, name)[row].tolist(), robot) for name in _QUANTITIES]
+        lines = [
+            (joint.name, *(f"{value:.6f}" for value in figures), unit)
+            for joint, unit, *figures in zip(robot.joints, _units(robot), *values, strict=True)
+        ]
+        title = f"{Status(status).name.lower()}, branch {solution.branches[int(solution.branch[row])]}"
+        print_table(title, ("joint", "corrected", "nominal", "correction", "unit"), lines)
+        print(Status(status).sentence)
+
+
+def write_joints(solution: Solution, robot: Robot, path: Path) -> None:
+    """Write one row per pose, whole or not at all: status, branch, corrected and nominal joint values.
+
+    Raises:
+        OutputError: the file cannot be written there.
+    """
+    units = _units(robot)
+    header = ["status", "branch", *(f"q{i}_{unit}" for i, unit in enumerate(units, 1))]
+    header += [f"q{i}_nominal_{unit}" for i, unit in enumerate(units, 1)]
+    try:
+        handle, scratch = tempfile.mkstemp(prefix=f".{path.name}.", dir=path.parent)
+    except OSError as problem:
+        raise OutputError(f"{path}: cannot be written ({problem.strerror}); choose another --out.") from None
+    try:
+        with os.fdopen(handle, "w", newline="", encoding="utf-8") as file:
+            writer = csv.writer(file)
+            writer.writerow(header)
+            for q, nominal, status, branch in zip(
+                solution.q.tolist(), solution.q_nominal.tolist(), solution.status.tolist(), solution.branch.tolist(),
+                strict=True,
+            ):
+                cells = ["" if math.isnan(v) else repr(v) for part in (q, nominal) for v in _in_file_units(part, robot)]
+                writer.writerow([Status(status).name.lower(), solution.branches[branch], *cells])
+        os.chmod(scratch, 0o644)
+        os.replace(scratch, path)
+    finally:
+        Path(scratch).unlink(missing_ok=True)
+
+
+def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str | None:
+    """Say which poses the robot cannot take as asked; None where it can take all.
+
+    Args:
+        solution: the solutions.
+        places: what to call each of them.
+        any_will_do: one that reaches is enough (all branches of one pose).
+    """
+    statuses = [Status(status) for status in solution.status.tolist()]
+    failed = [row for row, status in enumerate(statuses) if status in _FAILURES]
+    if not failed or (any_will_do and len(failed) < len(statuses)):
+        return None
+    more = f" ({len(failed) - 1} more poses like this)" if len(failed) > 1 and not any_will_do else ""
+    status = statuses[failed[0]]
+    return f"{places[failed[0]]}: {status.name.lower()}. {status.sentence}{more}"
+
+
+def _units(robot: Robot) -> list[str]:
+    return ["deg" if revolute else "mm" for revolute in robot.revolute]
+
+
+def _in_file_units(values: Sequence[float], robot: Robot) -> list[float]:
+    return [math.degrees(v) if revolute else v * 1e3 for v, revolute in zip(values, robot.revolute, strict=True)]
+
+
+def _or_none(value: float) -> float | None:
+    return None if math.isnan(value) else value

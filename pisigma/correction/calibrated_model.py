@@ -1,0 +1,102 @@
+"""A calibrated robot: geometry, learned joint corrections and where both hold."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.correction.domain import Domain
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.network.correction_network import CorrectionNetwork
+from pisigma.robot.description import Robot
+
+FORWARD_ITERATIONS = 100
+FORWARD_TOLERANCE = 1e-12
+"""[rad or m] Joint values have settled when none moves more than this in an iteration."""
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a model comes from.
+
+    Attributes:
+        recipe: the recipe's name.
+        recipe_sha256: hash of the recipe file.
+        data_source: the measured file, or "simulation".
+        data_sha256: hash of the training measurements.
+        rows: training rows used.
+        rows_left_out: training rows left out, with the rule in `rule`.
+        rule: why rows were left out.
+        seed: of the training.
+        versions: of pisigma, torch and python.
+    """
+
+    recipe: str = ""
+    recipe_sha256: str = ""
+    data_source: str = ""
+    data_sha256: str = ""
+    rows: int = 0
+    rows_left_out: int = 0
+    rule: str = ""
+    seed: int = 0
+    versions: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedModel:
+    """Everything that `pisigma.load` needs.
+
+    Attributes:
+        name: of the model.
+        kind: how it was made, such as "inverse_calibration".
+        robot: its kinematics give the nominal joint values; base and tool as fitted.
+        network: joint corrections, or None.
+        domain: where the corrections hold, or None.
+        branches: branches of the closed-form inverse that the training rows lie on, most frequent first; empty where
+            there is no closed form.
+        starts: joint values [rad or m] from which the numeric inverse starts, where there is no closed form.
+        provenance: recipe, data, versions.
+        metrics: figures for the card, by name.
+    """
+
+    name: str
+    kind: str
+    robot: Robot
+    network: CorrectionNetwork | None
+    domain: Domain | None
+    branches: tuple[str, ...]
+    starts: Float64[Tensor, "starts dof"]
+    provenance: Provenance = field(default_factory=Provenance)
+    metrics: dict[str, Any] = field(default_factory=dict)
+
+    def correction(
+        self, T: Float64[Tensor, "*batch 4 4"], q_nominal: Float64[Tensor, "*batch dof"]
+    ) -> Float64[Tensor, "*batch dof"]:
+        """Correction [rad or m] to add to the nominal joint values of poses T_base_tool; 0 without a network."""
+        if self.network is None:
+            return torch.zeros_like(q_nominal)
+        with torch.no_grad():
+            result: Tensor = self.network(T, q_nominal)
+        return result
+
+    def forward(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch 4 4"]:
+        """Pose T_base_tool that the robot really takes when commanded to q [rad or m], as far as the model knows.
+
+        It is the pose whose corrected joint values are q: `q_nominal = q - Δ(FK(q_nominal), q_nominal)`, solved by
+        iteration.
+
+        Returns:
+            The poses; NaN where the iteration does not settle because the correction is steeper than the joints,
+            which happens far outside the domain only.
+        """
+        q_nominal, moved = q, torch.zeros_like(q)
+        for _ in range(FORWARD_ITERATIONS if self.network is not None else 0):
+            following = q - self.correction(forward_kinematics(self.robot, q_nominal), q_nominal)
+            moved, q_nominal = (following - q_nominal).abs(), following
+            if bool((moved <= FORWARD_TOLERANCE).all()):
+                break
+        settled = (moved <= 1e-9).all(-1)
+        T = forward_kinematics(self.robot, torch.where(settled[..., None], q_nominal, q))
+        return torch.where(settled[..., None, None], T, torch.nan)

@@ -1,0 +1,1 @@
+"""The Pi-Sigma network and what it sees."""

@@ -1,0 +1,70 @@
+"""Joint corrections of a pose: one Pi-Sigma network for every group of joints that sees the same inputs."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+from pisigma.network.inputs import Inputs
+from pisigma.network.pi_sigma import PiSigma
+
+
+@dataclass(frozen=True, eq=False)
+class JointGroup:
+    """Joints whose corrections are outputs of one network.
+
+    Attributes:
+        joints: index of every joint, in the order of the network's outputs.
+        inputs: what the network sees.
+    """
+
+    joints: tuple[int, ...]
+    inputs: Inputs
+
+
+class CorrectionNetwork(nn.Module):
+    """Corrections of all joints [rad or m]; joints in no group are not corrected."""
+
+    networks: nn.ModuleList
+
+    def __init__(self, dof: int, groups: Sequence[JointGroup], networks: Sequence[PiSigma]) -> None:
+        """Put groups and their networks together.
+
+        Raises:
+            ValueError: a joint is in two groups, or a network does not fit its group.
+        """
+        super().__init__()
+        joints = [joint for group in groups for joint in group.joints]
+        if len(set(joints)) != len(joints):
+            raise ValueError(f"a joint stands in two groups of the network: {joints}.")
+        for group, network in zip(groups, networks, strict=True):
+            if (network.inputs, network.outputs) != (len(group.inputs.names), len(group.joints)):
+                raise ValueError(
+                    f"a group of {len(group.joints)} joints and {len(group.inputs.names)} inputs was given a network "
+                    f"of {network.outputs} outputs and {network.inputs} inputs."
+                )
+        self.dof = dof
+        self.groups = tuple(groups)
+        self.networks = nn.ModuleList(networks)
+
+    def members(self) -> list[tuple[JointGroup, PiSigma]]:
+        """Every group with its network."""
+        return [(group, network) for group, network in zip(self.groups, self.networks, strict=True)]  # type: ignore[misc]
+
+    def scaled_inputs(
+        self, T: Float[Tensor, "*batch 4 4"], q: Float[Tensor, "*batch dof"]
+    ) -> Float[Tensor, "*batch all_inputs"]:
+        """Scaled inputs of all groups side by side: the space in which the domain is measured."""
+        return torch.cat([net.scale_inputs(group.inputs(T, q)) for group, net in self.members()], -1)
+
+    def forward(
+        self, T: Float[Tensor, "*batch 4 4"], q: Float[Tensor, "*batch dof"]
+    ) -> Float[Tensor, "*batch dof"]:
+        """Correction to add to the nominal joint values `q` of the poses `T`."""
+        columns: list[Tensor] = [torch.zeros_like(q[..., 0])] * self.dof
+        for group, network in self.members():
+            for joint, value in zip(group.joints, network(group.inputs(T, q)).unbind(-1), strict=True):
+                columns[joint] = value
+        return torch.stack(columns, -1)

@@ -1,0 +1,61 @@
+"""The energy of a Pi-Sigma network and its derivatives in closed form."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pisigma.network.pi_sigma import PiSigma, products_of_others, sum_of_products, weigh_sums
+
+
+def energy(
+    outputs: Float[Tensor, "patterns *models"], targets: Float[Tensor, "patterns *models"]
+) -> Float[Tensor, "*models"]:
+    """Energy `E = 1/2 Σ_μ (d - y)²` over the patterns, for every output (Jeong et al. 1998, eq. 3)."""
+    return (targets - outputs).square().sum(0) / 2
+
+
+def energy_gradient(
+    network: PiSigma, x: Float[Tensor, "patterns inputs"], d: Float[Tensor, "patterns outputs"]
+) -> tuple[Float[Tensor, " outputs"], Float[Tensor, "outputs units inputs"], Float[Tensor, "outputs units"]]:
+    """Energy of every output and its gradient (Jeong et al. 1998, eq. 4).
+
+    `∂E/∂h_j = -Σ_μ (d - y) · Π_{i≠j} W_i h_i · W_j`, times `∂h_j/∂w_ji = x_i`, or times 1 for the bias.
+
+    Args:
+        network: the network.
+        x: scaled inputs.
+        d: scaled targets.
+
+    Returns:
+        Energy, its gradient by `network.weight` and by `network.bias`.
+    """
+    weighted = weigh_sums(x, network.weight.detach(), network.bias.detach(), network.fixed)
+    difference = d - sum_of_products(weighted, network.orders)
+    by_sum = -difference[..., None] * products_of_others(weighted, network.orders) * network.fixed
+    flat = by_sum.reshape(x.shape[0], -1)
+    by_weight = (flat.mT @ x).reshape(network.weight.shape)
+    return difference.square().sum(0) / 2, by_weight, by_sum.sum(0)
+
+
+def output_jacobian(
+    x: Float[Tensor, "patterns inputs"],
+    weighted: Float[Tensor, "patterns *models units"],
+    fixed: Float[Tensor, "*models units"],
+    orders: Sequence[int],
+) -> Float[Tensor, "*models patterns parameters"]:
+    """Derivative of the outputs by all weights and biases.
+
+    Args:
+        x: scaled inputs.
+        weighted: `W_j h_j` of the summing units, as `weigh_sums` gives them.
+        fixed: the fixed weights W.
+        orders: number of summing units of every product unit.
+
+    Returns:
+        For every summing unit in turn the derivative by its weights, then by its bias.
+    """
+    by_sum = (products_of_others(weighted, orders) * fixed).movedim(0, -2)
+    with_bias = torch.cat([x, x.new_ones((x.shape[0], 1))], -1)
+    return (by_sum[..., None] * with_bias[:, None, :]).flatten(-2)

@@ -1,0 +1,100 @@
+"""What a network sees of a pose: named inputs, computed from the pose and its nominal joint values."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from pisigma.errors import RecipeError, nearest_choice
+from pisigma.robot.description import Robot
+from pisigma.se3 import rpy_from_rotation
+
+POSE_INPUTS = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Coordinates of the pose: x, y, z [m] and the angles [rad] of the rotation seen from the reference orientation."""
+
+_FUNCTION = re.compile(r"^(sin|cos)\((.+)\)$")
+
+
+@dataclass(frozen=True, eq=False)
+class Inputs:
+    """A named choice of inputs for one robot.
+
+    A name is a coordinate of the pose (`x`, `y`, `z`, `roll`, `pitch`, `yaw`), a joint (`theta_1`: its nominal value
+    [rad or m]), or `sin(...)` and `cos(...)` of a sum of joints (`sin(theta_1)`, `cos(theta_2 + theta_3)`,
+    `sin(theta_5 - theta_4)`).
+
+    Attributes:
+        names: the inputs in order.
+        joint_names: the robot's joints.
+        reference: rotation from which roll, pitch and yaw are counted: `R = reference · RotZ · RotY · RotX`.
+    """
+
+    names: tuple[str, ...]
+    joint_names: tuple[str, ...]
+    reference: Float64[np.ndarray, "3 3"]
+
+    @staticmethod
+    def of(
+        robot: Robot, names: Sequence[str], reference: Float64[np.ndarray, "3 3"] | None = None
+    ) -> "Inputs":
+        """Choose inputs for a robot.
+
+        Raises:
+            RecipeError: a name is none of those above; the message lists the valid ones.
+        """
+        joints = tuple(joint.name for joint in robot.joints)
+        chosen = Inputs(tuple(names), joints, np.eye(3) if reference is None else reference)
+        for name in names:
+            chosen._combination(name)
+        if len(set(names)) != len(names):
+            raise RecipeError(f"the inputs {', '.join(names)} hold a name twice; name each once.")
+        return chosen
+
+    def __call__(
+        self, T: Float[Tensor, "*batch 4 4"], q: Float[Tensor, "*batch dof"]
+    ) -> Float[Tensor, "*batch inputs"]:
+        """Values of the inputs.
+
+        Args:
+            T: poses T_base_tool.
+            q: their nominal joint values [rad or m].
+        """
+        rpy: tuple[Tensor, ...] = ()
+        if set(self.names) & set(POSE_INPUTS[3:]):
+            reference = torch.as_tensor(self.reference, dtype=T.dtype, device=T.device)
+            rpy = rpy_from_rotation(reference.mT @ T[..., :3, :3]).unbind(-1)
+        columns = []
+        for name in self.names:
+            if name in POSE_INPUTS:
+                index = POSE_INPUTS.index(name)
+                columns.append(T[..., index, 3] if index < 3 else rpy[index - 3])
+                continue
+            function, factors = self._combination(name)
+            angle = q @ torch.tensor(factors, dtype=q.dtype, device=q.device)
+            columns.append({"sin": torch.sin, "cos": torch.cos}[function](angle) if function else angle)
+        return torch.stack(columns, -1)
+
+    def _combination(self, name: str) -> tuple[str, list[float]]:
+        """Function ("" for none) and the factor of every joint in its argument."""
+        if name in POSE_INPUTS:
+            return "", []
+        match = _FUNCTION.match(name)
+        function, argument = match.groups() if match else ("", name)
+        factors = [0.0] * len(self.joint_names)
+        terms = re.findall(r"([+-]?)\s*([^\s+-]+)", argument)
+        if not terms or (not match and argument not in self.joint_names):
+            raise RecipeError(self._unknown(name))
+        for sign, term in terms:
+            if term not in self.joint_names:
+                raise RecipeError(self._unknown(name))
+            factors[self.joint_names.index(term)] += -1.0 if sign == "-" else 1.0
+        return function, factors
+
+    def _unknown(self, name: str) -> str:
+        functions = [f"{f}({joint})" for f in ("sin", "cos") for joint in self.joint_names]
+        choices = [*POSE_INPUTS, *self.joint_names, *functions]
+        return f"unknown network input '{name}'; {nearest_choice(name, choices)}"

@@ -1,0 +1,165 @@
+"""The Pi-Sigma network: a hidden layer of linear sums, an output layer of products with fixed weights."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float
+from torch import Tensor, nn
+
+
+class PiSigma(nn.Module):
+    """Outputs that are sums of products of linear sums.
+
+    For every output k and every unit u of order m_u, with inputs x and outputs y in scaled form::
+
+        h_kj = b_kj + Σ_i w_kji x_i                                (Jeong et al. 1998, eq. 1, with a bias)
+        y_k  = Σ_u Π_{j in unit u} W_kj h_kj                       (eq. 2; one unit in the paper)
+
+    One unit is a Pi-Sigma network; several units of rising order are a ridge polynomial network (Shin and Ghosh
+    1995). The weights W between the summing units and the products are fixed: a buffer, never a parameter. Nothing is
+    shared between outputs, so every output can be trained on its own.
+
+    Scaling is part of the network: `forward` takes and gives plain values.
+
+    Attributes:
+        weight: `(outputs, summing_units, inputs)`: w.
+        bias: `(outputs, summing_units)`: b.
+        fixed: `(outputs, summing_units)`: W, a buffer.
+        input_offset, input_scale: `(inputs,)`: scaled input = (input - offset) / scale.
+        output_offset, output_scale: `(outputs,)`: output = offset + scale · y.
+    """
+
+    weight: nn.Parameter
+    bias: nn.Parameter
+    fixed: Tensor
+    input_offset: Tensor
+    input_scale: Tensor
+    output_offset: Tensor
+    output_scale: Tensor
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        orders: Sequence[int],
+        *,
+        fixed_product: float = 1.0,
+        dtype: torch.dtype = torch.float64,
+    ) -> None:
+        """Build a network whose products are all exactly `fixed_product` until it is initialised or trained.
+
+        Args:
+            inputs: number of inputs.
+            outputs: number of outputs.
+            orders: number of summing units of every product unit, such as `(3,)` or `(1, 2, 3)`.
+            fixed_product: product of the fixed weights of a unit; each is the root of it.
+            dtype: of weights and buffers.
+
+        Raises:
+            ValueError: a count is below 1, or the fixed product is not positive.
+        """
+        super().__init__()
+        if inputs < 1 or outputs < 1 or not orders or min(orders) < 1:
+            raise ValueError(
+                f"a Pi-Sigma network needs inputs, outputs and orders of at least 1, got {inputs} inputs, "
+                f"{outputs} outputs, orders {tuple(orders)}."
+            )
+        if not fixed_product > 0:
+            raise ValueError(f"the product of the fixed weights must be above 0, got {fixed_product}.")
+        self.orders = tuple(orders)
+        summing_units = sum(self.orders)
+        self.weight = nn.Parameter(torch.zeros(outputs, summing_units, inputs, dtype=dtype))
+        self.bias = nn.Parameter(torch.ones(outputs, summing_units, dtype=dtype))
+        roots = [fixed_product ** (1 / order) for order in self.orders for _ in range(order)]
+        self.register_buffer("fixed", torch.tensor(roots, dtype=dtype).expand(outputs, -1).clone())
+        self.register_buffer("input_offset", torch.zeros(inputs, dtype=dtype))
+        self.register_buffer("input_scale", torch.ones(inputs, dtype=dtype))
+        self.register_buffer("output_offset", torch.zeros(outputs, dtype=dtype))
+        self.register_buffer("output_scale", torch.ones(outputs, dtype=dtype))
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs."""
+        return self.weight.shape[-1]
+
+    @property
+    def outputs(self) -> int:
+        """Number of outputs."""
+        return self.weight.shape[0]
+
+    @torch.no_grad()
+    def initialise(self, spread: float, generator: torch.Generator) -> None:
+        """Draw the weights from ±spread and the biases from 1 ± spread, both uniformly.
+
+        Every product then starts near the product of its fixed weights. Near 0 it would stall: the gradient of a
+        product by one factor is the product of the others.
+        """
+        for parameter, centre in ((self.weight, 0.0), (self.bias, 1.0)):
+            parameter.copy_(centre + draw_uniform(parameter, spread, generator))
+
+    def scale_inputs(self, x: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch inputs"]:
+        """Inputs as the summing units see them."""
+        return (x - self.input_offset) / self.input_scale
+
+    def scale_targets(self, y: Float[Tensor, "*batch outputs"]) -> Float[Tensor, "*batch outputs"]:
+        """Wanted outputs as the products are compared with."""
+        return (y - self.output_offset) / self.output_scale
+
+    def products(self, scaled: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch outputs"]:
+        """Scaled outputs of scaled inputs: eqs (1) and (2)."""
+        return sum_of_products(weigh_sums(scaled, self.weight, self.bias, self.fixed), self.orders)
+
+    def forward(self, x: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch outputs"]:
+        """Outputs of inputs, both in plain units."""
+        return self.output_offset + self.output_scale * self.products(self.scale_inputs(x))
+
+
+def draw_uniform(like: Tensor, spread: float, generator: torch.Generator) -> Tensor:
+    """Numbers uniform in ±spread with the shape of `like`, drawn in float64 so that every dtype starts alike."""
+    drawn = torch.rand(like.shape, generator=generator, dtype=torch.float64, device=generator.device)
+    return (spread * (2 * drawn - 1)).to(like)
+
+
+def weigh_sums(
+    x: Float[Tensor, "*batch inputs"],
+    weight: Float[Tensor, "*models units inputs"],
+    bias: Float[Tensor, "*models units"],
+    fixed: Float[Tensor, "*models units"],
+) -> Float[Tensor, "... units"]:
+    """Weighted outputs `W_kj h_kj` of the summing units (eq. 1), for any leading axes of models."""
+    flat = x @ weight.reshape(-1, weight.shape[-1]).mT
+    sums = flat.reshape(*x.shape[:-1], *bias.shape) + bias
+    return sums * fixed
+
+
+def sum_of_products(weighted: Float[Tensor, "*batch units"], orders: Sequence[int]) -> Float[Tensor, "*batch"]:
+    """Sum over the product units (eq. 2) of summing units that lie one unit after the other."""
+    total: Tensor | None = None
+    for unit in weighted.split(list(orders), dim=-1):
+        factors = unit.unbind(-1)
+        value = factors[0]
+        for factor in factors[1:]:
+            value = value * factor
+        total = value if total is None else total + value
+    assert total is not None
+    return total
+
+
+def products_of_others(
+    weighted: Float[Tensor, "*batch units"], orders: Sequence[int]
+) -> Float[Tensor, "*batch units"]:
+    """For every summing unit the product of the others of its product unit, exact where factors are zero.
+
+    This is `Π_{i≠j} W_ki h_i` in the derivative of eq. (4).
+    """
+    columns: list[Tensor] = []
+    for unit in weighted.split(list(orders), dim=-1):
+        factors = unit.unbind(-1)
+        ones = torch.ones_like(factors[0])
+        before, after = [ones], [ones]
+        for factor in factors[:-1]:
+            before.append(before[-1] * factor)
+        for factor in reversed(factors[1:]):
+            after.append(after[-1] * factor)
+        columns += [b * a for b, a in zip(before, reversed(after), strict=True)]
+    return torch.stack(columns, -1)

@@ -1,0 +1,110 @@
+"""Training pairs of inverse calibration: a measured pose, and the joint difference that explains it."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError
+from pisigma.kinematics.closed_form import closed_form_solver
+from pisigma.kinematics.numeric import solve_numeric
+from pisigma.kinematics.singularity import singularity_measure
+from pisigma.kinematics.status import Status
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+from pisigma.se3 import wrap_to_pi
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingPairs:
+    """Poses with the corrections that a network shall learn.
+
+    Attributes:
+        T: measured poses T_base_tool.
+        q_nominal: nominal joint values of those poses, on the branch nearest to the commanded ones [rad or m].
+        target: `Δ = q - q_nominal`, wrapped to (-pi, pi] where a joint turns.
+        used: rows that are fit for training.
+        singular: rows left out because they are near a singularity.
+        unreachable: rows left out because the nominal robot cannot take the measured pose.
+        branches: the branches that the used rows lie on, most frequent first; empty without closed-form inverse.
+    """
+
+    T: Float64[Tensor, "rows 4 4"]
+    q_nominal: Float64[Tensor, "rows dof"]
+    target: Float64[Tensor, "rows dof"]
+    used: Bool[Tensor, " rows"]
+    singular: Bool[Tensor, " rows"]
+    unreachable: Bool[Tensor, " rows"]
+    branches: tuple[str, ...]
+
+    @property
+    def left_out(self) -> str:
+        """How many rows were left out and why, in words; "" where none was."""
+        counts = ((self.singular, "near a singularity"), (self.unreachable, "not reachable by the nominal robot"))
+        return ", ".join(f"{int(mask.sum())} {reason}" for mask, reason in counts if mask.any())
+
+
+def build_pairs(robot: Robot, measurements: Measurements, singular_below: float | None) -> TrainingPairs:
+    """Turn measured poses into training pairs: `Δθ = θ_measured - θ_analytic` (Jeong et al. 1998, eq. 5).
+
+    No truth is needed: the commanded joint values q take the place of θ_measured, and the nominal inverse kinematics
+    of the measured pose gives θ_analytic, on the branch nearest to q.
+
+    Args:
+        robot: with the base and tool that the poses are measured by.
+        measurements: rows with poses.
+        singular_below: rows whose `singularity_measure` is below this are not used; None uses all.
+
+    Raises:
+        MeasurementError: no poses were measured.
+        IdentificationError: no row is left to train on.
+    """
+    T, q = measurements.T, measurements.q
+    if closed_form_solver(robot) is None:
+        found = solve_numeric(robot, T, q)
+        q_nominal, index = found.q, torch.zeros(len(q), dtype=torch.int64)
+        unreachable = found.status == Status.NOT_CONVERGED
+        names: tuple[str, ...] = ()
+    else:
+        q_nominal, index, names = _nearest_branch(robot, T, q)
+        unreachable = ~torch.isfinite(q_nominal).all(-1)
+    target = joint_difference(robot, q, q_nominal)
+    target = torch.where(unreachable[:, None], 0.0, target)
+    q_nominal = torch.where(unreachable[:, None], q, q - target)
+    singular = torch.zeros_like(unreachable)
+    if singular_below is not None:
+        singular = (singularity_measure(robot, q_nominal) < singular_below) & ~unreachable
+    used = ~singular & ~unreachable
+    if not used.any():
+        raise IdentificationError(
+            f"{measurements.source}: none of the {len(q)} rows can be used for training; check base, tool and units, "
+            "or measure away from singularities."
+        )
+    return TrainingPairs(T, q_nominal, target, used, singular, unreachable, _frequent(index[used], names))
+
+
+def joint_difference(
+    robot: Robot, q: Float64[Tensor, "*batch dof"], q_nominal: Float64[Tensor, "*batch dof"]
+) -> Float64[Tensor, "*batch dof"]:
+    """`q - q_nominal`, wrapped to (-pi, pi] for the joints that turn [rad or m]."""
+    difference = q - q_nominal
+    return torch.where(torch.tensor(robot.revolute), wrap_to_pi(difference), difference)
+
+
+def _nearest_branch(robot: Robot, T: Tensor, q: Tensor) -> tuple[Tensor, Tensor, tuple[str, ...]]:
+    """Joint values of the closed-form branch nearest to q, its index, and the names of the branches."""
+    solver = closed_form_solver(robot)
+    assert solver is not None
+    every = solver.solve(T).q
+    distance = joint_difference(robot, q[:, None, :], every).square().sum(-1)
+    index = torch.where(torch.isfinite(distance), distance, torch.inf).argmin(-1)
+    return every[torch.arange(len(q)), index], index, solver.branches
+
+
+def _frequent(index: Tensor, names: tuple[str, ...]) -> tuple[str, ...]:
+    if not names:
+        return ()
+    counts = torch.bincount(index, minlength=len(names))
+    order = counts.argsort(descending=True, stable=True).tolist()
+    return tuple(names[i] for i in order if counts[i] > 0)
