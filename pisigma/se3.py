@@ -3,8 +3,9 @@
 Angles are in rad, lengths in m. `T_a_b` maps coordinates in b to coordinates in a.
 """
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pisigma.errors import PoseError
@@ -32,14 +33,24 @@ def rpy_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3
 
     Inverse of `rotation_from_rpy` for pitch within ±90 deg.
     """
-    horizontal = torch.hypot(R[..., 0, 0], R[..., 1, 0])
-    regular = horizontal > 1e-12
+    regular = R[..., 0, 0].square() + R[..., 1, 0].square() > 1e-24
+    cosine, sine = _where_regular(regular, R[..., 0, 0], R[..., 1, 0])
+    horizontal = torch.where(regular, torch.hypot(cosine, sine), torch.zeros_like(sine))
     pitch = torch.atan2(-R[..., 2, 0], horizontal)
-    roll = torch.where(
-        regular, torch.atan2(R[..., 1, 0], R[..., 0, 0]), torch.atan2(-R[..., 0, 1], R[..., 1, 1])
-    )
-    yaw = torch.where(regular, torch.atan2(R[..., 2, 1], R[..., 2, 2]), torch.zeros_like(roll))
+    upright, leaning = _where_regular(~regular, R[..., 1, 1], -R[..., 0, 1])
+    roll = torch.where(regular, torch.atan2(sine, cosine), torch.atan2(leaning, upright))
+    cosine, sine = _where_regular(regular, R[..., 2, 2], R[..., 2, 1])
+    yaw = torch.where(regular, torch.atan2(sine, cosine), torch.zeros_like(roll))
     return torch.stack([roll, pitch, yaw], -1)
+
+
+def _where_regular(
+    regular: Bool[Tensor, "*batch"], cosine: Float[Tensor, "*batch"], sine: Float[Tensor, "*batch"]
+) -> tuple[Float[Tensor, "*batch"], Float[Tensor, "*batch"]]:
+    """Cosine and sine where regular, else 1 and 0, so that the gradient of their angle is finite."""
+    return torch.where(regular, cosine, torch.ones_like(cosine)), torch.where(
+        regular, sine, torch.zeros_like(sine)
+    )
 
 
 def rotation_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Tensor, "*batch 3 3"]:
@@ -69,17 +80,18 @@ def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*b
 def rotation_vector(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:
     """Rotation vector [rad] of a rotation: axis times angle in [0, pi].
 
-    Near the identity the vector part of `R - R^T` is used as it is; near pi the axis comes from `R + R^T`.
+    Near the identity the factor of the vector part of `R - R^T` is a series; near pi the axis comes from `R +
+    R^T`. Gradients are finite everywhere.
     """
     twice_sine_axis = torch.stack(
         [R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], -1
     )
     cosine = (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1) / 2
     sine_square = (twice_sine_axis * twice_sine_axis).sum(-1) / 4
-    regular = sine_square > 1e-14
-    sine = torch.where(regular, sine_square, torch.ones_like(sine_square)).sqrt()
-    angle = torch.atan2(torch.where(regular, sine, torch.zeros_like(sine)), cosine)
-    factor = torch.where(regular, angle / (2 * sine), torch.full_like(sine, 0.5))
+    positive = sine_square > 0
+    sine = torch.where(positive, sine_square, torch.ones_like(sine_square)).sqrt()
+    angle = torch.atan2(torch.where(positive, sine, torch.zeros_like(sine)), cosine)
+    factor = torch.where(sine_square > 1e-8, angle / (2 * sine), 0.5 + sine_square / 12)
     ordinary = factor[..., None] * twice_sine_axis
     near_pi = (cosine < -0.99)[..., None]
     return torch.where(near_pi, _rotation_vector_near_pi(R, twice_sine_axis, angle), ordinary)
@@ -88,16 +100,16 @@ def rotation_vector(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]
 def _rotation_vector_near_pi(
     R: Float[Tensor, "*batch 3 3"], twice_sine_axis: Float[Tensor, "*batch 3"], angle: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 3"]:
-    """Axis from the symmetric part, whose largest column is `axis · axis_k (1 - cos)`; sign from `R - R^T`."""
+    """Axis from the symmetric part: its largest column is `axis · axis_k (1 - cos)`; sign from `R - R^T`."""
     symmetric = (R + R.mT) / 2 + torch.eye(3, dtype=R.dtype, device=R.device)
     trace = R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2]
-    # (R + R^T)/2 = cos·I + (1 - cos)·n n^T, so subtracting (1 + cos)·I from the sum above leaves (1 - cos)·n n^T.
+    # (R + R^T)/2 = cos·I + (1 - cos)·n n^T, so the sum above less (1 + cos)·I is (1 - cos)·n n^T.
     cosine = (trace - 1) / 2
     outer = symmetric - (1 + cosine)[..., None, None] * torch.eye(3, dtype=R.dtype, device=R.device)
     largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
     column = torch.take_along_dim(outer, largest[..., None, None], -1)[..., 0]
     column = torch.where((column * column).sum(-1, keepdim=True) > 0, column, torch.ones_like(column))
-    axis = column / column.norm(dim=-1, keepdim=True)
+    axis: Tensor = column / torch.linalg.vector_norm(column, dim=-1, keepdim=True)
     sign = torch.where((axis * twice_sine_axis).sum(-1) < 0, -1.0, 1.0).to(R.dtype)
     return (sign * angle)[..., None] * axis
 
@@ -114,12 +126,10 @@ def transform(
     rotation: Float[Tensor, "*batch 3 3"], translation: Float[Tensor, "*batch 3"]
 ) -> Float[Tensor, "*batch 4 4"]:
     """Homogeneous transform of a rotation and a translation [m]; both broadcast."""
-    batch = torch.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
-    T = rotation.new_zeros((*batch, 4, 4))
-    T[..., :3, :3] = rotation
-    T[..., :3, 3] = translation
-    T[..., 3, 3] = 1
-    return T
+    batch = np.broadcast_shapes(rotation.shape[:-2], translation.shape[:-1])
+    upper = torch.cat([rotation.expand(*batch, 3, 3), translation.expand(*batch, 3)[..., None]], -1)
+    last_row = torch.eye(4, dtype=upper.dtype, device=upper.device)[3:].expand(*batch, 1, 4)
+    return torch.cat([upper, last_row], -2)
 
 
 def transform_from_xyzrpy(xyzrpy: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
@@ -152,33 +162,46 @@ def pose_error(
 
 
 def wrap_to_pi(angle: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-    """The same angle [rad] in (-pi, pi]."""
+    """The same angle [rad] in (-pi, pi]; an angle that is there already keeps every digit."""
     wrapped = torch.remainder(angle + torch.pi, 2 * torch.pi) - torch.pi
-    return torch.where(wrapped <= -torch.pi, torch.full_like(wrapped, torch.pi), wrapped)
+    wrapped = torch.where(wrapped <= -torch.pi, torch.full_like(wrapped, torch.pi), wrapped)
+    return torch.where((angle > -torch.pi) & (angle <= torch.pi), angle, wrapped)
 
 
-def check_transforms(T: Float[Tensor, "*batch 4 4"], name: str, tolerance: float = 1e-6) -> None:
+def check_transforms(T: Tensor, name: str, tolerance: float = 1e-6) -> None:
     """Refuse matrices that are no rigid transforms.
 
     Args:
-        T: the matrices.
+        T: the matrices; anything but a float tensor `(*batch, 4, 4)` is refused too.
         name: what complaints call them.
         tolerance: largest deviation of `R^T R` from the identity and of the last row from (0, 0, 0, 1).
 
     Raises:
-        PoseError: an entry is not finite, a rotation is not orthonormal or left-handed, or the last row is wrong;
-            the message gives the index of the first such matrix.
+        PoseError: the shape or type is wrong, an entry is not finite, a rotation is not orthonormal or
+            left-handed, or the last row is wrong; the message gives the index of the first such matrix.
     """
+    if T.ndim < 2 or T.shape[-2:] != (4, 4):
+        raise PoseError(
+            f"{name} has the shape {tuple(T.shape)}; give homogeneous transforms of shape (*batch, 4, 4)."
+        )
+    if not T.is_floating_point():
+        raise PoseError(f"{name} holds {T.dtype}; give float64 or float32, lengths in metres.")
+    eye = torch.eye(4, dtype=T.dtype, device=T.device)
     finite = torch.isfinite(T).all(-1).all(-1)
-    R = torch.where(finite[..., None, None], T, torch.eye(4, dtype=T.dtype, device=T.device))[..., :3, :3]
-    skewness = (R.mT @ R - torch.eye(3, dtype=T.dtype, device=T.device)).abs().amax((-1, -2))
-    determinant = torch.linalg.det(R)
-    last_row = (T[..., 3, :] - T.new_tensor([0.0, 0.0, 0.0, 1.0])).abs().amax(-1)
+    R = torch.where(finite[..., None, None], T, eye)[..., :3, :3]
+    skewness = (R.mT @ R - eye[:3, :3]).abs().amax((-1, -2))
+    last_row = (T[..., 3, :] - eye[3]).abs().amax(-1)
     for bad, what in (
         (~finite, "has entries that are not finite numbers; give 16 finite numbers"),
         (last_row > tolerance, "does not end with the row 0 0 0 1; give a homogeneous transform"),
-        (skewness > tolerance, "has a rotation part that is not orthonormal; normalise it or check its source"),
-        (determinant < 0, "has a left-handed rotation part (determinant -1); a reflection is no pose, check its axes"),
+        (
+            skewness > tolerance,
+            "has a rotation part that is not orthonormal; normalise it or check its source",
+        ),
+        (
+            torch.linalg.det(R) < 0,
+            "has a left-handed rotation part (determinant -1); a reflection is no pose, check its axes",
+        ),
     ):
         if bad.any():
             index = tuple(bad.nonzero()[0].tolist())

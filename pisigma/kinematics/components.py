@@ -1,8 +1,8 @@
 """Frames written out on components, so that exact zeros and ones of a nominal robot cost nothing.
 
-A frame is kept as twelve scalars: the three columns of its rotation and its origin. Each scalar is either a Python
-float, the same for every pose, or a tensor with the batch shape. Products with a float 0 or 1 are never computed.
-Written this way, forward kinematics is 25 times as fast as with batched 4x4 products.
+A frame is kept as twelve scalars: the three columns of its rotation and its origin. Each scalar is either a
+Python float, the same for every pose, or a tensor with the batch shape. Products with a float 0 or 1 are
+never computed. Written this way, forward kinematics is 25 times as fast as with batched 4x4 products.
 """
 
 import math
@@ -21,9 +21,9 @@ IDENTITY: Frame = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0), (0.0, 0.0,
 
 def product(a: Scalar, b: Scalar) -> Scalar:
     """`a · b`, without work where either is the float 0 or ±1."""
-    if isinstance(a, Tensor) and not isinstance(b, Tensor):
+    if isinstance(b, float):
         a, b = b, a
-    if not isinstance(a, Tensor):
+    if isinstance(a, float):
         if a == 0.0:
             return 0.0
         if a == 1.0:
@@ -35,23 +35,35 @@ def product(a: Scalar, b: Scalar) -> Scalar:
 
 def add(a: Scalar, b: Scalar) -> Scalar:
     """`a + b`, without work where either is the float 0."""
-    if not isinstance(a, Tensor) and a == 0.0:
+    if isinstance(a, float) and a == 0.0:
         return b
-    if not isinstance(b, Tensor) and b == 0.0:
+    if isinstance(b, float) and b == 0.0:
         return a
     return a + b
 
 
-def combine(a: Scalar, u: Vector, b: Scalar, v: Vector) -> Vector:
-    """The vector `a · u + b · v`."""
-    x, y, z = (add(product(a, s), product(b, t)) for s, t in zip(u, v, strict=True))
-    return x, y, z
+def add_product(base: Scalar, a: Scalar, b: Scalar, sign: float = 1.0) -> Scalar:
+    """`base + sign · a · b` in one pass over the numbers, sign ±1."""
+    if isinstance(b, float):
+        a, b = b, a
+    if isinstance(a, float):
+        if a == 0.0:
+            return base
+        if isinstance(base, float) or isinstance(b, float):
+            return add(base, product(sign * a, b))
+        return torch.add(base, b, alpha=sign * a)
+    if isinstance(base, float) or isinstance(b, float):
+        return add(base, product(sign, a * b))
+    return torch.addcmul(base, a, b, value=sign)
 
 
-def negate(u: Vector) -> Vector:
-    """The vector `-u`."""
-    x, y, z = (product(-1.0, s) for s in u)
-    return x, y, z
+def combine(a: Scalar, u: Vector, b: Scalar, v: Vector, sign: float = 1.0) -> Vector:
+    """The vector `a · u + sign · b · v`, sign ±1."""
+    return (
+        add_product(product(a, u[0]), b, v[0], sign),
+        add_product(product(a, u[1]), b, v[1], sign),
+        add_product(product(a, u[2]), b, v[2], sign),
+    )
 
 
 def subtract(u: Vector, v: Vector) -> Vector:
@@ -62,15 +74,15 @@ def subtract(u: Vector, v: Vector) -> Vector:
 def cross(u: Vector, v: Vector) -> Vector:
     """The vector `u × v`."""
     (a, b, c), (d, e, f) = u, v
-    x = add(product(b, f), product(-1.0, product(c, e)))
-    y = add(product(c, d), product(-1.0, product(a, f)))
-    z = add(product(a, e), product(-1.0, product(b, d)))
+    x = add_product(product(b, f), c, e, -1.0)
+    y = add_product(product(c, d), a, f, -1.0)
+    z = add_product(product(a, e), b, d, -1.0)
     return x, y, z
 
 
 def cosine_sine(angle: Scalar) -> tuple[Scalar, Scalar]:
     """Cosine and sine; for a float within 1e-15 rad of a multiple of 90 deg they are exactly 0 and ±1."""
-    if isinstance(angle, Tensor):
+    if not isinstance(angle, float):
         return torch.cos(angle), torch.sin(angle)
     quarter = angle / (math.pi / 2)
     if abs(quarter - round(quarter)) < 1e-15 * max(1.0, abs(quarter)):
@@ -78,33 +90,39 @@ def cosine_sine(angle: Scalar) -> tuple[Scalar, Scalar]:
     return math.cos(angle), math.sin(angle)
 
 
+def _turn(u: Vector, v: Vector, angle: Scalar) -> tuple[Vector, Vector]:
+    """The pair of axes (u, v) turned from u towards v by an angle [rad]."""
+    if isinstance(angle, float) and angle == 0.0:
+        return u, v
+    c, s = cosine_sine(angle)
+    return combine(c, u, s, v), combine(c, v, s, u, -1.0)
+
+
 def rotate_z(frame: Frame, angle: Scalar) -> Frame:
     """`frame · RotZ(angle)`, angle in rad."""
-    x, y, z, p = frame
-    c, s = cosine_sine(angle)
-    return combine(c, x, s, y), combine(c, y, product(-1.0, s), x), z, p
+    x, y = _turn(frame[0], frame[1], angle)
+    return x, y, frame[2], frame[3]
 
 
 def rotate_x(frame: Frame, angle: Scalar) -> Frame:
     """`frame · RotX(angle)`, angle in rad."""
-    x, y, z, p = frame
-    c, s = cosine_sine(angle)
-    return x, combine(c, y, s, z), combine(c, z, product(-1.0, s), y), p
+    y, z = _turn(frame[1], frame[2], angle)
+    return frame[0], y, z, frame[3]
 
 
 def rotate_y(frame: Frame, angle: Scalar) -> Frame:
     """`frame · RotY(angle)`, angle in rad."""
-    x, y, z, p = frame
-    c, s = cosine_sine(angle)
-    return combine(c, x, product(-1.0, s), z), y, combine(c, z, s, x), p
+    z, x = _turn(frame[2], frame[0], angle)
+    return x, frame[1], z, frame[3]
 
 
 def translate(frame: Frame, along_x: Scalar, along_y: Scalar, along_z: Scalar) -> Frame:
     """`frame · Trans(along_x, along_y, along_z)`, lengths in m."""
     x, y, z, p = frame
-    moved = combine(1.0, p, along_x, x)
-    moved = combine(1.0, moved, along_y, y)
-    return x, y, z, combine(1.0, moved, along_z, z)
+    for distance, axis in ((along_x, x), (along_y, y), (along_z, z)):
+        if not isinstance(distance, float) or distance != 0.0:
+            p = combine(1.0, p, distance, axis)
+    return x, y, z, p
 
 
 def follow_xyzrpy(frame: Frame, xyzrpy: Sequence[Scalar]) -> Frame:
@@ -114,12 +132,27 @@ def follow_xyzrpy(frame: Frame, xyzrpy: Sequence[Scalar]) -> Frame:
     return rotate_x(rotate_y(rotate_z(moved, roll), pitch), yaw)
 
 
+def stack_components(values: Sequence[Scalar], like: Tensor) -> Tensor:
+    """The scalars side by side as `(*batch, len(values))`, a view of memory in which the batch runs fastest.
+
+    Args:
+        values: floats, or tensors that broadcast to the shape of `like`.
+        like: gives batch shape, dtype and device.
+    """
+    constants: dict[float, Tensor] = {}
+    parts = []
+    for value in values:
+        if isinstance(value, float):
+            if value not in constants:
+                constants[value] = torch.full_like(like, value)
+            parts.append(constants[value])
+        else:
+            parts.append(value if value.shape == like.shape else value.expand(like.shape))
+    return torch.stack(parts).movedim(0, -1)
+
+
 def as_transform(frame: Frame, like: Tensor) -> Tensor:
-    """The frame as `(*batch, 4, 4)`; batch shape, dtype and device are those of `like`."""
-    T = like.new_zeros((*like.shape, 4, 4))
-    for column, vector in enumerate(frame):
-        for row, value in enumerate(vector):
-            if isinstance(value, Tensor) or value != 0.0:
-                T[..., row, column] = value
-    T[..., 3, 3] = 1.0
-    return T
+    """The frame as `(*batch, 4, 4)`, laid out as `stack_components` says."""
+    x, y, z, p = frame
+    rows = [value for row in zip(x, y, z, p, strict=True) for value in row]
+    return stack_components([*rows, 0.0, 0.0, 0.0, 1.0], like).reshape(*like.shape, 4, 4)

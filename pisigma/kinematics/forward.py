@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -98,8 +99,8 @@ def forward_kinematics(
 ) -> Float[Tensor, "*batch 4 4"]:
     """Tool pose of a robot: `base · Π RotZ(theta + q) Trans(a, 0, d) RotX(alpha) RotY(beta) · tool`.
 
-    Source: Hayati and Mirmirani 1985, in the order of Denavit-Hartenberg rows that DESIGN-level documents and the
-    paper's (Jeong et al. 1998) sequel use; a prismatic joint adds q to d.
+    Source: Denavit and Hartenberg 1955 with the term of Hayati and Mirmirani 1985; a prismatic joint adds q
+    to d. Gradients flow to q and to the tensors of a geometry, in reverse and in forward mode.
 
     Args:
         robot: the robot.
@@ -107,23 +108,28 @@ def forward_kinematics(
         geometry: other parameters for the same rows, such as tensors to differentiate by.
 
     Returns:
-        T_base_tool, with q's dtype and device.
+        T_base_tool, contiguous, with q's dtype and device.
 
     Raises:
         PoseError: q has another number of columns than the robot has joints.
     """
     robot.check_joint_count(q.shape[-1])
     geometry = geometry or Geometry.of(robot)
-    flat = q.reshape(-1, robot.dof)
-    if flat.shape[0] <= CHUNK or q.requires_grad:
-        return _forward_chunk(robot, geometry, flat).reshape(*q.shape[:-1], 4, 4)
-    T = flat.new_empty((flat.shape[0], 4, 4))
-    for start in range(0, flat.shape[0], CHUNK):
-        T[start : start + CHUNK] = _forward_chunk(robot, geometry, flat[start : start + CHUNK])
+    chunks = [_forward_chunk(robot, geometry, chunk).contiguous() for chunk in iterate_chunks(q)]
+    T = torch.cat(chunks) if len(chunks) > 1 else chunks[0]
     return T.reshape(*q.shape[:-1], 4, 4)
 
 
-def _forward_chunk(robot: Robot, geometry: Geometry, q: Float[Tensor, "poses dof"]) -> Float[Tensor, "poses 4 4"]:
+def iterate_chunks(q: Float[Tensor, "*batch dof"]) -> Iterator[Float[Tensor, "poses dof"]]:
+    """The poses in a row, `CHUNK` at a time; one empty chunk where there are none."""
+    flat = q.reshape(-1, q.shape[-1])
+    for start in range(0, max(flat.shape[0], 1), CHUNK):
+        yield flat[start : start + CHUNK]
+
+
+def _forward_chunk(
+    robot: Robot, geometry: Geometry, q: Float[Tensor, "poses dof"]
+) -> Float[Tensor, "poses 4 4"]:
     columns = q.t().contiguous().unbind(0)
     frame = IDENTITY
     for row in iterate_rows(robot, geometry, columns):

@@ -4,8 +4,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pisigma.kinematics.components import IDENTITY, Frame, as_transform, cross, follow_xyzrpy, product, subtract
-from pisigma.kinematics.forward import CHUNK, Geometry, iterate_rows
+from pisigma.kinematics.components import (
+    IDENTITY,
+    Frame,
+    Scalar,
+    as_transform,
+    cross,
+    follow_xyzrpy,
+    product,
+    stack_components,
+    subtract,
+)
+from pisigma.kinematics.forward import Geometry, iterate_chunks, iterate_rows
 from pisigma.robot.description import Robot
 
 
@@ -14,26 +24,35 @@ def joint_jacobian(
 ) -> tuple[Float[Tensor, "*batch 4 4"], Float[Tensor, "*batch 6 dof"]]:
     """Tool pose and geometric Jacobian, in the base frame and at the tool's origin.
 
-    Column j is `direction_j · [z × (p_tool - p); z]` for a revolute and `direction_j · [z; 0]` for a prismatic
-    joint, with z and p the axis and origin of the frame before the joint's row (Siciliano et al. 2009, eq. 3.30).
+    Column j is `direction_j · [z × (p_tool - p); z]` for a revolute and `direction_j · [z; 0]` for a
+    prismatic joint, with z and p the axis and origin of the frame before the joint's row (Siciliano et al.
+    2009, eq. 3.30).
 
     Args:
         robot: the robot.
         q: joint values [rad or m].
 
     Returns:
-        T_base_tool, and J with `J @ dq` = [translation [m]; rotation vector [rad]] of the tool, both in the base frame.
+        T_base_tool, and J with `J @ dq` = [translation [m]; rotation vector [rad]] of the tool, both in the
+        base frame. Both may be views of memory in which the batch runs fastest; call ``.contiguous()`` where
+        that matters.
 
     Raises:
         PoseError: q has another number of columns than the robot has joints.
     """
     robot.check_joint_count(q.shape[-1])
     geometry = Geometry.of(robot)
-    chunks = [_jacobian_chunk(robot, geometry, chunk) for chunk in q.reshape(-1, robot.dof).split(CHUNK)]
+    chunks = [_jacobian_chunk(robot, geometry, chunk) for chunk in iterate_chunks(q)]
+    T, J = chunks[0]
+    if len(chunks) > 1:
+        T, J = _join([T for T, _ in chunks]), _join([J for _, J in chunks])
     batch = q.shape[:-1]
-    T = torch.cat([T for T, _ in chunks]) if len(chunks) > 1 else chunks[0][0]
-    J = torch.cat([J for _, J in chunks]) if len(chunks) > 1 else chunks[0][1]
     return T.reshape(*batch, 4, 4), J.reshape(*batch, 6, robot.dof)
+
+
+def _join(chunks: list[Tensor]) -> Tensor:
+    """Chunks one after the other, copied in the order in which they lie in memory, the batch fastest."""
+    return torch.cat([chunk.movedim(0, -1) for chunk in chunks], -1).movedim(-1, 0)
 
 
 def _jacobian_chunk(
@@ -47,12 +66,12 @@ def _jacobian_chunk(
             joints.append(frames.before)
         frame = frames.after
     tool = follow_xyzrpy(frame, geometry.tool)
-    J = columns[0].new_zeros((columns[0].shape[0], 6, robot.dof))
-    for index, (joint, before) in enumerate(zip(robot.joints, joints, strict=True)):
+    rows: list[list[Scalar]] = [[] for _ in range(6)]
+    for joint, before in zip(robot.joints, joints, strict=True):
         axis, origin = before[2], before[3]
         linear = axis if joint.type == "prismatic" else cross(axis, subtract(tool[3], origin))
         angular = (0.0, 0.0, 0.0) if joint.type == "prismatic" else axis
-        for component, value in enumerate((*linear, *angular)):
-            if isinstance(value, Tensor) or value != 0.0:
-                J[:, component, index] = product(float(joint.direction), value)
-    return as_transform(tool, like=columns[0]), J
+        for entries, value in zip(rows, (*linear, *angular), strict=True):
+            entries.append(product(float(joint.direction), value))
+    J = stack_components([value for entries in rows for value in entries], like=columns[0])
+    return as_transform(tool, like=columns[0]), J.reshape(-1, 6, robot.dof)

@@ -1,0 +1,66 @@
+"""Closed form of planar SCARA robots: turn, turn, slide, turn about parallel axes."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pisigma.kinematics.closed_form.canonical import canonical_rows
+from pisigma.kinematics.closed_form.interface import AbstractClosedForm
+from pisigma.kinematics.closed_form.tolerance import rounding
+from pisigma.kinematics.closed_form.two_link import solve_two_link
+from pisigma.robot.description import Robot
+
+TILT_TOLERANCE = 1e-9
+"""Largest tilt [rad] of the wanted tool axis from the joint axes that is taken for rounding."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scara(AbstractClosedForm):
+    """R R P R with all axes parallel (twists 0 or 180 deg): appendix A of Jeong et al. 1998, for any lengths.
+
+    Branches: `elbow_positive` has a positive sine of the elbow angle, counted about the first row's axis from
+    link 1 to link 2, and `elbow_negative` a negative one; they are the two signs of `S_2`, in the appendix's
+    order.
+
+    A pose whose tool axis is not parallel to the joint axes is UNREACHABLE. SINGULAR: the arm is stretched or
+    folded, where both branches meet; folded with equal links, axis 4 lies on axis 1 and joint 1 is given as
+    0.
+    """
+
+    @classmethod
+    def of(cls, robot: Robot) -> "Scara | None":
+        """The solver, or None where the rows are no R R P R with parallel axes and links longer than 0."""
+        rows = canonical_rows(robot, ("revolute", "revolute", "prismatic", "revolute"), (0.0, 0.0, 0.0))
+        solver = rows and cls(robot, rows)
+        return solver if solver and solver.rows.a[0] != 0 and solver._second_link[0] != 0 else None
+
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """`elbow_positive`, `elbow_negative`."""
+        return ("elbow_positive", "elbow_negative")
+
+    @property
+    def _second_link(self) -> tuple[float, float]:
+        """Length [m] of link 2, from axis 2 to axis 4, and its angle [rad] at t_2 = 0."""
+        x = self.rows.a[1] + self.rows.a[2] * math.cos(self.rows.theta[2])
+        y = self.rows.a[2] * math.sin(self.rows.theta[2])
+        return math.hypot(x, y), math.atan2(y, x)
+
+    def _solve_canonical(
+        self, T: Float[Tensor, "*batch 4 4"]
+    ) -> tuple[Float[Tensor, "*batch 2 4"], Bool[Tensor, "*batch 2"], Bool[Tensor, "*batch 2"]]:
+        rows = self.rows
+        length, angle = self._second_link
+        signs = T.new_tensor([1.0, -1.0]).expand(*T.shape[:-2], 2)
+        x, y = T[..., 0, 3, None].expand(signs.shape), T[..., 1, 3, None].expand(signs.shape)
+        arm = solve_two_link(x, y, rows.a[0], length, signs, rows.variable_at_zero(0))
+        t_2 = arm.elbow - angle
+        d_3 = (T[..., 2, 3] - rows.d[0] - rows.d[1])[..., None].expand(signs.shape)
+        turn = torch.atan2(T[..., 1, 0], T[..., 0, 0])[..., None]
+        t_4 = turn - arm.first - t_2 - rows.theta[2]
+        tilt = torch.hypot(T[..., 0, 2], T[..., 1, 2])
+        upright = (tilt <= max(TILT_TOLERANCE, rounding(T.dtype))) & (T[..., 2, 2] > 0)
+        return torch.stack([arm.first, t_2, d_3, t_4], -1), arm.reached & upright[..., None], arm.singular

@@ -1,0 +1,34 @@
+"""Joint limits: bring joint values inside by full turns where that is possible, and say which are not."""
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pisigma.robot.description import Robot
+
+LIMIT_TOLERANCE = 1e-9
+"""How far [rad or m] a value may lie beyond a limit and still count as on it; it is not moved."""
+
+
+def turn_into_limits(
+    robot: Robot, q: Float[Tensor, "*batch dof"]
+) -> tuple[Float[Tensor, "*batch dof"], Bool[Tensor, "*batch"]]:
+    """Move revolute joints that are outside their limits by full turns where that brings them inside.
+
+    Args:
+        robot: the robot, for the limits.
+        q: joint values [rad or m], as the controller counts; NaN stays NaN.
+
+    Returns:
+        The joint values, and whether all joints of a pose are inside (False where one is NaN). A value that
+        no full turn brings inside is left as it came.
+    """
+    limits = torch.from_numpy(robot.limits).to(q)
+    tolerance = max(LIMIT_TOLERANCE, 8 * torch.finfo(q.dtype).eps)
+    lower, upper = limits[:, 0] - tolerance, limits[:, 1] + tolerance
+    turn = 2 * torch.pi * torch.tensor(robot.revolute).to(q)
+    up = torch.where(q < lower, torch.ceil((lower - q) / (2 * torch.pi)), 0.0)
+    down = torch.where(q > upper, torch.ceil((q - upper) / (2 * torch.pi)), 0.0)
+    moved = q + (up - down) * turn
+    inside = (moved >= lower) & (moved <= upper)
+    return torch.where(inside, moved, q), inside.all(-1)

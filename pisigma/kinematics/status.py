@@ -1,0 +1,55 @@
+"""What became of a wanted pose, as a number that fits in a tensor and a sentence that a person can act on."""
+
+import enum
+
+
+class Status(enum.IntEnum):
+    """Outcome of inverse kinematics for one pose and one branch.
+
+    Joint values are NaN where, and only where, the status is UNREACHABLE. Where several apply, the gravest
+    counts, in the order REACHED, SINGULAR, OUTSIDE_DOMAIN, OUTSIDE_JOINT_LIMITS, then NOT_CONVERGED or
+    UNREACHABLE.
+    """
+
+    REACHED = 0
+    SINGULAR = 1
+    OUTSIDE_JOINT_LIMITS = 2
+    OUTSIDE_DOMAIN = 3
+    UNREACHABLE = 4
+    NOT_CONVERGED = 5
+
+    @property
+    def sentence(self) -> str:
+        """What the status means and what to do about it."""
+        return _SENTENCES[self]
+
+    @property
+    def reaches(self) -> bool:
+        """Whether the joint values given with this status take the tool to the pose, limits aside."""
+        return self not in (Status.UNREACHABLE, Status.NOT_CONVERGED)
+
+
+_SENTENCES = {
+    Status.REACHED: "The joint values reach the pose and lie within the joint limits.",
+    Status.SINGULAR: (
+        "The joint values reach the pose, but it is singular: a joint that is not determined there is given "
+        "as 0, and small moves of the tool need large moves of joints; choose another pose or branch, or go "
+        "through it by joint moves."
+    ),
+    Status.OUTSIDE_JOINT_LIMITS: (
+        "The joint values would reach the pose, but at least one lies outside the joint limits; choose "
+        "another branch or pose."
+    ),
+    Status.OUTSIDE_DOMAIN: (
+        "The joint values lie outside the region that the measurements covered, so the correction is "
+        "extrapolated; measure there too, or do not rely on it."
+    ),
+    Status.UNREACHABLE: (
+        "No joint values reach the pose on this branch; bring the pose into the workspace or choose another "
+        "branch."
+    ),
+    Status.NOT_CONVERGED: (
+        "The search stopped before it reached the pose, and the joint values given do not reach it; start "
+        "nearer, or check that the pose lies in the workspace."
+    ),
+}
