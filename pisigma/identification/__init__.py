@@ -1,0 +1,1 @@
+"""The geometric calibrator: base and tool, parameters, least squares, redundancy, result."""

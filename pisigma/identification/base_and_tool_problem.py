@@ -1,0 +1,233 @@
+"""Base and tool as a small least-squares problem, the arm being taken as it is."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError
+from pisigma.identification.least_squares import AbstractLeastSquares, Linearisation
+from pisigma.identification.problem import SMALLEST_NOISE
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+from pisigma.se3 import rotation_from_vector, rotation_vector, skew
+
+
+@dataclass(frozen=True, eq=False)
+class BaseToolState:
+    """Base and tool while they are being fitted.
+
+    Attributes:
+        R_base: rotation of the base.
+        p_base: position of the base [m].
+        R_tool: rotation of the tool.
+        points: per target, its place behind the last row [m].
+    """
+
+    R_base: Float64[Tensor, "3 3"]
+    p_base: Float64[Tensor, " 3"]
+    R_tool: Float64[Tensor, "3 3"]
+    points: Float64[Tensor, "targets 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
+    """Flange poses and what was measured there.
+
+    The unknowns are base shift [m], base turn [rad] about its own origin, both in the measuring frame, the points
+    (3 a target) [m] and the tool's turn [rad], both in the frame of the last row.
+
+    Attributes:
+        R_flange: rotation behind the last row, from the first row's frame.
+        p_flange: its position [m].
+        position: measured positions [m].
+        rotation: measured rotations where `rotated`, the identity elsewhere.
+        rotated: whether a row has a measured rotation.
+        target: index of the row's target.
+        targets: names of the targets.
+        sigma_position: per row [m]; None: the scatter is estimated.
+        sigma_rotation: per row [rad]; None: the scatter is estimated.
+        free_base: whether the base is to be found.
+        free_tool: whether the tool is to be found.
+    """
+
+    R_flange: Float64[Tensor, "rows 3 3"]
+    p_flange: Float64[Tensor, "rows 3"]
+    position: Float64[Tensor, "rows 3"]
+    rotation: Float64[Tensor, "rows 3 3"]
+    rotated: Bool[Tensor, " rows"]
+    target: Int64[Tensor, " rows"]
+    targets: tuple[str, ...]
+    sigma_position: Float64[Tensor, " rows"] | None
+    sigma_rotation: Float64[Tensor, " rows"] | None
+    free_base: bool = True
+    free_tool: bool = True
+
+    @cached_property
+    def turned(self) -> bool:
+        """Whether any rotation was measured."""
+        return bool(self.rotated.any())
+
+    @cached_property
+    def active(self) -> Int64[Tensor, " active"]:
+        """Indices of the unknowns that are free."""
+        unknowns = 9 + 3 * len(self.targets)
+        free = torch.zeros(unknowns, dtype=torch.bool)
+        free[:6] = self.free_base
+        free[6:-3] = self.free_tool
+        free[-3:] = self.free_tool and self.turned
+        return free.nonzero()[:, 0].to(self.position.device)
+
+    @property
+    def step_scale(self) -> Float64[Tensor, " active"]:
+        """1 mm and 1 mrad."""
+        return torch.full((len(self.active),), 1e-3, dtype=torch.float64, device=self.position.device)
+
+    def residuals(self, state: BaseToolState) -> tuple[Float64[Tensor, "rows 3"], Float64[Tensor, "rows 3"]]:
+        """Measured minus predicted: positions [m] and rotation vectors [rad], in the measuring frame."""
+        predicted = self._arm(state) @ state.R_base.mT + state.p_base
+        R_predicted = state.R_base @ self.R_flange @ state.R_tool
+        turn = rotation_vector(self.rotation @ R_predicted.mT) * self.rotated[:, None]
+        return self.position - predicted, turn
+
+    def linearise(
+        self, point: BaseToolState, like: Linearisation[BaseToolState] | None
+    ) -> Linearisation[BaseToolState]:
+        """Sum up the normal equations."""
+        noise = like.detail if like is not None else (1.0, 1.0)
+        assert isinstance(noise, tuple)
+        residual = torch.cat(self.residuals(point), -1)
+        weight = self._weights(noise)
+        A = (self._jacobian(point) * weight[..., None]).flatten(0, 1)
+        weighted = (residual * weight).flatten()
+        size = float(self.p_flange.abs().max()) + 1e-3
+        rounding = float((weight * 2 * torch.finfo(A.dtype).eps * size).square().sum())
+        cost = float(weighted @ weighted)
+        return Linearisation(point, cost, A.mT @ weighted, A.mT @ A, cost, rounding, noise)
+
+    def renewed(
+        self, linearisation: Linearisation[BaseToolState]
+    ) -> tuple[Linearisation[BaseToolState], bool]:
+        """Weight positions and rotations by 1 / their own scatter, where no sigma is given."""
+        given = self.sigma_position is not None, self.sigma_rotation is not None or not self.turned
+        if all(given) or not self.turned:
+            return linearisation, True
+        residual_p, residual_r = self.residuals(linearisation.point)
+        noise = (
+            max(float(residual_p.square().mean().sqrt()), SMALLEST_NOISE),
+            max(float(residual_r[self.rotated].square().mean().sqrt()), SMALLEST_NOISE),
+        )
+        old = linearisation.detail
+        assert isinstance(old, tuple)
+        settled = all(abs(new / before - 1) < 1e-3 for new, before in zip(noise, old, strict=True))
+        like = Linearisation(linearisation.point, 0.0, *(linearisation.descent,) * 2, 0.0, 0.0, noise)
+        return self.linearise(linearisation.point, like), settled
+
+    def moved(self, point: BaseToolState, step: Float64[Tensor, " active"]) -> BaseToolState:
+        """Turn and shift base and tool."""
+        full = step.new_zeros(9 + 3 * len(self.targets)).index_copy(0, self.active, step)
+        return BaseToolState(
+            R_base=rotation_from_vector(full[3:6]) @ point.R_base,
+            p_base=point.p_base + full[:3],
+            R_tool=rotation_from_vector(full[-3:]) @ point.R_tool,
+            points=point.points + full[6:-3].reshape(-1, 3),
+        )
+
+    def _arm(self, state: BaseToolState) -> Tensor:
+        """Where the target is in the first row's frame."""
+        return self.p_flange + (self.R_flange @ state.points[self.target, :, None])[..., 0]
+
+    def _weights(self, noise: tuple[float, float]) -> Tensor:
+        weight = torch.ones_like(self.position).repeat(1, 2)
+        weight[:, :3] /= noise[0] if self.sigma_position is None else self.sigma_position[:, None]
+        weight[:, 3:] /= noise[1] if self.sigma_rotation is None else self.sigma_rotation[:, None]
+        weight[:, 3:] *= self.rotated[:, None]
+        return weight
+
+    def _jacobian(self, state: BaseToolState) -> Tensor:
+        rows, targets = self.position.shape[0], len(self.targets)
+        R_base_flange = state.R_base @ self.R_flange
+        J = self.position.new_zeros((rows, 6, 9 + 3 * targets))
+        eye = torch.eye(3, dtype=J.dtype, device=J.device)
+        J[:, :3, :3] = eye
+        J[:, :3, 3:6] = -skew(self._arm(state) @ state.R_base.mT)
+        J[:, 3:, 3:6] = eye
+        own = torch.nn.functional.one_hot(self.target, targets).to(J.dtype)
+        J[:, :3, 6:-3] = (R_base_flange[:, :, None, :] * own[:, None, :, None]).reshape(rows, 3, 3 * targets)
+        J[:, 3:, -3:] = R_base_flange
+        return J[..., self.active]
+
+
+def build_base_and_tool_problem(
+    robot: Robot, measurements: Measurements, free_base: bool = True, free_tool: bool = True
+) -> BaseToolProblem:
+    """Gather the rows that can be used.
+
+    Raises:
+        IdentificationError: no positions, several frames, or too few values for the unknowns.
+    """
+    if measurements.position is None:
+        raise IdentificationError(
+            f"{measurements.source}: base and tool need measured positions or poses, and there are none; "
+            "give the columns x_mm, y_mm, z_mm."
+        )
+    frames = sorted(set(measurements.frame))
+    if len(frames) > 1:
+        raise IdentificationError(
+            f"{measurements.source}: one measuring frame was wanted, but there are {len(frames)} "
+            f"({', '.join(frames)}); give the rows of one frame at a time."
+        )
+    keep = torch.isfinite(measurements.position).all(-1)
+    names = measurements.target or ("",) * measurements.q.shape[0]
+    kept = [name for name, good in zip(names, keep.tolist(), strict=True) if good]
+    targets = tuple(dict.fromkeys(kept))
+    numbers = {name: number for number, name in enumerate(targets)}
+    still = robot.with_geometry(base=robot.base * 0, tool=robot.tool * 0)
+    T_flange = forward_kinematics(still, measurements.q[keep])
+    rotation, rotated = _rotations(measurements, keep)
+    problem = BaseToolProblem(
+        R_flange=T_flange[:, :3, :3],
+        p_flange=T_flange[:, :3, 3],
+        position=measurements.position[keep],
+        rotation=rotation,
+        rotated=rotated,
+        target=torch.tensor([numbers[name] for name in kept], dtype=torch.int64, device=keep.device),
+        targets=targets,
+        sigma_position=_given(measurements.sigma_position, keep, torch.ones_like(rotated)),
+        sigma_rotation=_given(measurements.sigma_rotation, keep, rotated),
+        free_base=free_base,
+        free_tool=free_tool,
+    )
+    _check_size(problem, measurements)
+    return problem
+
+
+def _rotations(measurements: Measurements, keep: Tensor) -> tuple[Tensor, Tensor]:
+    """Measured rotations of the rows to keep, the identity where there is none, and where there is one."""
+    eye = torch.eye(3, dtype=measurements.q.dtype, device=measurements.q.device)
+    if measurements.rotation is None:
+        count = int(keep.sum())
+        return eye.expand(count, 3, 3), torch.zeros(count, dtype=torch.bool, device=measurements.q.device)
+    rotation = measurements.rotation[keep]
+    rotated = torch.isfinite(rotation).all(-1).all(-1)
+    return torch.where(rotated[:, None, None], rotation, eye), rotated
+
+
+def _given(sigma: Tensor | None, keep: Tensor, used: Tensor) -> Tensor | None:
+    """Standard deviations of the rows to keep; None where not all used ones are given."""
+    if sigma is None or not bool(torch.isfinite(sigma[keep][used]).all()):
+        return None
+    return torch.where(used, sigma[keep], 1.0)
+
+
+def _check_size(problem: BaseToolProblem, measurements: Measurements) -> None:
+    rows = problem.position.shape[0]
+    values = 3 * rows + 3 * int(problem.rotated.sum())
+    if values < len(problem.active) or rows == 0:
+        raise IdentificationError(
+            f"{measurements.source}: {rows} rows with positions give {values} values, but base and tool have "
+            f"{len(problem.active)} unknowns; measure more poses, spread over the workspace."
+        )

@@ -1,0 +1,87 @@
+"""The identification Jacobian of a whole data set, condensed to a small triangular matrix."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.identification.parameters import Parameter
+from pisigma.identification.problem import CalibrationProblem, SensorView
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What the data say of each parameter, in units of its usual error (1 mm, 1 mrad).
+
+    With J the identification Jacobian of all rows (in mm and mrad, or in standard deviations) and r the
+    residuals, `[1 J r] = Q · root`.
+
+    Attributes:
+        parameters: what the columns of J belong to.
+        root: upper triangular; its first column belongs to ones, its last to the residuals.
+        values: number of rows of J.
+        poses: number of measured rows.
+    """
+
+    parameters: tuple[Parameter, ...]
+    root: Float64[np.ndarray, "rank columns"]
+    values: int
+    poses: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def jacobian(self) -> Float64[np.ndarray, "rank parameters"]:
+        """A small matrix with the same Gram matrix as J."""
+        return self.root[:, 1:-1]
+
+    @property
+    def residual(self) -> Float64[np.ndarray, " rank"]:
+        """A small vector with the same products with `jacobian` and itself as r has with J and itself."""
+        return self.root[:, -1]
+
+    @property
+    def centred(self) -> Float64[np.ndarray, "rank parameters"]:
+        """The same after the mean of every column of J was taken off."""
+        return self.root[1:, 1:-1]
+
+
+def information(
+    problem: CalibrationProblem,
+    point: Float64[Tensor, " parameters"],
+    candidates: list[int],
+    view: SensorView | None = None,
+) -> Information:
+    """Condense the Jacobian at a point by QR factorisations, chunk by chunk.
+
+    No normal equations are formed, so that singular values down to 1e-15 of the largest stay right.
+
+    Args:
+        problem: rows and sensors; the prior does not enter.
+        point: values of all parameters.
+        candidates: indices of the parameters to look at.
+        view: gives the rows' weights, in 1 / standard deviations; in 1/mm and 1/mrad where None.
+    """
+    index = torch.tensor(candidates, dtype=torch.int64, device=point.device)
+    usual = torch.from_numpy(problem.space.usual_errors).to(point)[index, None]
+    root = point.new_zeros((0, len(candidates) + 2))
+    values = 0
+    for rows in problem.chunks():
+        motion = problem.motion(point, rows)
+        blocks = [root]
+        for k, sensor in enumerate(problem.sensors):
+            seen = sensor.seen[rows]
+            weight = 1e3 if view is None else problem.row_weights(view, k, rows)[seen].repeat(sensor.components)
+            J = problem.spread(sensor.derivative(motion), rows, index)[..., seen].flatten(1) * usual
+            r = sensor.residual(motion, rows)[..., seen].flatten()[None]
+            blocks.append((torch.cat([torch.ones_like(r), J, r]) * weight).t())
+            values += J.shape[1]
+        root = torch.linalg.qr(torch.cat(blocks), mode="r").R
+    seen = torch.stack([sensor.seen for sensor in problem.sensors]).any(0)
+    parameters = tuple(problem.space.parameters[i] for i in candidates)
+    return Information(parameters, root.cpu().numpy(), values, int(seen.sum()))

@@ -1,0 +1,170 @@
+"""Levenberg-Marquardt on normal equations; problem, solver and solution are apart."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from enum import Enum
+from typing import Generic, TypeVar
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+Point = TypeVar("Point")
+START_DAMPING = 1e-3
+SMALLEST_DAMPING = 1e-9
+LARGEST_DAMPING = 1e12
+PATIENCE = 2
+"""Steps that may raise the cost before the search goes back."""
+SHORTEST_STEP = 1e-4
+"""[standard errors] A step shorter than this in every direction ends the search."""
+
+
+class SolutionStatus(Enum):
+    """How a search ended; the value is a sentence."""
+
+    CONVERGED = "converged: the last step moved nothing by more than 1e-4 of its standard error"
+    EXACT = "converged: the residuals are at rounding level"
+    STALLED = "stopped: no step lowers the cost any more, though the residuals are above rounding level"
+    ITERATION_LIMIT = "stopped at the iteration limit; allow more iterations or look for gross errors in the data"
+
+    @property
+    def good(self) -> bool:
+        """Whether the point is a minimum."""
+        return self in (SolutionStatus.CONVERGED, SolutionStatus.EXACT)
+
+
+@dataclass(frozen=True, eq=False)
+class Linearisation(Generic[Point]):
+    """A least-squares problem seen from one point: cost `Σ (r / sigma)²`, half its gradient and Gauss-Newton matrix.
+
+    Attributes:
+        point: where.
+        cost: without unit.
+        descent: minus half the gradient of the cost by the unknowns.
+        normal: half its Gauss-Newton Hessian, whose inverse is the covariance of the unknowns.
+        misfit: the part of the cost that the data make (the rest is a prior's).
+        rounding: the misfit that rounding errors alone may make.
+        detail: what the problem wants to remember.
+    """
+
+    point: Point
+    cost: float
+    descent: Float[Tensor, " unknowns"]
+    normal: Float[Tensor, "unknowns unknowns"]
+    misfit: float
+    rounding: float
+    detail: object
+
+
+class AbstractLeastSquares(ABC, Generic[Point]):
+    """What the solver needs to know of a problem."""
+
+    @abstractmethod
+    def linearise(self, point: Point, like: Linearisation[Point] | None) -> Linearisation[Point]:
+        """See the problem from a point, with the noise of `like` (a guess of its own where None)."""
+
+    @abstractmethod
+    def renewed(self, linearisation: Linearisation[Point]) -> tuple[Linearisation[Point], bool]:
+        """The same with the noise estimated from its residuals, and whether the noise has settled."""
+
+    @abstractmethod
+    def moved(self, point: Point, step: Float[Tensor, " unknowns"]) -> Point:
+        """The point after a step."""
+
+    @property
+    @abstractmethod
+    def step_scale(self) -> Float[Tensor, " unknowns"]:
+        """A usual size of every unknown, which the damping is measured with."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solution(Generic[Point]):
+    """Where a search ended.
+
+    Attributes:
+        linearisation: the problem seen from the end point, the noise renewed.
+        iterations: steps tried.
+        status: why it ended.
+        path: the problem seen from every point passed, the start first.
+    """
+
+    linearisation: Linearisation[Point]
+    iterations: int
+    status: SolutionStatus
+    path: tuple[Linearisation[Point], ...]
+
+
+def levenberg_marquardt(
+    problem: AbstractLeastSquares[Point],
+    start: Point,
+    maximum_iterations: int = 50,
+    like: Linearisation[Point] | None = None,
+) -> Solution[Point]:
+    """Minimise by Levenberg-Marquardt steps `(normal + damping / step_scale²) step = descent`.
+
+    The damping is measured against `step_scale` in units of the noise, which is estimated anew at every point: as the
+    residuals shrink, so does it, and exact data are met quadratically even where the normal matrix is singular
+    (Yamashita and Fukushima 2001). The linear system is solved by Cholesky after scaling its columns. A step that
+    raises the cost is followed further once or twice, because curved valleys are left and met again that way; if the
+    best cost is not undercut by then, the search goes back there with a hundredfold damping (watchdog technique,
+    Chamberlain et al. 1982).
+
+    Args:
+        problem: what to minimise.
+        start: where to begin.
+        maximum_iterations: steps tried at most.
+        like: gives the first guess of the noise.
+
+    Returns:
+        The best point, with the reason for stopping (see `SolutionStatus`).
+    """
+    best, settled = problem.renewed(problem.linearise(start, like))
+    here, path = best, [best]
+    damping, uphill, iterations = START_DAMPING, 0, 0
+    status = SolutionStatus.ITERATION_LIMIT
+    while iterations < maximum_iterations:
+        iterations += 1
+        step = solve_damped(here, problem.step_scale, damping)
+        decrement = float(step @ here.normal @ step)
+        there = problem.linearise(problem.moved(here.point, step), best)
+        if there.cost <= best.cost:
+            best, settled = problem.renewed(there)
+            here, uphill, damping = best, 0, max(damping / 10, SMALLEST_DAMPING)
+            path.append(best)
+            if best.misfit <= best.rounding:
+                status = SolutionStatus.EXACT
+                break
+            if decrement <= SHORTEST_STEP**2 and settled:
+                status = SolutionStatus.CONVERGED
+                break
+            continue
+        if best.misfit <= 100 * best.rounding:
+            status = SolutionStatus.EXACT
+            break
+        if here is best and (decrement <= SHORTEST_STEP**2 or decrement <= 1e-10 * best.cost):
+            status = SolutionStatus.CONVERGED
+            break
+        if damping > LARGEST_DAMPING:
+            status = SolutionStatus.STALLED
+            break
+        uphill += 1
+        if uphill <= PATIENCE and there.cost < float("inf"):
+            here = problem.renewed(there)[0]
+        else:
+            here, uphill, damping = best, 0, max(100 * damping, 1.0)
+    return Solution(best, iterations, status, tuple(path))
+
+
+def solve_damped(
+    linearisation: Linearisation[Point], step_scale: Float[Tensor, " unknowns"], damping: float
+) -> Float[Tensor, " unknowns"]:
+    """Solve `(normal + damping / step_scale²) step = descent` by Cholesky with column scaling."""
+    normal = linearisation.normal
+    while True:
+        damped = normal + torch.diag(damping / step_scale.square())
+        scale = damped.diagonal().rsqrt()
+        scaled = damped * scale * scale[:, None]
+        factor, failed = torch.linalg.cholesky_ex(scaled + 1e-14 * torch.eye(len(scale)).to(scaled))
+        if not failed:
+            return scale * torch.cholesky_solve((scale * linearisation.descent)[:, None], factor)[:, 0]
+        damping = max(10 * damping, 1e-6)

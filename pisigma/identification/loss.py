@@ -1,0 +1,105 @@
+"""Losses: how much a row counts, given its distance from the prediction in standard deviations."""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+MEDIAN_DISTANCE = {1: 0.674490, 2: 1.177410, 3: 1.538172}
+"""Median of the length of a standard normal vector with so many components."""
+DISTANCE_99 = {1: 2.575829, 2: 3.034854, 3: 3.368214}
+"""Its 99 % quantile."""
+
+HAMPEL_VARIANCE = {1: 0.990933, 2: 0.995409, 3: 0.996914}
+"""Weighted variance of standard normal noise under Hampel's weights: `E[w d²] / (components · E[w])`."""
+
+
+class AbstractLoss(ABC):
+    """What a row's distance (in standard deviations) costs; `components` is how many values the row has."""
+
+    @abstractmethod
+    def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+        """Cost of every row; the distance's square for small distances."""
+
+    @abstractmethod
+    def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+        """Weight of every row in least squares: half the derivative of the cost over the distance."""
+
+    @abstractmethod
+    def scale(self, distance: Float[Tensor, " rows"], components: int, used: float) -> float:
+        """Standard deviation of one value while the scale is still unknown.
+
+        Args:
+            distance: distances of the rows that were seen, in the sensor's unit.
+            components: values a row.
+            used: how many values the estimated parameters use up.
+        """
+
+    @abstractmethod
+    def deviation(self, distance: Float[Tensor, " rows"], components: int, used: float, scale: float) -> float:
+        """Standard deviation of one value, from all good rows; see `scale` for the rest.
+
+        Args:
+            scale: about what it is, to tell the good rows.
+        """
+
+
+@dataclass(frozen=True)
+class SquaredLoss(AbstractLoss):
+    """Plain least squares."""
+
+    def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+        """The square."""
+        return distance.square()
+
+    def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+        """One."""
+        return torch.ones_like(distance)
+
+    def scale(self, distance: Float[Tensor, " rows"], components: int, used: float) -> float:
+        """Root mean square, corrected for the parameters."""
+        return self.deviation(distance, components, used, 1.0)
+
+    def deviation(self, distance: Float[Tensor, " rows"], components: int, used: float, scale: float) -> float:
+        """Root mean square, corrected for the parameters."""
+        return math.sqrt(float(distance.square().sum()) / max(len(distance) * components - used, 1.0))
+
+
+@dataclass(frozen=True)
+class HampelLoss(AbstractLoss):
+    """Least squares up to the 99 % quantile of normal noise, then less and less, at three times that nothing.
+
+    Hampel's three parts (Hampel et al. 1986, section 2.6) with corners at 1, 1.5 and 3 times the quantile: good rows
+    keep the weight one, so normal noise is treated as by least squares; rows far off do not count at all. The scale is
+    the median of the distances, so it needs no threshold in metres and stands up to nearly half of the rows being wrong.
+    """
+
+    def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+        """Square, line, parabola, constant."""
+        a = DISTANCE_99[components]
+        b, c = 1.5 * a, 3 * a
+        falling = 2 * a * b - a * a + a * (c - b) * (1 - ((c - distance.clamp(max=c)) / (c - b)).square())
+        beyond = torch.where(distance < b, 2 * a * distance - a * a, falling)
+        return torch.where(distance < a, distance.square(), beyond)
+
+    def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+        """One, a / distance, falling, zero."""
+        a = DISTANCE_99[components]
+        b, c = 1.5 * a, 3 * a
+        return (a / distance.clamp(min=a)) * ((c - distance) / (c - b)).clamp(0, 1)
+
+    def scale(self, distance: Float[Tensor, " rows"], components: int, used: float) -> float:
+        """Median over that of a standard normal vector, corrected for the parameters."""
+        values = len(distance) * components
+        left = max(values - used, 1.0) / values
+        return float(distance.median()) / MEDIAN_DISTANCE[components] / math.sqrt(left)
+
+    def deviation(self, distance: Float[Tensor, " rows"], components: int, used: float, scale: float) -> float:
+        """Weighted root mean square, corrected for the parameters and for what the weights take off normal noise."""
+        weight = self.weight(distance / scale, components)
+        left = float(weight.sum()) * components - used
+        square = float((weight * distance.square()).sum()) / max(left, 1.0)
+        return math.sqrt(square / HAMPEL_VARIANCE[components])

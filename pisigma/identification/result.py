@@ -1,0 +1,174 @@
+"""What a calibration comes to: the robot, its parameters with their errors, and what the data do not tell."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.identification.information import Information
+from pisigma.identification.least_squares import SolutionStatus
+from pisigma.identification.observability import Observability
+from pisigma.identification.pairwise import PairwiseRedundancy, find_pairwise_redundancy
+from pisigma.identification.prediction import prediction_errors
+from pisigma.identification.redundancy import Redundancy
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+
+
+@dataclass(frozen=True)
+class ParameterEstimate:
+    """One row of the parameter table, in SI units.
+
+    Attributes:
+        name: such as "theta_1".
+        unit: "m" or "rad".
+        nominal: as drawn.
+        estimated: as identified.
+        change: estimated - nominal.
+        standard_error: of the estimate; NaN where it was not estimated.
+        remark: "identified", what it is only identified together with, or why it was not estimated.
+    """
+
+    name: str
+    unit: str
+    nominal: float
+    estimated: float
+    change: float
+    standard_error: float
+    remark: str
+
+    @property
+    def free(self) -> bool:
+        """Whether it was estimated."""
+        return not np.isnan(self.standard_error)
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Noise of one kind of sensor, as the residuals show it.
+
+    Attributes:
+        sensor: "position" or "rotation".
+        sigma: standard deviation of one value [m or rad]; where the rows give their own, the factor on it.
+        unit: "m" or "rad", or "given" for a factor.
+        values: number of measured values.
+        used: how many of them the parameters used up.
+        rms: root mean square of the residuals' lengths, all rows [m or rad].
+    """
+
+    sensor: str
+    sigma: float
+    unit: str
+    values: int
+    used: float
+    rms: float
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A row that counted for less than half.
+
+    Attributes:
+        row: its number in the measurements, from 0.
+        place: file and line, or source and row.
+        sensor: which value of the row.
+        residual: length of the residual [m or rad].
+        deviations: the same in standard deviations of one value.
+    """
+
+    row: int
+    place: str
+    sensor: str
+    residual: float
+    deviations: float
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationResult:
+    """A geometric calibration.
+
+    Attributes:
+        robot: the calibrated robot, with the base of the first frame and the tool of the first target.
+        bases: per frame x, y, z [m], roll, pitch, yaw [rad].
+        tools: the same per target.
+        parameters: all parameters, free or not.
+        covariance: of all parameters in their order (SI), zero where they were not free.
+        residuals: per sensor, measured - predicted of every row [m or rad], NaN where it saw nothing.
+        outliers: rows that counted for less than half, the worst first.
+        noise: per sensor.
+        redundancy: rank, chosen parameters and dependencies at the start.
+        information: what `redundancy` was found from.
+        sizes: nominal values behind `information`.
+        extended: parameters that were added because at the solution the data do tell them.
+        unseen: directions that the data hardly see, in words; there the nominal value stands.
+        observability: indices O1 to O5 of the free parameters at the solution.
+        iterations: steps tried.
+        cost: sum of squared residuals over variances, with loss and prior.
+        status: why the search ended.
+        rms_path: RMS of the position residuals' lengths at every point passed [m], the start first.
+        warnings: what to measure next, in sentences.
+    """
+
+    robot: Robot
+    bases: dict[str, Float64[np.ndarray, " 6"]]
+    tools: dict[str, Float64[np.ndarray, " 6"]]
+    parameters: tuple[ParameterEstimate, ...]
+    covariance: Float64[np.ndarray, "parameters parameters"]
+    residuals: dict[str, Float64[np.ndarray, "rows components"]]
+    outliers: tuple[Outlier, ...]
+    noise: tuple[SensorNoise, ...]
+    redundancy: Redundancy
+    information: Information
+    sizes: Float64[np.ndarray, " candidates"]
+    extended: tuple[str, ...]
+    unseen: tuple[str, ...]
+    observability: Observability
+    iterations: int
+    cost: float
+    status: SolutionStatus
+    rms_path: tuple[float, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def rank(self) -> int:
+        """How many independent combinations of the parameters the data see, at the nominal geometry."""
+        return self.redundancy.rank
+
+    @property
+    def condition_number(self) -> float:
+        """Of the Jacobian of the free parameters, in mm and mrad."""
+        return self.observability.condition_number
+
+    @property
+    def free(self) -> tuple[str, ...]:
+        """Names of the parameters that were estimated."""
+        return tuple(parameter.name for parameter in self.parameters if parameter.free)
+
+    @cached_property
+    def pairwise(self) -> PairwiseRedundancy:
+        """Redundancy the paper's way, by Pearson correlation."""
+        return find_pairwise_redundancy(self.information, self.sizes)
+
+    def parameter(self, name: str) -> ParameterEstimate:
+        """The row of the parameter table with that name.
+
+        Raises:
+            KeyError: there is none.
+        """
+        for parameter in self.parameters:
+            if parameter.name == name:
+                return parameter
+        raise KeyError(name)
+
+    def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows 3"]]:
+        """Measured - predicted of any measurements with known frames and targets, such as held-out ones.
+
+        Returns:
+            "position" [m] and, where measured, "rotation" [rad]; NaN where a row has none.
+
+        Raises:
+            IdentificationError: a row has a frame or a target that is not known.
+        """
+        return prediction_errors(self.robot, self.bases, self.tools, measurements)

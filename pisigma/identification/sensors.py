@@ -1,0 +1,101 @@
+"""Sensors as residual blocks: what is predicted, what is left over, and its derivative by the chain rule."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import ClassVar, Literal
+
+import torch
+from jaxtyping import Bool, Float, Float64
+from torch import Tensor
+
+from pisigma.identification.jacobian import ToolMotion
+from pisigma.se3 import rotation_vector
+
+
+class AbstractSensor(ABC):
+    """One kind of measurement; its rows are those of the problem, and `seen` says where it has one.
+
+    A new kind of sensor says how its value follows from the tool's motion. Values have the row index last.
+
+    Attributes:
+        name: such as "position"; one noise figure is estimated per name.
+        unit: of its values.
+        components: values a row.
+        turning: whether it needs the tool's rotation.
+        seen: whether a row has a value.
+        sigma: standard deviation of a value where the rows give it, else None: it is estimated.
+    """
+
+    name: ClassVar[str]
+    unit: ClassVar[Literal["m", "rad"]]
+    components: ClassVar[int]
+    turning: ClassVar[bool]
+    seen: Bool[Tensor, " rows"]
+    sigma: Float64[Tensor, " rows"] | None
+
+    @abstractmethod
+    def residual(self, motion: ToolMotion, rows: slice) -> Float[Tensor, "components poses"]:
+        """Measured minus predicted; whatever it is where nothing was seen, it is not used."""
+
+    @abstractmethod
+    def derivative(self, motion: ToolMotion) -> Float[Tensor, "parameters components poses"]:
+        """Derivative of the predicted value by every parameter."""
+
+
+@dataclass(frozen=True, eq=False)
+class PositionSensor(AbstractSensor):
+    """A tracker that sees a reflector: three coordinates in its frame.
+
+    Attributes:
+        measured: positions [m].
+        seen: whether a row has one.
+        sigma: standard deviation of a coordinate [m] of every row, or None.
+    """
+
+    name = "position"
+    unit = "m"
+    components = 3
+    turning = False
+    measured: Float64[Tensor, "3 rows"]
+    seen: Bool[Tensor, " rows"]
+    sigma: Float64[Tensor, " rows"] | None
+
+    def residual(self, motion: ToolMotion, rows: slice) -> Float[Tensor, "components poses"]:
+        """Measured minus predicted position [m]."""
+        return self.measured[:, rows] - motion.position
+
+    def derivative(self, motion: ToolMotion) -> Float[Tensor, "parameters components poses"]:
+        """The tool's shift."""
+        return motion.derivative[:, :3]
+
+
+@dataclass(frozen=True, eq=False)
+class RotationSensor(AbstractSensor):
+    """The orientation that a 6D tracker sees, as a rotation vector from the predicted to the measured one.
+
+    Attributes:
+        measured: rotations, the row index last.
+        seen: whether a row has one.
+        sigma: standard deviation of an angle [rad] of every row, or None.
+    """
+
+    name = "rotation"
+    unit = "rad"
+    components = 3
+    turning = True
+    measured: Float64[Tensor, "3 3 rows"]
+    seen: Bool[Tensor, " rows"]
+    sigma: Float64[Tensor, " rows"] | None
+
+    def residual(self, motion: ToolMotion, rows: slice) -> Float[Tensor, "components poses"]:
+        """Rotation vector of measured · predicted^T [rad]."""
+        difference = torch.einsum("ijn,kjn->nik", self.measured[..., rows], motion.rotation)
+        return rotation_vector(difference).t()
+
+    def derivative(self, motion: ToolMotion) -> Float[Tensor, "parameters components poses"]:
+        """The tool's turn.
+
+        The residual r falls by `J_r(r)^-1 turn` rather than by the turn; as `J_r^-T r = r`, the cost's gradient is exact
+        with the turn itself, and the Gauss-Newton matrix is right to second order in r.
+        """
+        return motion.derivative[:, 3:]
