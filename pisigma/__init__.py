@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pisigma.correction.corrected_ik import CorrectedIK as CorrectedIK
-    from pisigma.correction.corrected_ik import Solution as Solution
     from pisigma.correction.corrected_ik import load as load
+    from pisigma.correction.solution import Solution as Solution
     from pisigma.errors import PisigmaError as PisigmaError
     from pisigma.kinematics.status import Status as Status
     from pisigma.measurement.dataset import Measurements as Measurements
@@ -24,7 +24,7 @@ _HOMES = {
     "PiSigma": "pisigma.network.pi_sigma",
     "PisigmaError": "pisigma.errors",
     "Robot": "pisigma.robot.description",
-    "Solution": "pisigma.correction.corrected_ik",
+    "Solution": "pisigma.correction.solution",
     "Status": "pisigma.kinematics.status",
     "load": "pisigma.correction.corrected_ik",
 }

@@ -1,5 +1,6 @@
 """Reading YAML files into validated, typed documents, with file and line in every complaint."""
 
+import json
 import os
 import re
 from pathlib import Path
@@ -9,6 +10,10 @@ import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pisigma.errors import PisigmaError, nearest_choice
+from pisigma.yaml_schema import allowed_texts, valid_keys
+
+MAXIMUM_NODES = 1_000_000
+"""Values that a file may hold, aliases written out."""
 
 
 class Section(BaseModel):
@@ -21,29 +26,54 @@ Document = TypeVar("Document", bound=BaseModel)
 _Path = tuple[str | int, ...]
 
 
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """YAML's safe loader, refusing a key that stands twice and reading 1e-3 as a number."""
+class _PlainLoader(yaml.SafeLoader):
+    """YAML's safe loader with the plain scalars of YAML 1.2, refusing a key that stands twice.
+
+    YAML 1.1 reads `010` as 8, `1:30` as 90, `no` as false and `1e-3` as text. Here they are 10, text, text
+    and 0.001.
+    """
+
+    yaml_implicit_resolvers: dict[str, Any] = {}  # noqa: RUF012
 
 
-def _construct_mapping(loader: _UniqueKeyLoader, node: yaml.MappingNode) -> dict[Any, Any]:
+def _construct_mapping(loader: _PlainLoader, node: yaml.MappingNode) -> dict[Any, Any]:
     mapping: dict[Any, Any] = {}
     for key_node, value_node in node.value:
-        key = loader.construct_object(key_node, deep=True)  # type: ignore[no-untyped-call]
+        key = loader.construct_object(key_node, deep=True)
+        mark = key_node.start_mark
         if not isinstance(key, str):
-            raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is no text", key_node.start_mark)
+            raise yaml.constructor.ConstructorError(None, None, f"the key {key!r} is no text", mark)
         if key in mapping:
-            raise yaml.constructor.ConstructorError(None, None, f"the key '{key}' stands twice", key_node.start_mark)
-        mapping[key] = loader.construct_object(value_node, deep=True)  # type: ignore[no-untyped-call]
+            raise yaml.constructor.ConstructorError(None, None, f"the key '{key}' stands twice", mark)
+        mapping[key] = loader.construct_object(value_node, deep=True)
     return mapping
 
 
-_UniqueKeyLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
-# YAML 1.1 wants a dot in a float; people write 1e-3.
-_UniqueKeyLoader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(r"^[-+]?[0-9][0-9_]*[eE][-+]?[0-9]+$"),
-    list("-+0123456789"),
-)
+def _construct_number(loader: _PlainLoader, node: yaml.ScalarNode) -> int | float:
+    text = str(node.value)
+    try:
+        return float(text.replace(".inf", "inf").replace(".nan", "nan").lower())
+    except ValueError:
+        problem = f"'{text}' is no number"
+        raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
+
+
+def _construct_integer(loader: _PlainLoader, node: yaml.ScalarNode) -> int | float:
+    number = _construct_number(loader, node)
+    return int(node.value) if re.fullmatch(r"[-+]?[0-9]{1,400}", node.value) else number
+
+
+_PlainLoader.add_constructor(yaml.resolver.BaseResolver.DEFAULT_MAPPING_TAG, _construct_mapping)
+_PlainLoader.add_constructor("tag:yaml.org,2002:int", _construct_integer)
+_PlainLoader.add_constructor("tag:yaml.org,2002:float", _construct_number)
+for _tag, _pattern, _first in (
+    ("null", r"^(?:~|null|Null|NULL|)$", ["~", "n", "N", ""]),
+    ("bool", r"^(?:true|True|TRUE|false|False|FALSE)$", list("tTfF")),
+    ("int", r"^[-+]?[0-9]+$", list("-+0123456789")),
+    ("float", r"^[-+]?(?:\.[0-9]+|[0-9]+(?:\.[0-9]*)?)(?:[eE][-+]?[0-9]+)?$", list("-+.0123456789")),
+    ("float", r"^(?:[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN))$", list("-+.")),
+):
+    _PlainLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), _first)
 
 
 def read_yaml(path: str | os.PathLike[str], document: type[Document], error: type[PisigmaError]) -> Document:
@@ -57,32 +87,73 @@ def read_yaml(path: str | os.PathLike[str], document: type[Document], error: typ
     Raises:
         error: the file is missing, no YAML, or does not fit; the message names file, line and key.
     """
+    return parse_yaml(_read_text(path, error), document, error, source=str(path))
+
+
+def parse_yaml(text: str, document: type[Document], error: type[PisigmaError], source: str) -> Document:
+    """Read YAML text as a `document`; `source` is what complaints call it. See `read_yaml`.
+
+    Types are taken strictly: a text is no number, and a number no text.
+    """
+    node, content = _load(text, error, source)
+    if node is None or not isinstance(content, dict):
+        raise error(f"{source}: a YAML mapping of keys to values was wanted, but it holds none.")
     try:
-        text = Path(path).read_text(encoding="utf-8")
+        # By way of JSON, because strict validation of Python objects wants tuples where YAML has lists.
+        return document.model_validate_json(json.dumps(content), strict=True)
+    except TypeError as problem:
+        raise error(f"{source}: {problem}; write numbers, texts, lists and mappings without tags.") from None
+    except ValidationError as problem:
+        raise error(_complaint(problem, node, document, source)) from None
+
+
+def line_of(path: str | os.PathLike[str], keys: _Path) -> int:
+    """Line of a YAML file, counted from 1, on which the value under `keys` stands; as near as the keys lead.
+
+    For complaints about values that only other things than the file's form can judge.
+    """
+    node, _ = _load(_read_text(path, PisigmaError), PisigmaError, str(path))
+    return _locate(node, keys)[0] if node else 1
+
+
+def _read_text(path: str | os.PathLike[str], error: type[PisigmaError]) -> str:
+    try:
+        return Path(path).read_text(encoding="utf-8")
     except OSError as problem:
         raise error(f"{path}: cannot be read ({problem.strerror}); check the path.") from None
     except UnicodeDecodeError:
         raise error(f"{path}: is not UTF-8 text; a YAML file was wanted.") from None
-    return parse_yaml(text, document, error, source=str(path))
 
 
-def parse_yaml(text: str, document: type[Document], error: type[PisigmaError], source: str) -> Document:
-    """Read YAML text as a `document`; `source` is what complaints call it. See `read_yaml`."""
-    loader = _UniqueKeyLoader(text)
+def _load(text: str, error: type[PisigmaError], source: str) -> tuple[yaml.Node | None, Any]:
+    """The YAML nodes, for places, and what they hold."""
     try:
-        node = loader.get_single_node()  # type: ignore[no-untyped-call]
-        content = loader.construct_document(node) if node else None  # type: ignore[no-untyped-call]
+        loader = _PlainLoader(text)
+        node = loader.get_single_node()
+        if node is not None and _count(node, {}) > MAXIMUM_NODES:
+            raise error(
+                f"{source}: holds more than {MAXIMUM_NODES} values; a file that people write was wanted."
+            )
+        return node, loader.construct_document(node) if node else None
     except yaml.YAMLError as problem:
         mark = getattr(problem, "problem_mark", None)
         place = f"{source}, line {mark.line + 1}" if mark else source
-        what = getattr(problem, "problem", None) or str(problem).splitlines()[0]
+        what = getattr(problem, "problem", None) or " ".join(str(problem).split())
         raise error(f"{place}: {what}; correct the YAML there.") from None
-    if not isinstance(content, dict):
-        raise error(f"{source}: a YAML mapping of keys to values was wanted, but it holds none.")
-    try:
-        return document.model_validate(content)
-    except ValidationError as problem:
-        raise error(_complaint(problem, node, document, source)) from None
+    except RecursionError:
+        raise error(f"{source}: is nested too deeply or within itself; correct the YAML.") from None
+
+
+def _count(node: yaml.Node, known: dict[int, int]) -> int:
+    """Number of values below a node, aliases counted wherever they stand."""
+    if id(node) not in known:
+        children: list[yaml.Node] = []
+        if isinstance(node, yaml.MappingNode):
+            children = [child for pair in node.value for child in pair]
+        elif isinstance(node, yaml.SequenceNode):
+            children = node.value
+        known[id(node)] = 1 + sum(_count(child, known) for child in children)
+    return known[id(node)]
 
 
 def _complaint(problem: ValidationError, node: yaml.Node, document: type[BaseModel], source: str) -> str:
@@ -93,16 +164,34 @@ def _complaint(problem: ValidationError, node: yaml.Node, document: type[BaseMod
     line, keys = _locate(node, path)
     key = ".".join(str(part) for part in keys) or "the file"
     more = f" ({len(found) - 1} more findings)" if len(found) > 1 else ""
-    place = f"{source}, line {line}"
+    context = first.get("ctx", {})
     if first["type"] == "extra_forbidden":
-        choices = _valid_keys(document, path[:-1])
-        return f"{place}: unknown key '{keys[-1]}' in '{key}'; {nearest_choice(str(keys[-1]), choices)}{more}"
+        section = ".".join(str(part) for part in keys[:-1]) or "the file"
+        hint = nearest_choice(str(keys[-1]), valid_keys(document, path[:-1]))
+        return f"{source}, line {line}: unknown key '{keys[-1]}' in '{section}'; {hint}{more}"
     if first["type"] == "missing":
-        return f"{place}: the key '{path[-1]}' is missing in '{key}'; add it.{more}"
-    message = first["msg"].removeprefix("Value error, ")
+        return f"{source}, line {line}: the key '{path[-1]}' is missing in '{key}'; add it.{more}"
+    if first["type"] == "union_tag_not_found":
+        tag = str(context["discriminator"]).strip("'")
+        choices = ", ".join(allowed_texts(document, (*path, tag)))
+        return (
+            f"{source}, line {line}: the key '{tag}' is missing in '{key}'; add it. Valid: {choices}.{more}"
+        )
+    if first["type"] == "union_tag_invalid":
+        path = (*path, str(context["discriminator"]).strip("'"))
+        line, keys = _locate(node, path)
+        return _wrong_choice(source, line, keys, str(context["tag"]), allowed_texts(document, path)) + more
+    if first["type"] == "literal_error" and (texts := allowed_texts(document, path)):
+        return _wrong_choice(source, line, keys, str(first["input"]), texts) + more
+    message = first["msg"].removeprefix("Value error, ").rstrip(".")
     given = first["input"]
-    came = f", but got {given!r}" if isinstance(given, str | int | float | bool) else ""
-    return f"{place}: '{key}': {message[:1].lower()}{message[1:]}{came}.{more}".replace("..", ".")
+    came = f", but got {given!r}" if isinstance(given, str | int | float) else ""
+    return f"{source}, line {line}: '{key}': {message[:1].lower()}{message[1:]}{came}.{more}"
+
+
+def _wrong_choice(source: str, line: int, keys: list[str | int], given: str, choices: list[str]) -> str:
+    key = ".".join(str(part) for part in keys)
+    return f"{source}, line {line}: '{key}' cannot be '{given}'; {nearest_choice(given, choices)}"
 
 
 def _locate(node: yaml.Node, path: _Path) -> tuple[int, list[str | int]]:
@@ -125,48 +214,3 @@ def _locate(node: yaml.Node, path: _Path) -> tuple[int, list[str | int]]:
             continue
         keys.append(part)
     return line, keys
-
-
-def _valid_keys(document: Any, path: _Path) -> set[str]:
-    """Field names that are valid where `path` leads, found by walking the JSON schema."""
-    schema = document.model_json_schema()
-    definitions = schema.get("$defs", {})
-    nodes = [schema]
-    for part in path:
-        following = []
-        for candidate in _alternatives(nodes, definitions):
-            properties = candidate.get("properties", {})
-            if part in properties:
-                following.append(properties[part])
-            elif isinstance(part, int) and ("items" in candidate or "prefixItems" in candidate):
-                following.append(candidate.get("items") or candidate["prefixItems"][part])
-            elif isinstance(candidate.get("additionalProperties"), dict):
-                following.append(candidate["additionalProperties"])
-        if following:
-            nodes = following
-        else:  # a union's tag: keep the alternative of that tag
-            tagged = [c for c in _alternatives(nodes, definitions) if part in _tags(c)]
-            nodes = tagged or nodes
-    keys: set[str] = set()
-    for candidate in _alternatives(nodes, definitions):
-        keys |= set(candidate.get("properties", {}))
-    return keys
-
-
-def _tags(schema: dict[str, Any]) -> set[Any]:
-    return {value.get("const") for value in schema.get("properties", {}).values()}
-
-
-def _alternatives(nodes: list[dict[str, Any]], definitions: dict[str, Any]) -> list[dict[str, Any]]:
-    """Resolve references and unions into the plain schemas that they stand for."""
-    plain: list[dict[str, Any]] = []
-    open_nodes = list(nodes)
-    while open_nodes:
-        schema = open_nodes.pop()
-        if "$ref" in schema:
-            open_nodes.append(definitions[schema["$ref"].rsplit("/", 1)[-1]])
-        elif "anyOf" in schema or "oneOf" in schema:
-            open_nodes += schema.get("anyOf", []) + schema.get("oneOf", [])
-        else:
-            plain.append(schema)
-    return plain

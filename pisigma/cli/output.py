@@ -1,17 +1,70 @@
-"""Tables for people on stdout."""
+"""What the commands print: tables for people on stdout, one JSON object, one line for a problem."""
 
-from collections.abc import Sequence
+import functools
+import json
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import typer
+
+from pisigma.errors import PisigmaError
+
+WIDTH_WITHOUT_TERMINAL = 120
+
+_INTERRUPTED = 130
+
+
+def print_json(result: Any) -> None:
+    """Print one JSON object on stdout; what is no number has to be None, as JSON has no NaN."""
+    typer.echo(json.dumps(result, allow_nan=False))
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table; the first column is text, the others are set right if they look like numbers."""
+    """Print a table; columns that hold numbers are set right, and no cell is cut or wrapped."""
+    from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
+    from rich.text import Text
 
-    table = Table(title=title, title_justify="left")
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1), pad_edge=False, collapse_padding=True)
     for index, column in enumerate(columns):
-        numeric = index > 0 and all(row[index][:1] in "-+.0123456789n" for row in rows)
-        table.add_column(column, justify="right" if numeric else "left")
+        number = index > 0 and all(_is_number(row[index]) for row in rows)
+        table.add_column(Text(column), justify="right" if number else "left", no_wrap=True)
     for row in rows:
-        table.add_row(*row)
-    Console().print(table)
+        table.add_row(*(Text(cell) for cell in row))
+    console = Console(highlight=False)
+    width = console.width if console.is_terminal else WIDTH_WITHOUT_TERMINAL
+    widest = console.measure(table, options=console.options.update(max_width=10_000)).maximum
+    console.width = max(width, widest)
+    console.print(Text(title), soft_wrap=True)
+    console.print(table)
+
+
+def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
+    """Make a command end with one line on stderr and exit status 2 where the user's input is at fault."""
+
+    @functools.wraps(command)
+    def told(*args: Any, **kwargs: Any) -> None:
+        try:
+            command(*args, **kwargs)
+        except PisigmaError as problem:
+            fail(str(problem))
+        except KeyboardInterrupt:
+            typer.echo("pisigma: interrupted; nothing was left half written.", err=True)
+            raise typer.Exit(_INTERRUPTED) from None
+
+    return told
+
+
+def fail(sentence: str) -> None:
+    """Say what is wrong in one line on stderr and end with exit status 2."""
+    typer.echo(f"pisigma: {' '.join(sentence.split())}", err=True)
+    raise typer.Exit(2) from None
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True

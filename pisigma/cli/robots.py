@@ -1,6 +1,5 @@
 """`pisigma robots`: the catalogue."""
 
-import json
 from typing import Annotated
 
 import typer
@@ -10,6 +9,7 @@ def robots(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """List the robots that come with pisigma."""
+    from pisigma.cli.output import print_json, print_table
     from pisigma.robot import catalogue, load_robot
 
     known = [load_robot(name) for name in catalogue()]
@@ -24,12 +24,17 @@ def robots(
             }
             for robot in known
         ]
-        typer.echo(json.dumps({"robots": entries}))
+        print_json({"robots": entries})
         return
-    from pisigma.cli.output import print_table
-
     rows = [
-        (robot.name, str(robot.dof), "".join(j.type[0].upper() for j in robot.joints), f"{robot.reach * 1e3:.0f}", robot.maker)
+        (
+            robot.name,
+            str(robot.dof),
+            "".join(joint.type[0].upper() for joint in robot.joints),
+            f"{robot.reach * 1e3:.0f}",
+            robot.maker,
+        )
         for robot in known
     ]
-    print_table("robots of the catalogue", ("name", "joints", "types", "reach [mm]", "maker"), rows)
+    columns = ("name", "joints", "types", "reach [mm]", "maker")
+    print_table("robots of the catalogue (R: revolute, P: prismatic joint)", columns, rows)

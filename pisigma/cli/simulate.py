@@ -1,6 +1,5 @@
 """`pisigma simulate`: the simulated measurements of a recipe as a file."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
@@ -10,10 +9,13 @@ import typer
 def simulate(
     recipe: Annotated[Path, typer.Argument(help="Recipe (YAML) with simulated data.")],
     out: Annotated[Path, typer.Option(help="CSV file to write.")],
-    held_out: Annotated[bool, typer.Option(help="Write the held-out rows instead of the training rows.")] = False,
+    held_out: Annotated[
+        bool, typer.Option("--held-out", help="Write the held-out rows instead of the training rows.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Write the simulated measurements of a recipe as a CSV file."""
+    from pisigma.cli.output import print_json
     from pisigma.robot import Robot
     from pisigma.training.recipe import read_recipe
     from pisigma.training.run import simulate_held_out, simulate_training
@@ -22,6 +24,6 @@ def simulate(
     rows = simulate_held_out(stated) if held_out else simulate_training(stated)
     rows.write_csv(out, Robot.load(stated.robot))
     if as_json:
-        typer.echo(json.dumps({"file": str(out), "rows": rows.rows, "sha256": rows.content_hash()}))
+        print_json({"file": str(out), "rows": rows.rows, "sha256": rows.content_hash()})
     else:
         typer.echo(f"{rows.rows} measurements written to {out}.")

@@ -1,82 +1,97 @@
 """`pisigma train`: from a recipe to a model folder."""
 
-import json
 import shlex
 import time
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from pisigma.evaluation.cross_validation import CrossValidation
+    from pisigma.measurement.dataset import Measurements
+    from pisigma.training.recipe import Recipe
 
 
 def train(
     recipe: Annotated[Path, typer.Argument(help="Recipe (YAML), such as training/kiro3.yaml.")],
-    data: Annotated[Path | None, typer.Option(help="Measured data (CSV), for recipes that ask for it.")] = None,
+    data: Annotated[
+        Path | None, typer.Option(help="Measured data (CSV), for recipes that ask for it.")
+    ] = None,
     out: Annotated[Path | None, typer.Option(help="Model folder to write [runs/NAME].")] = None,
-    resume: Annotated[bool, typer.Option(help="Go on from where an interrupted training of this folder stopped.")] = False,
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on from where an interrupted training of this folder stopped."),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Train the model of a recipe and write it as a model folder with card and figures."""
     started = time.perf_counter()
-    from pisigma.correction.model_folder import check_replaceable, save_model, staged_folder
+    from pisigma.cli.output import print_json
+    from pisigma.correction.model_folder import save_model
+    from pisigma.correction.staging import check_replaceable, staged_folder
     from pisigma.evaluation.card import write_card
     from pisigma.evaluation.training_report import report_training
     from pisigma.training.checkpoints import checkpoint_folder, discard_checkpoints
-    from pisigma.training.recipe import MeasuredData, read_recipe, recipe_hash
+    from pisigma.training.geometric_recipe import is_geometric
+    from pisigma.training.recipe import read_recipe, recipe_hash
     from pisigma.training.run import RunOptions, load_measurements, train_recipe
 
+    if is_geometric(recipe):
+        from pisigma.cli.train_geometric import train_geometric
+
+        return train_geometric(recipe, data, out, resume, as_json)
     stated = read_recipe(recipe)
     folder = out or Path("runs") / stated.name
     check_replaceable(folder)
     measurements = load_measurements(stated, data)
     checkpoints = checkpoint_folder(folder)
     run = train_recipe(stated, measurements, RunOptions(checkpoints, resume, True, recipe_hash(recipe)))
-    validation = _cross_validate(stated, measurements) if isinstance(stated.data, MeasuredData) else None
-    report = report_training(stated, run, validation)
-    run.model.metrics.update(report)
+    report = report_training(stated, run, _cross_validate(stated, measurements))
     command = shlex.join(["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])])
     with staged_folder(folder) as scratch:
-        save_model(run.model, scratch)
+        save_model(replace(run.model, metrics=report), scratch)
         write_card(stated, command, run, report, scratch)
     discard_checkpoints(checkpoints)
     result = {"model": str(folder), "seconds": round(time.perf_counter() - started, 3), **report}
     if as_json:
-        typer.echo(json.dumps(result))
+        print_json(result)
     else:
         _print_report(result)
 
 
-def _cross_validate(recipe: Any, measurements: Any) -> Any:
+def _cross_validate(recipe: "Recipe", measurements: "Measurements") -> "CrossValidation | None":
+    """Cross-validate a recipe for measured data; a simulated one has held-out rows of its own."""
     from rich.console import Console
 
     from pisigma.evaluation.cross_validation import cross_validate
+    from pisigma.training.recipe import MeasuredData
 
+    if not isinstance(recipe.data, MeasuredData):
+        return None
     with Console(stderr=True).status("cross-validation") as status:
         return cross_validate(
-            recipe, measurements, lambda done, folds: status.update(f"cross-validation: fold {done + 1} of {folds}")
+            recipe,
+            measurements,
+            lambda done, folds: status.update(f"cross-validation: fold {done + 1} of {folds}"),
         )
 
 
 def _print_report(result: dict[str, Any]) -> None:
     from pisigma.cli.output import print_table
+    from pisigma.evaluation.tables import joint_rows, pose_rows
 
-    rows = []
-    for joint in result["joints"]:
-        for part in ("training", "held_out", "paper"):
-            if part in joint:
-                unit = next(iter(joint[part]["before"])).rsplit("_", 1)[1]
-                figures = [f"{value:.4f}" for when in ("before", "after") for value in joint[part][when].values()]
-                rows.append((f"{joint['name']} [{unit}]".replace("[", "\\["), part.replace("_", "-"), *figures))
-    columns = [f"{when}\n{name}" for when in ("before", "after") for name in ("average", "deviat.", "maximum")]
-    print_table("absolute joint errors", ("joint", "rows", *columns), rows)
+    columns = [
+        f"{when}\n{name}" for when in ("before", "after") for name in ("average", "deviat.", "maximum")
+    ]
+    print_table("absolute joint errors", ("joint", "unit", "rows", *columns), joint_rows(result["joints"]))
     if "cross_validation" in result:
         figures = result["cross_validation"]
-        names = [name for name in figures if name != "folds"]
-        table = [(name, *(f"{value:.3f}" for value in figures[name].values())) for name in names]
-        title = f"pose errors on held-out rows, {figures['folds']}-fold"
-        print_table(title, ("model", *(key.replace("_", " ") for key in figures[names[0]])), table)
+        title = f"pose errors of held-out rows, {figures['folds']}-fold cross-validation"
+        print_table(title, *pose_rows({name: figures[name] for name in ("nominal", "corrected")}))
         typer.echo(result["verdict"])
-    left_out = result["rows"]["left_out"]
-    reason = f" ({result['rows']['rule']})" if left_out else ""
-    typer.echo(f"{result['rows']['used']} rows used, {left_out} left out{reason}.")
+    rows = result["rows"]
+    reason = f" ({rows['rule']})" if rows["left_out"] else ""
+    typer.echo(f"{rows['used']} rows used, {rows['left_out']} left out{reason}.")
     typer.echo(f"Model written to {result['model']} in {result['seconds']:.1f} s; read its README.md.")

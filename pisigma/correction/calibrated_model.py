@@ -3,6 +3,7 @@
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
@@ -54,9 +55,15 @@ class CalibratedModel:
         robot: its kinematics give the nominal joint values; base and tool as fitted.
         network: joint corrections, or None.
         domain: where the corrections hold, or None.
-        branches: branches of the closed-form inverse that the training rows lie on, most frequent first; empty where
-            there is no closed form.
-        starts: joint values [rad or m] from which the numeric inverse starts, where there is no closed form.
+        branches: branches of the closed-form inverse that the training rows lie on, most frequent first;
+            empty where there is no closed form.
+        starts: commanded joint values [rad or m] of training rows: on the turns that the network knows, and
+            where there is no closed form the starts of the numeric inverse.
+        calibrated: the robot with its geometry as identified, base and tool those of `robot`; None where the geometry
+            is the nominal one.
+        bases: per frame of the measurements x, y, z [m], roll, pitch, yaw [rad] of the base in it; empty where there
+            was one frame without a name.
+        tools: the same per target for the tool.
         provenance: recipe, data, versions.
         metrics: figures for the card, by name.
     """
@@ -68,13 +75,16 @@ class CalibratedModel:
     domain: Domain | None
     branches: tuple[str, ...]
     starts: Float64[Tensor, "starts dof"]
+    calibrated: Robot | None = None
+    bases: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
+    tools: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)
     metrics: dict[str, Any] = field(default_factory=dict)
 
     def correction(
         self, T: Float64[Tensor, "*batch 4 4"], q_nominal: Float64[Tensor, "*batch dof"]
     ) -> Float64[Tensor, "*batch dof"]:
-        """Correction [rad or m] to add to the nominal joint values of poses T_base_tool; 0 without a network."""
+        """Correction [rad or m] to add to the nominal joint values of poses T; 0 without a network."""
         if self.network is None:
             return torch.zeros_like(q_nominal)
         with torch.no_grad():
@@ -82,15 +92,17 @@ class CalibratedModel:
         return result
 
     def forward(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch 4 4"]:
-        """Pose T_base_tool that the robot really takes when commanded to q [rad or m], as far as the model knows.
+        """Pose T_base_tool that the robot takes when commanded to q [rad or m], as far as the model knows.
 
-        It is the pose whose corrected joint values are q: `q_nominal = q - Δ(FK(q_nominal), q_nominal)`, solved by
-        iteration.
+        With an identified geometry it is its forward kinematics. Else it is the pose whose corrected joint values are q: `q_nominal = q - Δ(FK(q_nominal), q_nominal)`,
+        solved by iteration.
 
         Returns:
-            The poses; NaN where the iteration does not settle because the correction is steeper than the joints,
-            which happens far outside the domain only.
+            The poses; NaN where the iteration does not settle because the correction is steeper than the
+            joints, as it may be far outside the domain, and where a joint value is NaN.
         """
+        if self.calibrated is not None:
+            return forward_kinematics(self.calibrated, q)
         q_nominal, moved = q, torch.zeros_like(q)
         for _ in range(FORWARD_ITERATIONS if self.network is not None else 0):
             following = q - self.correction(forward_kinematics(self.robot, q_nominal), q_nominal)

@@ -6,11 +6,14 @@ from dataclasses import dataclass
 import torch
 
 from pisigma.errors import RecipeError
-from pisigma.evaluation.pose_statistics import PoseErrors, corrected_errors, nominal_errors
+from pisigma.evaluation.pose_statistics import Comparison, PoseErrors, compare_on
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import k_folds
 from pisigma.training.recipe import MeasuredData, Recipe
 from pisigma.training.run import train_recipe
+
+LEVEL = 0.05
+"""Relative change of an error that is taken for none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -19,33 +22,33 @@ class CrossValidation:
 
     Attributes:
         folds: number of folds.
-        nominal: with base and tool fitted to the training rows of the fold.
-        corrected: with the correction learned on them too.
+        comparison: nominal with base and tool fitted to the training rows of the fold, and corrected with the
+            correction learned on them too.
     """
 
     folds: int
-    nominal: PoseErrors
-    corrected: PoseErrors
+    comparison: Comparison
 
     def in_file_units(self) -> dict[str, object]:
         """The figures in mm and deg."""
-        return {
-            "folds": self.folds,
-            "nominal": self.nominal.in_file_units(),
-            "corrected": self.corrected.in_file_units(),
-        }
+        rows = {"folds": self.folds, "rows_not_predicted": self.comparison.not_predicted}
+        return {**rows, **self.comparison.in_file_units()}
 
     @property
     def verdict(self) -> str:
-        """Whether the correction helps, in one sentence."""
-        nominal, corrected = self.nominal.in_file_units(), self.corrected.in_file_units()
-        share = corrected["rms_mm"] / nominal["rms_mm"]
-        position = f"{nominal['rms_mm']:.3f} to {corrected['rms_mm']:.3f} mm RMS"
-        if share < 0.95:
-            return f"On held-out rows the correction lowers the position error from {position}."
-        if share <= 1.05:
-            return f"On held-out rows the correction does not change the position error ({position}): do not use it."
-        return f"On held-out rows the correction raises the position error from {position}: do not use it."
+        """Whether the correction helps, in a sentence."""
+        figures = self.comparison.in_file_units()
+        nominal, corrected = figures["nominal"], figures["corrected"]
+        findings, harm, help_ = [], False, False
+        for name, quantity, unit in (("position", "rms_mm", "mm"), ("orientation", "rms_deg", "deg")):
+            if quantity in nominal:
+                before, after = nominal[quantity], corrected[quantity]
+                change = "lowers" if after < before * (1 - LEVEL) else "does not change"
+                change = "raises" if after > before * (1 + LEVEL) else change
+                harm, help_ = harm or change == "raises", help_ or change == "lowers"
+                findings.append(f"{change} the {name} error ({before:.3f} to {after:.3f} {unit} RMS)")
+        advice = "" if help_ and not harm else "; do not use it" if not help_ else "; use it with care"
+        return f"On held-out rows the correction {' and '.join(findings)}{advice}."
 
 
 def cross_validate(
@@ -64,17 +67,19 @@ def cross_validate(
     """
     if not isinstance(recipe.data, MeasuredData):
         raise RecipeError(f"recipe '{recipe.name}' simulates its data; it has held-out rows of its own.")
+    not_predicted = 0
     nominal = torch.full((2, measurements.rows), torch.nan, dtype=torch.float64)
     corrected = nominal.clone()
     folds = k_folds(measurements, recipe.data.folds, recipe.data.seed)
     for done, (train, test) in enumerate(folds):
         on_fold(done, len(folds))
         model = train_recipe(recipe, measurements.select(train)).model
-        unseen = measurements.select(test)
-        for store, errors in ((nominal, nominal_errors(model, unseen)), (corrected, corrected_errors(model, unseen))):
+        comparison = compare_on(model, measurements.select(test))
+        not_predicted += comparison.not_predicted
+        for store, errors in ((nominal, comparison.nominal), (corrected, comparison.corrected)):
             store[0, test] = errors.position
             if errors.rotation is not None:
                 store[1, test] = errors.rotation
     rotated = measurements.rotation is not None
     before, after = (PoseErrors(store[0], store[1] if rotated else None) for store in (nominal, corrected))
-    return CrossValidation(len(folds), before, after)
+    return CrossValidation(len(folds), Comparison(before, after, not_predicted))

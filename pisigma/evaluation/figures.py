@@ -4,12 +4,9 @@ import csv
 from collections.abc import Sequence
 from pathlib import Path
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
 import numpy as np
 from jaxtyping import Float64
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from torch import Tensor
 
@@ -17,65 +14,82 @@ ENERGY_CSV = "energy.csv"
 ENERGY_PNG = "energy.png"
 WORKSPACE_PNG = "errors_over_workspace.png"
 
+_LEAST_ENERGY = 1e-32
+"""What 0 is drawn as on a logarithmic axis."""
+
 
 def write_energy_csv(joints: Sequence[str], energies: Float64[Tensor, "epochs joints"], path: Path) -> None:
     """Write the energy of every joint in every epoch (Jeong et al. 1998, Figs 5 and 8), scaled units."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["epoch", *(f"energy_{joint}" for joint in joints)])
         writer.writerows([epoch, *row] for epoch, row in enumerate(energies.tolist(), start=1))
 
 
 def draw_energy(joints: Sequence[str], energies: Float64[Tensor, "epochs joints"], path: Path) -> None:
     """Draw the energy curves on logarithmic axes; every joint has a line style of its own."""
-    figure, axes = plt.subplots(figsize=(6.4, 4.2), layout="constrained")
+    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    axes = figure.add_subplot()
     epochs = np.arange(1, len(energies) + 1)
     styles = ("-", "--", "-.", ":")
     for index, (joint, curve) in enumerate(zip(joints, energies.t().tolist(), strict=True)):
-        axes.plot(epochs, np.maximum(curve, 1e-32), styles[index % 4], label=joint, linewidth=1.6)
-    axes.set(xlabel="epoch", ylabel="energy E (scaled)", xscale="log", yscale="log")
+        drawn = np.maximum(curve, _LEAST_ENERGY)
+        axes.plot(epochs, drawn, styles[index % 4], label=joint, linewidth=1.6)
+    axes.set(xlabel="epoch", ylabel="energy E (scaled, no unit)", xscale="log", yscale="log")
+    axes.set_title("training energy of every joint", fontsize=10)
     axes.grid(alpha=0.3)
-    axes.legend()
-    _save(figure, path)
+    axes.legend(fontsize=9)
+    save_figure(figure, path)
 
 
 def draw_errors_over_workspace(
     joints: Sequence[str],
+    units: Sequence[str],
     position: Float64[Tensor, "rows 3"],
     before: Float64[Tensor, "rows joints"],
     after: Float64[Tensor, "rows joints"],
     path: Path,
 ) -> None:
-    """Draw the absolute joint error at every pose, seen from above, before and after (Jeong et al. 1998, Fig. 6).
+    """Draw the absolute joint error at every pose, seen from above, before and after (paper's Fig. 6).
 
     Args:
         joints: names of the corrected joints.
+        units: unit of every joint's errors, "deg" or "mm".
         position: tool positions [m].
-        before: joint errors without correction, in the unit that is shown (deg, mm for a prismatic joint).
+        before: joint errors without correction, in those units.
         after: the same with correction.
         path: the PNG to write.
     """
-    figure, grid = plt.subplots(
-        len(joints), 2, figsize=(8.4, 3.1 * len(joints)), layout="constrained", squeeze=False, sharex=True, sharey=True
-    )
     x, y = (position[:, axis].numpy() * 1e3 for axis in (0, 1))
-    for row, joint in enumerate(joints):
+    figure = Figure(figsize=(8.6, _row_height(x, y) * len(joints) + 0.6), layout="compressed")
+    grid = figure.subplots(len(joints), 2, squeeze=False, sharex=True, sharey=True)
+    for row, (joint, unit) in enumerate(zip(joints, units, strict=True)):
         for column, (errors, when) in enumerate(((before, "before"), (after, "after"))):
             axes = grid[row][column]
             values = errors[:, row].abs().numpy()
-            dots = axes.scatter(x, y, c=values, s=9, cmap="viridis", vmin=0.0, vmax=max(float(values.max()), 1e-12))
-            bar = figure.colorbar(dots, ax=axes)
-            bar.formatter.set_powerlimits((-2, 3))
-            bar.set_label("|error| [deg]" if joint.startswith("theta") else "|error|")
-            axes.set_title(f"{joint} {when}: mean {values.mean():.2g}, max {values.max():.2g}", fontsize=9)
+            top = max(float(values.max()), 1e-12)
+            dots = axes.scatter(x, y, c=values, s=8, linewidths=0, cmap="viridis", vmin=0.0, vmax=top)
+            bar = figure.colorbar(dots, ax=axes, format="%.2g")
+            bar.set_label(f"|error| [{unit}]", fontsize=9)
+            bar.ax.tick_params(labelsize=8)
+            title = f"{joint}, {when}: mean {values.mean():.2g}, max {values.max():.2g} {unit}"
+            axes.set_title(title, fontsize=9)
             axes.set_aspect("equal")
+            axes.tick_params(labelsize=8)
     for axes in grid[-1]:
-        axes.set_xlabel("x [mm]")
-    for row in grid:
-        row[0].set_ylabel("y [mm]")
-    _save(figure, path)
+        axes.set_xlabel("x [mm]", fontsize=9)
+    for row in range(len(joints)):
+        grid[row][0].set_ylabel("y [mm]", fontsize=9)
+    save_figure(figure, path)
 
 
-def _save(figure: Figure, path: Path) -> None:
+def _row_height(x: Float64[np.ndarray, " rows"], y: Float64[np.ndarray, " rows"]) -> float:
+    """Height [inch] of a row of axes 3.1 inch wide, so that millimetres are as long up as across."""
+    width, height = max(float(np.ptp(x)), 1.0), max(float(np.ptp(y)), 1.0)
+    return float(np.clip(3.1 * height / width, 1.2, 5.0)) + 0.4
+
+
+def save_figure(figure: Figure, path: Path) -> None:
+    """Write a PNG without touching matplotlib's global state."""
+    FigureCanvasAgg(figure)
     figure.savefig(path, dpi=120, metadata={"Software": "pisigma"})
-    plt.close(figure)

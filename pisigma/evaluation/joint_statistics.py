@@ -13,7 +13,8 @@ class JointStatistics:
 
     Attributes:
         average: mean of the absolute error.
-        deviation: standard deviation of the absolute error, over all rows (divided by n, as the paper's figures are).
+        deviation: standard deviation of the absolute error, over all rows (divided by n, as the paper's
+            figures are).
         maximum: largest absolute error.
     """
 

@@ -15,8 +15,8 @@ def report_joints(recipe: Recipe, run: TrainingRun) -> list[JointReport]:
     """Figures of every corrected joint: on training rows, on held-out rows, and the paper's.
 
     Returns:
-        Per joint ``{"name", "training": {"before", "after"}, "held_out": {...}, "paper": {...}}``; what does not
-        exist is left out.
+        Per joint ``{"name", "training": {"before", "after"}, "held_out": {...}, "paper": {...}}``; what does
+        not exist is left out.
     """
     robot = run.model.robot
     names = [joint.name for joint in robot.joints]

@@ -43,20 +43,25 @@ class BaseToolFit:
 
 
 def fit_base_and_tool(
-    robot: Robot, measurements: Measurements, free_base: bool = True, free_tool: bool = True
+    robot: Robot,
+    measurements: Measurements,
+    free_base: bool = True,
+    free_tool: bool = True,
+    maximum_iterations: int = 50,
 ) -> BaseToolFit:
     """Fit base and tool of a robot to measured poses or positions; no initial guess is needed.
 
     The start is closed form (see `base_and_tool_starts`), then least squares on base (6) and tool: 6 where
     rotations were measured; else the position of every target, and the tool's orientation stays as it is. The
-    weights are 1 / sigma where the measurements give it; else positions and rotations are weighted by 1 / their
-    own scatter.
+    weights are 1 / sigma where the measurements give it; else positions and rotations are weighted by 1 /
+    their own scatter.
 
     Args:
         robot: the robot; its base and tool are no guess, they only decide what the data leave open.
         measurements: rows with `position`, and `rotation` where measured; all in one frame.
         free_base: whether to fit the base; else the robot's is taken as it is.
         free_tool: whether to fit the tool; else the robot's is taken as it is.
+        maximum_iterations: steps of the least squares.
 
     Raises:
         IdentificationError: no positions, several frames, or too few rows for what has to be found.
@@ -65,7 +70,7 @@ def fit_base_and_tool(
     problem = build_base_and_tool_problem(robot, measurements, free_base, free_tool)
     best: Solution[BaseToolState] | None = None
     for start in base_and_tool_starts(robot, problem):
-        found = levenberg_marquardt(problem, start)
+        found = levenberg_marquardt(problem, start, maximum_iterations)
         if best is None or found.linearisation.cost < best.linearisation.cost * (1 - 1e-6):
             best = found
         if _rms_position(problem, best) < CLEAR_FIT * robot.reach:
@@ -89,7 +94,8 @@ def _result(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolS
     base = torch.cat([state.p_base, rpy_from_rotation(state.R_base)]).cpu().numpy()
     return BaseToolFit(
         robot=robot.with_geometry(
-            base=base if problem.free_base else None, tool=tools[problem.targets[0]] if problem.free_tool else None
+            base=base if problem.free_base else None,
+            tool=tools[problem.targets[0]] if problem.free_tool else None,
         ),
         tools=tools,
         rms_position=_rms_position(problem, solution),
@@ -110,6 +116,6 @@ def _status(solution: Solution[BaseToolState]) -> str:
     if rank == free:
         return solution.status.value
     return (
-        f"{solution.status.value}; the data see only {rank} of the {free} unknowns of base and tool, the others "
-        "stay where they started (poses with more different wrist orientations would tell)"
+        f"{solution.status.value}; the data see only {rank} of the {free} unknowns of base and tool, "
+        "the others stay where they started (poses with more different wrist orientations would tell)"
     )

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pisigma.errors import IdentificationError
 from pisigma.identification.least_squares import AbstractLeastSquares, Linearisation
-from pisigma.identification.problem import SMALLEST_NOISE
+from pisigma.identification.noise import SMALLEST_NOISE
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
@@ -34,11 +34,19 @@ class BaseToolState:
 
 
 @dataclass(frozen=True, eq=False)
+class _View:
+    """Normal matrix, descent and cost, and the standard deviation, of positions and of rotations."""
+
+    parts: tuple[tuple[Tensor, Tensor, float], ...]
+    noise: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
 class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
     """Flange poses and what was measured there.
 
-    The unknowns are base shift [m], base turn [rad] about its own origin, both in the measuring frame, the points
-    (3 a target) [m] and the tool's turn [rad], both in the frame of the last row.
+    The unknowns are base shift [m], base turn [rad] about its own origin, both in the measuring frame, the
+    points (3 a target) [m] and the tool's turn [rad], both in the frame of the last row.
 
     Attributes:
         R_flange: rotation behind the last row, from the first row's frame.
@@ -89,6 +97,8 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
     def residuals(self, state: BaseToolState) -> tuple[Float64[Tensor, "rows 3"], Float64[Tensor, "rows 3"]]:
         """Measured minus predicted: positions [m] and rotation vectors [rad], in the measuring frame."""
         predicted = self._arm(state) @ state.R_base.mT + state.p_base
+        if not self.turned:
+            return self.position - predicted, torch.zeros_like(predicted)
         R_predicted = state.R_base @ self.R_flange @ state.R_tool
         turn = rotation_vector(self.rotation @ R_predicted.mT) * self.rotated[:, None]
         return self.position - predicted, turn
@@ -96,35 +106,46 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
     def linearise(
         self, point: BaseToolState, like: Linearisation[BaseToolState] | None
     ) -> Linearisation[BaseToolState]:
-        """Sum up the normal equations."""
-        noise = like.detail if like is not None else (1.0, 1.0)
-        assert isinstance(noise, tuple)
-        residual = torch.cat(self.residuals(point), -1)
-        weight = self._weights(noise)
-        A = (self._jacobian(point) * weight[..., None]).flatten(0, 1)
-        weighted = (residual * weight).flatten()
-        size = float(self.p_flange.abs().max()) + 1e-3
-        rounding = float((weight * 2 * torch.finfo(A.dtype).eps * size).square().sum())
-        cost = float(weighted @ weighted)
-        return Linearisation(point, cost, A.mT @ weighted, A.mT @ A, cost, rounding, noise)
+        """Sum up the normal equations of positions and of rotations, apart."""
+        noise = (1.0, 1.0) if like is None else _view_of(like).noise
+        J = self._jacobian(point)
+        parts = []
+        given = (self.sigma_position, self.sigma_rotation)
+        for k, (residual, sigma) in enumerate(zip(self.residuals(point), given, strict=True)):
+            if k == 1 and not self.turned:
+                continue
+            A, r = J[:, 3 * k : 3 * k + 3].flatten(0, 1), residual.flatten()
+            if sigma is not None:
+                weight = (1 / sigma).repeat_interleave(3)
+                A, r = A * weight[:, None], r * weight
+            parts.append((A.mT @ A, A.mT @ r, float(r @ r)))
+        return self._combined(point, _View(tuple(parts), noise))
 
     def renewed(
         self, linearisation: Linearisation[BaseToolState]
     ) -> tuple[Linearisation[BaseToolState], bool]:
         """Weight positions and rotations by 1 / their own scatter, where no sigma is given."""
-        given = self.sigma_position is not None, self.sigma_rotation is not None or not self.turned
-        if all(given) or not self.turned:
-            return linearisation, True
-        residual_p, residual_r = self.residuals(linearisation.point)
-        noise = (
-            max(float(residual_p.square().mean().sqrt()), SMALLEST_NOISE),
-            max(float(residual_r[self.rotated].square().mean().sqrt()), SMALLEST_NOISE),
+        view = _view_of(linearisation)
+        values = (3 * len(self.position), 3 * int(self.rotated.sum()))
+        given = (self.sigma_position is not None, self.sigma_rotation is not None)
+        found = [1.0, 1.0]
+        for k, part in enumerate(view.parts):
+            if not given[k]:
+                found[k] = max((part[2] / values[k]) ** 0.5, SMALLEST_NOISE)
+        settled = all(abs(new / old - 1) < 1e-2 for new, old in zip(found, view.noise, strict=True))
+        return self._combined(linearisation.point, _View(view.parts, (found[0], found[1]))), settled
+
+    def _combined(self, point: BaseToolState, view: "_View") -> Linearisation[BaseToolState]:
+        normal = sum(
+            (part[0] / s**2 for part, s in zip(view.parts, view.noise, strict=False)), torch.zeros(())
         )
-        old = linearisation.detail
-        assert isinstance(old, tuple)
-        settled = all(abs(new / before - 1) < 1e-3 for new, before in zip(noise, old, strict=True))
-        like = Linearisation(linearisation.point, 0.0, *(linearisation.descent,) * 2, 0.0, 0.0, noise)
-        return self.linearise(linearisation.point, like), settled
+        descent = sum(
+            (part[1] / s**2 for part, s in zip(view.parts, view.noise, strict=False)), torch.zeros(())
+        )
+        cost = sum(part[2] / s**2 for part, s in zip(view.parts, view.noise, strict=False))
+        size = 2 * torch.finfo(self.position.dtype).eps * (float(self.p_flange.abs().max()) + 1e-3)
+        rounding = sum(3 * len(self.position) * (size / s) ** 2 for s in view.noise[: len(view.parts)])
+        return Linearisation(point, cost, descent, normal, cost, rounding, view)
 
     def moved(self, point: BaseToolState, step: Float64[Tensor, " active"]) -> BaseToolState:
         """Turn and shift base and tool."""
@@ -140,13 +161,6 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         """Where the target is in the first row's frame."""
         return self.p_flange + (self.R_flange @ state.points[self.target, :, None])[..., 0]
 
-    def _weights(self, noise: tuple[float, float]) -> Tensor:
-        weight = torch.ones_like(self.position).repeat(1, 2)
-        weight[:, :3] /= noise[0] if self.sigma_position is None else self.sigma_position[:, None]
-        weight[:, 3:] /= noise[1] if self.sigma_rotation is None else self.sigma_rotation[:, None]
-        weight[:, 3:] *= self.rotated[:, None]
-        return weight
-
     def _jacobian(self, state: BaseToolState) -> Tensor:
         rows, targets = self.position.shape[0], len(self.targets)
         R_base_flange = state.R_base @ self.R_flange
@@ -154,11 +168,16 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         eye = torch.eye(3, dtype=J.dtype, device=J.device)
         J[:, :3, :3] = eye
         J[:, :3, 3:6] = -skew(self._arm(state) @ state.R_base.mT)
-        J[:, 3:, 3:6] = eye
+        J[:, 3:, 3:6] = self.rotated[:, None, None] * eye
         own = torch.nn.functional.one_hot(self.target, targets).to(J.dtype)
         J[:, :3, 6:-3] = (R_base_flange[:, :, None, :] * own[:, None, :, None]).reshape(rows, 3, 3 * targets)
-        J[:, 3:, -3:] = R_base_flange
+        J[:, 3:, -3:] = self.rotated[:, None, None] * R_base_flange
         return J[..., self.active]
+
+
+def _view_of(linearisation: Linearisation[BaseToolState]) -> _View:
+    assert isinstance(linearisation.detail, _View)
+    return linearisation.detail
 
 
 def build_base_and_tool_problem(

@@ -12,6 +12,8 @@ from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_from_rpy
 
 ALTERNATIONS = 60
+SINGLE = 0.9
+"""A second singular value above this share of the first may mean that the rotations are not unique."""
 
 
 def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[BaseToolState]:
@@ -31,18 +33,23 @@ def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[Bas
     if not problem.free_base and not problem.free_tool:
         found = iter([(R_base, p_base, R_tool, point)])
     elif not problem.free_base:
-        found = iter([_tool_start(R_base, p_base, R_flange, p_flange, position, rotation, problem.turned, R_tool)])
+        found = iter(
+            [_tool_start(R_base, p_base, R_flange, p_flange, position, rotation, problem.turned, R_tool)]
+        )
     elif not problem.free_tool:
         arm = p_flange + R_flange @ point
         R_found = _procrustes(arm, position)
         if problem.turned:
             R_found = nearest_rotation((rotation @ R_tool.mT @ R_flange.mT).sum(0))
         found = iter([(R_found, (position - arm @ R_found.mT).mean(0), R_tool, point)])
-    elif problem.turned:
-        found = iter([start_from_poses(R_flange, p_flange, position, rotation, R_tool)])
     else:
         starts = starts_from_positions(R_flange, p_flange, position, point, robot.reach)
-        found = ((R, p, R_tool, place) for R, p, place in starts)
+        if problem.turned:
+            first = start_from_poses(R_flange, p_flange, position, rotation, R_tool)
+            rest = ((R, p, _mean_turn(R, R_flange, rotation), place) for R, p, place in starts)
+            found = itertools.chain([first], rest)
+        else:
+            found = ((R, p, R_tool, place) for R, p, place in starts)
     for R_start, p_start, R_tool_start, place in found:
         yield BaseToolState(R_start, p_start, R_tool_start, place.expand(len(problem.targets), 3))
 
@@ -57,19 +64,24 @@ def start_from_poses(
     """Solve measured = base · flange · tool for base and tool (robot-world and hand-eye).
 
     With Z the inverse of the tool's rotation, `R_measured · Z · R_flange^T = R_base`, so
-    `K vec(Z) = rows · vec(R_base)` with `K = Σ R_measured ⊗ R_flange` (Shah 2013, J. Mechanisms Robotics 5(3),
-    in row-major order). Where the leading singular value of K is not single (all axes parallel, as in a SCARA)
-    its vectors are no rotations; therefore the pair that maximises `vec(R_base)^T K vec(Z)` is found by
-    alternating projections onto the rotations, from the nominal tool, the singular vector and the 24 rotations of
-    a cube, the nominal one winning ties. Translations then are linear.
+    `K vec(Z) = rows · vec(R_base)` with `K = Σ R_measured ⊗ R_flange` (Shah 2013, J. Mechanisms Robotics
+    5(3), in row-major order). Where the leading singular value of K is not single (all axes parallel, as in
+    a SCARA) its vectors are no rotations; therefore the pair that maximises `vec(R_base)^T K vec(Z)` is
+    found by alternating projections onto the rotations: from the singular vector, and where that is not
+    unique, from the nominal tool and the 24 rotations of a cube too, the nominal one winning ties.
+    Translations then are linear.
 
     Returns:
         R_base, p_base [m], R_tool, p_tool [m].
     """
     rows = R_flange.shape[0]
     K = torch.einsum("nab,ncd->acbd", rotation, R_flange).reshape(9, 9) / rows
-    leading = torch.linalg.svd(K).Vh[0].reshape(3, 3)
-    Z = nearest_rotation(torch.cat([torch.stack([R_tool_nominal.mT, leading, -leading]), _cube_rotations(K)]))
+    _, singular, Vh = torch.linalg.svd(K)
+    leading = Vh[0].reshape(3, 3)
+    starts = torch.stack([leading, -leading])
+    if float(singular[1]) > SINGLE * float(singular[0]):
+        starts = torch.cat([R_tool_nominal.mT[None], starts, _cube_rotations(K)])
+    Z = nearest_rotation(starts)
     agreement = torch.zeros(len(Z)).to(K)
     for _ in range(ALTERNATIONS):
         R_base = nearest_rotation((Z.reshape(-1, 9) @ K.mT).reshape(-1, 3, 3))
@@ -92,10 +104,10 @@ def starts_from_positions(
 ) -> Iterator[tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"], Float64[Tensor, " 3"]]]:
     """Candidates for `position = R_base (R_flange · point + p_flange) + p_base`, to be polished and compared.
 
-    Written out, every coordinate is linear in 13 unknowns: the products of `R_base`'s row with the point (9), the
-    row itself (3) and the shift (1), which gives one candidate. The others assume a point (the nominal one, none, a
-    tenth of the reach along each axis) and find the base by Procrustes; they serve where the linear system is
-    singular, as with parallel axes or few rows.
+    Written out, every coordinate is linear in 13 unknowns: the products of `R_base`'s row with the point
+    (9), the row itself (3) and the shift (1), which gives one candidate. The others assume a point (the
+    nominal one, none, a tenth of the reach along each axis) and find the base by Procrustes; they serve
+    where the linear system is singular, as with parallel axes or few rows.
 
     Returns:
         R_base, p_base [m], point [m], each.
@@ -136,8 +148,13 @@ def _tool_start(
     seen = (position - p_base) @ R_base
     point = (R_flange.mT @ (seen - p_flange)[..., None])[..., 0].mean(0)
     if turned:
-        R_tool = nearest_rotation((R_flange.mT @ R_base.mT @ rotation).sum(0))
+        R_tool = _mean_turn(R_base, R_flange, rotation)
     return R_base, p_base, R_tool, point
+
+
+def _mean_turn(R_base: Tensor, R_flange: Tensor, rotation: Tensor) -> Tensor:
+    """The tool's rotation with the base's given."""
+    return nearest_rotation((R_flange.mT @ R_base.mT @ rotation).sum(0))
 
 
 def _procrustes(points: Tensor, position: Tensor) -> Tensor:

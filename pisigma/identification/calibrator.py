@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,13 +17,14 @@ from pisigma.identification.parameters import ParameterSpace, Prior
 from pisigma.identification.problem import CalibrationProblem, view_of
 from pisigma.identification.redundancy import Redundancy, find_redundancy
 from pisigma.identification.result import CalibrationResult
-from pisigma.identification.result_assembly import assemble_result
-from pisigma.identification.setup import CalibrationSetup, build_setup
+from pisigma.identification.result_assembly import Findings, assemble_result
+from pisigma.identification.setup import CalibrationSetup, build_setup, chosen_rows
 from pisigma.identification.sufficiency import check_sufficiency
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 
-Elimination = Literal["exact", "pairwise", "none"]
+ROUGH_ROWS = 4_096
+"""Rows that the first steps and the start are worked out from."""
 ROUGH_STEPS = 3
 """Steps without the prior, which show the noise before the prior is weighed against it."""
 
@@ -37,23 +37,23 @@ class GeometricCalibrator:
 
     Attributes:
         robot: the nominal robot.
-        free: "identifiable": all that the data can tell; "joint_offsets": theta of turning and d of sliding joints;
-            or names of parameters, such as "a_2". Base and tool come on top, see below.
+        free: "identifiable": all that the data can tell; "joint_offsets": theta of turning and d of sliding
+            joints; or names of parameters, such as "a_2". Base and tool come on top, see below.
         base: "free", or "fixed" to the robot's own (then only parameters that `free` names are estimated).
         tool: the same for the tool.
         elimination: how redundant parameters are left out: "exact" (rank and pivoted QR), "pairwise" (the
             paper's Pearson correlation), or "none". The predicted poses do not depend on it.
-        prior: standard deviations of the parameters' errors, or None. With it, what the data cannot see stays at
-            its nominal value.
+        prior: standard deviations of the parameters' errors, or None. With it, what the data cannot see
+            stays at its nominal value.
         loss: `HampelLoss()` gives rows that are far off less weight or none; `SquaredLoss()` does not.
         maximum_iterations: steps tried at most.
     """
 
     robot: Robot
-    free: Literal["identifiable", "joint_offsets"] | Sequence[str] = "identifiable"
-    base: Literal["free", "fixed"] = "free"
-    tool: Literal["free", "fixed"] = "free"
-    elimination: Elimination = "exact"
+    free: str | Sequence[str] = "identifiable"
+    base: str = "free"
+    tool: str = "free"
+    elimination: str = "exact"
     prior: Prior | None = field(default_factory=Prior)
     loss: AbstractLoss = field(default_factory=HampelLoss)
     maximum_iterations: int = 50
@@ -71,7 +71,8 @@ class GeometricCalibrator:
                 )
         if isinstance(self.free, str) and self.free not in ("identifiable", "joint_offsets"):
             raise IdentificationError(
-                f"free='{self.free}' is no choice; valid: identifiable, joint_offsets, or a list of parameter names."
+                f"free='{self.free}' is no choice; valid: identifiable, joint_offsets, or a list of "
+                "parameter names."
             )
 
     def fit(self, measurements: Measurements) -> CalibrationResult:
@@ -92,19 +93,9 @@ class GeometricCalibrator:
         )
         active = self._chosen(setup.problem.space, seen, sizes, redundancy)
         problem = setup.problem.with_active(active)
-        rough = levenberg_marquardt(problem.without_prior(), setup.start, min(ROUGH_STEPS, self.maximum_iterations))
-        extended: list[int] = []
-        if self.elimination == "exact":
-            extended = self._extension(problem, rough, candidates)
-            problem = problem.with_active(active + extended)
-        here = rough.linearisation
-        fine = levenberg_marquardt(problem, here.point, self.maximum_iterations - rough.iterations, here)
-        solution = Solution(
-            fine.linearisation, rough.iterations + fine.iterations, fine.status, rough.path + fine.path[1:]
-        )
-        return assemble_result(
-            measurements, setup, problem, solution, seen, sizes, redundancy, extended, self.prior, warnings
-        )
+        solution, problem, extended = self._solved(problem, setup.start, candidates)
+        findings = Findings(seen, sizes, redundancy, extended, warnings)
+        return assemble_result(measurements, setup, problem, solution, findings)
 
     def build(self, measurements: Measurements) -> CalibrationSetup:
         """The problem and its start, without solving it.
@@ -149,13 +140,30 @@ class GeometricCalibrator:
             names = find_pairwise_redundancy(seen, sizes).kept
         return [space.index(name) for name in names]
 
-    def _extension(
-        self, problem: CalibrationProblem, rough: Solution[Tensor], candidates: list[int]
-    ) -> list[int]:
-        """Parameters that are redundant at the nominal geometry, but that the data tell at the solution."""
-        kept = [candidates.index(i) for i in problem.active.tolist()]
-        if len(kept) == len(candidates):
-            return []
+    def _solved(
+        self, problem: CalibrationProblem, start: Float64[Tensor, " parameters"], candidates: list[int]
+    ) -> tuple[Solution[Tensor], CalibrationProblem, list[int]]:
+        """Solve roughly without the prior, add what the data tell there, then solve with the prior.
+
+        The rough steps show the noise that the prior is weighed against; a few thousand rows are enough for
+        them.
+        """
+        few = problem
+        if problem.q.shape[0] > ROUGH_ROWS:
+            few = problem.select(chosen_rows(problem.q.shape[0], ROUGH_ROWS).to(problem.q.device))
+        rough = levenberg_marquardt(few.without_prior(), start, min(ROUGH_STEPS, self.maximum_iterations))
         here = rough.linearisation
-        now = information(problem, here.point, candidates, view_of(here))
-        return [candidates[i] for i in told_besides(now, kept)]
+        extended: list[int] = []
+        kept = [candidates.index(i) for i in problem.active.tolist()]
+        if self.elimination == "exact" and len(kept) < len(candidates):
+            now = information(few, here.point, candidates, view_of(here))
+            extended = [candidates[i] for i in told_besides(now, kept)]
+            problem = problem.with_active(problem.active.tolist() + extended)
+        if extended or few.q is not problem.q:
+            here = problem.linearise(here.point, here)
+        else:
+            here = problem.combined(here.point, view_of(here))
+        fine = levenberg_marquardt(problem, here, self.maximum_iterations - rough.iterations)
+        iterations = rough.iterations + fine.iterations
+        path = rough.path + fine.path[1:]
+        return Solution(fine.linearisation, iterations, fine.status, path), problem, extended

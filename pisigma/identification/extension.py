@@ -17,9 +17,9 @@ VISIBLE = 1e-7
 def told_besides(information: Information, kept: list[int]) -> list[int]:
     """Find columns that the data tell besides those kept.
 
-    Nominal axes are parallel or meet exactly; real ones do not, so that dependencies of the nominal robot are not quite
-    dependencies of the real one. Columns are added one by one while the data tell the next to a usual error; or all
-    that are visible, if the residuals show that they are needed (as with exact data).
+    Nominal axes are parallel or meet exactly; real ones do not, so that dependencies of the nominal robot
+    are not quite dependencies of the real one. Columns are added one by one while the data tell the next to
+    a usual error; or all that are visible, if the residuals show that they are needed (as with exact data).
 
     Args:
         information: of all candidates at about the solution, its rows in standard deviations.

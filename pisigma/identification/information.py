@@ -7,8 +7,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.identification.noise import SensorView
 from pisigma.identification.parameters import Parameter
-from pisigma.identification.problem import CalibrationProblem, SensorView
+from pisigma.identification.problem import CalibrationProblem
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +77,9 @@ def information(
         blocks = [root]
         for k, sensor in enumerate(problem.sensors):
             seen = sensor.seen[rows]
-            weight = 1e3 if view is None else problem.row_weights(view, k, rows)[seen].repeat(sensor.components)
+            weight = (
+                1e3 if view is None else problem.row_weights(view, k, rows)[seen].repeat(sensor.components)
+            )
             J = problem.spread(sensor.derivative(motion), rows, index)[..., seen].flatten(1) * usual
             r = sensor.residual(motion, rows)[..., seen].flatten()[None]
             blocks.append((torch.cat([torch.ones_like(r), J, r]) * weight).t())

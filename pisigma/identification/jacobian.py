@@ -6,11 +6,12 @@ Every parameter is a shift along, or a turn about, an axis that the walk along t
     alpha_i  turns about x of the frame after RotZ           a_i  shifts along it
     beta_i   turns about y of the frame after RotX
 
-A shift along u moves the tool by u; a turn about u through o moves it by `u × (p_tool - o)` and turns it by u. This
-is the error propagation of Lim et al. 1999, eqs. (8) to (33), written in the base frame instead of the tool's.
+A shift along u moves the tool by u; a turn about u through o moves it by `u × (p_tool - o)` and turns it by
+u. This is the error propagation of Lim et al. 1999, eqs. (8) to (33), written in the base frame instead of
+the tool's.
 
-Frames are kept as four `(3, poses)` tensors (columns x, y, z of the rotation, and the origin): few operations for
-small batches, whole cache lines for large ones.
+Frames are kept as four `(3, poses)` tensors (columns x, y, z of the rotation, and the origin): few
+operations for small batches, whole cache lines for large ones.
 """
 
 import math
@@ -49,7 +50,8 @@ def motion_order(rows: int) -> list[int]:
     """Where the parameters stand in `ToolMotion.derivative`, which has all turns before all shifts.
 
     Returns:
-        For theta, d, a, alpha, beta of every row, then base and tool (x, y, z, roll, pitch, yaw each), its index.
+        For theta, d, a, alpha, beta of every row, then base and tool (x, y, z, roll, pitch, yaw each), its
+        index.
     """
     theta, alpha, beta, d, a = 0, rows, 2 * rows, 3 * rows + 6, 4 * rows + 6
     order = [start + row for row in range(rows) for start in (theta, d, a, alpha, beta)]
@@ -67,8 +69,9 @@ def identification_jacobian(
         q: joint values [rad or m], as the controller counts.
 
     Returns:
-        T_base_tool, and J with `J @ dx` = [shift [m]; rotation vector [rad]] of the tool, both in the measuring
-        frame. Columns: theta, d, a, alpha, beta of every row, then base and tool (x, y, z, roll, pitch, yaw each).
+        T_base_tool, and J with `J @ dx` = [shift [m]; rotation vector [rad]] of the tool, both in the
+        measuring frame. Columns: theta, d, a, alpha, beta of every row, then base and tool (x, y, z, roll,
+        pitch, yaw each).
 
     Raises:
         PoseError: q has another number of columns than the robot has joints.
@@ -131,7 +134,7 @@ def tool_motion(
 
 @dataclass(frozen=True, eq=False)
 class _RowAxes:
-    """What `_walk_rows` passes: per row the axes z before, x turned and y twisted, and the origins before and moved."""
+    """Per row the axes z before, x turned and y twisted, and the origins before and moved."""
 
     z: list[Tensor]
     x: list[Tensor]

@@ -15,17 +15,19 @@ SMALLEST_DAMPING = 1e-9
 LARGEST_DAMPING = 1e12
 PATIENCE = 2
 """Steps that may raise the cost before the search goes back."""
-SHORTEST_STEP = 1e-4
+SHORTEST_STEP = 1e-3
 """[standard errors] A step shorter than this in every direction ends the search."""
 
 
 class SolutionStatus(Enum):
     """How a search ended; the value is a sentence."""
 
-    CONVERGED = "converged: the last step moved nothing by more than 1e-4 of its standard error"
+    CONVERGED = "converged: the last step moved nothing by more than a thousandth of its standard error"
     EXACT = "converged: the residuals are at rounding level"
     STALLED = "stopped: no step lowers the cost any more, though the residuals are above rounding level"
-    ITERATION_LIMIT = "stopped at the iteration limit; allow more iterations or look for gross errors in the data"
+    ITERATION_LIMIT = (
+        "stopped at the iteration limit; allow more iterations or look for gross errors in the data"
+    )
 
     @property
     def good(self) -> bool:
@@ -35,7 +37,7 @@ class SolutionStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Linearisation(Generic[Point]):
-    """A least-squares problem seen from one point: cost `Σ (r / sigma)²`, half its gradient and Gauss-Newton matrix.
+    """A least-squares problem seen from one point, with cost `Σ (r / sigma)²`.
 
     Attributes:
         point: where.
@@ -96,29 +98,28 @@ class Solution(Generic[Point]):
 
 def levenberg_marquardt(
     problem: AbstractLeastSquares[Point],
-    start: Point,
+    start: Point | Linearisation[Point],
     maximum_iterations: int = 50,
-    like: Linearisation[Point] | None = None,
 ) -> Solution[Point]:
     """Minimise by Levenberg-Marquardt steps `(normal + damping / step_scale²) step = descent`.
 
-    The damping is measured against `step_scale` in units of the noise, which is estimated anew at every point: as the
-    residuals shrink, so does it, and exact data are met quadratically even where the normal matrix is singular
-    (Yamashita and Fukushima 2001). The linear system is solved by Cholesky after scaling its columns. A step that
-    raises the cost is followed further once or twice, because curved valleys are left and met again that way; if the
-    best cost is not undercut by then, the search goes back there with a hundredfold damping (watchdog technique,
-    Chamberlain et al. 1982).
+    The damping is measured against `step_scale` in units of the noise, which is estimated anew at every
+    point: as the residuals shrink, so does it, and exact data are met quadratically even where the normal
+    matrix is singular (Yamashita and Fukushima 2001). The linear system is solved by Cholesky after scaling
+    its columns. A step that raises the cost is followed further once or twice, because curved valleys are
+    left and met again that way; if the best cost is not undercut by then, the search goes back there with a
+    hundredfold damping (watchdog technique, Chamberlain et al. 1982).
 
     Args:
         problem: what to minimise.
-        start: where to begin.
+        start: where to begin, or the problem as already seen from there.
         maximum_iterations: steps tried at most.
-        like: gives the first guess of the noise.
 
     Returns:
         The best point, with the reason for stopping (see `SolutionStatus`).
     """
-    best, settled = problem.renewed(problem.linearise(start, like))
+    seen = start if isinstance(start, Linearisation) else problem.linearise(start, None)
+    best, settled = problem.renewed(seen)
     here, path = best, [best]
     damping, uphill, iterations = START_DAMPING, 0, 0
     status = SolutionStatus.ITERATION_LIMIT

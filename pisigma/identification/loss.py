@@ -39,10 +39,15 @@ class AbstractLoss(ABC):
         """
 
     @abstractmethod
-    def deviation(self, distance: Float[Tensor, " rows"], components: int, used: float, scale: float) -> float:
-        """Standard deviation of one value, from all good rows; see `scale` for the rest.
+    def deviation(
+        self, distance: Float[Tensor, " rows"], components: int, used: float, scale: float
+    ) -> float:
+        """Standard deviation of one value, from all good rows.
 
         Args:
+            distance: distances of the rows that were seen, in the sensor's unit.
+            components: values a row.
+            used: how many values the estimated parameters use up.
             scale: about what it is, to tell the good rows.
         """
 
@@ -63,7 +68,9 @@ class SquaredLoss(AbstractLoss):
         """Root mean square, corrected for the parameters."""
         return self.deviation(distance, components, used, 1.0)
 
-    def deviation(self, distance: Float[Tensor, " rows"], components: int, used: float, scale: float) -> float:
+    def deviation(
+        self, distance: Float[Tensor, " rows"], components: int, used: float, scale: float
+    ) -> float:
         """Root mean square, corrected for the parameters."""
         return math.sqrt(float(distance.square().sum()) / max(len(distance) * components - used, 1.0))
 
@@ -72,9 +79,10 @@ class SquaredLoss(AbstractLoss):
 class HampelLoss(AbstractLoss):
     """Least squares up to the 99 % quantile of normal noise, then less and less, at three times that nothing.
 
-    Hampel's three parts (Hampel et al. 1986, section 2.6) with corners at 1, 1.5 and 3 times the quantile: good rows
-    keep the weight one, so normal noise is treated as by least squares; rows far off do not count at all. The scale is
-    the median of the distances, so it needs no threshold in metres and stands up to nearly half of the rows being wrong.
+    Hampel's three parts (Hampel et al. 1986, section 2.6) with corners at 1, 1.5 and 3 times the quantile:
+    good rows keep the weight one, so normal noise is treated as by least squares; rows far off do not count
+    at all. The scale is the median of the distances, so it needs no threshold in metres and stands up to
+    nearly half of the rows being wrong.
     """
 
     def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
@@ -97,8 +105,10 @@ class HampelLoss(AbstractLoss):
         left = max(values - used, 1.0) / values
         return float(distance.median()) / MEDIAN_DISTANCE[components] / math.sqrt(left)
 
-    def deviation(self, distance: Float[Tensor, " rows"], components: int, used: float, scale: float) -> float:
-        """Weighted root mean square, corrected for the parameters and for what the weights take off normal noise."""
+    def deviation(
+        self, distance: Float[Tensor, " rows"], components: int, used: float, scale: float
+    ) -> float:
+        """Weighted root mean square, less what the parameters used up and what the weights take off."""
         weight = self.weight(distance / scale, components)
         left = float(weight.sum()) * components - used
         square = float((weight * distance.square()).sum()) / max(left, 1.0)

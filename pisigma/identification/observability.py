@@ -2,17 +2,17 @@
 
 from dataclasses import dataclass
 
-import numpy as np
+import torch
 from jaxtyping import Float64
-
-from pisigma.identification.information import Information
+from torch import Tensor
 
 
 @dataclass(frozen=True)
 class Observability:
-    """How well a set of poses tells the chosen parameters, by the singular values s_1 ≥ ... ≥ s_L of their Jacobian.
+    """How well poses tell the chosen parameters: from the singular values s_1 ≥ ... ≥ s_L of their Jacobian.
 
-    The scaling: parameters in mm and mrad, positions in mm, rotations in mrad; the Jacobian is not divided by noise.
+    The scaling: parameters in mm and mrad, positions in mm, rotations in mrad; the Jacobian is not divided
+    by noise.
 
     Attributes:
         O1: `(s_1 · ... · s_L)^(1/L) / sqrt(poses)` (Borm and Menq 1991).
@@ -34,15 +34,19 @@ class Observability:
         return float("inf") if self.O2 == 0 else 1 / self.O2
 
 
-def observability_of(information: Information, names: tuple[str, ...]) -> Observability:
-    """The indices for the named parameters; all 0 where the data do not see one of them."""
-    columns = [information.names.index(name) for name in names]
-    J: Float64[np.ndarray, "rank chosen"] = information.jacobian[:, columns]
-    s = np.linalg.svd(J, compute_uv=False)
-    if len(s) < len(columns) or len(s) == 0 or s[-1] <= 1e-12 * s[0]:
+def observability_of(gram: Float64[Tensor, "chosen chosen"], poses: int) -> Observability:
+    """The indices for the parameters of a Gram matrix `J^T J`; all 0 where the data do not see one of them.
+
+    Args:
+        gram: of the Jacobian scaled as said above.
+        poses: number of rows measured.
+    """
+    square = torch.linalg.eigvalsh(gram).flip(0)
+    if len(square) == 0 or float(square[-1]) <= 1e-15 * float(square[0]):
         return Observability(0.0, 0.0, 0.0, 0.0, 0.0)
+    s = square.sqrt()
     return Observability(
-        O1=float(np.exp(np.log(s).mean()) / np.sqrt(information.poses)),
+        O1=float(s.log().mean().exp()) / poses**0.5,
         O2=float(s[-1] / s[0]),
         O3=float(s[-1]),
         O4=float(s[-1] ** 2 / s[0]),

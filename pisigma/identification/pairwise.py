@@ -61,10 +61,10 @@ def find_pairwise_redundancy(
     sizes: Float64[np.ndarray, " parameters"],
     tolerance: float = CORRELATION_TOLERANCE,
 ) -> PairwiseRedundancy:
-    """Find redundant pairs by Park et al. 2022, section 3.2: |r| = 1 between columns of the identification Jacobian.
+    """Find redundant pairs by Park et al. 2022, section 3.2: |r| = 1 between columns of the Jacobian.
 
-    Lengths and angles are looked at apart. It cannot see dependencies of three and more parameters that are not pairs;
-    `find_redundancy` does.
+    Lengths and angles are looked at apart. It cannot see dependencies of three and more parameters that are
+    not pairs; `find_redundancy` does.
 
     Args:
         information: the condensed Jacobian.
@@ -87,7 +87,9 @@ def find_pairwise_redundancy(
         for members, signs in _sets(table.values, tolerance):
             indices = [chosen[k] for k in members]
             sets.append(
-                tuple(("-" if s < 0 else "") + parameters[i].name for i, s in zip(indices, signs, strict=True))
+                tuple(
+                    ("-" if s < 0 else "") + parameters[i].name for i, s in zip(indices, signs, strict=True)
+                )
             )
             best = max(indices, key=lambda i: preference_of(parameters[i], float(sizes[i]), i))
             dropped |= set(indices) - {best}
@@ -109,7 +111,7 @@ def _correlations(centred: np.ndarray, acting: np.ndarray) -> np.ndarray:
 
 
 def _sets(correlations: np.ndarray, tolerance: float) -> list[tuple[list[int], list[int]]]:
-    """Indices of parameters that act alike, with their signs against the first, for every set of two or more."""
+    """Sets of two or more parameters that act alike: their indices, and their signs against the first."""
     found, taken = [], set()
     for first in range(len(correlations)):
         if first in taken:

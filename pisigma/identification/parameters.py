@@ -1,4 +1,4 @@
-"""The parameters of an identification: their names, units and expected errors, and how they make up a geometry."""
+"""The parameters of an identification: names, units, expected errors, and how they make up a geometry."""
 
 import math
 from dataclasses import dataclass
@@ -150,7 +150,7 @@ class ParameterSpace:
 
 
 def row_labels(robot: Robot) -> tuple[str, ...]:
-    """What parameter names end in: the joint's number, or for a fixed row its name ("EE" for an end effector)."""
+    """What names end in: the joint's number, or a fixed row's name ("EE" for an end effector)."""
     labels, joint = [], 0
     for row in robot.rows:
         joint += row.type != "fixed"

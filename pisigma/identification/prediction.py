@@ -67,7 +67,8 @@ def _of_rows(
         if name not in known:
             row = names.index(name)
             raise IdentificationError(
-                f"{measurements.place(row)}: {what} '{name}' was not calibrated; {nearest_choice(name, order)}"
+                f"{measurements.place(row)}: {what} '{name}' was not calibrated; "
+                f"{nearest_choice(name, order)}"
             )
     frames = transform_from_xyzrpy(torch.from_numpy(np.stack([known[name] for name in order])))
     index = torch.tensor([order.index(name) for name in names], dtype=torch.int64)

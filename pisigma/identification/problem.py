@@ -11,48 +11,19 @@ from torch import Tensor
 from pisigma.identification.jacobian import JACOBIAN_CHUNK, ToolMotion, motion_order, tool_motion
 from pisigma.identification.least_squares import AbstractLeastSquares, Linearisation
 from pisigma.identification.loss import AbstractLoss
+from pisigma.identification.noise import (
+    ALWAYS_GOOD,
+    SMALLEST_NOISE,
+    SensorSums,
+    SensorView,
+    group_variance_ratio,
+    loss_scale,
+    prior_widening,
+    renumbered,
+    values_used,
+)
 from pisigma.identification.parameters import ParameterSpace
 from pisigma.identification.sensors import AbstractSensor
-
-SMALLEST_NOISE = 1e-14
-"""[m or rad] Floor of the estimated noise: what rounding does to a pose."""
-ALWAYS_GOOD = 1e-10
-"""[m or rad] Rows nearer to their prediction than this never count as wrong."""
-
-
-@dataclass(frozen=True, eq=False)
-class SensorSums:
-    """What one sensor contributes at one point, before division by its noise's variance.
-
-    Attributes:
-        normal: `Σ w J J^T / sigma_row²` over its rows.
-        descent: `Σ w J r / sigma_row²`.
-        residual: measured minus predicted, 0 where nothing was seen [m or rad].
-        distance: length of the residual over sigma_row, 0 where nothing was seen.
-    """
-
-    normal: Float64[Tensor, "active active"]
-    descent: Float64[Tensor, " active"]
-    residual: Float64[Tensor, "components rows"]
-    distance: Float64[Tensor, " rows"]
-
-
-@dataclass(frozen=True, eq=False)
-class SensorView:
-    """All sensors at one point.
-
-    Attributes:
-        sums: per sensor.
-        noise: per sensor, its standard deviation [m or rad], or a factor of 1 or more where the rows give their own.
-        repetition: per sensor, 1 or more: by how much repeats of a pose tell less than so many poses, because what
-            the model gets wrong there is the same in all of them.
-        widening: 1 or more, of the prior's standard deviations, for lengths and for angles.
-    """
-
-    sums: tuple[SensorSums, ...]
-    noise: tuple[float, ...]
-    repetition: tuple[float, ...]
-    widening: tuple[float, float] = (1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,15 +54,21 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     active: Int64[Tensor, " active"]
     pose: Int64[Tensor, " rows"] | None = None
 
-    @property
+    @cached_property
     def step_scale(self) -> Float64[Tensor, " active"]:
         """1 mm and 1 mrad."""
-        return torch.from_numpy(self.space.usual_errors)[self.active].to(self.q.device)
+        return torch.from_numpy(self.space.usual_errors).to(self.q.device)[self.active]
 
     @cached_property
     def values_seen(self) -> tuple[int, ...]:
         """Number of values of every sensor."""
         return tuple(int(sensor.seen.sum()) * sensor.components for sensor in self.sensors)
+
+    @cached_property
+    def lengths(self) -> Tensor:
+        """Which of the free parameters are lengths."""
+        units = [parameter.unit == "m" for parameter in self.space.parameters]
+        return torch.tensor(units, device=self.q.device)[self.active]
 
     def with_active(self, active: Sequence[int]) -> "CalibrationProblem":
         """The same with other free parameters."""
@@ -101,130 +78,69 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """The same with nothing known beforehand."""
         return replace(self, precision=torch.zeros_like(self.precision))
 
+    def select(self, rows: Int64[Tensor, " chosen"]) -> "CalibrationProblem":
+        """Some of the rows."""
+        return replace(
+            self,
+            q=self.q[rows],
+            frame=self.frame[rows],
+            target=self.target[rows],
+            sensors=tuple(sensor.select(rows) for sensor in self.sensors),
+            pose=None if self.pose is None else renumbered(self.pose[rows]),
+        )
+
     def moved(self, point: Tensor, step: Tensor) -> Tensor:
         """The parameters after a step of the free ones."""
         return point.index_add(0, self.active, step)
 
     def linearise(self, point: Tensor, like: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
         """Sum up the normal equations; rows are weighted by the noise of `like`."""
-        noise = view_of(like).noise if like is not None else (float("inf"),) * len(self.sensors)
-        size = len(self.active)
-        sums = [
-            SensorSums(
-                normal=point.new_zeros((size, size)),
-                descent=point.new_zeros(size),
-                residual=point.new_zeros((sensor.components, self.q.shape[0])),
-                distance=point.new_zeros(self.q.shape[0]),
-            )
-            for sensor in self.sensors
-        ]
+        known = None if like is None else view_of(like)
+        sums = [self._empty(sensor) for sensor in self.sensors]
         for rows in self.chunks():
             motion = self.motion(point, rows)
-            for sensor, total, sigma in zip(self.sensors, sums, noise, strict=True):
-                self._add(sensor, total, sigma, motion, rows)
-        ones = (1.0,) * len(noise)
-        if like is None:
-            return self._combined(point, SensorView(tuple(sums), ones, ones))
-        return self._combined(point, replace(view_of(like), sums=tuple(sums)))
+            for k, (sensor, total) in enumerate(zip(self.sensors, sums, strict=True)):
+                self._add(sensor, total, float("inf") if known is None else known.noise[k], motion, rows)
+        ones = (1.0,) * len(sums)
+        view = SensorView(tuple(sums), ones, ones) if known is None else replace(known, sums=tuple(sums))
+        return self.combined(point, view)
 
     def renewed(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], bool]:
-        """Estimate every sensor's noise from its residuals, robustly, less what the parameters used up."""
-        view = view_of(linearisation)
-        return self._with_noise(
-            linearisation,
-            [
-                self.loss.scale(sums.distance[sensor.seen], sensor.components, used)
-                for sensor, sums, used in zip(self.sensors, view.sums, self.used(linearisation), strict=True)
-            ],
-        )
+        """Estimate the noise robustly, what repeats are worth, and how wide the prior has to be."""
+        return self._renewed(linearisation, refine=False)
 
     def refined(self, linearisation: Linearisation[Tensor]) -> Linearisation[Tensor]:
         """The same with the noise estimated from all good rows, for the end of a search."""
-        view = view_of(linearisation)
-        noise = [
-            self.loss.deviation(sums.distance[sensor.seen], sensor.components, used, max(sigma, ALWAYS_GOOD))
-            for sensor, sums, used, sigma in zip(
-                self.sensors, view.sums, self.used(linearisation), view.noise, strict=True
-            )
-        ]
-        return self._with_noise(linearisation, noise)[0]
+        return self._renewed(linearisation, refine=True)[0]
 
-    def used(self, linearisation: Linearisation[Tensor]) -> tuple[float, ...]:
-        """How many values of every sensor the estimated parameters use up (Förstner 1979); the prior spares some."""
+    def _renewed(
+        self, linearisation: Linearisation[Tensor], refine: bool
+    ) -> tuple[Linearisation[Tensor], bool]:
         view = view_of(linearisation)
         covariance = covariance_of(linearisation.normal)
-        return tuple(
-            float((sums.normal * covariance).sum()) / (sigma**2 * repetition)
-            for sums, sigma, repetition in zip(view.sums, view.noise, view.repetition, strict=True)
-        )
-
-    def _with_noise(
-        self, linearisation: Linearisation[Tensor], found: Sequence[float]
-    ) -> tuple[Linearisation[Tensor], bool]:
-        """The same with other noise, and whether it is nearly the old one."""
-        view = view_of(linearisation)
+        used = values_used(view, covariance)
         noise = tuple(
-            max(sigma, SMALLEST_NOISE if sensor.sigma is None else 1.0)
-            for sensor, sigma in zip(self.sensors, found, strict=True)
-        )
-        repetition = tuple(
-            self._repetition(sensor, sums, sigma, used)
-            for sensor, sums, sigma, used in zip(
-                self.sensors, view.sums, noise, self.used(linearisation), strict=True
+            max(found, SMALLEST_NOISE if sensor.sigma is None else 1.0)
+            for sensor, found in zip(
+                self.sensors, loss_scale(self.sensors, self.loss, view, used, refine), strict=True
             )
         )
-        widening = self._widening(linearisation)
-        old = (*view.noise, *view.repetition, *view.widening)
-        settled = all(abs(b / a - 1) < 1e-3 for a, b in zip(old, (*noise, *repetition, *widening), strict=True))
-        return self._combined(linearisation.point, SensorView(view.sums, noise, repetition, widening)), settled
-
-    def _widening(self, linearisation: Linearisation[Tensor]) -> tuple[float, float]:
-        """How much larger than stated the errors turn out, for lengths and angles (MacKay 1992, eq. 4.7).
-
-        Every parameter counts by how much of it the data tell. Smaller errors do not tighten the prior.
-        """
-        precision = self._precision(view_of(linearisation).widening)
-        told = 1 - precision * covariance_of(linearisation.normal).diagonal()
-        stated = self.precision[self.active]
-        square = (linearisation.point - self.nominal)[self.active].square() * stated
-        found = []
-        for lengths in (True, False):
-            chosen = (self._lengths[self.active] == lengths) & (stated > 0)
-            total = float(told[chosen].sum())
-            found.append(max(float(square[chosen].sum()) / total, 1.0) ** 0.5 if total > 1 else 1.0)
-        return found[0], found[1]
-
-    def _precision(self, widening: tuple[float, float]) -> Tensor:
-        """1 / variance of the free parameters' errors by the prior, as far as it was widened."""
-        length, angle = (1 / factor**2 for factor in widening)
-        return self.precision[self.active] * torch.where(self._lengths[self.active], length, angle)
-
-    @cached_property
-    def _lengths(self) -> Tensor:
-        """Which parameters are lengths."""
-        units = [parameter.unit == "m" for parameter in self.space.parameters]
-        return torch.tensor(units, device=self.q.device)
-
-    def _repetition(self, sensor: AbstractSensor, sums: SensorSums, sigma: float, used: float) -> float:
-        """Variance of the poses' mean residuals over what independent rows would give (Kish's design effect)."""
-        if self.pose is None:
-            return 1.0
-        weight = self.loss.weight(sums.distance / max(sigma, ALWAYS_GOOD), sensor.components) * sensor.seen
-        if sensor.sigma is not None:
-            weight = torch.where(sensor.seen, weight / sensor.sigma.square(), 0.0)
-        poses = int(self.pose.max()) + 1
-        total = weight.new_zeros(poses).index_add(0, self.pose, weight)
-        sum_of = sums.residual.new_zeros((sensor.components, poses)).index_add(1, self.pose, sums.residual * weight)
-        seen = total > 0
-        distance = (sum_of[:, seen].norm(dim=0)) / total[seen].sqrt()
-        between = self.loss.deviation(distance, sensor.components, used, max(sigma, ALWAYS_GOOD) * 1e9)
-        return max((between / sigma) ** 2, 1.0)
+        repetition = view.repetition
+        if self.pose is not None:
+            repetition = group_variance_ratio(
+                self.sensors, self.loss, replace(view, noise=noise), used, self.pose
+            )
+        off = (linearisation.point - self.nominal)[self.active]
+        widening = prior_widening(off, self.precision[self.active], self.lengths, view, covariance)
+        old, new = (*view.noise, *view.repetition, *view.widening), (*noise, *repetition, *widening)
+        settled = all(abs(b / a - 1) < 1e-2 for a, b in zip(old, new, strict=True))
+        return self.combined(linearisation.point, SensorView(view.sums, noise, repetition, widening)), settled
 
     def row_weights(self, view: SensorView, sensor: int, rows: slice) -> Float64[Tensor, " poses"]:
-        """1 / standard deviation that each row counts with for a sensor, 0 where it saw nothing [1/m or 1/rad]."""
-        kind, sigma = self.sensors[sensor], view.noise[sensor]
-        distance = view.sums[sensor].distance[rows] / max(sigma, ALWAYS_GOOD)
-        root = self.loss.weight(distance, kind.components).sqrt() / (sigma * view.repetition[sensor] ** 0.5)
+        """1 / standard deviation of each row for a sensor, 0 where it saw nothing [1/m or 1/rad]."""
+        kind = self.sensors[sensor]
+        distance = view.sums[sensor].distance[rows] / view.scale(sensor)
+        root = self.loss.weight(distance, kind.components).sqrt() / view.variance(sensor) ** 0.5
         if kind.sigma is not None:
             root = root / kind.sigma[rows]
         return torch.where(kind.seen[rows], root, 0.0)
@@ -242,7 +158,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return tool_motion(self.space.robot, dh.cpu().numpy(), base, tool, self.q[rows], turning)
 
     def spread(self, derivative: Tensor, rows: slice, active: Tensor) -> Tensor:
-        """Columns of `active` parameters: those of base and tool are 0 in rows of other frames and targets."""
+        """Columns of `active` parameters: 0 for base and tool in rows of other frames and targets."""
         columns, frame, target = self._columns
         J = derivative.index_select(0, columns[active])
         if len(self.space.frames) > 1 or len(self.space.targets) > 1:
@@ -250,6 +166,27 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             own = ((f < 0) | (f == self.frame[rows])) & ((t < 0) | (t == self.target[rows]))
             J = J * own[:, None, :]
         return J
+
+    def combined(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
+        """Divide the sums by their variances and add the prior."""
+        off = (point - self.nominal)[self.active]
+        precision = view.widened(self.precision[self.active], self.lengths)
+        normal, descent, misfit, rounding = torch.diag(precision), -off * precision, 0.0, 0.0
+        for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True)):
+            scale, variance = view.scale(k), view.variance(k)
+            misfit += (
+                float(self.loss.cost(sums.distance / scale, sensor.components).sum()) * scale**2 / variance
+            )
+            normal = normal + sums.normal / variance
+            descent = descent + sums.descent / variance
+            size = self._reach if sensor.unit == "m" else 1.0
+            rounding += self.values_seen[k] * (torch.finfo(point.dtype).eps * size) ** 2 / variance
+        cost = misfit + float((off.square() * precision).sum())
+        return Linearisation(point, cost, descent, normal, misfit, rounding, view)
+
+    @cached_property
+    def _reach(self) -> float:
+        return self.space.robot.reach
 
     @cached_property
     def _columns(self) -> tuple[Tensor, Tensor, Tensor]:
@@ -262,6 +199,16 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         found = torch.tensor([columns, frame, target], device=self.q.device)
         return found[0], found[1], found[2]
 
+    def _empty(self, sensor: AbstractSensor) -> SensorSums:
+        rows, size = self.q.shape[0], len(self.active)
+        return SensorSums(
+            normal=self.q.new_zeros((size, size)),
+            descent=self.q.new_zeros(size),
+            residual=self.q.new_zeros((sensor.components, rows)),
+            distance=self.q.new_zeros(rows),
+            seen=int(sensor.seen.sum()),
+        )
+
     def _add(
         self, sensor: AbstractSensor, sums: SensorSums, sigma: float, motion: ToolMotion, rows: slice
     ) -> None:
@@ -271,30 +218,14 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         distance = residual.norm(dim=0)
         root = seen.to(residual.dtype)
         if sensor.sigma is not None:
-            distance = torch.where(seen, distance / sensor.sigma[rows], 0.0)
             root = torch.where(seen, 1 / sensor.sigma[rows], 0.0)
+            distance = distance * root
         root = root * self.loss.weight(distance / max(sigma, ALWAYS_GOOD), sensor.components).sqrt()
         A = (self.spread(sensor.derivative(motion), rows, self.active) * root).flatten(1)
         sums.normal.addmm_(A, A.t())
         sums.descent.addmv_(A, (residual * root).flatten())
         sums.residual[:, rows] = residual
         sums.distance[rows] = distance
-
-    def _combined(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
-        """Divide by the variances, add the prior."""
-        off = (point - self.nominal)[self.active]
-        precision = self._precision(view.widening)
-        normal, descent, misfit, rounding = torch.diag(precision), -off * precision, 0.0, 0.0
-        for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True)):
-            scale, variance = max(view.noise[k], ALWAYS_GOOD), view.noise[k] ** 2 * view.repetition[k]
-            row_costs = self.loss.cost(sums.distance / scale, sensor.components)
-            misfit += float(row_costs.sum()) * scale**2 / variance
-            normal = normal + sums.normal / variance
-            descent = descent + sums.descent / variance
-            size = self.space.robot.reach if sensor.unit == "m" else 1.0
-            rounding += self.values_seen[k] * (2 * torch.finfo(point.dtype).eps * size) ** 2 / variance
-        cost = misfit + float((off.square() * precision).sum())
-        return Linearisation(point, cost, descent, normal, misfit, rounding, view)
 
 
 def view_of(linearisation: Linearisation[Tensor]) -> SensorView:

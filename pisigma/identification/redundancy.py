@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from pisigma.identification.information import Information
 from pisigma.identification.parameters import Parameter
@@ -70,8 +70,9 @@ def find_redundancy(
 ) -> Redundancy:
     """Find rank, a choice of independent parameters and the dependencies of the others on them.
 
-    The columns are scaled to length one; the rank is that of the singular values. The choice is the first `rank`
-    pivots of a QR factorisation with column pivoting (Businger and Golub 1965) of the columns times their preference.
+    The columns are scaled to length one; the rank is that of the singular values. The choice is the first
+    `rank` pivots of a QR factorisation with column pivoting (Businger and Golub 1965) of the columns times
+    their preference.
 
     Args:
         information: the condensed Jacobian.
@@ -107,8 +108,8 @@ def preference_of(parameter: Parameter, size: float, index: int) -> float:
     return float(10.0 ** -PREFERENCE.index(parameter.group)) * (1 + bonus - 1e-6 * index)
 
 
-def pivoted_columns(A: Float64[np.ndarray, "rows columns"], count: int) -> Float64[np.ndarray, " count"]:
-    """The first pivots of a QR factorisation with column pivoting (modified Gram-Schmidt, lengths always fresh)."""
+def pivoted_columns(A: Float64[np.ndarray, "rows columns"], count: int) -> Int64[np.ndarray, " pivots"]:
+    """The first pivots of a QR factorisation with column pivoting, by modified Gram-Schmidt."""
     A = A.copy()
     pivots: list[int] = []
     for _ in range(count):

@@ -7,17 +7,20 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.identification.information import Information, information
+from pisigma.identification.information import Information
 from pisigma.identification.least_squares import Linearisation, Solution
+from pisigma.identification.noise import values_used
 from pisigma.identification.observability import observability_of
-from pisigma.identification.parameters import Prior
-from pisigma.identification.problem import ALWAYS_GOOD, CalibrationProblem, covariance_of, view_of
+from pisigma.identification.problem import CalibrationProblem, covariance_of, view_of
 from pisigma.identification.redundancy import Redundancy
 from pisigma.identification.result import CalibrationResult, Outlier, ParameterEstimate, SensorNoise
 from pisigma.identification.setup import CalibrationSetup
 from pisigma.identification.unseen import unseen_directions
 from pisigma.measurement.dataset import Measurements
 from pisigma.se3 import rotation_from_rpy, rpy_from_rotation, wrap_to_pi
+
+HELD = 0.7
+"""A parameter whose standard error is more than this share of its prior's is not told by the data."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,17 +38,31 @@ class _Estimate:
     change: Float64[Tensor, "parameters parameters"]
 
 
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What was found out about the parameters on the way.
+
+    Attributes:
+        information: the condensed Jacobian of the candidates at the start.
+        sizes: their values there.
+        redundancy: what follows from both.
+        extended: indices of parameters that were added later.
+        warnings: sentences so far.
+    """
+
+    information: Information
+    sizes: Float64[np.ndarray, " candidates"]
+    redundancy: Redundancy
+    extended: list[int]
+    warnings: tuple[str, ...]
+
+
 def assemble_result(
     measurements: Measurements,
     setup: CalibrationSetup,
     problem: CalibrationProblem,
     solution: Solution[Tensor],
-    seen: Information,
-    sizes: Float64[np.ndarray, " candidates"],
-    redundancy: Redundancy,
-    extended: list[int],
-    prior: Prior | None,
-    warnings: tuple[str, ...],
+    findings: Findings,
 ) -> CalibrationResult:
     """Make the result; see `CalibrationResult` for its parts."""
     here = problem.refined(solution.linearisation)
@@ -53,33 +70,36 @@ def assemble_result(
     estimate = _user_coordinates(setup, point, problem)
     dh = space.split(point)[0].numpy()
     covariance = _covariance(here, problem, estimate)
-    active = problem.active.tolist()
-    now = information(problem, here.point, active)
+    gram = sum((sums.normal for sums in view_of(here).sums), torch.zeros_like(here.normal))
+    usual = problem.step_scale * 1e3  # to rows in mm and mrad, columns per 1 mm and 1 mrad
+    poses = int(torch.stack([sensor.seen for sensor in problem.sensors]).any(0).sum())
     return CalibrationResult(
-        robot=space.robot.with_geometry(dh=dh, base=estimate.bases[0].numpy(), tool=estimate.tools[0].numpy()),
+        robot=space.robot.with_geometry(
+            dh=dh, base=estimate.bases[0].numpy(), tool=estimate.tools[0].numpy()
+        ),
         bases={name: base.numpy() for name, base in zip(space.frames, estimate.bases, strict=True)},
         tools={name: tool.numpy() for name, tool in zip(space.targets, estimate.tools, strict=True)},
-        parameters=_table(problem, point, estimate, covariance, redundancy, extended),
+        parameters=_table(problem, here, estimate, covariance, findings),
         covariance=covariance,
         residuals=_residuals(measurements, setup, problem, here),
         outliers=_outliers(measurements, setup, problem, here),
         noise=_noise(problem, here),
-        redundancy=redundancy,
-        information=seen,
-        sizes=sizes,
-        extended=tuple(space.names[i] for i in extended),
-        unseen=unseen_directions(problem, here, prior is not None),
-        observability=observability_of(now, now.names),
+        redundancy=findings.redundancy,
+        information=findings.information,
+        sizes=findings.sizes,
+        extended=tuple(space.names[i] for i in findings.extended),
+        unseen=unseen_directions(problem, here),
+        observability=observability_of(gram * usual * usual[:, None], poses),
         iterations=solution.iterations,
         cost=here.cost,
         status=solution.status,
-        rms_path=tuple(_rms(problem, passed) for passed in solution.path),
-        warnings=warnings if solution.status.good else (*warnings, f"the search {solution.status.value}."),
+        rms_path=tuple(view_of(passed).sums[0].rms for passed in solution.path),
+        warnings=(*findings.warnings, *_warnings(problem, here, solution)),
     )
 
 
 def _user_coordinates(setup: CalibrationSetup, point: Tensor, problem: CalibrationProblem) -> _Estimate:
-    """Put the anchors back; small turns keep their meaning as rotation vectors, which links both sets of angles."""
+    """Put the anchors back; as rotation vectors, small turns mean the same with and without them."""
     space = problem.space
     _, bases, tools = (part.clone() for part in space.split(point))
     change = torch.eye(len(point), dtype=point.dtype)
@@ -121,31 +141,58 @@ def _covariance(
     return (estimate.change @ full @ estimate.change.mT).numpy()
 
 
+def _warnings(
+    problem: CalibrationProblem, here: Linearisation[Tensor], solution: Solution[Tensor]
+) -> tuple[str, ...]:
+    """Sentences on the search and on a prior that was too narrow."""
+    found = []
+    if not solution.status.good:
+        found.append(f"the search {solution.status.value}.")
+    for kind, factor in zip(("length", "angle"), view_of(here).widening, strict=True):
+        if factor > 2 and bool((problem.precision > 0).any()):
+            found.append(
+                f"the {kind} errors are about {factor:.2g} times as large as the prior says, so it was "
+                "widened; check the nominal geometry, or give a wider prior."
+            )
+    return tuple(found)
+
+
 def _table(
     problem: CalibrationProblem,
-    point: Tensor,
+    here: Linearisation[Tensor],
     estimate: _Estimate,
     covariance: np.ndarray,
-    redundancy: Redundancy,
-    extended: list[int],
+    findings: Findings,
 ) -> tuple[ParameterEstimate, ...]:
     space, robot = problem.space, problem.space.robot
     bases, tools = np.tile(robot.base, (len(space.frames), 1)), np.tile(robot.tool, (len(space.targets), 1))
     nominal = space.values(bases, tools)
-    values = torch.cat([point[: space.arm_size], estimate.bases.flatten(), estimate.tools.flatten()])
+    arm = here.point.cpu()[: space.arm_size]
+    values = torch.cat([arm, estimate.bases.flatten(), estimate.tools.flatten()])
     change = values - nominal
     angle = torch.tensor([parameter.unit == "rad" for parameter in space.parameters])
     change = torch.where(angle, wrap_to_pi(change), change)
     errors = np.sqrt(np.maximum(covariance.diagonal(), 0))
+    held = errors * np.sqrt(_prior_precision(problem, here)) > HELD
     active = set(problem.active.tolist())
     rows = []
     for index, parameter in enumerate(space.parameters):
-        free = index in active or errors[index] > 0
-        remark = _remark(parameter.name, free, index in extended, redundancy)
+        free = index in active or bool(errors[index] > 0)
+        remark = _remark(parameter.name, free, index in findings.extended, findings.redundancy)
+        if free and held[index]:
+            remark += "; the data hardly see it, the prior holds it"
         numbers = (float(nominal[index]), float(values[index]), float(change[index]))
         error = float(errors[index]) if free else float("nan")
         rows.append(ParameterEstimate(parameter.name, parameter.unit, *numbers, error, remark))
     return tuple(rows)
+
+
+def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -> np.ndarray:
+    """1 / variance of all parameters by the prior, 0 where they are not free."""
+    full = torch.zeros_like(problem.precision)
+    full[problem.active] = view_of(here).widened(problem.precision[problem.active], problem.lengths)
+    found: np.ndarray = full.cpu().numpy()
+    return found
 
 
 def _remark(name: str, free: bool, extended: bool, redundancy: Redundancy) -> str:
@@ -183,8 +230,8 @@ def _outliers(
 ) -> tuple[Outlier, ...]:
     found = []
     view = view_of(here)
-    for sensor, sums, sigma in zip(problem.sensors, view.sums, view.noise, strict=True):
-        deviations = sums.distance / max(sigma, ALWAYS_GOOD)
+    for number, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
+        deviations = sums.distance / view.scale(number)
         for k in (problem.loss.weight(deviations, sensor.components) < 0.5).nonzero()[:, 0].tolist():
             row = int(setup.rows[k])
             length = float(sums.residual[:, k].norm())
@@ -194,18 +241,10 @@ def _outliers(
 
 def _noise(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[SensorNoise, ...]:
     found = []
-    view, used = view_of(here), problem.used(here)
+    view = view_of(here)
+    used = values_used(view, covariance_of(here.normal))
     for k, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
         sigma = view.noise[k]
-        if sensor.sigma is not None:
-            sigma = problem.loss.deviation(sums.distance[sensor.seen], sensor.components, used[k], 1.0)
-        rms = float(sums.residual[:, sensor.seen].square().sum(0).mean().sqrt())
         unit = sensor.unit if sensor.sigma is None else "given"
-        found.append(SensorNoise(sensor.name, sigma, unit, problem.values_seen[k], used[k], rms))
+        found.append(SensorNoise(sensor.name, sigma, unit, problem.values_seen[k], used[k], sums.rms))
     return tuple(found)
-
-
-def _rms(problem: CalibrationProblem, passed: Linearisation[Tensor]) -> float:
-    """Root mean square of the position residuals' lengths [m]."""
-    sensor, sums = problem.sensors[0], view_of(passed).sums[0]
-    return float(sums.residual[:, sensor.seen].square().sum(0).mean().sqrt())

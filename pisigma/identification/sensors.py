@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from pisigma.identification.jacobian import ToolMotion
@@ -38,6 +38,10 @@ class AbstractSensor(ABC):
         """Measured minus predicted; whatever it is where nothing was seen, it is not used."""
 
     @abstractmethod
+    def select(self, rows: Int64[Tensor, " chosen"]) -> "AbstractSensor":
+        """The same sensor with some of the rows."""
+
+    @abstractmethod
     def derivative(self, motion: ToolMotion) -> Float[Tensor, "parameters components poses"]:
         """Derivative of the predicted value by every parameter."""
 
@@ -63,6 +67,11 @@ class PositionSensor(AbstractSensor):
     def residual(self, motion: ToolMotion, rows: slice) -> Float[Tensor, "components poses"]:
         """Measured minus predicted position [m]."""
         return self.measured[:, rows] - motion.position
+
+    def select(self, rows: Int64[Tensor, " chosen"]) -> "PositionSensor":
+        """Some of the rows."""
+        sigma = None if self.sigma is None else self.sigma[rows]
+        return PositionSensor(self.measured[:, rows], self.seen[rows], sigma)
 
     def derivative(self, motion: ToolMotion) -> Float[Tensor, "parameters components poses"]:
         """The tool's shift."""
@@ -92,10 +101,15 @@ class RotationSensor(AbstractSensor):
         difference = torch.einsum("ijn,kjn->nik", self.measured[..., rows], motion.rotation)
         return rotation_vector(difference).t()
 
+    def select(self, rows: Int64[Tensor, " chosen"]) -> "RotationSensor":
+        """Some of the rows."""
+        sigma = None if self.sigma is None else self.sigma[rows]
+        return RotationSensor(self.measured[..., rows], self.seen[rows], sigma)
+
     def derivative(self, motion: ToolMotion) -> Float[Tensor, "parameters components poses"]:
         """The tool's turn.
 
-        The residual r falls by `J_r(r)^-1 turn` rather than by the turn; as `J_r^-T r = r`, the cost's gradient is exact
-        with the turn itself, and the Gauss-Newton matrix is right to second order in r.
+        The residual r falls by `J_r(r)^-1 turn` rather than by the turn; as `J_r^-T r = r`, the cost's
+        gradient is exact with the turn itself, and the Gauss-Newton matrix is right to second order in r.
         """
         return motion.derivative[:, 3:]

@@ -4,12 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
 from pisigma.identification.base_and_tool import BaseToolFit, fit_base_and_tool
 from pisigma.identification.loss import AbstractLoss
+from pisigma.identification.noise import renumbered
 from pisigma.identification.parameters import ParameterSpace, Prior
 from pisigma.identification.problem import CalibrationProblem
 from pisigma.identification.sensors import AbstractSensor, PositionSensor, RotationSensor
@@ -18,10 +19,15 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert, rotation_from_rpy, transform_from_xyzrpy
 
+START_ROWS = 1_024
+"""Rows that base and tool start from."""
+START_STEPS = 2
+"""Steps by which their closed-form start is polished."""
+
 
 @dataclass(frozen=True, eq=False)
 class Anchors:
-    """Where base and tool started: their parameters are small changes from there, so no angle nears its singularity.
+    """Where base and tool started; parameters are changes from there, so no angle nears its singularity.
 
     Attributes:
         bases: per frame, what stands before the base of the problem: `base = anchor · base_of_problem`.
@@ -40,14 +46,12 @@ class CalibrationSetup:
         problem: with no parameter free yet.
         start: values of all parameters.
         anchors: what base and tool are relative to.
-        base_and_tool: the fit of base and tool alone, by frame.
         rows: which rows of the measurements the problem has.
     """
 
     problem: CalibrationProblem
     start: Float64[Tensor, " parameters"]
     anchors: Anchors
-    base_and_tool: dict[str, BaseToolFit]
     rows: Tensor
 
 
@@ -72,7 +76,9 @@ def build_setup(
     space = ParameterSpace(robot, frames, targets)
     frame, target = _numbers(measurements.frame, frames), _numbers(measurements.target, targets)
     fits = {
-        name: fit_base_and_tool(robot, measurements.select(frame == number), free_base, free_tool)
+        name: fit_base_and_tool(
+            robot, _part(measurements, frame == number), free_base, free_tool, START_STEPS
+        )
         for number, name in enumerate(frames)
     }
     anchors, start = _start(space, fits, free_base, free_tool)
@@ -89,7 +95,7 @@ def build_setup(
         active=torch.zeros(0, dtype=torch.int64, device=start.device),
         pose=repeated_poses(measurements.q, frame.to(start.device), target.to(start.device)),
     )
-    return CalibrationSetup(problem, start, anchors, fits, rows)
+    return CalibrationSetup(problem, start, anchors, rows)
 
 
 def _usable(measurements: Measurements) -> tuple[Tensor, Measurements]:
@@ -105,7 +111,8 @@ def _usable(measurements: Measurements) -> tuple[Tensor, Measurements]:
     rows = seen.nonzero()[:, 0]
     if len(rows) == 0:
         raise IdentificationError(
-            f"{measurements.source}: none of its {len(seen)} rows has a measured value; measure positions or poses."
+            f"{measurements.source}: none of its {len(seen)} rows has a measured value; measure positions "
+            "or poses."
         )
     chosen = measurements.select(rows) if len(rows) < len(seen) else measurements
     check_poses(chosen)
@@ -117,23 +124,40 @@ def _numbers(names: tuple[str, ...], order: tuple[str, ...]) -> Tensor:
     return torch.tensor([numbers[name] for name in names], dtype=torch.int64)
 
 
+def chosen_rows(rows: int, most: int) -> Int64[Tensor, " chosen"]:
+    """All rows, or so many of them in a random order that is always the same."""
+    if rows <= most:
+        return torch.arange(rows)
+    return torch.randperm(rows, generator=torch.Generator().manual_seed(0))[:most]
+
+
+def _part(measurements: Measurements, chosen: Tensor) -> Measurements:
+    """The chosen rows, or enough of them for a start."""
+    if bool(chosen.all()) and len(chosen) <= START_ROWS:
+        return measurements
+    rows = chosen.nonzero()[:, 0]
+    return measurements.select(rows[chosen_rows(len(rows), START_ROWS).to(rows.device)])
+
+
 def repeated_poses(q: Tensor, frame: Tensor, target: Tensor) -> Tensor | None:
-    """Number every row's pose: joint values, frame and target; None where no two rows are of the same."""
-    rounded = (q * 1e9).round()
-    if len(rounded[:, 0].unique()) == len(q):
-        return None
-    keys = torch.cat([rounded, torch.stack([frame, target], 1).to(q.dtype)], 1)
-    found: Tensor = keys.unique(dim=0, return_inverse=True)[1]
+    """Number every row's pose (joint values to 1e-9, frame, target); None where none is repeated."""
+    keys = torch.stack([*(q * 1e9).round().long().unbind(1), frame, target])
+    mixed = torch.zeros_like(frame)
+    for key in keys:  # integers wrap around, so equal rows mix equally
+        mixed = mixed * 6_364_136_223_846_793_005 + key * 1_442_695_040_888_963_407
+    found = renumbered(mixed)
     return None if int(found.max()) + 1 == len(q) else found
 
 
 def _start(
     space: ParameterSpace, fits: dict[str, BaseToolFit], free_base: bool, free_tool: bool
 ) -> tuple[Anchors, Float64[Tensor, " parameters"]]:
-    """Bases start at their anchor; tools at their place, turned like their anchor. What is fixed has no anchor."""
+    """Bases start at their anchor, tools at their place, turned like their anchor; what is fixed has none."""
     robot = space.robot
     bases, tools = np.tile(robot.base, (len(space.frames), 1)), np.tile(robot.tool, (len(space.targets), 1))
-    anchors = Anchors(torch.eye(4).double().repeat(len(bases), 1, 1), torch.eye(3).double().repeat(len(tools), 1, 1))
+    anchors = Anchors(
+        torch.eye(4).double().repeat(len(bases), 1, 1), torch.eye(3).double().repeat(len(tools), 1, 1)
+    )
     if free_base:
         found = np.stack([fits[name].robot.base for name in space.frames])
         anchors = Anchors(transform_from_xyzrpy(torch.from_numpy(found)), anchors.tools)
@@ -156,7 +180,9 @@ def _sensors(
     position = (R_anchor @ measurements.position[..., None])[..., 0] + Ts[:, :3, 3]
     seen = torch.isfinite(position).all(-1)
     sigma = _sigma(measurements, measurements.sigma_position, seen, "sigma_mm")
-    sensors: list[AbstractSensor] = [PositionSensor(torch.where(seen, position.t(), 0.0).contiguous(), seen, sigma)]
+    sensors: list[AbstractSensor] = [
+        PositionSensor(torch.where(seen, position.t(), 0.0).contiguous(), seen, sigma)
+    ]
     if measurements.rotation is not None:
         rotation = R_anchor @ measurements.rotation @ anchors.tools.to(R_anchor.device)[target].mT
         seen = torch.isfinite(rotation).flatten(1).all(-1)

@@ -27,8 +27,8 @@ def check_poses(measurements: Measurements) -> None:
     q = measurements.q
     if q.shape[0] > 1 and float((q - q[0]).abs().max()) < 1e-9:
         raise IdentificationError(
-            f"{measurements.source}: all {q.shape[0]} rows are one pose, which tells the noise but no parameter; "
-            "measure at other joint values, spread over the workspace."
+            f"{measurements.source}: all {q.shape[0]} rows are one pose, which tells the noise but no "
+            "parameter; measure at other joint values, spread over the workspace."
         )
 
 
@@ -56,9 +56,9 @@ def check_sufficiency(
     if values <= wanted:
         missing = int(np.ceil((GOOD_RATIO * wanted - values) / per_row))
         raise IdentificationError(
-            f"{source}: {distinct_rows(problem)} different poses give {values} values for {wanted} free parameters, "
-            f"which leaves nothing to tell noise from error; measure about {missing} more poses, or free fewer "
-            "parameters."
+            f"{source}: {distinct_rows(problem)} different poses give {values} values for {wanted} free "
+            "parameters, which leaves nothing to tell noise from error; measure about "
+            f"{missing} more poses, or free fewer parameters."
         )
     warnings = [*_still_joints(robot, problem), *_targets_on_axis(robot, problem)]
     if values < GOOD_RATIO * wanted:
@@ -78,7 +78,7 @@ def distinct_rows(problem: CalibrationProblem) -> int:
 def distinct_values(problem: CalibrationProblem) -> int:
     """Number of measured values, repeats counted once."""
     share = distinct_rows(problem) / problem.q.shape[0]
-    return int(round(sum(problem.values_seen) * share))
+    return round(sum(problem.values_seen) * share)
 
 
 def _still_joints(robot: Robot, problem: CalibrationProblem) -> list[str]:
@@ -89,8 +89,8 @@ def _still_joints(robot: Robot, problem: CalibrationProblem) -> list[str]:
         if moved < LITTLE_MOTION:
             text = f"{np.rad2deg(moved):.3g} deg" if joint.type == "revolute" else f"{moved * 1e3:.3g} mm"
             found.append(
-                f"joint {joint.name} moves by {text} only, so its errors cannot be told from its neighbours'; "
-                "measure poses that move it through more of its range."
+                f"joint {joint.name} moves by {text} only, so its errors cannot be told from its "
+                "neighbours'; measure poses that move it through more of its range."
             )
     return found
 
@@ -102,7 +102,9 @@ def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[str]:
     last = robot.joint_rows[-1]
     names, offs = [], []
     for name, tool in zip(problem.space.targets, problem.space.split(problem.nominal)[2].cpu(), strict=True):
-        end = Robot(robot.name, robot.maker, robot.source, robot.rows[last:], robot.dh[last:], tool=tool.numpy())
+        end = Robot(
+            robot.name, robot.maker, robot.source, robot.rows[last:], robot.dh[last:], tool=tool.numpy()
+        )
         T = forward_kinematics(end, torch.zeros(1, dtype=torch.float64))
         names.append(name)
         offs.append(float(torch.hypot(T[0, 3], T[1, 3])))
@@ -110,7 +112,7 @@ def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[str]:
         return []
     which = f"target {names[int(np.argmax(offs))]}" if len(names) > 1 else "the target"
     return [
-        f"{which} is {max(offs) * 1e3:.2g} mm from the axis of joint {robot.joints[-1].name}, so positions say next "
-        f"to nothing of that joint and of its axis; mount it {0.05 * robot.reach * 1e3:.0f} mm or more beside "
-        "the axis, or measure orientations too."
+        f"{which} is {max(offs) * 1e3:.2g} mm from the axis of joint {robot.joints[-1].name}, so positions "
+        "say next to nothing of that joint and of its axis; mount it "
+        f"{0.05 * robot.reach * 1e3:.0f} mm or more beside the axis, or measure orientations too."
     ]

@@ -4,26 +4,25 @@ import torch
 from torch import Tensor
 
 from pisigma.identification.least_squares import Linearisation
-from pisigma.identification.problem import CalibrationProblem
+from pisigma.identification.problem import CalibrationProblem, view_of
 
 SHOWN = 0.25
 """Parameters with at least this share of a direction are named."""
 
 
-def unseen_directions(
-    problem: CalibrationProblem, here: Linearisation[Tensor], held: bool
-) -> tuple[str, ...]:
+def unseen_directions(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[str, ...]:
     """Find directions of the free arm parameters that the data tell less well than the prior does.
 
-    Base and tool are marginalised: what they can mimic does not count as seen. The directions are eigenvectors of
-    the data's information in units of the prior's standard deviations (1 mm and 1 mrad where there is none).
+    Base and tool are marginalised: what they can mimic does not count as seen. The directions are
+    eigenvectors of the data's information in units of the prior's standard deviations (1 mm and 1 mrad
+    where there is none).
 
     Args:
         problem: with its free parameters.
         here: its linearisation at the solution.
-        held: whether there is a prior that holds such directions.
     """
-    precision = problem.precision[problem.active]
+    precision = view_of(here).widened(problem.precision[problem.active], problem.lengths)
+    held = bool((precision > 0).any())
     data = here.normal - torch.diag(precision)
     usual = torch.where(precision > 0, precision.clamp(min=1e-30).rsqrt(), problem.step_scale)
     data = data * usual * usual[:, None]
@@ -31,7 +30,10 @@ def unseen_directions(
     if not bool(arm.any()):
         return ()
     cross = data[arm][:, ~arm]
-    seen = data[arm][:, arm] - cross @ torch.linalg.pinv(data[~arm][:, ~arm], rtol=1e-12, hermitian=True) @ cross.mT
+    seen = (
+        data[arm][:, arm]
+        - cross @ torch.linalg.pinv(data[~arm][:, ~arm], rtol=1e-12, hermitian=True) @ cross.mT
+    )
     values, vectors = torch.linalg.eigh((seen + seen.mT) / 2)
     names = [problem.space.names[i] for i in problem.active[arm].tolist()]
     end = "it stays near its nominal value" if held else "without a prior it may be anything"

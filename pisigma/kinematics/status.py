@@ -7,8 +7,8 @@ class Status(enum.IntEnum):
     """Outcome of inverse kinematics for one pose and one branch.
 
     Joint values are NaN where, and only where, the status is UNREACHABLE. Where several apply, the gravest
-    counts, in the order REACHED, SINGULAR, OUTSIDE_DOMAIN, OUTSIDE_JOINT_LIMITS, then NOT_CONVERGED or
-    UNREACHABLE.
+    counts, in the order REACHED, OUTSIDE_DOMAIN, SINGULAR, OUTSIDE_JOINT_LIMITS, then NOT_CONVERGED or
+    UNREACHABLE: a singular pose is never hidden, and the domain is seen in its measure too.
     """
 
     REACHED = 0

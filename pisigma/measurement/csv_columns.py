@@ -12,7 +12,8 @@ from pisigma.errors import nearest_choice
 POSITION = ("x", "y", "z")
 RPY = ("roll", "pitch", "yaw")
 QUATERNION = ("qx", "qy", "qz", "qw")
-TEXTS = ("target", "frame", "set")
+ANCHOR_PLACE = ("anchor_x", "anchor_y", "anchor_z")
+TEXTS = ("target", "frame", "set", "socket", "touch_axis", "anchor", "pair")
 
 REVOLUTE_UNITS = ("deg", "rad")
 PRISMATIC_UNITS = ("mm", "m")
@@ -55,6 +56,11 @@ _COLUMNS = {
         *(Column(f"{name}_m", name, "m") for name in POSITION),
         *(Column(f"{name}_deg", name, "deg") for name in RPY),
         *(Column(name, name, "") for name in QUATERNION),
+        *(
+            Column(f"{name}_{unit}", name, unit)
+            for name in ("touch", "distance", *ANCHOR_PLACE)
+            for unit in PRISMATIC_UNITS
+        ),
         *(Column(name, name, "") for name in TEXTS),
         Column("sigma_mm", "sigma_position", "mm"),
         Column("sigma_deg", "sigma_rotation", "deg"),

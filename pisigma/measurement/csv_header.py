@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement.csv_columns import (
+    ANCHOR_PLACE,
     POSITION,
     PRISMATIC_UNITS,
     QUATERNION,
@@ -34,6 +35,19 @@ class Layout:
     index: dict[str, int]
     dof: int
     orientation: tuple[str, ...]
+
+    @property
+    def position(self) -> tuple[str, ...]:
+        """The quantities x, y, z, or none."""
+        return POSITION if POSITION[0] in self.index else ()
+
+    @property
+    def lengths(self) -> tuple[str, ...]:
+        """The quantities beside position and orientation of which one is enough for a measurement.
+
+        The names are among them, so that a name without its value is complained of as such.
+        """
+        return tuple(name for name in ("socket", *_NEEDED) if name in self.index)
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -70,6 +84,7 @@ def read_header(table: Table, robot: Robot | None) -> Layout:
     if robot is not None:
         _check_robot(place, [columns[index[f"q{number}"]] for number in range(1, dof + 1)], robot)
     _check_position(place, columns)
+    _check_lengths(place, columns)
     return Layout(columns, index, dof, _check_orientation(place, columns))
 
 
@@ -149,8 +164,10 @@ def _check_robot(place: str, joints: list[Column], robot: Robot) -> None:
 
 
 def _check_position(place: str, columns: tuple[Column, ...]) -> None:
-    """x, y and z are there, in one unit."""
+    """x, y and z are there, in one unit, unless the file has other lengths."""
     present = [column for column in columns if column.quantity in POSITION]
+    if not present and {column.quantity for column in columns} & {"socket", *_NEEDED}:
+        return
     unit = present[0].unit if present else "mm"
     for quantity in POSITION:
         if quantity not in {column.quantity for column in present}:
@@ -160,6 +177,42 @@ def _check_position(place: str, columns: tuple[Column, ...]) -> None:
                 "measured)."
             )
     _check_one_unit(place, present)
+
+
+_NEEDED = {
+    "touch": (("touch_axis",), "add the column touch_axis (x, y or z)"),
+    "touch_axis": (("touch",), "add the column touch_mm, the coordinate that was touched"),
+    "distance": (
+        ("anchor", "pair"),
+        "add the column anchor (name of a fixed point) or pair (name of two rows)",
+    ),
+    "anchor": (("distance",), "add the column distance_mm"),
+    "pair": (("distance",), "add the column distance_mm"),
+}
+
+
+def _check_lengths(place: str, columns: tuple[Column, ...]) -> None:
+    """Columns that say nothing without another one have it."""
+    present = {column.quantity: column for column in columns}
+    needed = dict(_NEEDED)
+    for name in ANCHOR_PLACE:
+        others = tuple(other for other in ANCHOR_PLACE if other not in present)
+        if name in present and others:
+            needed[name] = (others, f"add {', '.join(f'{other}_{present[name].unit}' for other in others)}")
+        elif name in present:
+            needed[name] = (("anchor",), "add the column anchor, its name")
+    for quantity, (others, remedy) in needed.items():
+        if quantity in present and not set(others) & set(present):
+            raise MeasurementError(
+                f"{place}, column '{present[quantity].name}': says nothing without another column; {remedy}."
+            )
+    if "touch" in present and "frame" not in present:
+        raise MeasurementError(
+            f"{place}, column '{present['touch'].name}': says nothing without the frame of a "
+            "jig; add the column "
+            "frame, which placement of the jig was touched."
+        )
+    _check_one_unit(place, [present[name] for name in ANCHOR_PLACE if name in present])
 
 
 def _check_orientation(place: str, columns: tuple[Column, ...]) -> tuple[str, ...]:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
-from pisigma.measurement.csv_columns import POSITION, QUATERNION, to_si
+from pisigma.measurement.csv_columns import ANCHOR_PLACE, POSITION, QUATERNION, to_si
 from pisigma.measurement.csv_header import Layout, read_header
 from pisigma.measurement.csv_rows import CheckedRows, check_rows
 from pisigma.measurement.csv_table import Table, read_table
@@ -21,10 +21,15 @@ def read_csv(
 ) -> Measurements:
     """Read a measurement file; the header says quantity and unit of every column, in any order.
 
-    `q1_deg` or `q1_rad` and so on (prismatic: `q3_mm` or `q3_m`) and `x_mm,y_mm,z_mm` (or `_m`) must be
-    there; `roll_deg,pitch_deg,yaw_deg` (RotZ(roll) · RotY(pitch) · RotX(yaw)) or `qx,qy,qz,qw`,
-    `target`, `frame`, `sigma_mm`, `sigma_deg`, `set`, `payload_kg` and `temperature_c` may be. An empty cell
-    is what was not measured.
+    `q1_deg` or `q1_rad` and so on (prismatic: `q3_mm` or `q3_m`) must be there, and at least one kind of
+    length (each also in `_m`), of which a row holds one: `x_mm,y_mm,z_mm`; `socket`, the name of the fixed
+    point that the ball sits in; `touch_axis` (x, y or z) and `touch_mm` with `frame`, the jig; `distance_mm`
+    with `anchor`, the name of a fixed point whose place `anchor_x_mm,anchor_y_mm,anchor_z_mm` may be known,
+    or with `pair`, the name of the two rows it lies between, given in both.
+
+    `roll_deg,pitch_deg,yaw_deg` (RotZ(roll) · RotY(pitch) · RotX(yaw)) or `qx,qy,qz,qw`, `target`, `frame`,
+    `sigma_mm` (of the length in the row), `sigma_deg`, `set`, `payload_kg` and `temperature_c` may be. An
+    empty cell is what was not measured.
 
     Args:
         path: the file.
@@ -91,6 +96,13 @@ def _measurements(table: Table, layout: Layout, rows: CheckedRows) -> Measuremen
         split=texts("set") or None,
         payload=single("payload"),
         temperature=single("temperature"),
+        socket=texts("socket") or None,
+        touch_axis=texts("touch_axis") or None,
+        touch=single("touch"),
+        distance=single("distance"),
+        anchor=texts("anchor") or None,
+        anchor_place=numbers(*ANCHOR_PLACE),
+        pair=texts("pair") or None,
         line=tuple(table.lines[row] for row in kept),
         source=table.source,
         left_out=tuple(LeftOut(table.lines[row], faults[row]) for row in sorted(faults)),

@@ -1,14 +1,17 @@
 """Which rows of a measurement file can be used: every cell checked, every fault with its column."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from pisigma.measurement.csv_columns import POSITION, QUATERNION, Column, from_si, quoted, to_si
+from pisigma.measurement.csv_columns import QUATERNION, Column, from_si, quoted, to_si
+from pisigma.measurement.csv_faults import Faults
 from pisigma.measurement.csv_header import Layout
+from pisigma.measurement.csv_lengths import length_cells
 from pisigma.measurement.csv_table import Table
+from pisigma.measurement.lengths import group_faults, row_faults
 from pisigma.robot import Robot, Row
 
 LIMIT_TOLERANCE = 1e-9
@@ -25,20 +28,6 @@ _UNIT_DOUBT = {
     "m": "check the value, and whether these are millimetres in a _m column",
     "mm": "check the value, its unit and how the controller counts",
 }
-
-
-class _Faults:
-    """What is wrong with which row; the first finding of a row stays."""
-
-    def __init__(self, broken: dict[int, str]):
-        self.reasons = {
-            row: f"all columns: no valid CSV ({what}); check the quotes" for row, what in broken.items()
-        }
-
-    def add(self, rows: Bool[np.ndarray, " rows"], describe: Callable[[int], str]) -> None:
-        for row in np.flatnonzero(rows).tolist():
-            if row not in self.reasons:
-                self.reasons[row] = describe(row)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,19 +53,25 @@ def check_rows(table: Table, layout: Layout, robot: Robot | None) -> CheckedRows
         layout: what its header says.
         robot: checks the limits of the joints, where given.
     """
-    faults = _Faults(table.broken)
+    faults = Faults(table.broken)
     cells = _cells(table, faults)
     values = np.stack([_numbers(cells[i], column, faults) for i, column in enumerate(layout.columns)], axis=1)
     _check_texts(cells, layout, faults)
     _check_joints(values, layout, robot, faults)
     with np.errstate(over="ignore"):
-        _check_measured(values, layout, faults)
+        _check_measured(values, cells, layout, faults)
     _check_optional(values, layout, faults)
+    lengths = length_cells(values, cells, layout)
+    for rows, describe in row_faults(lengths):
+        faults.add(rows, describe)
     _check_equal_rows(values, cells, layout, table, faults)
+    lines = [f"line {line}" for line in table.lines]
+    for rows, describe in group_faults(lengths, faults.sound(len(values)), lines.__getitem__):
+        faults.add(rows, describe)
     return CheckedRows(values, cells, faults.reasons)
 
 
-def _cells(table: Table, faults: _Faults) -> list[Sequence[str]]:
+def _cells(table: Table, faults: Faults) -> list[Sequence[str]]:
     """The cells by column; rows of a wrong length are noted and stand there empty."""
     names, wanted = table.header, len(table.header)
     records = table.records
@@ -97,7 +92,7 @@ def _cells(table: Table, faults: _Faults) -> list[Sequence[str]]:
     return list(zip(*records, strict=True))
 
 
-def _numbers(cells: Sequence[str], column: Column, faults: _Faults) -> Float64[np.ndarray, " rows"]:
+def _numbers(cells: Sequence[str], column: Column, faults: Faults) -> Float64[np.ndarray, " rows"]:
     """The values of a column in the file's unit, NaN where a cell is empty (and throughout for a text)."""
     if not column.is_number:
         return np.full(len(cells), np.nan)
@@ -130,7 +125,7 @@ def _number(cell: str) -> float:
         return np.inf
 
 
-def _check_texts(cells: list[Sequence[str]], layout: Layout, faults: _Faults) -> None:
+def _check_texts(cells: list[Sequence[str]], layout: Layout, faults: Faults) -> None:
     """The column set holds train and test only."""
     if "set" in layout.index:
         texts = [cell.strip() for cell in cells[layout.index["set"]]]
@@ -142,7 +137,7 @@ def _check_texts(cells: list[Sequence[str]], layout: Layout, faults: _Faults) ->
         )
 
 
-def _check_joints(values: _Values, layout: Layout, robot: Robot | None, faults: _Faults) -> None:
+def _check_joints(values: _Values, layout: Layout, robot: Robot | None, faults: Faults) -> None:
     """Every joint value is there and within the robot's limits."""
     for number, quantity in enumerate(layout.joints):
         column, q = layout.column(quantity), values[:, layout.index[quantity]]
@@ -151,7 +146,7 @@ def _check_joints(values: _Values, layout: Layout, robot: Robot | None, faults: 
             _check_limits(q, column, robot.joints[number], robot.name, faults)
 
 
-def _check_present(q: Float64[np.ndarray, " rows"], column: Column, faults: _Faults) -> None:
+def _check_present(q: Float64[np.ndarray, " rows"], column: Column, faults: Faults) -> None:
     """One joint has a value in every row."""
     faults.add(
         np.isnan(q), lambda row: f"column '{column.name}': the cell is empty; every row needs all joints"
@@ -159,7 +154,7 @@ def _check_present(q: Float64[np.ndarray, " rows"], column: Column, faults: _Fau
 
 
 def _check_limits(
-    q: Float64[np.ndarray, " rows"], column: Column, joint: Row, robot: str, faults: _Faults
+    q: Float64[np.ndarray, " rows"], column: Column, joint: Row, robot: str, faults: Faults
 ) -> None:
     """The values of one joint are within its limits."""
     q_si = to_si(q, column.unit)
@@ -175,14 +170,19 @@ def _check_limits(
     )
 
 
-def _check_measured(values: _Values, layout: Layout, faults: _Faults) -> None:
-    """Position and orientation are there whole or not at all, and one of them is; quaternions have norm 1."""
+def _check_measured(values: _Values, cells: list[Sequence[str]], layout: Layout, faults: Faults) -> None:
+    """Position and orientation are there whole or not at all, something is; quaternions have norm 1."""
     nothing = np.ones(len(values), dtype=bool)
-    for group in filter(None, (POSITION, layout.orientation)):
+    for quantity in layout.lengths:
+        filled = [bool(cell.strip()) for cell in cells[layout.index[quantity]]]
+        nothing &= ~np.array(filled, dtype=bool)
+    for group in filter(None, (layout.position, layout.orientation)):
         missing = np.isnan(values[:, [layout.index[quantity] for quantity in group]])
         nothing &= missing.all(1)
         _check_whole(missing, [layout.column(quantity) for quantity in group], faults)
-    measured = quoted(layout.column(quantity) for quantity in (*POSITION, *layout.orientation))
+    measured = quoted(
+        layout.column(quantity) for quantity in (*layout.position, *layout.orientation, *layout.lengths)
+    )
     faults.add(
         nothing, lambda row: f"columns {measured}: nothing was measured in this row; remove it or fill them"
     )
@@ -197,7 +197,7 @@ def _check_measured(values: _Values, layout: Layout, faults: _Faults) -> None:
         )
 
 
-def _check_whole(missing: Bool[np.ndarray, "rows group"], columns: list[Column], faults: _Faults) -> None:
+def _check_whole(missing: Bool[np.ndarray, "rows group"], columns: list[Column], faults: Faults) -> None:
     """All cells of a group are filled or none."""
     faults.add(
         np.asarray(missing.any(1) & ~missing.all(1)),
@@ -208,14 +208,14 @@ def _check_whole(missing: Bool[np.ndarray, "rows group"], columns: list[Column],
     )
 
 
-def _check_optional(values: _Values, layout: Layout, faults: _Faults) -> None:
+def _check_optional(values: _Values, layout: Layout, faults: Faults) -> None:
     """Standard deviations are above 0, payloads not below."""
     for quantity in ("sigma_position", "sigma_rotation", "payload"):
         if quantity in layout.index:
             _check_sign(values[:, layout.index[quantity]], layout.column(quantity), faults)
 
 
-def _check_sign(values: Float64[np.ndarray, " rows"], column: Column, faults: _Faults) -> None:
+def _check_sign(values: Float64[np.ndarray, " rows"], column: Column, faults: Faults) -> None:
     """The values of one column are above 0, or not below for a payload."""
     zero_too = column.quantity == "payload"
     wanted = "0 or more" if zero_too else "more than 0"
@@ -233,17 +233,15 @@ def _check_equal_rows(
     cells: list[Sequence[str]],
     layout: Layout,
     table: Table,
-    faults: _Faults,
+    faults: Faults,
 ) -> None:
     """No two rows are equal in all columns; the later one is at fault."""
     texts = [
         [cell.strip() for cell in cells[i]] for i, column in enumerate(layout.columns) if not column.is_number
     ]
     first = first_of_equal_rows(values, texts)
-    sound = np.ones(len(values), dtype=bool)
-    sound[list(faults.reasons)] = False
     faults.add(
-        sound & (first != np.arange(len(values))),
+        faults.sound(len(values)) & (first != np.arange(len(values))),
         lambda row: (
             f"all columns: the row equals line {table.lines[first[row]]}; remove one of them "
             "(a repeated measurement has other readings)"

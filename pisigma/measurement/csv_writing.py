@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, OutputError
-from pisigma.measurement.csv_columns import POSITION, QUATERNION, from_si
+from pisigma.measurement.csv_columns import ANCHOR_PLACE, POSITION, QUATERNION, from_si
 from pisigma.measurement.csv_rows import first_of_equal_rows
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
@@ -89,11 +89,7 @@ def _columns(measurements: Measurements, revolute: tuple[bool, ...]) -> _Columns
     for number, (q, turns) in enumerate(zip(measurements.q.T, revolute, strict=True), start=1):
         unit = "deg" if turns else "mm"
         columns.add(f"q{number}_{unit}", q, unit)
-    position = measurements.position
-    if position is None:
-        position = measurements.q.new_full((measurements.rows, 3), torch.nan)
-    for name, values in zip(POSITION, position.T, strict=True):
-        columns.add(f"{name}_mm", values, "mm")
+    _add_lengths(columns, measurements)
     if measurements.rotation is not None and not measurements.rotation.isnan().all():
         for name, values in zip(QUATERNION, _quaternions(measurements.rotation).T, strict=True):
             columns.add(name, values)
@@ -109,10 +105,30 @@ def _columns(measurements: Measurements, revolute: tuple[bool, ...]) -> _Columns
         ("target", measurements.target),
         ("frame", measurements.frame),
         ("set", measurements.split),
+        ("socket", measurements.socket),
+        ("touch_axis", measurements.touch_axis),
+        ("anchor", measurements.anchor),
+        ("pair", measurements.pair),
     ):
         if texts is not None and any(texts):
             columns.texts[name] = texts
     return columns
+
+
+def _add_lengths(columns: _Columns, measurements: Measurements) -> None:
+    """The measured lengths; the position also where there is none, unless there are others."""
+    position = measurements.position
+    if position is None:
+        position = measurements.q.new_full((measurements.rows, 3), torch.nan)
+    if not position.isnan().all() or not measurements.kinds & {"socket", "touch", "distance"}:
+        for name, values in zip(POSITION, position.T, strict=True):
+            columns.add(f"{name}_mm", values, "mm")
+    for name, lengths in (("touch_mm", measurements.touch), ("distance_mm", measurements.distance)):
+        if lengths is not None and not lengths.isnan().all():
+            columns.add(name, lengths, "mm")
+    if measurements.anchor_place is not None and not measurements.anchor_place.isnan().all():
+        for name, values in zip(ANCHOR_PLACE, measurements.anchor_place.T, strict=True):
+            columns.add(f"{name}_mm", values, "mm")
 
 
 def _quaternions(R: Float64[Tensor, "rows 3 3"]) -> Float64[Tensor, "rows 4"]:
@@ -143,8 +159,10 @@ def _check(measurements: Measurements, columns: _Columns) -> None:
             f"{measurements.source}: holds no row to write; give at least one measurement."
         )
     values = np.stack(list(columns.numbers.values()), axis=1)
-    measured = [name in ("x_mm", QUATERNION[0]) for name in columns.numbers]
-    nothing = np.isnan(values[:, measured]).all(1)
+    something = np.zeros(measurements.rows, dtype=bool)
+    for kind in measurements.kinds:
+        something |= measurements.seen(kind).cpu().numpy()
+    nothing = ~something
     if nothing.any():
         place = measurements.place(int(nothing.argmax()))
         raise MeasurementError(

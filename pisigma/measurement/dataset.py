@@ -6,30 +6,22 @@ import math
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.errors import MeasurementError
+from pisigma.measurement.consistency import NUMBERS, TEXTS, check_parts, row_place
 from pisigma.robot import Robot
 from pisigma.se3 import transform
 
 OnBadRow = Literal["error", "leave_out"]
 
-_SHAPES: dict[str, tuple[int, ...]] = {
-    "position": (3,),
-    "rotation": (3, 3),
-    "sigma_position": (),
-    "sigma_rotation": (),
-    "payload": (),
-    "temperature": (),
-}
-_TEXTS = ("frame", "target", "split")
-_SPLITS = ("train", "test")
-_ROTATION_TOLERANCE = 1e-6
+Kind = Literal["pose", "position", "rotation", "touch", "socket", "distance"]
+"""What a sensor sees in a row; the orientation alone is "rotation", with a position it makes a "pose"."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +41,9 @@ class LeftOut:
 class Measurements:
     """One row a measurement, in SI units.
 
-    What was not measured in a row is NaN there; a column that no row has is None.
+    What was not measured in a row is NaN there, and "" where it is a name; a column that no row has is None.
+    A row holds one length at most: a position, a touch, a socket or a distance. The orientation may stand
+    beside any of them. What a second sensor saw at the same joint values is a second row.
 
     Attributes:
         q: commanded joint values [rad or m], as the controller counts.
@@ -57,11 +51,22 @@ class Measurements:
         rotation: measured rotation of the tool in its frame.
         frame: per row, the frame the sensor measures from; "" where the file names none.
         target: per row, which reflector on the tool was seen; "" where the file names none.
-        sigma_position: per row, standard deviation of a measured coordinate [m], where given.
+        sigma_position: per row, standard deviation of the length that was measured there (of every coordinate
+            of a position) [m], where given.
         sigma_rotation: per row, standard deviation of a measured angle [rad], where given.
         split: per row "train" or "test" (column `set`), where given.
         payload: per row [kg], where given.
         temperature: per row [deg C], where given.
+        socket: per row, the socket that the target's ball sits in; all rows of one share one unknown point.
+        touch_axis: per row, the axis ("x", "y" or "z") of the row's frame along which the target's tip
+            touched.
+        touch: per row, the coordinate at which it touched [m].
+        distance: per row [m], from the anchor to the target, or between the targets of the two rows of a
+            pair, each of which holds it.
+        anchor: per row, the fixed point that the distance is from; its rows share one place and one zero
+            offset.
+        anchor_place: per row, the place of the anchor in the row's frame [m], where it is known.
+        pair: per row, the pair that it belongs to; a pair has exactly two rows, in one frame.
         line: per row, the line in the file it came from (0 where it came from none).
         source: the file, or what made the rows.
         left_out: rows of the file that are not here, and why.
@@ -80,6 +85,13 @@ class Measurements:
     split: tuple[str, ...] | None = None
     payload: Float64[Tensor, " rows"] | None = None
     temperature: Float64[Tensor, " rows"] | None = None
+    socket: tuple[str, ...] | None = None
+    touch_axis: tuple[str, ...] | None = None
+    touch: Float64[Tensor, " rows"] | None = None
+    distance: Float64[Tensor, " rows"] | None = None
+    anchor: tuple[str, ...] | None = None
+    anchor_place: Float64[Tensor, "rows 3"] | None = None
+    pair: tuple[str, ...] | None = None
     line: tuple[int, ...] = ()
     source: str = "memory"
     left_out: tuple[LeftOut, ...] = ()
@@ -94,75 +106,10 @@ class Measurements:
             object.__setattr__(self, name, tuple(getattr(self, name)) or (default,) * self.rows)
         if self.split is not None:
             object.__setattr__(self, "split", tuple(self.split))
-        self._check_shapes()
-        self._refuse(~torch.isfinite(self.q).all(-1), "q", "is not finite; give every joint value")
-        self._check_values()
-        self._check_split()
-
-    def _check_shapes(self) -> None:
-        """One row per measurement, float64, on one device."""
-        for name, shape in {"q": (self.dof,), **_SHAPES}.items():
-            values = getattr(self, name)
-            if values is None:
-                continue
-            if tuple(values.shape) != (self.rows, *shape):
-                raise MeasurementError(
-                    f"{self.source}: '{name}' of shape {(self.rows, *shape)} was wanted for {self.rows} "
-                    f"rows, got {tuple(values.shape)}."
-                )
-            if values.dtype != torch.float64:
-                raise MeasurementError(
-                    f"{self.source}: '{name}' in float64 was wanted, got {values.dtype}; convert it."
-                )
-            if values.device != self.q.device:
-                raise MeasurementError(
-                    f"{self.source}: '{name}' is on {values.device}, but q is on {self.q.device}; move it "
-                    "there."
-                )
-        for name in (*_TEXTS, "line"):
-            texts = getattr(self, name)
-            if texts is not None and len(texts) != self.rows:
-                raise MeasurementError(
-                    f"{self.source}: '{name}' has {len(texts)} entries for {self.rows} rows."
-                )
-
-    def _check_values(self) -> None:
-        """What is not NaN is finite and can be; a position or a rotation is there whole or not at all."""
-        for name in _SHAPES:
-            values = getattr(self, name)
-            if values is None:
-                continue
-            flat = values.reshape(self.rows, math.prod(_SHAPES[name]))
-            missing = torch.isnan(flat)
-            self._refuse(torch.isinf(flat).any(-1), name, "is infinite; give NaN where nothing was measured")
-            self._refuse(missing.any(-1) & ~missing.all(-1), name, "is NaN in part; give all of it or none")
-            if name.startswith("sigma"):
-                self._refuse(flat[:, 0] <= 0, name, "is not above 0; give a standard deviation or NaN")
-        if self.payload is not None:
-            self._refuse(self.payload < 0, "payload", "is below 0; give a mass or NaN")
-        if self.rotation is not None:
-            R = self.rotation
-            deviation = (R.mT @ R - torch.eye(3, dtype=R.dtype, device=R.device)).abs().amax((-1, -2))
-            left_handed = (torch.linalg.cross(R[..., 0], R[..., 1]) * R[..., 2]).sum(-1) < 0
-            self._refuse(deviation > _ROTATION_TOLERANCE, "rotation", "is not orthonormal; normalise it")
-            self._refuse(
-                left_handed, "rotation", "is left-handed; a reflection is no rotation, check its axes"
-            )
-
-    def _check_split(self) -> None:
-        """Nothing but train and test."""
-        for row, name in enumerate(self.split or ()):
-            if name not in _SPLITS:
-                raise MeasurementError(
-                    f"{self.place(row)}: split '{name}' is unknown; {nearest_choice(name, _SPLITS)}"
-                )
-
-    def _refuse(self, bad: Bool[Tensor, " rows"], name: str, what: str) -> None:
-        """Raise for the first bad row, if there is one."""
-        if bad.any():
-            row = int(bad.nonzero()[0])
-            value = getattr(self, name)[row].tolist()
-            raise MeasurementError(f"{self.place(row)}: {name} {value} {what}.")
+        for name in ("socket", "touch_axis", "anchor", "pair"):
+            names = getattr(self, name) or ()
+            object.__setattr__(self, name, tuple(names) if any(names) else None)
+        check_parts({item.name: getattr(self, item.name) for item in fields(self)})
 
     @property
     def rows(self) -> int:
@@ -174,10 +121,32 @@ class Measurements:
         """Number of joints."""
         return self.q.shape[1]
 
+    def seen(self, kind: Kind) -> Bool[Tensor, " rows"]:
+        """For every row, whether it holds a measurement of a kind.
+
+        A row with position and orientation is of the kind "pose" and of no other.
+        """
+        if kind == "socket":
+            names = self.socket or ("",) * self.rows
+            return torch.tensor([bool(name) for name in names], dtype=torch.bool, device=self.q.device)
+        if kind in ("touch", "distance"):
+            return self._there(self.touch if kind == "touch" else self.distance)
+        position, rotation = self._there(self.position), self._there(self.rotation)
+        return {
+            "pose": position & rotation,
+            "position": position & ~rotation,
+            "rotation": rotation & ~position,
+        }[kind]
+
+    def _there(self, values: Tensor | None) -> Bool[Tensor, " rows"]:
+        if values is None:
+            return torch.zeros(self.rows, dtype=torch.bool, device=self.q.device)
+        return torch.isfinite(values.reshape(self.rows, math.prod(values.shape[1:]))).all(-1)
+
     @property
-    def kind(self) -> Literal["pose", "position"]:
-        """What the sensor saw: "pose" where there are rotations, else "position"."""
-        return "position" if self.rotation is None else "pose"
+    def kinds(self) -> frozenset[Kind]:
+        """What was measured in any of the rows; empty where nothing was."""
+        return frozenset(kind for kind in get_args(Kind) if bool(self.seen(kind).any()))
 
     @property
     def T(self) -> Float64[Tensor, "rows 4 4"]:
@@ -196,8 +165,7 @@ class Measurements:
 
     def place(self, row: int) -> str:
         """Where a row is from, as complaints say it: file and line, or source and row counted from 0."""
-        line = self.line[row] if len(self.line) == self.rows else 0
-        return f"{self.source}, line {line}" if line else f"{self.source}, row {row}"
+        return row_place(self.source, self.line, row)
 
     def select(self, index: Tensor) -> "Measurements":
         """The rows of an index, in its order, or of a mask, with everything that belongs to them.
@@ -206,7 +174,7 @@ class Measurements:
             index: int64 numbers of rows, or one bool per row.
 
         Raises:
-            MeasurementError: the index is outside the rows, or the mask has another length.
+            MeasurementError: the index is outside the rows, the mask has another length, or a pair is parted.
         """
         if index.ndim != 1 or index.dtype not in (torch.int64, torch.bool):
             raise MeasurementError(
@@ -226,7 +194,7 @@ class Measurements:
             )
         chosen: dict[str, Any] = {}
         places = index.tolist()
-        for name in ("q", *_SHAPES, *_TEXTS, "line"):
+        for name in ("q", *NUMBERS, *TEXTS, "line"):
             values = getattr(self, name)
             if isinstance(values, Tensor):
                 chosen[name] = values[index]

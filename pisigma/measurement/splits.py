@@ -1,4 +1,4 @@
-"""Parting measurements into training and test; rows of equal joint values always stay together."""
+"""Parting measurements into training and test; rows of equal joint values, and of a pair, stay together."""
 
 import heapq
 from typing import Literal
@@ -9,29 +9,14 @@ from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import groups_of_equal_joints as groups_of_equal_joints
+from pisigma.measurement.groups import groups_to_keep_whole
 
 SplitBy = Literal["joints", "time", "space"]
 """By joints: at random; by time: blocks of the file's order; by space: blocks of the measured positions."""
 
 TrainTest = tuple[Int64[Tensor, " _train"], Int64[Tensor, " _test"]]
 """Rows to train on and rows to test on, each in the order of the measurements."""
-
-
-def groups_of_equal_joints(q: Float64[Tensor, "rows dof"]) -> Int64[Tensor, " rows"]:
-    """Number the different joint vectors in the order of their first row.
-
-    Args:
-        q: joint values [rad or m]; two rows belong together where they are exactly equal.
-
-    Returns:
-        For every row the number of its group, from 0.
-    """
-    if q.shape[0] == 0:
-        return torch.zeros(0, dtype=torch.int64, device=q.device)
-    values, group = torch.unique(q + 0.0, dim=0, return_inverse=True)  # -0.0 becomes 0.0
-    rows = torch.arange(q.shape[0], device=q.device)
-    first = torch.full((values.shape[0],), q.shape[0], device=q.device).scatter_reduce(0, group, rows, "amin")
-    return first.argsort().argsort()[group]
 
 
 def k_folds(
@@ -54,7 +39,7 @@ def k_folds(
         MeasurementError: there are fewer different joint vectors than folds, or positions that are needed
             are not there.
     """
-    group = groups_of_equal_joints(measurements.q).cpu()
+    group = groups_to_keep_whole(measurements).cpu()
     sizes = torch.bincount(group)
     if folds < 2 or folds > len(sizes):
         raise MeasurementError(
@@ -90,7 +75,7 @@ def holdout(
         raise MeasurementError(
             f"{measurements.source}: a test share between 0 and 1 was wanted, got {share:g}."
         )
-    group = groups_of_equal_joints(measurements.q).cpu()
+    group = groups_to_keep_whole(measurements).cpu()
     sizes = torch.bincount(group)
     if len(sizes) < 2:
         raise MeasurementError(

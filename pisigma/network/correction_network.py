@@ -42,8 +42,8 @@ class CorrectionNetwork(nn.Module):
         for group, network in zip(groups, networks, strict=True):
             if (network.inputs, network.outputs) != (len(group.inputs.names), len(group.joints)):
                 raise ValueError(
-                    f"a group of {len(group.joints)} joints and {len(group.inputs.names)} inputs was given a network "
-                    f"of {network.outputs} outputs and {network.inputs} inputs."
+                    f"a group of {len(group.joints)} joints and {len(group.inputs.names)} inputs was given a "
+                    f"network of {network.outputs} outputs and {network.inputs} inputs."
                 )
         self.dof = dof
         self.groups = tuple(groups)

@@ -33,10 +33,32 @@ def energy_gradient(
     """
     weighted = weigh_sums(x, network.weight.detach(), network.bias.detach(), network.fixed)
     difference = d - sum_of_products(weighted, network.orders)
-    by_sum = -difference[..., None] * products_of_others(weighted, network.orders) * network.fixed
-    flat = by_sum.reshape(x.shape[0], -1)
-    by_weight = (flat.mT @ x).reshape(network.weight.shape)
-    return difference.square().sum(0) / 2, by_weight, by_sum.sum(0)
+    by_weight, by_bias = pull_back(-difference, x, weighted, network.fixed, network.orders)
+    return difference.square().sum(0) / 2, by_weight, by_bias
+
+
+def pull_back(
+    by_output: Float[Tensor, "patterns *models"],
+    x: Float[Tensor, "patterns inputs"],
+    weighted: Float[Tensor, "patterns *models units"],
+    fixed: Float[Tensor, "*models units"],
+    orders: Sequence[int],
+) -> tuple[Float[Tensor, "*models units inputs"], Float[Tensor, "*models units"]]:
+    """Carry derivatives by the outputs back to the weights and biases, summed over the patterns.
+
+    Args:
+        by_output: derivative of anything by every output of every pattern.
+        x: scaled inputs.
+        weighted: `W_j h_j` of the summing units, as `weigh_sums` gives them.
+        fixed: the fixed weights W.
+        orders: number of summing units of every product unit.
+
+    Returns:
+        The derivative by the weights, and by the biases: `J^T by_output` without forming J.
+    """
+    by_sum = by_output[..., None] * products_of_others(weighted, orders) * fixed
+    by_weight = by_sum.reshape(x.shape[0], -1).mT @ x
+    return by_weight.reshape(*by_sum.shape[1:], x.shape[-1]), by_sum.sum(0)
 
 
 def output_jacobian(

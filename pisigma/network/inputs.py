@@ -14,7 +14,7 @@ from pisigma.robot.description import Robot
 from pisigma.se3 import rpy_from_rotation
 
 POSE_INPUTS = ("x", "y", "z", "roll", "pitch", "yaw")
-"""Coordinates of the pose: x, y, z [m] and the angles [rad] of the rotation seen from the reference orientation."""
+"""Coordinates of the pose: x, y, z [m] and angles [rad] of the rotation seen from the reference."""
 
 _FUNCTION = re.compile(r"^(sin|cos)\((.+)\)$")
 
@@ -23,9 +23,9 @@ _FUNCTION = re.compile(r"^(sin|cos)\((.+)\)$")
 class Inputs:
     """A named choice of inputs for one robot.
 
-    A name is a coordinate of the pose (`x`, `y`, `z`, `roll`, `pitch`, `yaw`), a joint (`theta_1`: its nominal value
-    [rad or m]), or `sin(...)` and `cos(...)` of a sum of joints (`sin(theta_1)`, `cos(theta_2 + theta_3)`,
-    `sin(theta_5 - theta_4)`).
+    A name is a coordinate of the pose (`x`, `y`, `z`, `roll`, `pitch`, `yaw`), a joint (`theta_1`: its
+    nominal value [rad or m]), or `sin(...)` and `cos(...)` of a sum of revolute joints (`sin(theta_1)`,
+    `cos(theta_2 + theta_3)`, `sin(theta_5 - theta_4)`).
 
     Attributes:
         names: the inputs in order.
@@ -44,14 +44,27 @@ class Inputs:
         """Choose inputs for a robot.
 
         Raises:
-            RecipeError: a name is none of those above; the message lists the valid ones.
+            RecipeError: a name is none of those above (the message lists the valid ones), two mean the same,
+                or one is a sine or cosine of a length.
         """
         joints = tuple(joint.name for joint in robot.joints)
         chosen = Inputs(tuple(names), joints, np.eye(3) if reference is None else reference)
+        meanings: dict[tuple[str, tuple[float, ...]], str] = {}
         for name in names:
-            chosen._combination(name)
-        if len(set(names)) != len(names):
-            raise RecipeError(f"the inputs {', '.join(names)} hold a name twice; name each once.")
+            if name in POSE_INPUTS and name in joints:
+                raise RecipeError(
+                    f"the network input '{name}' is a coordinate of the pose and a joint of robot "
+                    f"'{robot.name}'; rename the joint."
+                )
+            function, factors = chosen._combination(name)
+            meaning = (function if factors else name, tuple(factors))
+            if meaning in meanings:
+                raise RecipeError(
+                    f"the network inputs '{meanings[meaning]}' and '{name}' are the same; leave one out."
+                )
+            meanings[meaning] = name
+            if function:
+                _check_angle(robot, name, factors)
         return chosen
 
     def __call__(
@@ -79,22 +92,47 @@ class Inputs:
         return torch.stack(columns, -1)
 
     def _combination(self, name: str) -> tuple[str, list[float]]:
-        """Function ("" for none) and the factor of every joint in its argument."""
+        """Function ("" for none) and the factor of every joint in its argument; none for a coordinate."""
         if name in POSE_INPUTS:
             return "", []
-        match = _FUNCTION.match(name)
-        function, argument = match.groups() if match else ("", name)
         factors = [0.0] * len(self.joint_names)
-        terms = re.findall(r"([+-]?)\s*([^\s+-]+)", argument)
-        if not terms or (not match and argument not in self.joint_names):
+        if name in self.joint_names:
+            factors[self.joint_names.index(name)] = 1.0
+            return "", factors
+        match = _FUNCTION.match(name)
+        if not match:
             raise RecipeError(self._unknown(name))
-        for sign, term in terms:
-            if term not in self.joint_names:
-                raise RecipeError(self._unknown(name))
+        function, argument = match.groups()
+        for sign, term in self._terms(argument, name):
             factors[self.joint_names.index(term)] += -1.0 if sign == "-" else 1.0
         return function, factors
+
+    def _terms(self, argument: str, name: str) -> list[tuple[str, str]]:
+        """Sign ("+", "-" or "") and joint of every term of a sum; nothing may be left over between them."""
+        joints = "|".join(re.escape(joint) for joint in sorted(self.joint_names, key=len, reverse=True))
+        term = rf"\s*({{sign}})\s*({joints})\s*"
+        rest = argument
+        terms: list[tuple[str, str]] = []
+        while match := re.match(term.format(sign="[+-]" if terms else "[+-]?"), rest):
+            terms.append((match[1], match[2]))
+            rest = rest[match.end() :]
+        if rest or not terms:
+            raise RecipeError(self._unknown(name))
+        return terms
 
     def _unknown(self, name: str) -> str:
         functions = [f"{f}({joint})" for f in ("sin", "cos") for joint in self.joint_names]
         choices = [*POSE_INPUTS, *self.joint_names, *functions]
         return f"unknown network input '{name}'; {nearest_choice(name, choices)}"
+
+
+def _check_angle(robot: Robot, name: str, factors: Sequence[float]) -> None:
+    """Refuse a sine or cosine of a length, or of nothing."""
+    for joint, factor in zip(robot.joints, factors, strict=True):
+        if factor and joint.type == "prismatic":
+            raise RecipeError(
+                f"the network input '{name}' takes a function of prismatic joint '{joint.name}', which is "
+                f"a length; use '{joint.name}' itself."
+            )
+    if not any(factors):
+        raise RecipeError(f"the network input '{name}' is the same for all joint values; leave it out.")

@@ -15,9 +15,9 @@ class PiSigma(nn.Module):
         h_kj = b_kj + Σ_i w_kji x_i                                (Jeong et al. 1998, eq. 1, with a bias)
         y_k  = Σ_u Π_{j in unit u} W_kj h_kj                       (eq. 2; one unit in the paper)
 
-    One unit is a Pi-Sigma network; several units of rising order are a ridge polynomial network (Shin and Ghosh
-    1995). The weights W between the summing units and the products are fixed: a buffer, never a parameter. Nothing is
-    shared between outputs, so every output can be trained on its own.
+    One unit is a Pi-Sigma network; several units of rising order are a ridge polynomial network (Shin and
+    Ghosh 1995). The weights W between the summing units and the products are fixed: a buffer, never a
+    parameter. Nothing is shared between outputs, so every output can be trained on its own.
 
     Scaling is part of the network: `forward` takes and gives plain values.
 
@@ -91,8 +91,8 @@ class PiSigma(nn.Module):
     def initialise(self, spread: float, generator: torch.Generator) -> None:
         """Draw the weights from ±spread and the biases from 1 ± spread, both uniformly.
 
-        Every product then starts near the product of its fixed weights. Near 0 it would stall: the gradient of a
-        product by one factor is the product of the others.
+        Every product then starts near the product of its fixed weights. Near 0 it would stall: the gradient
+        of a product by one factor is the product of the others.
         """
         for parameter, centre in ((self.weight, 0.0), (self.bias, 1.0)):
             parameter.copy_(centre + draw_uniform(parameter, spread, generator))
@@ -115,7 +115,7 @@ class PiSigma(nn.Module):
 
 
 def draw_uniform(like: Tensor, spread: float, generator: torch.Generator) -> Tensor:
-    """Numbers uniform in ±spread with the shape of `like`, drawn in float64 so that every dtype starts alike."""
+    """Numbers uniform in ±spread, shaped as `like`, drawn in float64 so that every dtype starts alike."""
     drawn = torch.rand(like.shape, generator=generator, dtype=torch.float64, device=generator.device)
     return (spread * (2 * drawn - 1)).to(like)
 
@@ -132,10 +132,12 @@ def weigh_sums(
     return sums * fixed
 
 
-def sum_of_products(weighted: Float[Tensor, "*batch units"], orders: Sequence[int]) -> Float[Tensor, "*batch"]:
+def sum_of_products(
+    weighted: Float[Tensor, "*batch units"], orders: Sequence[int]
+) -> Float[Tensor, "*batch"]:
     """Sum over the product units (eq. 2) of summing units that lie one unit after the other."""
     total: Tensor | None = None
-    for unit in weighted.split(list(orders), dim=-1):
+    for unit in torch.split(weighted, list(orders), dim=-1):
         factors = unit.unbind(-1)
         value = factors[0]
         for factor in factors[1:]:
@@ -153,7 +155,7 @@ def products_of_others(
     This is `Π_{i≠j} W_ki h_i` in the derivative of eq. (4).
     """
     columns: list[Tensor] = []
-    for unit in weighted.split(list(orders), dim=-1):
+    for unit in torch.split(weighted, list(orders), dim=-1):
         factors = unit.unbind(-1)
         ones = torch.ones_like(factors[0])
         before, after = [ones], [ones]

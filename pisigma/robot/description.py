@@ -2,12 +2,12 @@
 
 import os
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.errors import PoseError, RobotError
+from pisigma.errors import PoseError, RobotError, nearest_choice
 
 JointType = Literal["revolute", "prismatic", "fixed"]
 
@@ -65,23 +65,36 @@ class Robot:
 
     def __post_init__(self) -> None:
         """Check that the parts fit together and make the arrays read-only."""
-        if self.dh.shape != (len(self.rows), 5):
-            raise RobotError(f"robot '{self.name}': {len(self.rows)} DH rows were wanted, got {self.dh.shape[0]}.")
-        for name in ("dh", "base", "tool"):
+        for name, shape in (("dh", (len(self.rows), 5)), ("base", (6,)), ("tool", (6,))):
             values = np.array(getattr(self, name), dtype=np.float64)
+            if values.shape != shape:
+                raise RobotError(
+                    f"robot '{self.name}': {name} of shape {shape} was wanted, got {values.shape}."
+                )
             if not np.isfinite(values).all():
                 raise RobotError(f"robot '{self.name}': {name} has an entry that is not finite; correct it.")
             values.setflags(write=False)
             object.__setattr__(self, name, values)
         if self.dof == 0:
-            raise RobotError(f"robot '{self.name}': it has no joint that moves; add a revolute or prismatic one.")
+            raise RobotError(
+                f"robot '{self.name}': it has no joint that moves; add a revolute or prismatic one."
+            )
         names = [row.name for row in self.rows]
         twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
-            raise RobotError(f"robot '{self.name}': the row name '{twice[0]}' stands twice; names must differ.")
+            raise RobotError(
+                f"robot '{self.name}': the row name '{twice[0]}' stands twice; names must differ."
+            )
         for row in self.rows:
+            if row.type not in get_args(JointType):
+                raise RobotError(
+                    f"robot '{self.name}', row '{row.name}': the type cannot be '{row.type}'; "
+                    f"{nearest_choice(row.type, get_args(JointType))}"
+                )
             if row.direction not in (1, -1):
-                raise RobotError(f"robot '{self.name}', row '{row.name}': direction is +1 or -1, got {row.direction}.")
+                raise RobotError(
+                    f"robot '{self.name}', row '{row.name}': direction is +1 or -1, got {row.direction}."
+                )
             if not row.lower < row.upper:
                 raise RobotError(
                     f"robot '{self.name}', row '{row.name}': the lower limit {row.lower:g} is not below "
@@ -167,5 +180,6 @@ class Robot:
         if count != self.dof:
             names = ", ".join(joint.name for joint in self.joints)
             raise PoseError(
-                f"robot '{self.name}' has {self.dof} joints ({names}), but the joint values have {count} columns."
+                f"robot '{self.name}' has {self.dof} joints ({names}), but the joint values have {count} "
+                "columns; give one per joint."
             )

@@ -13,7 +13,9 @@ from pisigma.yaml_file import parse_yaml, read_yaml
 def catalogue() -> tuple[str, ...]:
     """Names of the robots that come with pisigma, sorted."""
     folder = resources.files("pisigma.robot") / "catalogue"
-    return tuple(sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml")))
+    return tuple(
+        sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    )
 
 
 def load_robot(robot: str | os.PathLike[str]) -> Robot:

@@ -36,6 +36,12 @@ class RowSection(Section):
         }[self.type]
         if wrong:
             raise ValueError(f"row '{self.name}' is {self.type} and cannot have {wrong}; remove it")
+        limits = self.limits_deg or self.limits_mm
+        if limits and not limits[0] < limits[1]:
+            raise ValueError(
+                f"the lower limit {limits[0]:g} of row '{self.name}' is not below its upper limit "
+                f"{limits[1]:g}; swap or correct them"
+            )
         return self
 
     def to_row(self) -> Row:
@@ -75,6 +81,15 @@ class RobotDocument(Section):
     base: FrameSection = FrameSection()
     tool: FrameSection = FrameSection()
 
+    @model_validator(mode="after")
+    def _rows_fit_together(self) -> "RobotDocument":
+        names = [row.name for row in self.rows]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"the row name '{twice[0]}' stands twice in rows; names must differ")
+        if all(row.type == "fixed" for row in self.rows):
+            raise ValueError("no row moves; add a revolute or prismatic one")
+        return self
+
     def to_robot(self) -> Robot:
         """The robot in SI units.
 
@@ -103,7 +118,11 @@ class RobotDocument(Section):
 
 
 def robot_to_yaml(robot: Robot) -> str:
-    """The robot as YAML text that `RobotDocument` reads back; floats keep every digit they need."""
+    """The robot as YAML text that `RobotDocument` reads back, equal to within the rounding of the units.
+
+    Raises:
+        RobotError: a row has one limit only, which a file cannot hold.
+    """
     rows = []
     for row, parameters in zip(robot.rows, robot.dh, strict=True):
         entry: dict[str, object] = {"name": row.name, "type": row.type, "direction": row.direction}
@@ -111,7 +130,12 @@ def robot_to_yaml(robot: Robot) -> str:
         for name, value in zip(DH_COLUMNS, parameters, strict=True):
             entry |= _in_file_units(name, float(value), length=name in ("d", "a"))
         rows.append(entry)
-    document = {"name": robot.name, "maker": robot.maker, "source": robot.source, "rows": rows}
+    document: dict[str, object] = {
+        "name": robot.name,
+        "maker": robot.maker,
+        "source": robot.source,
+        "rows": rows,
+    }
     for frame in ("base", "tool"):
         values = getattr(robot, frame)
         section: dict[str, float] = {}

@@ -5,11 +5,14 @@ from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float64
-from pydantic import Field, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat
 from torch import Tensor
 
-from pisigma.errors import RecipeError, nearest_choice
+from pisigma.errors import RecipeError
 from pisigma.yaml_file import Section
+
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+Epochs = Annotated[int, Field(ge=1, le=1_000_000)]
 
 
 class GradientDescentSection(Section):
@@ -24,8 +27,8 @@ class GradientDescentSection(Section):
 
     method: Literal["gradient_descent"]
     learning_rate: dict[str, PositiveFloat]
-    epochs: PositiveInt = 3000
-    seed: int = 0
+    epochs: Epochs = 3000
+    seed: Seed = 0
     spread: PositiveFloat = 0.3
 
     def rates(self, joints: Sequence[str]) -> Float64[Tensor, " outputs"]:
@@ -36,8 +39,10 @@ class GradientDescentSection(Section):
         """
         for joint in joints:
             if joint not in self.learning_rate:
-                hint = nearest_choice(joint, self.learning_rate)
-                raise RecipeError(f"fit.learning_rate has no rate for joint '{joint}'; add one. Given: {hint}")
+                given = ", ".join(sorted(self.learning_rate)) or "none"
+                raise RecipeError(
+                    f"'fit.learning_rate' has no rate for joint '{joint}'; add one to those given ({given})."
+                )
         return torch.tensor([self.learning_rate[joint] for joint in joints], dtype=torch.float64)
 
 
@@ -54,11 +59,11 @@ class LevenbergMarquardtSection(Section):
     """
 
     method: Literal["levenberg_marquardt"]
-    epochs: PositiveInt = 100
-    starts: PositiveInt = 8
+    epochs: Epochs = 300
+    starts: Annotated[int, Field(ge=1, le=1000)] = 8
     validation_share: Annotated[float, Field(ge=0, lt=0.9)] = 0.2
     ridge: Annotated[float, Field(ge=0)] = 0.0
-    seed: int = 0
+    seed: Seed = 0
     spread: PositiveFloat = 0.3
 
 

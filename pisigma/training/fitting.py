@@ -1,6 +1,8 @@
 """Running a training with Lightning: checkpoints, resuming, quiet on stdout."""
 
 import logging
+import signal
+import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -10,20 +12,23 @@ from pathlib import Path
 import lightning
 import torch
 from jaxtyping import Float
-from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
 
 from pisigma.errors import TrainingError
 from pisigma.network.pi_sigma import PiSigma
+from pisigma.training.checkpoint_writer import CheckpointWriter
+from pisigma.training.checkpoints import find_checkpoint, prepare_checkpoints
 from pisigma.training.fit_sections import FitSection
 from pisigma.training.levenberg_marquardt import Patterns
 from pisigma.training.lightning_module import PatternData, PiSigmaTraining
 from pisigma.training.progress import EnergyProgress
 
-CHECKPOINTS = 20
-"""How often a whole training is saved."""
-
-_CHECKPOINT = "last.ckpt"
+_HARMLESS = (
+    "does not have many workers",
+    "will run with no optimizer",
+    "isinstance.treespec",
+    "Trainer already configured",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,41 +72,54 @@ def fit_networks(
         show_progress: draw a bar on stderr.
 
     Raises:
-        TrainingError: the training diverged, or there is no checkpoint of this recipe and data to resume from.
+        TrainingError: a pattern is not finite, the training diverged, or there is no checkpoint of this
+        recipe
+            and data to resume from.
+        OutputError: checkpoints cannot be written.
     """
-    logging.getLogger("lightning.pytorch").setLevel(logging.ERROR)
+    _check_finite(patterns, labels)
     module = PiSigmaTraining(networks, fit, labels)
+    module.fingerprint = fingerprint
     callbacks: list[lightning.Callback] = [EnergyProgress(title)] if show_progress else []
     start, checkpoint = 0, None
     if checkpoints is not None:
         if resume:
-            checkpoint, start = _find_checkpoint(checkpoints, fingerprint)
-        callbacks.append(_checkpointing(checkpoints, fit.epochs))
-        module.fingerprint = fingerprint
-    with _one_thread(), warnings.catch_warnings():
-        for harmless in (".*does not have many workers.*", ".*will run with no optimizer.*", ".*isinstance.treespec.*",
-                         ".*exists and is not empty.*", ".*Trainer already configured.*"):
-            warnings.filterwarnings("ignore", harmless)
+            checkpoint, start = find_checkpoint(checkpoints, fingerprint)
+        else:
+            prepare_checkpoints(checkpoints)
+        callbacks.append(CheckpointWriter(checkpoints, fit.epochs))
+    with _one_thread(), _quiet(), _keyboard_interrupts():
         trainer = lightning.Trainer(
             max_epochs=fit.epochs,
             accelerator="cpu",
             devices=1,
             logger=False,
             callbacks=callbacks,
-            enable_checkpointing=checkpoints is not None,
+            enable_checkpointing=False,
             enable_progress_bar=False,
             enable_model_summary=False,
             use_distributed_sampler=False,
         )
         trainer.fit(module, datamodule=PatternData(patterns), ckpt_path=checkpoint)
-    if trainer.interrupted:
-        raise KeyboardInterrupt
+        if trainer.interrupted:
+            raise KeyboardInterrupt
+    module.write_networks()
     return TrainingHistory(tuple(module.labels), module.history, start)
+
+
+def _check_finite(patterns: Sequence[Patterns], labels: Sequence[Sequence[str]]) -> None:
+    for part, names in zip(patterns, labels, strict=True):
+        for values in (part.x, part.d):
+            if not torch.isfinite(values).all():
+                row = int((~torch.isfinite(values)).nonzero()[0, 0])
+                raise TrainingError(
+                    f"pattern {row} (counted from 0) of {', '.join(names)} is not finite; leave that row out."
+                )
 
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Compute on one thread: on a hundred patterns, handing work to a second one costs more than the work."""
+    """Compute on one thread: on a hundred patterns, a second one costs more than it does."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -110,26 +128,33 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(threads)
 
 
-def _checkpointing(folder: Path, epochs: int) -> ModelCheckpoint:
-    return ModelCheckpoint(
-        dirpath=folder,
-        filename="epoch",
-        save_last=True,
-        save_top_k=1,
-        every_n_epochs=max(1, epochs // CHECKPOINTS),
-        enable_version_counter=False,
-        save_on_train_epoch_end=True,
-    )
+@contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Lightning's hints and warnings about what we do on purpose to ourselves."""
+    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
+    levels = [logger.level for logger in loggers]
+    for logger in loggers:
+        logger.setLevel(logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            for harmless in _HARMLESS:
+                warnings.filterwarnings("ignore", f".*{harmless}.*")
+            yield
+    finally:
+        for logger, level in zip(loggers, levels, strict=True):
+            logger.setLevel(level)
 
 
-def _find_checkpoint(folder: Path, fingerprint: str) -> tuple[Path, int]:
-    path = folder / _CHECKPOINT
-    if not path.is_file():
-        raise TrainingError(f"{folder}: there is no interrupted training to resume; run the same command without --resume.")
-    state = torch.load(path, map_location="cpu", weights_only=True)
-    if state.get("pisigma_fingerprint") != fingerprint:
-        raise TrainingError(
-            f"{folder}: the interrupted training there is of another recipe or other data; "
-            "run without --resume to start afresh, or choose another --out."
-        )
-    return path, int(state["epoch"]) + 1
+@contextmanager
+def _keyboard_interrupts() -> Iterator[None]:
+    """Let Ctrl-C arrive as `KeyboardInterrupt`: Lightning exits with status 1 and ignores all later ones."""
+    handler = signal.getsignal(signal.SIGINT)
+    try:
+        yield
+    except SystemExit as problem:
+        if isinstance(problem.__context__, KeyboardInterrupt):
+            raise KeyboardInterrupt from None
+        raise
+    finally:
+        if threading.current_thread() is threading.main_thread() and handler is not None:
+            signal.signal(signal.SIGINT, handler)

@@ -14,8 +14,10 @@ from pisigma.network.pi_sigma import PiSigma
 class GradientDescent(torch.optim.Optimizer):
     """`Δw = -η ∂E/∂w` with a learning rate η per output (Jeong et al. 1998, eq. 4); no momentum, no state."""
 
-    def __init__(self, networks: Sequence[PiSigma], learning_rates: Sequence[Float[Tensor, " outputs"]]) -> None:
-        """Take the weights and biases of networks, each with one rate per output; fixed weights are never seen."""
+    def __init__(
+        self, networks: Sequence[PiSigma], learning_rates: Sequence[Float[Tensor, " outputs"]]
+    ) -> None:
+        """Take weights and biases of networks, with one rate per output; fixed weights are never seen."""
         groups = [
             {"params": [network.weight, network.bias], "rates": rates}
             for network, rates in zip(networks, learning_rates, strict=True)

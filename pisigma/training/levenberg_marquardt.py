@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt training of Pi-Sigma networks: every output a small problem of its own, many at once."""
+"""Levenberg-Marquardt training of Pi-Sigma networks: every output a small problem, many at once."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,13 +7,26 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
-from pisigma.network.energy import output_jacobian
+from pisigma.network.energy import energy, output_jacobian, pull_back
 from pisigma.network.pi_sigma import PiSigma, draw_uniform, sum_of_products, weigh_sums
 
 DAMPING_START = 1e-2
 DAMPING_RANGE = (1e-14, 1e10)
-CONVERGED = 1e-12
-"""A problem has converged when an accepted step lowers its cost by less than this share."""
+DAMPING_FALL, DAMPING_RISE = 0.2, 3.0
+
+WINDOW = 5
+"""Iterations after which progress is judged."""
+CONVERGED_SHARE = 0.02
+"""A problem has converged when a window lowers its cost by less than this share, ..."""
+CONVERGED_COST = 1e-11
+"""... or by less than this: an RMS of 4e-6 of the width of the targets, in the scaling of `build_network`."""
+
+_PROBE = 0.1
+"""Share of a step at which the curvature along it is probed."""
+_BEND = 0.75
+"""Largest ratio of twice the bend of a step to the step."""
+_CHUNK = 8_000_000
+"""Largest number of Jacobian entries that are in memory at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,39 +36,48 @@ class Patterns:
     Attributes:
         x: scaled inputs.
         d: scaled targets.
-        weight: weight of every pattern, 0 to leave it out.
         validation: patterns that choose between starts and are not fitted.
     """
 
     x: Float[Tensor, "patterns inputs"]
     d: Float[Tensor, "patterns outputs"]
-    weight: Float[Tensor, " patterns"]
     validation: Bool[Tensor, " patterns"]
 
 
 class LevenbergMarquardt(nn.Module):
-    """Damped Gauss-Newton on `1/2 Σ_μ weight (d - y)² + 1/2 ridge Σ w²`, for several starts and all outputs.
+    """Damped Gauss-Newton on `1/2 Σ_μ (d - y)² + 1/2 ridge Σ w²`, for several starts and all outputs.
 
-    Steps solve `(J^T J + λ diag(J^T J)) δ = J^T r` with the Jacobian in closed form (Marquardt 1963); λ falls by 10
-    after a step that lowers the cost and rises by 10 after one that does not, which is then taken back. Everything is
-    a buffer, so that an interrupted training resumes exactly.
+    Steps solve `(J^T J + λ diag(J^T J)) δ = J^T r` with the Jacobian in closed form (Marquardt 1963) and
+    follow the curve of the outputs to second order: `δ - 1/2 (J^T J + λ diag(J^T J))⁻¹ J^T y''`, y'' being
+    the second derivative along δ (geodesic acceleration, Transtrum and Sethna 2012). The weights of a
+    product trade scale with each other, and plain steps creep along such valleys. λ falls after a step that
+    lowers the cost and rises after one that does not, which is then taken back. Everything is a buffer, so
+    that an interrupted training resumes exactly.
 
     Attributes:
         parameters_now: `(starts, outputs, units, inputs + 1)`: weights and, last, the bias.
         damping: `(starts, outputs)`: λ.
         cost: `(starts, outputs)`: of the fitted patterns, with the ridge.
+        window_cost: `(starts, outputs)`: cost when progress was last judged.
+        moving: `(starts, outputs)`: problems that have not converged.
+        iterations: steps taken.
         best: the parameters of every start with the lowest validation error so far.
-        best_error: `(starts, outputs)`: that error, the mean square over the validation patterns.
+        best_error: `(starts, outputs)`: that error, the sum of squares over the validation patterns.
     """
 
+    fixed: Tensor
     parameters_now: Tensor
     damping: Tensor
     cost: Tensor
+    window_cost: Tensor
+    moving: Tensor
+    iterations: Tensor
     best: Tensor
     best_error: Tensor
-    moving: Tensor
 
-    def __init__(self, network: PiSigma, starts: int, spread: float, ridge: float, generator: torch.Generator) -> None:
+    def __init__(
+        self, network: PiSigma, starts: int, spread: float, ridge: float, generator: torch.Generator
+    ) -> None:
         """Draw the starts as `PiSigma.initialise` does.
 
         Args:
@@ -72,31 +94,41 @@ class LevenbergMarquardt(nn.Module):
         start = network.bias.new_zeros(shape)
         start[..., -1] = 1.0
         start = start + draw_uniform(start, spread, generator)
-        self.register_buffer("fixed", network.fixed.clone())
+        self.register_buffer("fixed", network.fixed.expand(starts, -1, -1).clone())
         self.register_buffer("parameters_now", start)
         self.register_buffer("damping", start.new_full(shape[:2], DAMPING_START))
         self.register_buffer("cost", start.new_full(shape[:2], torch.inf))
+        self.register_buffer("window_cost", start.new_full(shape[:2], torch.inf))
+        self.register_buffer("moving", torch.ones(shape[:2], dtype=torch.bool))
+        self.register_buffer("iterations", torch.zeros((), dtype=torch.int64))
         self.register_buffer("best", start.clone())
         self.register_buffer("best_error", start.new_full(shape[:2], torch.inf))
-        self.register_buffer("moving", torch.ones(shape[:2], dtype=torch.bool))
 
     @torch.no_grad()
     def iterate(self, patterns: Patterns) -> Float[Tensor, " outputs"]:
         """Take one step with every start and output.
 
         Returns:
-            Energy (eq. 3, all weighted patterns) of the best start of every output.
+            Energy (eq. 3, all patterns) of the best start of every output.
         """
-        fitted = torch.where(patterns.validation, 0.0, 1.0).to(patterns.weight) * patterns.weight
-        weighted = self._weigh(patterns.x, self.parameters_now)
-        residual = (patterns.d[:, None, :] - sum_of_products(weighted, self.orders)).movedim(0, -1)
-        if not torch.isfinite(self.cost).any():
+        fitted = (~patterns.validation).to(patterns.x)
+        if int(self.iterations) == 0:
+            residual = self._residual(patterns, self.parameters_now)
             self.cost = self._cost(residual, self.parameters_now, fitted)
             self._remember(patterns, residual, torch.ones_like(self.moving))
-        J = output_jacobian(patterns.x, weighted, self.fixed, self.orders)
-        step = self._solve(J, residual, fitted)
-        self._try(step, patterns, fitted)
-        return self._energy(patterns)
+        candidate = self.parameters_now + self._step(patterns, fitted)
+        residual = self._residual(patterns, candidate)
+        cost = self._cost(residual, candidate, fitted)
+        accepted = (cost < self.cost) & self.moving
+        self.parameters_now = torch.where(accepted[..., None, None], candidate, self.parameters_now)
+        self.cost = torch.where(accepted, cost, self.cost)
+        factor = torch.where(accepted, DAMPING_FALL, DAMPING_RISE).to(self.damping)
+        self.damping = (self.damping * factor).clamp(*DAMPING_RANGE)
+        self._remember(patterns, residual, accepted)
+        self._judge_progress()
+        best = self._winner()
+        weighted = weigh_sums(patterns.x, best[..., :-1], best[..., -1], self.fixed[0])
+        return energy(sum_of_products(weighted, self.orders), patterns.d)
 
     @property
     def converged(self) -> bool:
@@ -105,69 +137,84 @@ class LevenbergMarquardt(nn.Module):
 
     @torch.no_grad()
     def write_best(self, network: PiSigma) -> None:
-        """Give the network, for every output, the parameters of the start with the lowest validation error."""
-        winner = self.best_error.argmin(0)
-        chosen = self.best[winner, torch.arange(self.best.shape[1])]
+        """Give the network, for every output, the parameters with the lowest validation error."""
+        chosen = self._winner()
         network.weight.copy_(chosen[..., :-1])
         network.bias.copy_(chosen[..., -1])
+
+    def _winner(self) -> Tensor:
+        """For every output the best parameters of its best start."""
+        return self.best[self.best_error.argmin(0), torch.arange(self.best.shape[1], device=self.best.device)]
 
     def _weigh(self, x: Tensor, parameters: Tensor) -> Tensor:
         return weigh_sums(x, parameters[..., :-1], parameters[..., -1], self.fixed)
 
     def _residual(self, patterns: Patterns, parameters: Tensor) -> Tensor:
-        products = sum_of_products(self._weigh(patterns.x, parameters), self.orders)
-        return (patterns.d[:, None, :] - products).movedim(0, -1)
+        """`d - y` as `(patterns, starts, outputs)`."""
+        return patterns.d[:, None, :] - sum_of_products(self._weigh(patterns.x, parameters), self.orders)
 
     def _cost(self, residual: Tensor, parameters: Tensor, fitted: Tensor) -> Tensor:
         pull = parameters[..., :-1].square().sum((-1, -2)) * self.ridge
-        return ((residual.square() * fitted).sum(-1) + pull) / 2
+        return ((residual.square() * fitted[:, None, None]).sum(0) + pull) / 2
 
-    def _solve(self, J: Tensor, residual: Tensor, fitted: Tensor) -> Tensor:
-        size = J.shape[-1]
-        weighted_J = J * fitted[:, None]
-        A = weighted_J.mT @ J
-        g = (weighted_J.mT @ residual[..., None])[..., 0]
+    def _step(self, patterns: Patterns, fitted: Tensor) -> Tensor:
+        """The step of every problem, bent along the curve of its outputs where that is a small correction."""
+        weighted = self._weigh(patterns.x, self.parameters_now)
         pull = torch.full_like(self.parameters_now, self.ridge)
         pull[..., -1] = 0.0
+        residual = self._residual(patterns, self.parameters_now)
+        downhill = self._pull_back(residual, patterns.x, weighted, fitted) - pull * self.parameters_now
+        factor = self._factorise(self._normal_matrix(patterns.x, weighted, fitted), pull)
+        step = self._solve(factor, downhill)
+        ahead, behind = (
+            self._residual(patterns, self.parameters_now + sign * _PROBE * step) for sign in (1, -1)
+        )
+        curvature = (2 * residual - ahead - behind) / _PROBE**2
+        bend = -self._solve(factor, self._pull_back(curvature, patterns.x, weighted, fitted)) / 2
+        small = 2 * bend.flatten(-2).norm(dim=-1) <= _BEND * step.flatten(-2).norm(dim=-1)
+        return torch.where(small[..., None, None], step + bend, step)
+
+    def _pull_back(self, by_output: Tensor, x: Tensor, weighted: Tensor, fitted: Tensor) -> Tensor:
+        by_output = by_output * fitted[:, None, None]
+        by_weight, by_bias = pull_back(by_output, x, weighted, self.fixed, self.orders)
+        return torch.cat([by_weight, by_bias[..., None]], -1)
+
+    def _normal_matrix(self, x: Tensor, weighted: Tensor, fitted: Tensor) -> Tensor:
+        """`J^T J` over the fitted patterns, in chunks of patterns that fit into memory."""
+        size = self.parameters_now.shape[-2] * self.parameters_now.shape[-1]
+        rows = max(1, _CHUNK // (self.cost.numel() * size))
+        total = x.new_zeros(*self.cost.shape, size, size)
+        chunks = (torch.split(values, rows) for values in (x, weighted, fitted))
+        for part, sums, mask in zip(*chunks, strict=True):
+            J = output_jacobian(part, sums, self.fixed, self.orders)
+            total = total + (J * mask[:, None]).mT @ J
+        return total
+
+    def _factorise(self, A: Tensor, pull: Tensor) -> Tensor:
+        """Cholesky factor of the damped normal matrix."""
         A = A + torch.diag_embed(pull.flatten(-2))
-        g = g - (pull * self.parameters_now).flatten(-2)
         diagonal = A.diagonal(dim1=-2, dim2=-1)
         floor = diagonal.amax(-1, keepdim=True) * 1e-12 + torch.finfo(A.dtype).tiny
-        damped = A + torch.diag_embed(self.damping[..., None] * diagonal.clamp_min(floor) + floor * 1e-3)
-        factor, info = torch.linalg.cholesky_ex(damped)
-        eye = torch.eye(size, dtype=A.dtype, device=A.device)
-        factor = torch.where((info == 0)[..., None, None], factor, eye)
-        step = torch.cholesky_solve(g[..., None], factor)[..., 0]
-        step = torch.where((info == 0)[..., None], step, torch.zeros_like(step))
-        return step.reshape(self.parameters_now.shape)
+        damping = self.damping[..., None] * diagonal.clamp_min(floor) + floor * 1e-3
+        factor, info = torch.linalg.cholesky_ex(A + torch.diag_embed(damping))
+        # A matrix that rounding made indefinite gives no step: its candidate is no better, and λ rises.
+        return torch.where((info == 0)[..., None, None], factor, torch.inf)
 
-    def _try(self, step: Tensor, patterns: Patterns, fitted: Tensor) -> None:
-        candidate = self.parameters_now + step
-        residual = self._residual(patterns, candidate)
-        cost = self._cost(residual, candidate, fitted)
-        accepted = (cost < self.cost) & self.moving
-        gain = torch.where(accepted, self.cost - cost, torch.zeros_like(cost))
-        tiny = accepted & (gain <= CONVERGED * self.cost)
-        self.parameters_now = torch.where(accepted[..., None, None], candidate, self.parameters_now)
-        self.cost = torch.where(accepted, cost, self.cost)
-        lower, upper = DAMPING_RANGE
-        stuck = ~accepted & (self.damping >= upper)
-        factor = torch.where(accepted, 0.1, 10.0).to(self.damping)
-        self.damping = (self.damping * factor).clamp(lower, upper)
-        self.moving = self.moving & ~tiny & ~stuck & (self.cost > 0)
-        self._remember(patterns, residual, accepted)
+    def _solve(self, factor: Tensor, right: Tensor) -> Tensor:
+        solved = torch.cholesky_solve(right.flatten(-2)[..., None], factor)[..., 0].reshape(right.shape)
+        return torch.where(torch.isfinite(solved), solved, 0.0)
+
+    def _judge_progress(self) -> None:
+        self.iterations = self.iterations + 1
+        if int(self.iterations) % WINDOW == 0:
+            gain = self.window_cost - self.cost
+            self.moving = self.moving & (gain > CONVERGED_SHARE * self.cost) & (gain > CONVERGED_COST)
+            self.window_cost = self.cost.clone()
 
     def _remember(self, patterns: Patterns, residual: Tensor, changed: Tensor) -> None:
-        """Keep what does best on the validation patterns, or on the fitted ones where there are none to validate."""
+        """Keep what does best on the validation patterns, or on all where none validates."""
         chosen = patterns.validation if patterns.validation.any() else torch.ones_like(patterns.validation)
-        weight = patterns.weight * chosen
-        error = (residual.square() * weight).sum(-1) / weight.sum()
+        error = (residual.square() * chosen[:, None, None]).sum(0)
         better = changed & (error < self.best_error)
         self.best_error = torch.where(better, error, self.best_error)
         self.best = torch.where(better[..., None, None], self.parameters_now, self.best)
-
-    def _energy(self, patterns: Patterns) -> Tensor:
-        winner = self.best_error.argmin(0)
-        chosen = self.best[winner, torch.arange(self.best.shape[1])]
-        products = sum_of_products(self._weigh(patterns.x, chosen), self.orders)
-        return ((patterns.d - products).square() * patterns.weight[:, None]).sum(0) / 2

@@ -22,12 +22,14 @@ class TrainingPairs:
 
     Attributes:
         T: measured poses T_base_tool.
-        q_nominal: nominal joint values of those poses, on the branch nearest to the commanded ones [rad or m].
+        q_nominal: nominal joint values of those poses, on the branch nearest to the commanded ones
+            [rad or m].
         target: `Δ = q - q_nominal`, wrapped to (-pi, pi] where a joint turns.
         used: rows that are fit for training.
         singular: rows left out because they are near a singularity.
         unreachable: rows left out because the nominal robot cannot take the measured pose.
-        branches: the branches that the used rows lie on, most frequent first; empty without closed-form inverse.
+        branches: the branches that the used rows lie on, most frequent first; empty without closed-form
+            inverse.
     """
 
     T: Float64[Tensor, "rows 4 4"]
@@ -41,15 +43,18 @@ class TrainingPairs:
     @property
     def left_out(self) -> str:
         """How many rows were left out and why, in words; "" where none was."""
-        counts = ((self.singular, "near a singularity"), (self.unreachable, "not reachable by the nominal robot"))
+        counts = (
+            (self.singular, "near a singularity"),
+            (self.unreachable, "not reachable by the nominal robot"),
+        )
         return ", ".join(f"{int(mask.sum())} {reason}" for mask, reason in counts if mask.any())
 
 
 def build_pairs(robot: Robot, measurements: Measurements, singular_below: float | None) -> TrainingPairs:
-    """Turn measured poses into training pairs: `Δθ = θ_measured - θ_analytic` (Jeong et al. 1998, eq. 5).
+    """Turn measured poses into pairs: `Δθ = θ_measured - θ_analytic` (Jeong et al. 1998, eq. 5).
 
-    No truth is needed: the commanded joint values q take the place of θ_measured, and the nominal inverse kinematics
-    of the measured pose gives θ_analytic, on the branch nearest to q.
+    No truth is needed: the commanded joint values q take the place of θ_measured, and the nominal inverse
+    kinematics of the measured pose gives θ_analytic, on the branch nearest to q.
 
     Args:
         robot: with the base and tool that the poses are measured by.
@@ -78,8 +83,8 @@ def build_pairs(robot: Robot, measurements: Measurements, singular_below: float 
     used = ~singular & ~unreachable
     if not used.any():
         raise IdentificationError(
-            f"{measurements.source}: none of the {len(q)} rows can be used for training; check base, tool and units, "
-            "or measure away from singularities."
+            f"{measurements.source}: none of the {len(q)} rows can be used for training; check base, "
+            "tool and units, or measure away from singularities."
         )
     return TrainingPairs(T, q_nominal, target, used, singular, unreachable, _frequent(index[used], names))
 
@@ -97,7 +102,7 @@ def _nearest_branch(robot: Robot, T: Tensor, q: Tensor) -> tuple[Tensor, Tensor,
     solver = closed_form_solver(robot)
     assert solver is not None
     every = solver.solve(T).q
-    distance = joint_difference(robot, q[:, None, :], every).square().sum(-1)
+    distance = joint_difference(robot, q[:, None, :].expand_as(every), every).square().sum(-1)
     index = torch.where(torch.isfinite(distance), distance, torch.inf).argmin(-1)
     return every[torch.arange(len(q)), index], index, solver.branches
 

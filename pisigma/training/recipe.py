@@ -5,16 +5,28 @@ import os
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, NonNegativeFloat, PositiveInt
+import numpy as np
+from pydantic import AfterValidator, Field, NonNegativeFloat
 
-from pisigma.errors import RecipeError, nearest_choice
+from pisigma.errors import RecipeError, RobotError
 from pisigma.robot.description import Robot
 from pisigma.simulation.measure import SimulatedMeasurements
 from pisigma.simulation.true_robot import ErrorSource
-from pisigma.training.fit_sections import FitSection
-from pisigma.yaml_file import Section, read_yaml
+from pisigma.training.fit_sections import FitSection, Seed
+from pisigma.training.recipe_checks import find_misfit
+from pisigma.yaml_file import Section, line_of, read_yaml
 
-Rotation = tuple[tuple[float, float, float], tuple[float, float, float], tuple[float, float, float]]
+_Row = tuple[float, float, float]
+
+
+def _check_rotation(rows: tuple[_Row, _Row, _Row]) -> tuple[_Row, _Row, _Row]:
+    R = np.array(rows, dtype=np.float64)
+    if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
+        raise ValueError("the three rows are no rotation; give an orthonormal, right-handed matrix")
+    return rows
+
+
+Rotation = Annotated[tuple[_Row, _Row, _Row], AfterValidator(_check_rotation)]
 
 
 class SimulatedData(Section):
@@ -44,7 +56,7 @@ class MeasuredData(Section):
 
     kind: Literal["measured"]
     folds: Annotated[int, Field(ge=2)] = 5
-    seed: int = 0
+    seed: Seed = 0
 
 
 class NetworkSection(Section):
@@ -53,13 +65,14 @@ class NetworkSection(Section):
     Attributes:
         joints: names of the joints.
         inputs: names of the inputs.
-        orders: summing units of every product unit; `[3]` is the paper's network, `[1, 2, 3]` a ridge polynomial.
+        orders: summing units of every product unit; `[3]` is the paper's network, `[1, 2, 3]` a ridge
+            polynomial.
         reference: rotation from which roll, pitch and yaw are counted, as three rows.
     """
 
     joints: Annotated[tuple[str, ...], Field(min_length=1)]
     inputs: Annotated[tuple[str, ...], Field(min_length=1)]
-    orders: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
+    orders: Annotated[tuple[Annotated[int, Field(ge=1, le=20)], ...], Field(min_length=1, max_length=20)]
     reference: Rotation = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
@@ -91,9 +104,10 @@ class BeforeAfter(Section):
 
 
 class Recipe(Section):
-    """A whole recipe.
+    """A whole recipe of inverse calibration.
 
     Attributes:
+        kind: "inverse_calibration"; recipes of the geometric calibrator are `GeometricRecipe`.
         name: of the recipe and, by default, of the model.
         description: what it shows, for the model's card.
         not_validated: what a reader must not take from it, for the card.
@@ -105,6 +119,7 @@ class Recipe(Section):
         paper: published figures by joint, to stand beside ours.
     """
 
+    kind: Literal["inverse_calibration"] = "inverse_calibration"
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
     description: str
     not_validated: str
@@ -113,7 +128,7 @@ class Recipe(Section):
     network: Annotated[tuple[NetworkSection, ...], Field(min_length=1)]
     fit: Annotated[FitSection, Field(discriminator="method")]
     singular_rows: SingularRows = SingularRows()
-    paper: dict[str, BeforeAfter] = {}
+    paper: dict[str, BeforeAfter] = Field(default_factory=dict)
 
 
 def read_recipe(path: str | os.PathLike[str]) -> Recipe:
@@ -121,20 +136,17 @@ def read_recipe(path: str | os.PathLike[str]) -> Recipe:
 
     Raises:
         RecipeError: the file cannot be read or does not fit; the message names file, line and key.
-        RobotError: its robot cannot be used.
+        RobotError: its robot cannot be used; the message names file, line and key too.
     """
     recipe = read_yaml(path, Recipe, RecipeError)
-    joints = [joint.name for joint in Robot.load(recipe.robot).joints]
-    for place, names in (
-        ("network.joints", [name for group in recipe.network for name in group.joints]),
-        ("paper", list(recipe.paper)),
-        ("fit.learning_rate", list(getattr(recipe.fit, "learning_rate", {}))),
-    ):
-        for name in names:
-            if name not in joints:
-                raise RecipeError(f"{path}: '{place}' names joint '{name}'; {nearest_choice(name, joints)}")
-        if len(set(names)) != len(names):
-            raise RecipeError(f"{path}: '{place}' names a joint twice; name each once.")
+    try:
+        robot = Robot.load(recipe.robot)
+    except RobotError as problem:
+        raise type(problem)(f"{path}, line {line_of(path, ('robot',))}: 'robot': {problem}") from None
+    if misfit := find_misfit(recipe, robot):
+        keys, problem_text = misfit
+        place = ".".join(str(key) for key in keys)
+        raise RecipeError(f"{path}, line {line_of(path, keys)}: '{place}': {problem_text}")
     return recipe
 
 

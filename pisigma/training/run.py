@@ -1,8 +1,7 @@
 """Running a recipe: data, training pairs, network, model."""
 
 import platform
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from pisigma.correction.domain import Domain
 from pisigma.errors import RecipeError
 from pisigma.identification.base_and_tool import fit_base_and_tool
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.splits import groups_of_equal_joints, k_folds
+from pisigma.measurement.splits import groups_of_equal_joints
 from pisigma.robot.description import Robot
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.training.fit_sections import LevenbergMarquardtSection
@@ -117,7 +116,9 @@ def simulate_held_out(recipe: Recipe) -> Measurements:
     return data.held_out.measure(TrueRobot(Robot.load(recipe.robot), data.errors))
 
 
-def train_recipe(recipe: Recipe, measurements: Measurements, options: RunOptions = RunOptions()) -> TrainingRun:
+def train_recipe(
+    recipe: Recipe, measurements: Measurements, options: RunOptions = RunOptions()
+) -> TrainingRun:
     """Train the model of a recipe.
 
     Args:
@@ -133,6 +134,7 @@ def train_recipe(recipe: Recipe, measurements: Measurements, options: RunOptions
         robot = fit_base_and_tool(robot, measurements).robot
     bound = recipe.singular_rows.below if recipe.singular_rows.rule == "leave_out" else None
     pairs = build_pairs(robot, measurements, bound)
+    held_out = _held_out_pairs(recipe, robot)
     network = build_network(robot, recipe.network, pairs)
     generator = torch.Generator().manual_seed(recipe.fit.seed)
     share = recipe.fit.validation_share if isinstance(recipe.fit, LevenbergMarquardtSection) else 0.0
@@ -157,11 +159,11 @@ def train_recipe(recipe: Recipe, measurements: Measurements, options: RunOptions
         network=network,
         domain=Domain.around(network.scaled_inputs(pairs.T[used], pairs.q_nominal[used]), generator),
         branches=pairs.branches,
-        starts=measurements.q[used][:MAXIMUM_STARTS].clone(),
+        starts=_spread_rows(measurements.q[used]),
         provenance=_provenance(recipe, measurements, pairs, options),
     )
-    training = joint_errors(model, pairs)
-    return TrainingRun(model, history, pairs, training, _held_out(recipe, robot, model), measurements)
+    unseen = joint_errors(model, held_out) if held_out else None
+    return TrainingRun(model, history, pairs, joint_errors(model, pairs), unseen, measurements)
 
 
 def joint_errors(model: CalibratedModel, pairs: TrainingPairs) -> JointErrors:
@@ -170,16 +172,27 @@ def joint_errors(model: CalibratedModel, pairs: TrainingPairs) -> JointErrors:
     return JointErrors(T, before, before - model.correction(T, q))
 
 
-def _held_out(recipe: Recipe, robot: Robot, model: CalibratedModel) -> JointErrors | None:
-    """Joint errors on fresh simulated poses."""
+def _held_out_pairs(recipe: Recipe, robot: Robot) -> TrainingPairs | None:
+    """Fresh simulated poses, all of which must have a joint error to judge by."""
     if not isinstance(recipe.data, SimulatedData):
         return None
-    return joint_errors(model, build_pairs(robot, simulate_held_out(recipe), None))
+    pairs = build_pairs(robot, simulate_held_out(recipe), None)
+    if not pairs.used.all():
+        raise RecipeError(
+            f"recipe '{recipe.name}': {int((~pairs.used).sum())} of {len(pairs.used)} poses of data.held_out "
+            "cannot be reached by the nominal robot and have no joint error; change their region."
+        )
+    return pairs
+
+
+def _spread_rows(q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "starts dof"]:
+    """All rows, or as many as are kept, evenly spread over them."""
+    return q[torch.linspace(0, len(q) - 1, min(len(q), MAXIMUM_STARTS)).round().long()].clone()
 
 
 def _simulated(recipe: Recipe) -> SimulatedData:
     if not isinstance(recipe.data, SimulatedData):
-        raise RecipeError(f"recipe '{recipe.name}' is for measured data and simulates nothing; use one with simulated data.")
+        raise RecipeError(f"recipe '{recipe.name}' is for measured data and simulates nothing; use another.")
     return recipe.data
 
 
@@ -189,11 +202,14 @@ def _provenance(
     return Provenance(
         recipe=recipe.name,
         recipe_sha256=options.recipe_sha256,
-        data_source="simulation" if isinstance(recipe.data, SimulatedData) else Path(measurements.source).name,
+        data_source="simulation"
+        if isinstance(recipe.data, SimulatedData)
+        else Path(measurements.source).name,
         data_sha256=measurements.content_hash(),
         rows=int(pairs.used.sum()),
         rows_left_out=int((~pairs.used).sum()),
         rule=pairs.left_out,
         seed=recipe.fit.seed,
-        versions={name: version(name) for name in ("pisigma", "torch")} | {"python": platform.python_version()},
+        versions={name: version(name) for name in ("pisigma", "torch")}
+        | {"python": platform.python_version()},
     )

@@ -64,7 +64,7 @@ def test_reads_roll_pitch_yaw(write):
     )
     expected = rotation_from_rpy(torch.deg2rad(torch.tensor([[10, 20, 30]], dtype=torch.float64)))
     assert_close(measurements.rotation, expected, atol=1e-15)
-    assert measurements.kind == "pose"
+    assert measurements.kinds == {"pose"}
 
 
 def test_reads_quaternions_and_normalises_them(write):
@@ -183,7 +183,7 @@ def test_says_so_where_no_row_can_be_used(write):
 )
 def test_reads_measured_robots(shared_data: Path, file: str, robot: str | None, rows: int, kind: str):
     measurements = Measurements.read_csv(shared_data / file, load_robot(robot) if robot else None)
-    assert (measurements.rows, measurements.dof, measurements.kind) == (rows, 6, kind)
+    assert (measurements.rows, measurements.dof, measurements.kinds) == (rows, 6, {kind})
     assert measurements.line == tuple(range(2, rows + 2))
     assert measurements.left_out == ()
     table = np.genfromtxt(shared_data / file, delimiter=",", names=True, dtype=None, encoding="utf-8")

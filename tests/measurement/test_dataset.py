@@ -41,7 +41,7 @@ def zeros(*shape: int) -> torch.Tensor:
 
 def test_fills_in_names_that_are_not_given():
     measurements = Measurements(q=zeros(3, 2))
-    assert (measurements.rows, measurements.dof, measurements.kind) == (3, 2, "position")
+    assert (measurements.rows, measurements.dof, measurements.kinds) == (3, 2, set())
     assert measurements.frame == measurements.target == ("", "", "")
     assert measurements.line == (0, 0, 0)
     assert measurements.place(1) == "memory, row 1"
@@ -60,7 +60,7 @@ def test_is_frozen():
 
 def test_poses_hold_position_and_rotation():
     measurements = make_measurements()
-    assert measurements.kind == "pose"
+    assert measurements.kinds == {"pose"}
     assert_close(measurements.T[:, :3, 3], measurements.position)
     assert_close(measurements.T[:, :3, :3], measurements.rotation)
     assert_close(measurements.T[:, 3], torch.eye(4, dtype=torch.float64)[3].expand(4, 4))

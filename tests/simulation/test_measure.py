@@ -46,7 +46,7 @@ def test_wanted_poses_are_reached_by_the_true_robot_on_the_named_branch(branch):
     robot = true_robot("kiro3", GEOMETRIC, OFFSET)
     section = SimulatedMeasurements(poses=GRID, branch={"name": branch})
     data = section.measure(robot)
-    assert data.kind == "pose"
+    assert data.kinds == {"pose"}
     assert_close(data.T, section.poses.transforms(), atol=1e-12)
     assert_close(robot.forward(data.q), data.T, atol=1e-15)
     sign = 1 if branch == "elbow_positive" else -1

@@ -174,7 +174,7 @@ def test_recipe_is_read_and_misspelt_keys_are_refused():
         RecipeError, match=r"recipe.yaml, line 7: unknown key 'ofset_deg'.* did you mean 'offset_deg'"
     ):
         parse_yaml(RECIPE.replace("offset_deg", "ofset_deg"), TrueRobotSection, RecipeError, "recipe.yaml")
-    with pytest.raises(RecipeError, match=r"recipe.yaml, line 6: .*'joint_compliance'"):
+    with pytest.raises(RecipeError, match=r"recipe.yaml, line 6: .*did you mean 'joint_offset'"):
         parse_yaml(
             RECIPE.replace("joint_offset", "joint_ofset"), TrueRobotSection, RecipeError, "recipe.yaml"
         )

@@ -1,0 +1,99 @@
+"""`model.yaml`: what it holds, and the checksum by which a truncated or edited one is told."""
+
+import hashlib
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import ConfigDict, Field, PositiveInt
+
+from pisigma.errors import ModelError
+from pisigma.robot.robot_file import RobotDocument
+from pisigma.yaml_file import Section, parse_yaml
+
+FORMAT = 1
+DESCRIPTION = "model.yaml"
+
+_CHECKSUM = re.compile(r"(.*^)sha256: ([0-9a-f]{64})\n", re.DOTALL | re.MULTILINE)
+
+_Vector = tuple[float, float, float]
+_Frame = tuple[float, float, float, float, float, float]
+"""x, y, z [m], roll, pitch, yaw [rad]."""
+
+
+class GroupSection(Section):
+    """One joint group of the network: see `pisigma.network.correction_network.JointGroup`."""
+
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    inputs: Annotated[tuple[str, ...], Field(min_length=1)]
+    orders: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
+    reference: tuple[_Vector, _Vector, _Vector]
+
+
+class ProvenanceSection(Section):
+    """See `pisigma.correction.calibrated_model.Provenance`."""
+
+    recipe: str
+    recipe_sha256: str
+    data_source: str
+    data_sha256: str
+    rows: int
+    rows_left_out: int
+    rule: str
+    seed: int
+    versions: dict[str, str]
+
+
+class ModelDocument(Section):
+    """The whole of `model.yaml`, but for the checksum in its last line."""
+
+    model_config = ConfigDict(protected_namespaces=())
+
+    format: Literal[1]
+    name: str
+    kind: str
+    branches: tuple[str, ...]
+    weights_sha256: str
+    robot: RobotDocument
+    calibrated: RobotDocument | None
+    bases: dict[str, _Frame]
+    tools: dict[str, _Frame]
+    network: tuple[GroupSection, ...]
+    provenance: ProvenanceSection
+    metrics: dict[str, Any]
+
+
+def write_document(document: dict[str, Any], path: Path) -> None:
+    """Write the document, and as its last line the checksum of all before it."""
+    text = yaml.safe_dump({"format": FORMAT, **document}, sort_keys=False, allow_unicode=True)
+    path.write_text(f"{text}sha256: {_digest(text)}\n", encoding="utf-8", newline="\n")
+
+
+def read_document(path: Path) -> ModelDocument:
+    """Read the document and check it.
+
+    Raises:
+        ModelError: the file cannot be read, is of a newer format, truncated, edited, or no model's.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as problem:
+        reason = problem.strerror if isinstance(problem, OSError) else "it is no UTF-8 text"
+        raise ModelError(f"{path}: cannot be read ({reason}); train or copy the model again.") from None
+    stated = re.match(r"format: ([0-9]{1,9})\n", text)
+    if stated and int(stated[1]) > FORMAT:
+        raise ModelError(
+            f"{path}: format {stated[1]} is newer than this pisigma reads ({FORMAT}); upgrade pisigma."
+        )
+    signed = _CHECKSUM.fullmatch(text)
+    if not signed or _digest(signed[1]) != signed[2]:
+        raise ModelError(
+            f"{path}: is truncated, was edited, or is no model of pisigma (its last line is not the "
+            "checksum of the lines before it); train or copy the model again."
+        )
+    return parse_yaml(signed[1], ModelDocument, ModelError, source=str(path))
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,163 @@
+"""What the residuals say of the noise, of repeated poses and of the prior."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.identification.loss import AbstractLoss
+from pisigma.identification.sensors import AbstractSensor
+
+SMALLEST_NOISE = 1e-14
+"""[m or rad] Floor of the estimated noise: what rounding does to a pose."""
+ALWAYS_GOOD = 1e-10
+"""[m or rad] Rows nearer to their prediction than this never count as wrong."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorSums:
+    """What one sensor contributes at one point, before division by its noise's variance.
+
+    Attributes:
+        normal: `Σ w J J^T / sigma_row²` over its rows.
+        descent: `Σ w J r / sigma_row²`.
+        residual: measured minus predicted, 0 where nothing was seen [m or rad].
+        distance: length of the residual over sigma_row, 0 where nothing was seen.
+        seen: number of rows that were seen.
+    """
+
+    normal: Float64[Tensor, "active active"]
+    descent: Float64[Tensor, " active"]
+    residual: Float64[Tensor, "components rows"]
+    distance: Float64[Tensor, " rows"]
+    seen: int
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals' lengths [m or rad]."""
+        return float((self.residual.square().sum() / max(self.seen, 1)).sqrt())
+
+
+@dataclass(frozen=True, eq=False)
+class SensorView:
+    """All sensors at one point, with the noise they are believed to have.
+
+    Attributes:
+        sums: per sensor.
+        noise: per sensor, its standard deviation [m or rad], or a factor of 1 or more where the rows give
+            their own.
+        repetition: per sensor, 1 or more: by how much repeats of a pose tell less than so many poses,
+            because what the model gets wrong there is the same in all of them.
+        widening: 1 or more, of the prior's standard deviations, for lengths and for angles.
+    """
+
+    sums: tuple[SensorSums, ...]
+    noise: tuple[float, ...]
+    repetition: tuple[float, ...]
+    widening: tuple[float, float] = (1.0, 1.0)
+
+    def scale(self, sensor: int) -> float:
+        """What distances are divided by for the loss."""
+        return max(self.noise[sensor], ALWAYS_GOOD)
+
+    def variance(self, sensor: int) -> float:
+        """What a sensor's sums are divided by."""
+        return self.noise[sensor] ** 2 * self.repetition[sensor]
+
+    def widened(self, precision: Float64[Tensor, " active"], lengths: Tensor) -> Float64[Tensor, " active"]:
+        """1 / variance of parameters by the prior, as far as it was widened."""
+        length, angle = (1 / factor**2 for factor in self.widening)
+        return precision * torch.where(lengths, length, angle)
+
+
+def values_used(view: SensorView, covariance: Float64[Tensor, "active active"]) -> tuple[float, ...]:
+    """How many values of every sensor the parameters use up (Förstner 1979); the prior spares some."""
+    return tuple(
+        float((sums.normal * covariance).sum()) / view.variance(k) for k, sums in enumerate(view.sums)
+    )
+
+
+def loss_scale(
+    sensors: Sequence[AbstractSensor],
+    loss: AbstractLoss,
+    view: SensorView,
+    used: Sequence[float],
+    refine: bool,
+) -> tuple[float, ...]:
+    """Standard deviation of every sensor's values; `refine` uses all good rows instead of the median."""
+    found = []
+    for k, sensor in enumerate(sensors):
+        distance = view.sums[k].distance[sensor.seen]
+        if refine:
+            found.append(loss.deviation(distance, sensor.components, used[k], view.scale(k)))
+        else:
+            found.append(loss.scale(distance, sensor.components, used[k]))
+    return tuple(found)
+
+
+def renumbered(keys: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
+    """Numbers from 0 on, equal where the keys are equal."""
+    found: Tensor = torch.unique(keys, return_inverse=True)[1]
+    return found
+
+
+def group_variance_ratio(
+    sensors: Sequence[AbstractSensor],
+    loss: AbstractLoss,
+    view: SensorView,
+    used: Sequence[float],
+    pose: Int64[Tensor, " rows"],
+) -> tuple[float, ...]:
+    """Variance of the poses' mean residuals over that of independent rows (Kish 1965: design effect).
+
+    Args:
+        sensors: per sensor, which rows it saw.
+        loss: weights the rows within a pose.
+        view: residuals and noise.
+        used: values that the parameters use up, per sensor; they come off the poses, not off their repeats.
+        pose: number of every row's pose.
+    """
+    poses = int(pose.max()) + 1
+    found = []
+    for k, (sensor, sums) in enumerate(zip(sensors, view.sums, strict=True)):
+        weight = loss.weight(sums.distance / view.scale(k), sensor.components) * sensor.seen
+        if sensor.sigma is not None:
+            weight = torch.where(sensor.seen, weight / sensor.sigma.square(), 0.0)
+        total = weight.new_zeros(poses).index_add(0, pose, weight)
+        summed = weight.new_zeros((sensor.components, poses)).index_add(1, pose, sums.residual * weight)
+        seen = total > 0
+        square = float((summed[:, seen].square().sum(0) / total[seen]).sum())
+        left = max(int(seen.sum()) * sensor.components - used[k], 1.0)
+        found.append(max(square / left / view.noise[k] ** 2, 1.0))
+    return tuple(found)
+
+
+def prior_widening(
+    off: Float64[Tensor, " active"],
+    precision: Float64[Tensor, " active"],
+    lengths: Tensor,
+    view: SensorView,
+    covariance: Float64[Tensor, "active active"],
+) -> tuple[float, float]:
+    """How much larger than stated the parameters' errors turn out, for lengths and for angles.
+
+    MacKay's update (1992, Neural Computation 4(3), eq. 4.7): every parameter counts by how much of it the
+    data tell. Smaller errors than stated do not tighten the prior.
+
+    Args:
+        off: distance of the parameters from their nominal values [m or rad].
+        precision: 1 / variance as stated, 0 where nothing is known.
+        lengths: which parameters are lengths.
+        view: how far the prior is widened now.
+        covariance: of the parameters.
+    """
+    told = 1 - view.widened(precision, lengths) * covariance.diagonal()
+    square = off.square() * precision
+    found = []
+    for chosen in (lengths, ~lengths):
+        chosen = chosen & (precision > 0)
+        total = float(told[chosen].sum())
+        found.append(max(float(square[chosen].sum()) / total, 1.0) ** 0.5 if total > 1 else 1.0)
+    return found[0], found[1]

@@ -1,0 +1,254 @@
+"""Jigs: stepped blocks whose faces a tip touches, known in the frame of the jig."""
+
+import os
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.yaml_file import Section, parse_yaml, read_yaml
+
+Side = Literal["-x", "+x", "-y", "+y", "-z", "+z"]
+Millimetres = tuple[float, float, float]
+
+_SKIN = 1e-7
+"""[m] A point counts as outside of a block where it is farther than this from it."""
+
+
+class BlockSection(Section):
+    """A block with edges along the axes of the jig's frame.
+
+    Attributes:
+        name: unique in the jig.
+        corner_mm: its corner with the smallest coordinates [mm].
+        size_mm: its extent along x, y and z [mm].
+        faces: those that may be touched, by their outward direction.
+    """
+
+    name: str = Field(min_length=1)
+    corner_mm: Millimetres
+    size_mm: tuple[
+        Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)], Annotated[float, Field(gt=0)]
+    ]
+    faces: tuple[Side, ...] = ()
+
+    @model_validator(mode="after")
+    def _each_face_once(self) -> "BlockSection":
+        for side in self.faces:
+            if self.faces.count(side) > 1:
+                raise ValueError(f"the face {side} of block '{self.name}' stands twice; remove one")
+        return self
+
+
+class JigDocument(Section):
+    """The whole file.
+
+    Attributes:
+        name: of the jig.
+        source: where its sizes come from.
+        blocks: what it is made of; they may touch but not overlap.
+    """
+
+    name: str = Field(min_length=1)
+    source: str
+    blocks: tuple[BlockSection, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "JigDocument":
+        names = [block.name for block in self.blocks]
+        for name in names:
+            if names.count(name) > 1:
+                raise ValueError(f"the block name '{name}' stands twice; names must differ")
+        if not any(block.faces for block in self.blocks):
+            raise ValueError("no block has a face that may be touched; name at least one in 'faces'")
+        jig = self.to_jig()
+        jig.check_overlaps()
+        jig.check_faces()
+        return self
+
+    def to_jig(self) -> "Jig":
+        """The jig in SI units."""
+        corner = torch.tensor([block.corner_mm for block in self.blocks], dtype=torch.float64) / 1e3
+        size = torch.tensor([block.size_mm for block in self.blocks], dtype=torch.float64) / 1e3
+        faces = [(number, side) for number, block in enumerate(self.blocks) for side in block.faces]
+        return Jig(
+            name=self.name,
+            source=self.source,
+            block_names=tuple(block.name for block in self.blocks),
+            lower=corner,
+            upper=corner + size,
+            block=torch.tensor([number for number, _ in faces], dtype=torch.int64),
+            axis=torch.tensor(["xyz".index(side[1]) for _, side in faces], dtype=torch.int64),
+            sign=torch.tensor([1.0 if side[0] == "+" else -1.0 for _, side in faces], dtype=torch.float64),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Jig:
+    """Blocks and those of their faces that may be touched, in the frame of the jig [m].
+
+    A touch on face i gives the coordinate `coordinate[i]` along axis `axis[i]`: x on y-z faces, y on x-z
+    faces, z on x-y faces (Lim et al., eqs 35 to 37).
+
+    Attributes:
+        name: of the jig.
+        source: where its sizes come from.
+        block_names: of the blocks.
+        lower: corner of every block with the smallest coordinates.
+        upper: the opposite corner.
+        block: index of every face's block.
+        axis: index of the axis that every face is square to.
+        sign: +1 or -1: outward direction along that axis.
+    """
+
+    name: str
+    source: str
+    block_names: tuple[str, ...]
+    lower: Float64[Tensor, "blocks 3"]
+    upper: Float64[Tensor, "blocks 3"]
+    block: Int64[Tensor, " faces"]
+    axis: Int64[Tensor, " faces"]
+    sign: Float64[Tensor, " faces"]
+
+    @staticmethod
+    def load(jig: str | os.PathLike[str] = "stepped") -> "Jig":
+        """Load a jig that comes with pisigma by its name, or one from a YAML file.
+
+        Raises:
+            MeasurementError: neither such a jig nor a file, or the file describes no jig; the message names
+                file, line and key.
+        """
+        name = os.fspath(jig)
+        if name in catalogue():
+            text = (resources.files("pisigma.measurement") / "jigs" / f"{name}.yaml").read_text(
+                encoding="utf-8"
+            )
+            return parse_yaml(text, JigDocument, MeasurementError, source=f"jigs/{name}.yaml").to_jig()
+        if Path(name).suffix.lower() in (".yaml", ".yml"):
+            return read_yaml(name, JigDocument, MeasurementError).to_jig()
+        raise MeasurementError(
+            f"'{name}' is no jig that comes with pisigma and no .yaml file: "
+            f"{nearest_choice(name, catalogue())}"
+        )
+
+    @property
+    def faces(self) -> int:
+        """Number of faces that may be touched."""
+        return len(self.block)
+
+    @property
+    def face_names(self) -> tuple[str, ...]:
+        """Such as "low/+z", for every face."""
+        sides = zip(self.block.tolist(), self.sign.tolist(), self.axis.tolist(), strict=True)
+        return tuple(
+            f"{self.block_names[b]}/{'+' if sign > 0 else '-'}{'xyz'[axis]}" for b, sign, axis in sides
+        )
+
+    @property
+    def coordinate(self) -> Float64[Tensor, " faces"]:
+        """Coordinate of every face along its axis [m]."""
+        side = torch.where(self.sign[:, None] > 0, self.upper[self.block], self.lower[self.block])
+        return side.take_along_dim(self.axis[:, None], 1)[:, 0]
+
+    @property
+    def outward(self) -> Float64[Tensor, "faces 3"]:
+        """Unit vector out of every face."""
+        return torch.nn.functional.one_hot(self.axis, 3) * self.sign[:, None]
+
+    @property
+    def extent(self) -> tuple[Float64[Tensor, "faces 3"], Float64[Tensor, "faces 3"]]:
+        """Smallest and largest coordinates on every face [m]; along its axis both are `coordinate`."""
+        along = torch.nn.functional.one_hot(self.axis, 3).bool()
+        coordinate = self.coordinate[:, None]
+        return (
+            torch.where(along, coordinate, self.lower[self.block]),
+            torch.where(along, coordinate, self.upper[self.block]),
+        )
+
+    def on_face(
+        self, face: Int64[Tensor, "*batch"], point: Float64[Tensor, "*batch 3"], margin: float = 0.0
+    ) -> Bool[Tensor, "*batch"]:
+        """Whether points lie on a face, away from its edges, and no other block covers them there.
+
+        Args:
+            face: index of the face.
+            point: in the frame of the jig [m]; the coordinate along the face's axis does not count.
+            margin: smallest distance [m] from the edges and from what stands on the face.
+        """
+        lower, upper = (bound[face] for bound in self.extent)
+        along = torch.nn.functional.one_hot(self.axis[face], 3).bool()
+        on_plane = torch.where(along, lower, point)
+        inside = ((on_plane >= lower + margin) & (on_plane <= upper - margin) | along).all(-1)
+        just_outside = on_plane + 2 * _SKIN * self.outward[face]
+        grown = torch.where(along, 0.0, margin)[..., None, :]
+        others = (just_outside[..., None, :] > self.lower - grown - _SKIN) & (
+            just_outside[..., None, :] < self.upper + grown + _SKIN
+        )
+        return inside & ~others.all(-1).any(-1)
+
+    def is_hit(
+        self, start: Float64[Tensor, "*batch 3"], end: Float64[Tensor, "*batch 3"]
+    ) -> Bool[Tensor, "*batch"]:
+        """Whether a straight line from `start` to `end` [m] runs through a block.
+
+        Source: the slabs of Kay and Kajiya 1986, "Ray tracing complex scenes".
+        """
+        step = (end - start)[..., None, :]
+        parallel = step.abs() < 1e-15
+        safe = torch.where(parallel, 1.0, step)
+        near = (self.lower + _SKIN - start[..., None, :]) / safe
+        far = (self.upper - _SKIN - start[..., None, :]) / safe
+        enter, leave = torch.minimum(near, far), torch.maximum(near, far)
+        within = (start[..., None, :] > self.lower + _SKIN) & (start[..., None, :] < self.upper - _SKIN)
+        enter = torch.where(parallel, torch.where(within, -torch.inf, torch.inf), enter)
+        leave = torch.where(parallel, torch.where(within, torch.inf, -torch.inf), leave)
+        return (enter.amax(-1).clamp(min=0) < leave.amin(-1).clamp(max=1)).any(-1)
+
+    def check_overlaps(self) -> None:
+        """Refuse blocks that overlap.
+
+        Raises:
+            ValueError: two blocks overlap.
+        """
+        common = torch.minimum(self.upper[:, None], self.upper) - torch.maximum(
+            self.lower[:, None], self.lower
+        )
+        overlap = (common > _SKIN).all(-1).triu(1)
+        if overlap.any():
+            a, b = (self.block_names[number] for number in overlap.nonzero()[0].tolist())
+            raise ValueError(f"the blocks '{a}' and '{b}' overlap; correct corner_mm or size_mm")
+
+    def check_faces(self) -> None:
+        """Refuse faces that nothing can touch.
+
+        Raises:
+            ValueError: a face is covered by one other block throughout.
+        """
+        lower, upper = self.extent
+        outside = 2 * _SKIN * self.outward
+        covered = (
+            ((lower + outside)[:, None] > self.lower - _SKIN)
+            & ((upper + outside)[:, None] < self.upper + _SKIN)
+        ).all(-1)
+        if covered.any():
+            face, block = covered.nonzero()[0].tolist()
+            raise ValueError(
+                f"the face {self.face_names[face].rpartition('/')[2]} of block "
+                f"'{self.block_names[int(self.block[face])]}' is covered by block "
+                f"'{self.block_names[block]}'; "
+                "remove it from 'faces'"
+            )
+
+
+def catalogue() -> tuple[str, ...]:
+    """Names of the jigs that come with pisigma, sorted."""
+    folder = resources.files("pisigma.measurement") / "jigs"
+    return tuple(
+        sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    )

@@ -1,0 +1,117 @@
+"""Distances: a draw wire from an anchor, or a ball bar between two poses."""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float64
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from pisigma.errors import RecipeError
+from pisigma.measurement.dataset import Measurements
+from pisigma.simulation.commanded import AbstractCommanded
+from pisigma.simulation.sensor_noise import SensorNoise, draw_noise, row_sigma
+from pisigma.simulation.true_robot import TrueRobot
+from pisigma.yaml_file import Section
+
+
+class AnchorSection(Section):
+    """A fixed point from which a wire is drawn.
+
+    Attributes:
+        name: of the anchor.
+        point_mm: where it is, in the base frame [mm].
+        zero_mm: what the sensor shows at no distance [mm].
+        known: whether the measurements tell its place.
+    """
+
+    name: str = Field(min_length=1)
+    point_mm: tuple[float, float, float]
+    zero_mm: float = 0.0
+    known: bool = False
+
+
+class SimulatedDistances(AbstractCommanded):
+    """The part of a recipe that states distances from an anchor.
+
+    Attributes:
+        kind: "distances".
+        anchor: where they are measured from.
+        noise: of the sensor and of the robot; left out, both are exact.
+    """
+
+    kind: Literal["distances"]
+    anchor: AnchorSection
+    noise: SensorNoise | None = None
+
+    def measure(self, robot: TrueRobot) -> Measurements:
+        """The distances `|FK_true(q) + n_robot - anchor| + zero + n_sensor`, the same at every call.
+
+        Raises:
+            RecipeError: a distance is below 0.
+        """
+        q = self.commanded(robot)
+        draws = draw_noise(self.noise, len(q))
+        anchor = torch.tensor(self.anchor.point_mm, dtype=torch.float64) / 1e3
+        away = robot.forward(q)[:, :3, 3] + draws.robot - anchor
+        shown = away.norm(dim=-1) + self.anchor.zero_mm / 1e3 + draws.sensor[:, 0]
+        return Measurements(
+            q=q,
+            distance=_not_below_zero(shown),
+            anchor=(self.anchor.name,) * len(q),
+            anchor_place=anchor.expand(len(q), 3).clone() if self.anchor.known else None,
+            sigma_position=row_sigma(self.noise, len(q)),
+            source=f"simulation of {robot.nominal.name}",
+        )
+
+
+class SimulatedPairs(AbstractCommanded):
+    """The part of a recipe that states distances between two poses each: the first and the second, and so on.
+
+    Attributes:
+        kind: "pairs".
+        name: of the pairs, which are numbered from 0 behind it.
+        noise: of the sensor and of the robot, whose two poses both deviate; left out, both are exact.
+    """
+
+    kind: Literal["pairs"]
+    name: str = "pair"
+    noise: SensorNoise | None = None
+
+    @model_validator(mode="after")
+    def _even(self) -> "SimulatedPairs":
+        count = getattr(self.poses, "count", 0)
+        if count % 2:
+            raise ValueError("poses are taken two at a time; ask for an even number of them")
+        return self
+
+    def measure(self, robot: TrueRobot) -> Measurements:
+        """The distances `|p_1 - p_2| + n_sensor` of `p = FK_true(q) + n_robot`, the same at every call.
+
+        Raises:
+            RecipeError: the number of poses is odd, or a distance is below 0.
+        """
+        q = self.commanded(robot)
+        if len(q) % 2:
+            raise RecipeError(f"pairs: an even number of poses was wanted, got {len(q)}; add or remove one.")
+        draws = draw_noise(self.noise, len(q))
+        position = (robot.forward(q)[:, :3, 3] + draws.robot).reshape(-1, 2, 3)
+        shown = (position[:, 0] - position[:, 1]).norm(dim=-1) + draws.sensor[::2, 0]
+        return Measurements(
+            q=q,
+            distance=_not_below_zero(shown).repeat_interleave(2),
+            pair=tuple(f"{self.name} {row // 2}" for row in range(len(q))),
+            sigma_position=row_sigma(self.noise, len(q), points=2),
+            source=f"simulation of {robot.nominal.name}",
+        )
+
+
+def _not_below_zero(shown: Float64[Tensor, " rows"]) -> Float64[Tensor, " rows"]:
+    if (shown < 0).any():
+        row = int(shown.argmin())
+        raise RecipeError(
+            f"distances: the sensor would show {float(shown[row]) * 1e3:.6g} mm at pose {row} "
+            "(counted from 0); state "
+            "poses farther away, less noise, or a larger zero_mm."
+        )
+    return shown

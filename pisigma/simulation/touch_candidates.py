@@ -1,0 +1,237 @@
+"""Candidates of touches: a face of a jig, a point on it and a tilt of the torch, all within reach."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from pydantic import Field
+from torch import Tensor
+
+from pisigma.errors import RecipeError
+from pisigma.kinematics.numeric import solve_numeric
+from pisigma.kinematics.singularity import singularity_measure
+from pisigma.kinematics.status import Status
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.jig import Jig
+from pisigma.robot.description import Robot
+from pisigma.se3 import invert, rotation_from_rpy, transform
+from pisigma.simulation.branch import BranchSection
+from pisigma.simulation.jig_placement import JigPlacement, check_names
+from pisigma.yaml_file import Section
+
+ROUNDS = 20
+"""Draws after which the search for candidates is given up."""
+DRAWN = 8192
+"""Candidates drawn at a time."""
+MOST_ITERATIONS = 10
+"""Steps of the numeric inverse to an end of the travel; it needs some five."""
+END_TOLERANCE = 1e-8
+"""[m and rad] How nearly the ends of the travel are solved for."""
+LARGEST_MOVE = 1.5
+"""[rad or m] A joint that moves farther within the travel has changed its branch."""
+
+
+@dataclass(frozen=True, eq=False)
+class TouchCandidates:
+    """Touches that the nominal robot can make, by where the operator believes that the jigs stand.
+
+    Attributes:
+        placements: names of the placements, which are the frames.
+        placement: index of every candidate's placement.
+        face: index of its face on the jig of that placement.
+        axis: index of the axis along which it touches.
+        sign: +1 or -1: outward direction of the face along that axis.
+        coordinate: of the face along that axis [m], in the frame of the jig.
+        T_jig_tool: pose of the tool at the touch, in the frame of the jig.
+        q: joint values [rad or m] of the nominal robot there.
+    """
+
+    placements: tuple[str, ...]
+    placement: Int64[Tensor, " candidates"]
+    face: Int64[Tensor, " candidates"]
+    axis: Int64[Tensor, " candidates"]
+    sign: Float64[Tensor, " candidates"]
+    coordinate: Float64[Tensor, " candidates"]
+    T_jig_tool: Float64[Tensor, "candidates 4 4"]
+    q: Float64[Tensor, "candidates dof"]
+
+    @property
+    def count(self) -> int:
+        """Number of candidates."""
+        return len(self.face)
+
+    @property
+    def frame(self) -> tuple[str, ...]:
+        """Name of every candidate's placement."""
+        return tuple(self.placements[number] for number in self.placement.tolist())
+
+    @property
+    def touch_axis(self) -> tuple[str, ...]:
+        """Name of every candidate's axis."""
+        return tuple("xyz"[axis] for axis in self.axis.tolist())
+
+    def select(self, index: Int64[Tensor, " chosen"] | Bool[Tensor, " candidates"]) -> "TouchCandidates":
+        """The candidates of an index, in its order, or of a mask."""
+        return replace(self, **{name: getattr(self, name)[index] for name in _ARRAYS})
+
+    def as_measurements(self) -> Measurements:
+        """What the nominal robot would measure if it and the placements were as believed, for planning."""
+        return Measurements(
+            q=self.q,
+            frame=self.frame,
+            touch_axis=self.touch_axis,
+            touch=self.coordinate,
+            source="planned touches",
+        )
+
+
+_ARRAYS = ("placement", "face", "axis", "sign", "coordinate", "T_jig_tool", "q")
+
+
+class TouchCandidatesSection(Section):
+    """How candidates of touches are drawn; the axes x, y and z get equally many of them.
+
+    A face of its axis and a point on it are drawn uniformly. The tool's z axis, along which the wire leaves
+    the torch, points down the jig's z axis but for a tilt; tilt and azimuth are drawn uniformly over the
+    cone, the turn about the wire uniformly. What the nominal robot cannot do is drawn again.
+
+    Attributes:
+        count: candidates per placement.
+        seed: of the generator.
+        tilt_deg: largest tilt of the torch from straight down [deg].
+        least_lean_deg: smallest angle between the torch and the face [deg], so that its tip touches first.
+        margin_mm: smallest distance of the point from edges of the face and from what stands on it [mm].
+        travel_mm: how far before and behind the face the tip must be able to go along its normal, as neither
+            robot nor placement are quite where they are believed to be [mm].
+        shaft_mm: length of the torch behind its tip, as a straight line, that must be clear of the jig [mm].
+        least_singular_value: how far from singularities the robot stays; see `singularity_measure`.
+        branch: on which branch of the inverse kinematics the robot touches.
+    """
+
+    count: int = Field(ge=1)
+    seed: int = Field(ge=0)
+    tilt_deg: float = Field(default=45.0, ge=0, le=90)
+    least_lean_deg: float = Field(default=10.0, ge=0, lt=90)
+    margin_mm: float = Field(default=25.0, ge=0)
+    travel_mm: float = Field(default=60.0, gt=0)
+    shaft_mm: float = Field(default=300.0, ge=0)
+    least_singular_value: float = Field(default=0.02, ge=0)
+    branch: BranchSection = BranchSection(near_deg={})
+
+    def find(self, robot: Robot, placements: Sequence[JigPlacement]) -> TouchCandidates:
+        """Draw candidates, the same at every call; those of the first placement come first.
+
+        Args:
+            robot: the nominal robot.
+            placements: of the jigs.
+
+        Raises:
+            RecipeError: the robot cannot make as many touches, or the sections do not fit together.
+            MeasurementError: there is no such jig.
+        """
+        check_names(placements)
+        generator = torch.Generator().manual_seed(self.seed)
+        found = [self._of_placement(robot, placement, generator) for placement in placements]
+        arrays = {name: torch.cat([getattr(part, name) for part in found]) for name in _ARRAYS}
+        arrays["placement"] = torch.arange(len(found)).repeat_interleave(self.count)
+        return TouchCandidates(tuple(placement.name for placement in placements), **arrays)
+
+    def _of_placement(
+        self, robot: Robot, placement: JigPlacement, generator: torch.Generator
+    ) -> TouchCandidates:
+        """Candidates on one placement: every axis has its share."""
+        jig = placement.load_jig()
+        axes = sorted(set(jig.axis.tolist()))
+        share = {axis: (self.count + len(axes) - 1 - place) // len(axes) for place, axis in enumerate(axes)}
+        parts: list[TouchCandidates] = []
+        found = dict.fromkeys(axes, 0)
+        for _ in range(ROUNDS):
+            drawn = self._draw(jig, placement.name, robot.dof, generator)
+            parts.append(self._reachable(robot, jig, placement, drawn))
+            for axis in axes:
+                found[axis] += int((parts[-1].axis == axis).sum())
+            if all(found[axis] >= share[axis] for axis in axes):
+                break
+        else:
+            lacking = next(axis for axis in axes if found[axis] < share[axis])
+            raise RecipeError(
+                f"touches: robot '{robot.name}' can make {found[lacking]} of {share[lacking]} touches along "
+                f"{'xyz'[lacking]} of jig '{placement.name}' ({ROUNDS * DRAWN} drawn); place the "
+                "jig nearer, allow more "
+                "tilt, ask for less margin, travel or shaft, or state another branch."
+            )
+        arrays = {name: torch.cat([getattr(part, name) for part in parts]) for name in _ARRAYS}
+        whole = TouchCandidates((placement.name,), **arrays)
+        kept = [(whole.axis == axis).nonzero()[: share[axis], 0] for axis in axes]
+        return whole.select(torch.cat(kept).sort().values)
+
+    def _draw(self, jig: Jig, name: str, dof: int, generator: torch.Generator) -> TouchCandidates:
+        """Faces, points and torches that are clear of the jig and may or may not be reached."""
+        u = torch.rand(DRAWN, 7, generator=generator, dtype=torch.float64)
+        face = _draw_faces(jig, u[:, 0])
+        lower, upper = (bound[face] for bound in jig.extent)
+        point = lower + (upper - lower) * u[:, 1:4]
+        tilt = torch.deg2rad(torch.tensor(self.tilt_deg, dtype=torch.float64))
+        tilt = torch.arccos(1 - (1 - torch.cos(tilt)) * u[:, 4])
+        azimuth, turn = (2 * torch.pi * u[:, 5], 2 * torch.pi * u[:, 6])
+        zero = torch.zeros_like(tilt)
+        R = rotation_from_rpy(torch.stack([azimuth, tilt, zero], -1))
+        R = R @ rotation_from_rpy(torch.stack([turn, zero, zero + torch.pi], -1))
+        drawn = TouchCandidates(
+            placements=(name,),
+            placement=torch.zeros_like(face),
+            face=face,
+            axis=jig.axis[face],
+            sign=jig.sign[face],
+            coordinate=jig.coordinate[face],
+            T_jig_tool=transform(R, point),
+            q=torch.zeros(DRAWN, dof, dtype=torch.float64),
+        )
+        return drawn.select(self._is_clear(jig, drawn))
+
+    def _is_clear(self, jig: Jig, drawn: TouchCandidates) -> Bool[Tensor, " candidates"]:
+        """Whether the tip touches the face first, at the touch and where it comes from."""
+        point, shaft = drawn.T_jig_tool[:, :3, 3], -drawn.T_jig_tool[:, :3, 2]
+        outward = jig.outward[drawn.face]
+        lean = torch.arcsin((shaft * outward).sum(-1).clamp(-1, 1))
+        clear = torch.rad2deg(lean) >= self.least_lean_deg
+        clear &= jig.on_face(drawn.face, point, self.margin_mm / 1e3)
+        for distance in (1e-6, self.travel_mm / 1e3):
+            tip = point + distance * outward
+            clear &= ~jig.is_hit(tip, tip + self.shaft_mm / 1e3 * shaft)
+        return clear & ~jig.is_hit(point + 1e-6 * outward, point + self.travel_mm / 1e3 * outward)
+
+    def _reachable(
+        self, robot: Robot, jig: Jig, placement: JigPlacement, drawn: TouchCandidates
+    ) -> TouchCandidates:
+        """Those that the nominal robot can make, with their joint values."""
+        T_base_jig = invert(placement.T_jig_base)
+        T = T_base_jig @ drawn.T_jig_tool
+        q, reached = self.branch.find(robot, T)
+        reached = reached & (singularity_measure(robot, q) >= self.least_singular_value)
+        drawn = replace(drawn, q=q).select(reached)
+        T, outward = T[reached], (T_base_jig[:3, :3] @ jig.outward[drawn.face].mT).mT
+        shift = self.travel_mm / 1e3 * torch.stack([outward, -outward])
+        ends = solve_numeric(
+            robot, _shifted(T, shift), drawn.q, tolerance=END_TOLERANCE, max_iterations=MOST_ITERATIONS
+        )
+        ends_reached = ends.status == Status.REACHED
+        ends_reached &= (ends.q - drawn.q).abs().amax(-1) < LARGEST_MOVE
+        ends_reached &= singularity_measure(robot, ends.q) >= self.least_singular_value
+        both_ways = ends_reached.all(0)
+        return drawn.select(both_ways)
+
+
+def _draw_faces(jig: Jig, u: Float64[Tensor, " candidates"]) -> Int64[Tensor, " candidates"]:
+    """Faces by numbers in [0, 1): every axis with the same chance, and every face of an axis."""
+    per_axis = torch.bincount(jig.axis, minlength=3)
+    weight = 1.0 / per_axis[jig.axis].to(u.dtype)
+    bounds = weight.cumsum(0) / weight.sum()
+    return torch.searchsorted(bounds, u.contiguous(), right=True).clamp(max=jig.faces - 1)
+
+
+def _shifted(
+    T: Float64[Tensor, "poses 4 4"], shift: Float64[Tensor, "ends poses 3"]
+) -> Float64[Tensor, "ends poses 4 4"]:
+    return transform(T[:, :3, :3].expand(*shift.shape[:-1], 3, 3), T[:, :3, 3] + shift)

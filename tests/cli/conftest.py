@@ -1,0 +1,66 @@
+"""Fixtures for commands: run them in this process, and models to run them on."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from testing.models import hand_made_model, no_type_checker, small_recipe_text
+from typer.testing import CliRunner, Result
+
+from pisigma.cli.main import app
+from pisigma.correction.model_folder import save_model
+
+Run = Callable[..., Result]
+
+
+def _run(*arguments: object) -> Result:
+    with no_type_checker():
+        result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    return result
+
+
+@pytest.fixture(scope="session")
+def run() -> Run:
+    """Run a command; gives exit code, stdout and stderr."""
+    return _run
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], Result]:
+    """A folder with kiro3.yaml and model/, as `pisigma train --json` made it, and what that printed."""
+    folder = tmp_path_factory.mktemp("trained")
+    (folder / "kiro3.yaml").write_text(small_recipe_text("kiro3"))
+    result = _run("train", folder / "kiro3.yaml", "--out", folder / "model", "--json")
+    assert result.exit_code == 0, result.output
+    return folder, json.loads(result.stdout), result
+
+
+@pytest.fixture(scope="session")
+def models(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the hand-made models kiro3, kiro4 and ur10."""
+    folder = tmp_path_factory.mktemp("models")
+    for name in ("kiro3", "kiro4", "ur10"):
+        (folder / name).mkdir()
+        save_model(hand_made_model(name), folder / name)
+    return folder
+
+
+@pytest.fixture
+def refuses(run: Run) -> Callable[..., str]:
+    """Run a command that must end with status 2 and one line on stderr; gives that line."""
+
+    def check(*arguments: object, stdout: str | None = "") -> str:
+        result = run(*arguments)
+        assert result.exit_code == 2, result.output
+        assert stdout is None or result.stdout == stdout
+        lines = result.stderr.strip().splitlines()
+        assert len(lines) == 1, result.stderr
+        assert lines[0].startswith("pisigma: ")
+        assert "Traceback" not in result.stderr
+        return lines[0].removeprefix("pisigma: ")
+
+    return check

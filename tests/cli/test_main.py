@@ -1,0 +1,122 @@
+"""The command itself: quick, with the agreed exit status, JSON and nothing else on stdout."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+import pisigma
+from pisigma.cli.output import print_table
+from pisigma.robot import catalogue
+
+HEAVY = ("torch", "numpy", "yaml", "lightning", "matplotlib", "scipy", "rich.table")
+START = "import sys; sys.argv = ['pisigma', *sys.argv[1:]]; from pisigma.cli.main import run; run()"
+
+
+def command(*arguments: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", START, *map(str, arguments)], capture_output=True, text=True, check=False
+    )
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["train", "--help"], ["ik", "--help"]])
+def test_help_imports_nothing_heavy(arguments):
+    script = (
+        "import sys\n"
+        "from pisigma.cli.main import run\n"
+        f"sys.argv = ['pisigma', *{arguments!r}]\n"
+        "try:\n    run()\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
+        f"print('heavy:', [name for name in {HEAVY!r} if name in sys.modules])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("heavy: []\n")
+
+
+@pytest.mark.parametrize("name", ["robots", "simulate", "train", "evaluate", "ik"])
+def test_every_command_explains_itself(run, name):
+    result = run(name, "--help")
+    assert result.exit_code == 0
+    assert "--json" in result.stdout
+    assert name in run("--help").stdout
+
+
+def test_version(run):
+    assert run("--version").stdout == f"pisigma {pisigma.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    "arguments", [["trian"], ["robots", "--colour"], ["evaluate"], ["train"], ["simulate", "x.yaml"]]
+)
+def test_usage_errors_exit_2(run, arguments):
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert "Traceback" not in result.stderr
+
+
+def test_robots(run):
+    listed = run("robots")
+    printed = json.loads(run("robots", "--json").stdout)
+    assert [robot["name"] for robot in printed["robots"]] == list(catalogue())
+    for robot in printed["robots"]:
+        assert robot["name"] in listed.stdout
+        assert {"name", "maker", "joints", "reach_mm", "source"} == set(robot)
+
+
+def test_problem_in_a_process_of_its_own(tmp_path):
+    done = command("evaluate", tmp_path / "nothing", "data.csv")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == (
+        f"pisigma: {tmp_path}/nothing: there is no such model folder; give a folder that `pisigma train` "
+        "wrote.\n"
+    )
+
+
+def test_a_defect_of_ours_exits_1_with_its_traceback(tmp_path):
+    script = (
+        "import sys\nfrom pisigma.robot import loading\n"
+        "import pisigma.robot\npisigma.robot.catalogue = lambda: 1 / 0\n"
+        "sys.argv = ['pisigma', 'robots']\nfrom pisigma.cli.main import run\nrun()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "ZeroDivisionError" in done.stderr
+
+
+def test_an_interruption_exits_130_with_one_line():
+    script = (
+        "import sys\nimport pisigma.robot\n"
+        "def interrupted():\n    raise KeyboardInterrupt\n"
+        "pisigma.robot.catalogue = interrupted\n"
+        "sys.argv = ['pisigma', 'robots']\nfrom pisigma.cli.main import run\nrun()\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 130
+    assert done.stderr == "pisigma: interrupted; nothing was left half written.\n"
+
+
+def test_the_inverse_imports_no_lightning_and_no_matplotlib(models):
+    script = (
+        "import sys\nfrom pisigma.cli.main import run\n"
+        f"sys.argv = ['pisigma', 'ik', {str(models / 'kiro3')!r}, '--pose', '300', '300', '300', '0', '0', "
+        "'0', '--json']\ntry:\n    run()\nexcept SystemExit as end:\n    assert not end.code, end.code\n"
+        "heavy = ('lightning', 'matplotlib', 'scipy', 'pisigma.training')\n"
+        "print([name for name in heavy if name in sys.modules], file=sys.stderr)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == "[]\n"
+    assert json.loads(done.stdout)["solutions"][0]["branch"] == "elbow_positive"
+
+
+def test_tables_are_never_cut(capsys):
+    long = "a" * 150
+    print_table("title [bold]x[/bold]", ("name", "value [mm]"), [(long, "1.5"), ("b", "-12.25")])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "title [bold]x[/bold]"
+    assert any(line.strip().startswith(long) for line in lines)
+    assert lines[-2].rstrip().endswith("-12.25")
+    assert lines[-3].rstrip().endswith("   1.5")

@@ -1,0 +1,114 @@
+"""`pisigma train`: from a recipe to a model folder, a report for people and one for programs."""
+
+import json
+
+import pytest
+from testing.models import small_recipe_text
+
+from pisigma.correction.model_folder import load_model
+
+STATISTICS = {"average_deg", "deviation_deg", "maximum_deg"}
+
+
+def test_json_has_the_agreed_shape(trained):
+    folder, printed, result = trained
+    assert printed["model"] == str(folder / "model")
+    assert printed["seconds"] > 0
+    assert [joint["name"] for joint in printed["joints"]] == ["theta_1", "theta_2"]
+    for joint in printed["joints"]:
+        assert set(joint) == {"name", "training", "held_out", "paper"}
+        for part in ("training", "held_out", "paper"):
+            assert set(joint[part]) == {"before", "after"}
+            for figures in joint[part].values():
+                assert set(figures) == STATISTICS
+    assert result.stdout.count("\n") == 1
+
+
+def test_the_folder_is_whole(trained):
+    folder, printed, _ = trained
+    files = {entry.name for entry in (folder / "model").iterdir()}
+    assert files == {
+        "README.md",
+        "energy.csv",
+        "energy.png",
+        "errors_over_workspace.png",
+        "model.safetensors",
+        "model.yaml",
+    }
+    model = load_model(folder / "model")
+    assert model.metrics["joints"] == printed["joints"]
+    assert not list(folder.glob(".*"))
+
+
+def test_tables_for_people_fit_in_80_columns(run, trained, tmp_path):
+    folder, _, _ = trained
+    result = run("train", folder / "kiro3.yaml", "--out", tmp_path / "model")
+    assert result.exit_code == 0
+    table = result.stdout.splitlines()[:-1]
+    assert max(map(len, table)) <= 80
+    for word in ("theta_1", "theta_2", "training", "held-out", "paper", "average", "maximum", "deg"):
+        assert word in result.stdout
+    assert "100 rows used, 0 left out." in result.stdout
+    assert f"Model written to {tmp_path / 'model'}" in result.stdout
+    card = (tmp_path / "model" / "README.md").read_text()
+    assert "Trained on 100 simulated rows, none left out." in card
+
+
+def test_a_model_is_replaced_and_other_folders_are_not(refuses, trained, tmp_path):
+    folder, _, _ = trained
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "thesis.txt").write_text("mine")
+    (tmp_path / "file").write_text("mine")
+    for name in ("folder", "file"):
+        sentence = refuses("train", folder / "kiro3.yaml", "--out", tmp_path / name)
+        assert "exists and is no model folder; choose another --out or remove it." in sentence
+    sentence = refuses("train", folder / "kiro3.yaml", "--out", tmp_path / "file" / "model")
+    assert "cannot be written" in sentence
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["file", "folder"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        ("epochs: 40", "epoch: 40", "did you mean 'epochs'?"),
+        ("robot: kiro3", "robot: kiro33", "did you mean 'kiro3'?"),
+        ("sin(theta_1)", "sin(theta_7)", "unknown network input 'sin(theta_7)'"),
+        ("epochs: 40", "epochs: many", "many"),
+        ("name: kiro3", "name: [", "line"),
+    ],
+)
+def test_recipes_at_fault(refuses, tmp_path, old, new, complaint):
+    text = small_recipe_text("kiro3")
+    assert old in text
+    (tmp_path / "recipe.yaml").write_text(text.replace(old, new, 1))
+    assert complaint in refuses("train", tmp_path / "recipe.yaml", "--out", tmp_path / "model")
+    assert not (tmp_path / "model").exists()
+
+
+def test_data_where_none_is_wanted_and_none_where_it_is(refuses, trained, tmp_path):
+    folder, _, _ = trained
+    sentence = refuses("train", folder / "kiro3.yaml", "--data", "x.csv", "--out", tmp_path / "model")
+    assert "takes no --data; leave it out." in sentence
+    text = small_recipe_text("kiro3")
+    start, end = text.index("data:\n"), text.index("singular_rows:")
+    (tmp_path / "measured.yaml").write_text(f"{text[:start]}data: {{kind: measured}}\n{text[end:]}")
+    arguments = ("train", tmp_path / "measured.yaml", "--out", tmp_path / "model")
+    assert "give the file with --data FILE.csv." in refuses(*arguments)
+    assert "cannot be read" in refuses(*arguments, "--data", tmp_path / "no.csv")
+    assert "cannot be read" in refuses("train", tmp_path / "no.yaml", "--out", tmp_path / "model")
+
+
+def test_resume_without_anything_to_resume(refuses, trained, tmp_path):
+    folder, _, _ = trained
+    sentence = refuses("train", folder / "kiro3.yaml", "--out", tmp_path / "model", "--resume")
+    assert "there is no interrupted training to resume" in sentence
+
+
+def test_printed_figures_are_those_of_the_model(trained):
+    folder, printed, _ = trained
+    text = (folder / "model" / "README.md").read_text()
+    for joint in printed["joints"]:
+        assert (
+            f"| {joint['name']} | deg | training | {joint['training']['before']['average_deg']:.4f} |" in text
+        )
+    assert json.dumps(printed, allow_nan=False)

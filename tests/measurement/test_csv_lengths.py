@@ -1,0 +1,204 @@
+"""Files with touches, sockets and distances: what is read, what reads back, every fault in a sentence."""
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import torch
+from testing.closeness import assert_close
+
+from pisigma.errors import MeasurementError
+from pisigma.measurement import Measurements
+from pisigma.robot import load_robot
+
+MIXED = """\
+q1_deg,x_mm,y_mm,z_mm,socket,touch_axis,touch_mm,distance_mm,anchor,anchor_x_mm,anchor_y_mm,anchor_z_mm,pair,frame,sigma_mm
+1,1,2,3,,,,,,,,,,tracker,0.1
+2,,,,a/0,,,,,,,,,,
+3,,,,a/0,,,,,,,,,,
+4,,,,,z,-120.5,,,,,,,left,0.2
+5,,,,,,,812.25,wire,100,0,-5,,,0.1
+6,,,,,,,300,,,,,bar 1,,0.05
+7,,,,,,,300,,,,,bar 1,,0.05
+8,,,,,,,0,rope,,,,,,
+"""
+
+
+def read(tmp_path: Path, text: str, on_bad_row: str = "error") -> Measurements:
+    path = tmp_path / "data.csv"
+    path.write_text(text)
+    return Measurements.read_csv(path, on_bad_row=on_bad_row)
+
+
+def test_a_file_mixes_kinds_and_frames(tmp_path: Path):
+    data = read(tmp_path, MIXED)
+    assert data.kinds == {"position", "socket", "touch", "distance"}
+    assert data.seen("position").tolist() == [True] + [False] * 7
+    assert data.seen("socket").nonzero()[:, 0].tolist() == [1, 2]
+    assert data.seen("touch").nonzero()[:, 0].tolist() == [3]
+    assert data.seen("distance").nonzero()[:, 0].tolist() == [4, 5, 6, 7]
+    assert data.socket == ("", "a/0", "a/0", "", "", "", "", "")
+    assert (data.touch_axis[3], data.frame[3], data.anchor[4], data.pair[5:7]) == (
+        "z",
+        "left",
+        "wire",
+        ("bar 1",) * 2,
+    )
+    assert_close(data.touch[3], -0.1205, atol=1e-16)
+    assert_close(data.distance[4:], [0.81225, 0.3, 0.3, 0.0], atol=1e-16)
+    assert_close(data.anchor_place[4], [0.1, 0.0, -0.005], atol=1e-16)
+    assert data.anchor_place[[0, 5, 7]].isnan().all()
+    assert_close(data.sigma_position[[0, 3]], [1e-4, 2e-4], atol=1e-18)
+
+
+@pytest.mark.parametrize("rows", [[0, 1, 3], [1, 2], [3], [4, 7], [5, 6], list(range(8))])
+def test_what_is_written_reads_back(tmp_path: Path, rows: list[int]):
+    data = read(tmp_path, MIXED).select(torch.tensor(rows))
+    data.write_csv(tmp_path / "again.csv")
+    again = Measurements.read_csv(tmp_path / "again.csv")
+    for item in fields(Measurements):
+        actual, expected = getattr(again, item.name), getattr(data, item.name)
+        if item.name in ("line", "source", "left_out"):
+            continue
+        if isinstance(expected, torch.Tensor) and expected.isnan().all():
+            assert actual is None, item.name
+        elif isinstance(expected, torch.Tensor):
+            assert torch.equal(actual.isnan(), expected.isnan())
+            assert_close(actual.nan_to_num(), expected.nan_to_num(), atol=1e-15, rtol=1e-14)
+        else:
+            assert actual == expected, item.name
+    assert again.kinds == data.kinds
+
+
+def test_metres_are_read_too(tmp_path: Path):
+    data = read(
+        tmp_path,
+        "q1_rad,frame,touch_axis,touch_m,distance_m,anchor,anchor_x_m,anchor_y_m,anchor_z_m\n"
+        "0,left,x,0.5,,,,,\n0,,,,2,wire,1,2,3\n",
+    )
+    assert_close(data.touch[0], 0.5)
+    assert_close(data.distance[1], 2.0)
+    assert_close(data.anchor_place[1], [1.0, 2.0, 3.0])
+
+
+def test_measured_sockets(shared_data: Path, tmp_path: Path):
+    robot = load_robot("panda")
+    data = Measurements.read_csv(shared_data / "panda_sockets" / "panda_3.csv", robot)
+    assert (data.rows, data.dof, data.kinds) == (387, 7, {"socket"})
+    assert len(set(data.socket)) == 12
+    assert {name.rpartition("/")[2] for name in data.socket} == {"0", "1"}
+    assert data.position is None
+    data.write_csv(tmp_path / "again.csv", robot)
+    again = Measurements.read_csv(tmp_path / "again.csv", robot)
+    assert again.socket == data.socket
+    assert_close(again.q, data.q, atol=1e-14)
+
+
+TOUCH = "q1_deg,frame,touch_axis,touch_mm"
+WIRE = "q1_deg,distance_mm,anchor,anchor_x_mm,anchor_y_mm,anchor_z_mm,pair,frame,sigma_mm"
+ALL = "q1_deg,x_mm,y_mm,z_mm,socket,frame,touch_axis,touch_mm,distance_mm,anchor"
+CASES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "no axis": (f"{TOUCH}\n1,left,w,3\n", ("line 2", "column 'touch_axis'", "'w' is no axis", "x, y or z")),
+    "capital axis": (f"{TOUCH}\n1,left,X,3\n", ("line 2", "'X' is no axis")),
+    "touch without axis": (f"{TOUCH}\n1,left,,3\n", ("line 2", "column 'touch_axis'", "no axis was given")),
+    "axis without touch": (f"{TOUCH}\n1,left,y,\n", ("line 2", "column 'touch_mm'", "along y")),
+    "touch without frame": (f"{TOUCH}\n1,,y,3\n", ("line 2", "column 'frame'", "which placement of the jig")),
+    "no axis column": (
+        "q1_deg,frame,touch_mm\n1,left,3\n",
+        ("line 1", "'touch_mm'", "touch_axis (x, y or z)"),
+    ),
+    "no touch column": (
+        "q1_deg,frame,touch_axis\n1,left,x\n",
+        ("line 1", "'touch_axis'", "add the column touch_mm"),
+    ),
+    "no frame column": ("q1_deg,touch_axis,touch_mm\n1,x,3\n", ("line 1", "column frame", "jig")),
+    "distance from nowhere": (f"{WIRE}\n1,3,,,,,,,\n", ("line 2", "column 'anchor'", "from nowhere")),
+    "no anchor column": ("q1_deg,distance_mm\n1,3\n", ("line 1", "'distance_mm'", "anchor", "or pair")),
+    "anchor without distance": (f"{WIRE}\n1,,wire,,,,,,\n", ("line 2", "column 'distance_mm'", "'wire'")),
+    "no distance column": ("q1_deg,pair\n1,a\n", ("line 1", "column 'pair'", "distance_mm")),
+    "anchor and pair": (f"{WIRE}\n1,3,wire,,,,bar,,\n", ("line 2", "'anchor' and column 'pair'", "keep one")),
+    "negative distance": (
+        f"{WIRE}\n1,-3,wire,,,,,,\n",
+        ("line 2", "column 'distance_mm'", "-3", "0 or more"),
+    ),
+    "half an anchor": (f"{WIRE}\n1,3,wire,1,,2,,,\n", ("line 2", "'anchor_x_mm'", "in part", "or none")),
+    "half an anchor in the header": (
+        "q1_deg,distance_mm,anchor,anchor_x_mm\n1,3,w,1\n",
+        ("line 1", "'anchor_x_mm'", "anchor_y_mm, anchor_z_mm"),
+    ),
+    "anchor in two units": (
+        "q1_deg,distance_mm,anchor,anchor_x_mm,anchor_y_m,anchor_z_mm\n1,3,w,1,2,3\n",
+        ("line 1", "'anchor_y_m'", "one unit"),
+    ),
+    "place of no anchor": (f"{WIRE}\n1,3,,1,2,3,bar,,\n2,3,,,,,bar,,\n", ("line 2", "no anchor is named")),
+    "anchor in two places": (
+        f"{WIRE}\n1,3,wire,1,2,3,,,\n2,3,wire,1,2,4,,,\n",
+        ("line 2", "'wire' has not the same place", "1 more row"),
+    ),
+    "anchor known in one row": (f"{WIRE}\n1,3,wire,1,2,3,,,\n2,3,wire,,,,,,\n", ("line 2", "or in none")),
+    "anchor in two frames": (
+        f"{WIRE}\n1,3,wire,,,,,a,\n2,3,wire,,,,,b,\n",
+        ("line 2", "column 'frame'", "anchor 'wire'", "'a' and 'b'"),
+    ),
+    "socket in two frames": (
+        "q1_deg,socket,frame\n1,s,a\n2,s,b\n",
+        ("line 2", "socket 's'", "another name in each frame"),
+    ),
+    "pair of one": (
+        f"{WIRE}\n1,3,,,,,bar,,\n",
+        ("line 2", "column 'pair'", "'bar' has 1 row", "two were wanted"),
+    ),
+    "pair of three": (
+        f"{WIRE}\n1,3,,,,,bar,,\n2,3,,,,,bar,,\n3,3,,,,,bar,,\n",
+        ("line 2", "'bar' has 3 rows", "2 more rows"),
+    ),
+    "pair of two distances": (
+        f"{WIRE}\n1,3,,,,,bar,,\n2,4,,,,,bar,,\n",
+        ("line 2", "3 and 4", "the same in both"),
+    ),
+    "pair of two sigmas": (f"{WIRE}\n1,3,,,,,bar,,1\n2,3,,,,,bar,,2\n", ("line 2", "'sigma_mm'", "the same")),
+    "pair in two frames": (f"{WIRE}\n1,3,,,,,bar,a,\n2,3,,,,,bar,b,\n", ("line 2", "'a' and 'b'", "in one")),
+    "pair with a bad row": (f"{WIRE}\n1,3,,,,,bar,,\n2,3,,,,,bar,,0\n", ("line 2", "line 3 cannot be used")),
+    "two lengths": (
+        f"{ALL}\n1,1,2,3,s,,,,,\n",
+        ("line 2", "columns 'x_mm', 'y_mm', 'z_mm' and column 'socket'", "one measured length"),
+    ),
+    "touch and distance": (f"{ALL}\n1,,,,,left,x,2,3,w\n", ("line 2", "'touch_mm' and column 'distance_mm'")),
+    "nothing": (f"{ALL}\n1,,,,,left,,,,\n", ("line 2", "nothing was measured", "'socket'", "'touch_mm'")),
+    "no socket": ("q1_deg,socket\n1,a\n2,\n", ("line 3", "columns 'socket'", "nothing was measured")),
+    "equal sockets": ("q1_deg,socket\n1,a\n1,b\n1,a\n", ("line 4", "equals line 2")),
+    "no number": (f"{TOUCH}\n1,left,x,here\n", ("line 2", "column 'touch_mm'", "'here'")),
+    "touch of zero sigma": (f"{TOUCH},sigma_mm\n1,left,x,1,0\n", ("line 2", "'sigma_mm'", "more than 0")),
+    "misspelt": ("q1_deg,sokket\n1,a\n", ("line 1", "'sokket'", "did you mean 'socket'")),
+    "part of a position": ("q1_deg,x_mm,socket\n1,2,a\n", ("line 1", "'y_mm' is missing")),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_faults_are_one_sentence_with_file_line_and_column(tmp_path: Path, case: str):
+    text, parts = CASES[case]
+    with pytest.raises(MeasurementError) as caught:
+        read(tmp_path, text)
+    message = str(caught.value)
+    assert message.startswith(f"{tmp_path / 'data.csv'}, line")
+    assert message.endswith(".")
+    assert "\n" not in message
+    assert "column" in message
+    for part in parts:
+        assert part in message
+
+
+def test_a_pair_is_left_out_whole(tmp_path: Path):
+    text = f"{WIRE}\n1,3,,,,,bar,,\n2,3,,,,,bar,,0\n3,5,,,,,rod,,\n4,5,,,,,rod,,\n"
+    data = read(tmp_path, text, "leave_out")
+    assert data.pair == ("rod", "rod")
+    assert [left.line for left in data.left_out] == [2, 3]
+    assert "line 3 cannot be used" in data.left_out[0].reason
+    assert "sigma_mm" in data.left_out[1].reason
+
+
+def test_refuses_to_write_a_row_without_a_measurement(tmp_path: Path):
+    data = read(tmp_path, MIXED).select(torch.tensor([1, 3]))
+    data = replace(data, socket=None)
+    with pytest.raises(MeasurementError, match=r"line 3: nothing was measured"):
+        data.write_csv(tmp_path / "again.csv")

@@ -1,0 +1,111 @@
+"""Jigs: what a description gives, what it may not say, and which points can be touched."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from testing.closeness import assert_close
+
+from pisigma.errors import MeasurementError
+from pisigma.measurement import Jig
+
+STAIRS = """\
+name: stairs
+source: ours
+blocks:
+  - name: low
+    corner_mm: [0, 0, 0]
+    size_mm: [100, 100, 50]
+    faces: [+z, -y]
+  - name: high
+    corner_mm: [0, 100, 0]
+    size_mm: [100, 100, 120]
+    faces: [-y, +z]
+"""
+
+
+def load(tmp_path: Path, text: str) -> Jig:
+    path = tmp_path / "jig.yaml"
+    path.write_text(text)
+    return Jig.load(path)
+
+
+def points(*values: tuple[float, float, float]) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64) / 1e3
+
+
+def test_faces_have_axis_coordinate_extent_and_direction(tmp_path: Path):
+    jig = load(tmp_path, STAIRS)
+    assert jig.face_names == ("low/+z", "low/-y", "high/-y", "high/+z")
+    assert jig.axis.tolist() == [2, 1, 1, 2]
+    assert_close(jig.coordinate, [0.05, 0.0, 0.1, 0.12], atol=1e-16)
+    assert_close(jig.outward, [[0, 0, 1], [0, -1, 0], [0, -1, 0], [0, 0, 1.0]])
+    lower, upper = jig.extent
+    assert_close(lower, points((0, 0, 50), (0, 0, 0), (0, 100, 0), (0, 100, 120)), atol=1e-16)
+    assert_close(upper, points((100, 100, 50), (100, 0, 50), (100, 100, 120), (100, 200, 120)), atol=1e-16)
+
+
+def test_points_on_a_face_are_inside_its_edges_and_uncovered(tmp_path: Path):
+    jig = load(tmp_path, STAIRS)
+    riser = torch.full((5,), 2)
+    on = points((50, 100, 85), (50, 100, 30), (50, 100, 55), (-1, 100, 85), (50, 250, 85))
+    assert jig.on_face(riser, on).tolist() == [True, False, True, False, True]
+    assert jig.on_face(riser, on, margin=0.01).tolist() == [True, False, False, False, True]
+    tread = torch.zeros(3, dtype=torch.int64)
+    on = points((50, 50, 0), (50, 95, 0), (5, 50, 0))
+    assert jig.on_face(tread, on).all()
+    assert jig.on_face(tread, on, margin=0.01).tolist() == [True, False, False]
+    assert jig.on_face(tread[:0], on[:0]).tolist() == []
+
+
+def test_lines_hit_blocks_that_they_run_through(tmp_path: Path):
+    jig = load(tmp_path, STAIRS)
+    start = points((50, 50, 60), (50, 50, 51), (50, 50, 51), (50, 50, 51), (50, -10, 25), (50, 50, 50))
+    end = points((50, 50, 500), (50, 500, 51), (50, -500, 51), (50, 99, 300), (50, 210, 25), (500, 50, 50))
+    assert jig.is_hit(start, end).tolist() == [False, True, False, False, True, False]
+    assert jig.is_hit(end, start).tolist() == [False, True, False, False, True, False]
+
+
+def test_the_jig_that_comes_with_the_package_steps_down_along_x_and_y():
+    jig = Jig.load("stepped")
+    assert sorted(set(jig.axis.tolist())) == [0, 1, 2]
+    assert jig.faces == 15
+    assert sorted(jig.coordinate[jig.axis == 2].tolist()) == pytest.approx([0.12, 0.24, 0.36])
+    assert "not published" in jig.source
+    middles = torch.stack(jig.extent).mean(0)
+    uncovered = jig.on_face(torch.arange(15), middles)
+    covered = {name for name, free in zip(jig.face_names, uncovered.tolist(), strict=True) if not free}
+    assert covered == {"low/+z", "middle/+z"}  # their middles are under the next step, their rims are free
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "parts"),
+    [
+        ("faces: [+z, -y]", "faces: [+w, -y]", ("line 7", "blocks.0.faces", "'+w'")),
+        ("faces: [+z, -y]", "faces: [-y, -y]", ("line 4", "face -y of block 'low' stands twice")),
+        ("faces: [+z, -y]", "faces: [+y, -y]", ("face +y of block 'low' is covered by block 'high'",)),
+        ("[100, 100, 50]", "[100, 0, 50]", ("line 6", "size_mm.1", "greater than 0")),
+        ("[100, 100, 50]", "[100, 101, 50]", ("'low' and 'high' overlap",)),
+        ("name: high", "name: low", ("block name 'low' stands twice",)),
+        ("corner_mm: [0, 0, 0]", "corners_mm: [0, 0, 0]", ("line 5", "did you mean 'corner_mm'")),
+        ("source: ours\n", "", ("'source' is missing",)),
+    ],
+)
+def test_refuses_what_is_no_jig(tmp_path: Path, old: str, new: str, parts: tuple[str, ...]):
+    with pytest.raises(MeasurementError) as caught:
+        load(tmp_path, STAIRS.replace(old, new, 1))
+    message = str(caught.value)
+    assert message.startswith(f"{tmp_path / 'jig.yaml'}, line ")
+    for part in parts:
+        assert part in message
+
+
+def test_refuses_a_jig_without_faces(tmp_path: Path):
+    text = STAIRS.replace("faces: [+z, -y]", "faces: []").replace("faces: [-y, +z]", "faces: []")
+    with pytest.raises(MeasurementError, match="no block has a face"):
+        load(tmp_path, text)
+
+
+def test_refuses_an_unknown_jig():
+    with pytest.raises(MeasurementError, match=r"'steped' is no jig .* did you mean 'stepped'"):
+        Jig.load("steped")

@@ -1,0 +1,80 @@
+"""Files of wanted poses: units from the names, every complaint with file, line and column."""
+
+import pytest
+import torch
+from testing.closeness import assert_close
+
+from pisigma.errors import MeasurementError
+from pisigma.measurement.pose_csv import read_poses
+from pisigma.se3 import transform_from_xyzrpy
+
+RPY = "x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg"
+QUATERNION = "x_m,y_m,z_m,qx,qy,qz,qw"
+
+
+def read(tmp_path, *lines: str):
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return read_poses(path)
+
+
+def test_roll_pitch_yaw_in_degrees_and_millimetres(tmp_path):
+    found = read(tmp_path, "# wanted", RPY, "100,-200,300,10,20,30", "", " 1e2 ,0,+5,0,0,-90")
+    values = torch.tensor([[0.1, -0.2, 0.3, 10, 20, 30], [0.1, 0, 0.005, 0, 0, -90]], dtype=torch.float64)
+    values[:, 3:] = torch.deg2rad(values[:, 3:])
+    assert_close(found.T, transform_from_xyzrpy(values), atol=1e-15)
+    assert found.line == (3, 5)
+
+
+def test_quaternions_metres_and_any_order_of_columns(tmp_path):
+    half = 0.5**0.5
+    found = read(tmp_path, QUATERNION, f"0.1,0.2,0.3,0,0,{half},{half}")
+    quarter = transform_from_xyzrpy(torch.tensor([[0.1, 0.2, 0.3, torch.pi / 2, 0, 0]], dtype=torch.float64))
+    assert_close(found.T, quarter, atol=1e-15)
+    mixed = read(tmp_path, "yaw_deg,z_mm,x_mm,roll_deg,y_mm,pitch_deg", "0,300,100,90,200,0")
+    assert_close(mixed.T, quarter, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("lines", "complaint"),
+    [
+        (["x_mm,y_mm,z_mm,roll_deg,pitch_deg", "1,2,3,4,5"], "line 1: the column of 'yaw' is missing"),
+        (["x_mm,y_mm,z_mm", "1,2,3"], "line 1: the column of 'roll' is missing; a pose has x_mm"),
+        (["x_mm,y_mm,z_mm,qx,qy,qz", "1,2,3,0,0,0"], "'qw' is missing; a pose has x_mm, y_mm, z_mm, qx"),
+        ([f"{RPY},colour", "1,2,3,4,5,6,7"], "line 1, column 'colour': no column of a wanted pose; Valid:"),
+        ([f"{RPY},q1_deg", "1,2,3,4,5,6,7"], "column 'q1_deg': no column of a wanted pose"),
+        ([RPY.replace("roll_deg", "rol_deg"), "1,2,3,4,5,6"], "did you mean 'roll_deg'"),
+        ([f"{RPY},x_m", "1,2,3,4,5,6,7"], "column 'x_m': 'x' stands twice"),
+        ([f"{RPY},qx,qy,qz,qw", "1,2,3,4,5,6,0,0,0,1"], "both given; keep one"),
+        ([RPY.replace("y_mm", "y_m"), "1,2,3,4,5,6"], "columns 'x_mm', 'y_m', 'z_mm': mixed units"),
+        ([RPY, "1,2,3,4,5,6", "1,2,3,4,5"], "line 3: 6 fields were wanted, got 5"),
+        ([RPY, "1,5,2,3,4,5,6"], "decimal point, not a comma"),
+        ([RPY, '1,2,3,4,5,"6'], "line 2: is no valid CSV"),
+        ([RPY, "1,2,three,4,5,6"], "line 2, column 'z_mm': 'three' is no finite number"),
+        ([RPY, "1,2,nan,4,5,6"], "'nan' is no finite number"),
+        ([RPY, "1,2,3,4,5,inf"], "'inf' is no finite number"),
+        ([RPY, "1,2,,4,5,6"], "column 'z_mm': '' is no finite number"),
+        ([RPY, "1,2,1_000,4,5,6"], "'1_000' is no finite number"),
+        (
+            [QUATERNION, "0,0,0,0,0,0,1", "0,0,0,0,0,0,2"],
+            "line 3, columns 'qx' to 'qw': a quaternion of length 1",
+        ),
+        ([QUATERNION, "0,0,0,0,0,0,0"], "got 0; normalise it"),
+        ([RPY], "ends after its header"),
+        ([], "is empty"),
+    ],
+)
+def test_faults_are_named(tmp_path, lines, complaint):
+    with pytest.raises(MeasurementError) as caught:
+        read(tmp_path, *lines)
+    assert str(caught.value).startswith(str(tmp_path / "poses.csv"))
+    assert complaint in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(MeasurementError, match="cannot be read"):
+        read_poses(tmp_path / "nothing.csv")
+    (tmp_path / "poses.csv").write_bytes(b"\xff\xfe\x00x")
+    with pytest.raises(MeasurementError, match="not UTF-8"):
+        read_poses(tmp_path / "poses.csv")

@@ -1,0 +1,92 @@
+"""Shipped models: each folder loads, has its card and figures, and gives the figures that the card states."""
+
+import csv
+from pathlib import Path
+
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.models import no_type_checker
+
+import pisigma
+from pisigma.correction.model_folder import load_model
+from pisigma.evaluation.joint_statistics import JointStatistics
+from pisigma.evaluation.tables import joint_table
+from pisigma.training.pairs import build_pairs
+from pisigma.training.recipe import SimulatedData, read_recipe, recipe_hash
+from pisigma.training.run import simulate_held_out, simulate_training
+
+FOLDERS = sorted(path for path in (Path(__file__).parent.parent / "models").glob("*") if path.is_dir())
+SECTIONS = ("Joint errors", "Figures", "Domain", "Not validated", "Use", "Provenance")
+
+each = pytest.mark.parametrize("folder", FOLDERS, ids=lambda path: path.name)
+
+
+def test_the_models_of_the_paper_are_shipped():
+    assert {"kiro3", "kiro4"} <= {folder.name for folder in FOLDERS}
+
+
+@each
+def test_a_folder_is_whole(folder):
+    files = {path.name for path in folder.iterdir()}
+    assert {"README.md", "energy.csv", "energy.png", "errors_over_workspace.png"} <= files
+    assert {"model.yaml", "model.safetensors"} <= files
+    model = load_model(folder)
+    assert model.name == folder.name
+    solution = pisigma.load(folder)(model.forward(model.starts[:5]))
+    assert bool(torch.isfinite(solution.q).all())
+
+
+@each
+def test_a_card_says_everything(folder):
+    text = (folder / "README.md").read_text()
+    assert text.startswith(f"# {folder.name}\n")
+    headings = {line[3:] for line in text.splitlines() if line.startswith("## ")}
+    assert set(SECTIONS) <= headings
+    assert f'pisigma.load("models/{folder.name}")' in text
+    provenance = load_model(folder).provenance
+    for value in (provenance.recipe_sha256, provenance.data_sha256, *provenance.versions.values()):
+        assert value in text
+    assert joint_table(load_model(folder).metrics["joints"]) in text
+
+
+@each
+def test_a_model_comes_from_the_shipped_recipe(folder, repository):
+    recipe = repository / "training" / f"{folder.name}.yaml"
+    assert recipe.is_file()
+    assert load_model(folder).provenance.recipe_sha256 == recipe_hash(recipe)
+
+
+@each
+def test_energies_are_there_for_every_corrected_joint(folder):
+    head, *rows = csv.reader((folder / "energy.csv").read_text().splitlines())
+    joints = [joint["name"] for joint in load_model(folder).metrics["joints"]]
+    assert head == ["epoch", *(f"energy_{joint}" for joint in joints)]
+    energies = torch.tensor([[float(cell) for cell in row[1:]] for row in rows])
+    assert bool(torch.isfinite(energies).all())
+    assert bool((energies[-1] <= energies[0]).all())
+
+
+@each
+def test_figures_are_found_again(folder, repository):
+    """Training and held-out figures, computed again from the stored model and the recipe's true robot."""
+    recipe = read_recipe(repository / "training" / f"{folder.name}.yaml")
+    if not isinstance(recipe.data, SimulatedData):
+        pytest.skip("the measured rows are not part of the project")
+    model = load_model(folder)
+    names = [joint.name for joint in model.robot.joints]
+    bound = recipe.singular_rows.below if recipe.singular_rows.rule == "leave_out" else None
+    with no_type_checker():
+        parts = {
+            "training": build_pairs(model.robot, simulate_training(recipe), bound),
+            "held_out": build_pairs(model.robot, simulate_held_out(recipe), None),
+        }
+    for part, pairs in parts.items():
+        T, q, before = pairs.T[pairs.used], pairs.q_nominal[pairs.used], pairs.target[pairs.used]
+        after = before - model.correction(T, q)
+        for joint in model.metrics["joints"]:
+            index = names.index(joint["name"])
+            for when, errors in (("before", before), ("after", after)):
+                found = JointStatistics.of(errors[:, index]).in_file_units(model.robot.revolute[index])
+                for name, value in joint[part][when].items():
+                    assert_close(found[name], value, rtol=1e-6, atol=1e-9)

@@ -1,0 +1,244 @@
+"""The package as a whole: imports one way, a light start, small files, a wheel that works by itself."""
+
+import ast
+import re
+import site
+import subprocess
+import sys
+import venv
+import zipfile
+from pathlib import Path
+
+import pytest
+import tomllib
+from testing.models import hand_made_model
+
+import pisigma
+from pisigma.correction.model_folder import save_model
+
+LAYERS = (
+    "errors",
+    "yaml_schema",
+    "yaml_file",
+    "se3",
+    "robot",
+    "kinematics",
+    "measurement",
+    "simulation",
+    "identification",
+    "network",
+    "correction",
+    "training",
+    "evaluation",
+    "cli",
+)
+"""Every module or package may import those before it, and itself."""
+
+PACKAGE = Path(pisigma.__file__).parent
+MODULES = sorted(PACKAGE.rglob("*.py"))
+TESTS = Path(__file__).parent
+LINES = 300
+
+
+def name_of(path: Path) -> str:
+    return path.relative_to(PACKAGE).as_posix()
+
+
+def imported(path: Path) -> set[str]:
+    """Modules that a file imports anywhere, under `if TYPE_CHECKING` and inside functions too."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name_of(path)}: relative import"
+            assert node.module is not None
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return found
+
+
+def layer(module: str) -> str | None:
+    parts = module.split(".")
+    return parts[1] if parts[0] == "pisigma" and len(parts) > 1 and parts[1] in LAYERS else None
+
+
+def test_every_module_has_its_layer():
+    tops = {path.relative_to(PACKAGE).parts[0].removesuffix(".py") for path in MODULES}
+    assert tops - {"__init__"} <= set(LAYERS)
+
+
+@pytest.mark.parametrize("path", [path for path in MODULES if path != PACKAGE / "__init__.py"], ids=name_of)
+def test_imports_run_one_way(path):
+    own = LAYERS.index(path.relative_to(PACKAGE).parts[0].removesuffix(".py"))
+    above = {module for module in imported(path) if (found := layer(module)) and LAYERS.index(found) > own}
+    assert not above, f"{name_of(path)} imports {sorted(above)}, which stand above it"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_lightning_is_imported_in_training_only(path):
+    users = {module.split(".")[0] for module in imported(path)} & {"lightning", "pytorch_lightning"}
+    assert not users or path.relative_to(PACKAGE).parts[0] == "training"
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_files_stay_small(path):
+    lines = path.read_text(encoding="utf-8").count("\n")
+    assert lines <= LINES, f"{name_of(path)} has {lines} lines; split it"
+
+
+def test_no_catch_all_modules():
+    assert not {path.stem for path in MODULES} & {"utils", "util", "helpers", "common", "misc"}
+
+
+def test_import_is_light_and_has_no_side_effects(tmp_path):
+    script = (
+        "import sys, warnings, random\n"
+        "filters, state = list(warnings.filters), random.getstate()\n"
+        "import pisigma\n"
+        "heavy = ('torch', 'numpy', 'lightning', 'matplotlib', 'scipy', 'yaml', 'typer', 'rich')\n"
+        "assert not [name for name in heavy if name in sys.modules], sys.modules.keys() & set(heavy)\n"
+        "assert warnings.filters == filters and random.getstate() == state\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert not list(tmp_path.iterdir())
+
+
+def test_loading_a_model_needs_neither_lightning_nor_matplotlib():
+    script = (
+        "import sys\nimport pisigma\npisigma.load\npisigma.CorrectedIK\n"
+        "assert not [name for name in ('lightning', 'matplotlib', 'scipy', 'pisigma.training') if name in "
+        "sys.modules]\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("name", pisigma.__all__)
+def test_public_names_are_there_and_documented(name):
+    value = getattr(pisigma, name)
+    assert value.__name__ == name
+    assert value.__doc__
+    assert name in dir(pisigma)
+
+
+def test_unknown_names_are_no_attributes():
+    assert sorted(pisigma.__all__) == list(pisigma.__all__)
+    with pytest.raises(AttributeError, match="no attribute 'laod'"):
+        _ = pisigma.laod
+
+
+def test_version_is_that_of_the_project(repository):
+    project = tomllib.loads((repository / "pyproject.toml").read_text())["project"]
+    assert pisigma.__version__ == project["version"]
+
+
+@pytest.mark.parametrize(
+    "path", sorted(TESTS.rglob("*.py")), ids=lambda path: path.relative_to(TESTS).as_posix()
+)
+def test_tests_compare_numbers_through_the_one_helper(path):
+    """A bare allclose asserts nothing, and some of them pass NaN."""
+    if path.name == "closeness.py":
+        return
+    calls = {
+        node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call)
+    }
+    assert not calls & {"allclose", "isclose", "assert_allclose"}
+
+
+def test_nothing_is_said_about_machines(repository):
+    """No absolute path of a machine stands in what is shipped."""
+    pattern = re.compile(r"(?<![\w.])/(home|root|work|tmp|Users)/")
+    suffixes = {".py", ".md", ".yaml", ".toml", ".txt"}
+    folders = ("pisigma", "training", "models")
+    found = [
+        path
+        for folder in folders
+        for path in (repository / folder).rglob("*")
+        if path.suffix in suffixes and pattern.search(path.read_text(encoding="utf-8"))
+    ]
+    assert not found
+
+
+@pytest.fixture(scope="module")
+def wheel(repository, tmp_path_factory) -> Path:
+    """The built wheel."""
+    out = tmp_path_factory.mktemp("dist")
+    command = [
+        sys.executable,
+        "-m",
+        "build",
+        "--wheel",
+        "--no-isolation",
+        "--outdir",
+        str(out),
+        str(repository),
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    (found,) = out.glob("*.whl")
+    return found
+
+
+def test_the_wheel_holds_the_package_and_nothing_else(wheel):
+    names = zipfile.ZipFile(wheel).namelist()
+    assert {name.split("/")[0] for name in names} == {"pisigma", f"pisigma-{pisigma.__version__}.dist-info"}
+    shipped = {name for name in names if name.startswith("pisigma/")}
+    there = {
+        f"pisigma/{path.relative_to(PACKAGE).as_posix()}"
+        for path in PACKAGE.rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts
+    }
+    assert shipped == there
+    assert {"pisigma/py.typed", "pisigma/robot/catalogue/kiro3.yaml", "pisigma/cli/main.py"} <= shipped
+
+
+def test_the_wheel_works_without_lightning(wheel, tmp_path):
+    """Installed into a fresh environment that sees the dependencies, but no lightning and no checkout."""
+    folder = tmp_path / "environment"
+    venv.create(folder, with_pip=False, symlinks=True)
+    python = folder / "bin" / "python"
+    pip = [
+        sys.executable,
+        "-m",
+        "pip",
+        "--python",
+        str(python),
+        "install",
+        "--quiet",
+        "--no-deps",
+        "--no-index",
+    ]
+    installed = subprocess.run([*pip, str(wheel)], capture_output=True, text=True, check=False)
+    assert installed.returncode == 0, installed.stderr
+    (target,) = folder.glob("lib/python*/site-packages")
+    dependencies = [path for path in (*site.getsitepackages(), *sys.path) if path.endswith("site-packages")]
+    (target / "dependencies.pth").write_text("\n".join(dict.fromkeys(dependencies)) + "\n")
+    model = tmp_path / "model"
+    model.mkdir()
+    save_model(hand_made_model("kiro4"), model)
+    script = (
+        "import sys\n"
+        "sys.modules['lightning'] = sys.modules['pytorch_lightning'] = None  # importing them fails\n"
+        "import numpy as np, pisigma\n"
+        "assert pisigma.__file__.startswith(sys.argv[1]), pisigma.__file__\n"
+        "T = np.eye(4)\nT[:3, 3] = 0.7, 0.1, 0.6\n"
+        "solution = pisigma.load(sys.argv[2])(T)\n"
+        "print(tuple(solution.q.shape), pisigma.Robot.load('kiro3').name)\n"
+    )
+    done = subprocess.run(
+        [python, "-c", script, str(target), str(model)],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (0, "(6,) kiro3\n"), done.stderr
+    version = subprocess.run(
+        [folder / "bin" / "pisigma", "--version"], capture_output=True, text=True, check=False
+    )
+    assert (version.returncode, version.stdout) == (0, f"pisigma {pisigma.__version__}\n"), version.stderr

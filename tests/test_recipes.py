@@ -1,0 +1,92 @@
+"""Every shipped recipe parses, and trains to the figures that are promised of it."""
+
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+from testing.closeness import assert_close
+
+from pisigma.evaluation.training_report import report_joints
+from pisigma.training.recipe import Recipe, SimulatedData, read_recipe
+from pisigma.training.run import TrainingRun, load_measurements, train_recipe
+
+FOLDER = Path(__file__).parent.parent / "training"
+INVERSE = sorted(p.stem for p in FOLDER.glob("*.yaml") if "network" in yaml.safe_load(p.read_text()))
+SEEDS = range(5)
+SIGNS = {
+    "kiro3_paper": {"theta_1": {-1, 1}, "theta_2": {1}},
+    "kiro4_paper": {"theta_2": {-1, 1}, "theta_3": {-1, 1}},
+}
+STATISTICS = ("average_deg", "deviation_deg", "maximum_deg")
+
+
+def read(name: str) -> Recipe:
+    return read_recipe(FOLDER / f"{name}.yaml")
+
+
+def train(recipe: Recipe, seed: int = 0) -> TrainingRun:
+    recipe = recipe.model_copy(update={"fit": recipe.fit.model_copy(update={"seed": seed})})
+    return train_recipe(recipe, load_measurements(recipe, None))
+
+
+def test_the_recipes_of_inverse_calibration_are_there():
+    wanted = {"kiro3", "kiro4", "kiro3_paper", "kiro4_paper", "kiro3_physical", "ur10_inverse"}
+    assert wanted <= set(INVERSE)
+
+
+@pytest.mark.parametrize("name", INVERSE)
+def test_it_parses_and_says_what_it_is(name):
+    recipe = read(name)
+    assert recipe.name == name
+    assert recipe.description
+    assert recipe.not_validated
+    if isinstance(recipe.data, SimulatedData):
+        assert recipe.data.held_out.poses.count >= 2000
+
+
+@pytest.mark.parametrize("name", ["kiro3_paper", "kiro4_paper"])
+def test_the_papers_network_does_what_the_paper_says(name):
+    recipe = read(name)
+    assert (recipe.fit.method, recipe.fit.epochs) == ("gradient_descent", 3000)
+    assert {group.orders for group in recipe.network} == {(3,)}
+    run = train(recipe)
+    reports = report_joints(recipe, run)
+    assert [report["name"] for report in reports] == list(recipe.paper)
+    for index, report in enumerate(reports):
+        before, after, paper = report["training"]["before"], report["training"]["after"], report["paper"]
+        for key in STATISTICS:
+            assert_close(before[key], paper["before"][key], rtol=0.02)
+        assert after["average_deg"] <= paper["after"]["average_deg"]
+        signs = set(run.training.before[:, index].sign().int().tolist())
+        expected = SIGNS[name].get(report["name"])
+        assert signs == expected if expected else len(signs) == 1
+    assert run.history.energies.shape == (3000, len(reports))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("name", ["kiro3", "kiro4"])
+def test_the_default_is_ten_times_better_than_the_paper_on_new_poses(name, seed):
+    recipe = read(name)
+    run = train(recipe, seed)
+    for report in report_joints(recipe, run):
+        assert report["held_out"]["after"]["average_deg"] <= report["paper"]["after"]["average_deg"] / 10
+    assert len(run.held_out.before) == 2000
+    assert len(run.history.energies) < recipe.fit.epochs  # it ended because it had converged
+
+
+def test_the_physical_robot_is_corrected_too():
+    recipe = read("kiro3_physical")
+    run = train(recipe)
+    for report in report_joints(recipe, run):
+        for key in STATISTICS:
+            assert_close(report["training"]["before"][key], report["paper"]["before"][key], rtol=0.02)
+        assert report["held_out"]["after"]["average_deg"] < report["held_out"]["before"]["average_deg"] / 20
+
+
+def test_a_seed_gives_the_same_model_bit_for_bit_and_another_does_not():
+    recipe = read("kiro3")
+    recipe = recipe.model_copy(update={"fit": recipe.fit.model_copy(update={"epochs": 10})})
+    first, again, other = (train(recipe, seed).model.network.state_dict() for seed in (3, 3, 4))
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    assert any(not torch.equal(first[name], other[name]) for name in first)

@@ -1,0 +1,159 @@
+"""Training with Lightning: seeds, independent outputs, divergence, resuming at the end, silence."""
+
+import dataclasses
+
+import pytest
+import torch
+from testing.closeness import assert_close
+
+from pisigma.errors import TrainingError
+from pisigma.network.energy import energy_gradient
+from pisigma.network.pi_sigma import PiSigma
+from pisigma.training.fit_sections import GradientDescentSection, LevenbergMarquardtSection
+from pisigma.training.fitting import fit_networks
+from pisigma.training.gradient_descent import GradientDescent, set_gradient
+from pisigma.training.levenberg_marquardt import Patterns
+from pisigma.training.lightning_module import PiSigmaTraining
+
+NAMES = ["a", "b"]
+DESCENT = GradientDescentSection(
+    method="gradient_descent", learning_rate={"a": 0.02, "b": 0.01}, epochs=40, spread=0.2
+)
+SQUARES = LevenbergMarquardtSection(method="levenberg_marquardt", epochs=12, starts=2)
+BOTH = pytest.mark.parametrize("fit", [DESCENT, SQUARES], ids=["gradient_descent", "levenberg_marquardt"])
+
+
+@pytest.fixture
+def data(generator) -> Patterns:
+    x = 2 * torch.rand(30, 2, generator=generator, dtype=torch.float64) - 1
+    d = 1 + 0.3 * torch.randn(30, 2, generator=generator, dtype=torch.float64)
+    return Patterns(x, d, torch.zeros(30, dtype=torch.bool))
+
+
+def fit_one(data: Patterns, fit, **options) -> tuple[PiSigma, torch.Tensor]:
+    network = PiSigma(2, 2, (2,), fixed_product=0.5)
+    history = fit_networks([network], [data], [NAMES], fit, **options)
+    return network, history.energies
+
+
+@BOTH
+def test_a_seed_repeats_exactly_and_another_differs(data, fit):
+    first, energies = fit_one(data, fit)
+    second, again = fit_one(data, fit)
+    other, _ = fit_one(data, fit.model_copy(update={"seed": 1}))
+    assert_close(again, energies, atol=0)
+    assert_close(second.weight, first.weight, atol=0)
+    assert_close(second.bias, first.bias, atol=0)
+    assert float((other.weight - first.weight).detach().abs().max()) > 1e-6
+
+
+@BOTH
+def test_the_targets_of_one_output_do_not_touch_the_other(data, fit):
+    changed = dataclasses.replace(data, d=torch.stack([data.d[:, 0], data.d[:, 1] + data.x[:, 0]], 1))
+    first, second = fit_one(data, fit)[0], fit_one(changed, fit)[0]
+    assert_close(second.weight[0], first.weight[0], atol=0)
+    assert_close(second.bias[0], first.bias[0], atol=0)
+    assert float((second.weight[1] - first.weight[1]).detach().abs().max()) > 1e-6
+
+
+def test_the_learning_rate_of_one_output_does_not_touch_the_other(data):
+    faster = DESCENT.model_copy(update={"learning_rate": {"a": 0.02, "b": 0.03}})
+    first, second = fit_one(data, DESCENT)[0], fit_one(data, faster)[0]
+    assert_close(second.weight[0], first.weight[0], atol=0)
+    assert float((second.weight[1] - first.weight[1]).detach().abs().max()) > 1e-6
+
+
+def test_gradient_descent_is_the_papers_rule(data):
+    network = PiSigma(2, 2, (2,), fixed_product=0.5)
+    network.initialise(0.2, torch.Generator().manual_seed(0))
+    energies = []
+    for _ in range(40):
+        E, by_weight, by_bias = energy_gradient(network, data.x, data.d)
+        energies.append(E)
+        with torch.no_grad():
+            rates = torch.tensor([0.02, 0.01], dtype=torch.float64)
+            network.weight -= rates[:, None, None] * by_weight
+            network.bias -= rates[:, None] * by_bias
+    trained, history = fit_one(data, DESCENT)
+    assert_close(history, torch.stack(energies), rtol=1e-12)
+    assert_close(trained.weight, network.weight, rtol=1e-12)
+    assert_close(trained.bias, network.bias, rtol=1e-12)
+    assert float((history[-1] / history[0]).max()) < 1
+
+
+@BOTH
+def test_no_optimiser_sees_the_fixed_weights_and_they_stay(data, fit):
+    network, _ = fit_one(data, fit)
+    assert_close(network.fixed, torch.full((2, 2), 0.5**0.5, dtype=torch.float64), atol=0)
+    module = PiSigmaTraining([network], fit, [NAMES])
+    assert {name for name, _ in module.named_parameters()} == {"networks.0.weight", "networks.0.bias"}
+    optimiser = module.configure_optimizers()
+    if fit is SQUARES:
+        assert optimiser is None
+    else:
+        seen = [p.data_ptr() for group in optimiser.param_groups for p in group["params"]]
+        assert seen == [network.weight.data_ptr(), network.bias.data_ptr()]
+
+
+def test_an_optimiser_step_follows_the_rates(data):
+    network = PiSigma(2, 2, (1,))
+    before = network.bias.detach().clone()
+    set_gradient(network, data.x, data.d)
+    GradientDescent([network], [torch.tensor([0.0, 2.0], dtype=torch.float64)]).step()
+    assert_close(network.bias[0], before[0], atol=0)
+    assert_close(network.bias[1], before[1] - 2 * network.bias.grad[1], rtol=1e-15)
+
+
+@pytest.mark.parametrize("epochs", [400, 9])
+def test_a_diverging_learning_rate_is_told(data, epochs):
+    fit = DESCENT.model_copy(update={"learning_rate": {"a": 0.01, "b": 1e60}, "epochs": epochs})
+    with pytest.raises(TrainingError, match=r"the training of b diverged .* lower 'fit.learning_rate.b'"):
+        fit_one(data, fit)
+
+
+def test_a_last_step_that_diverges_is_told_too(data):
+    fit = DESCENT.model_copy(update={"learning_rate": {"a": 1e-3, "b": 1e308}, "epochs": 1})
+    scaled = dataclasses.replace(data, d=data.d * torch.tensor([1.0, 1e3], dtype=torch.float64))
+    with pytest.raises(TrainingError, match=r"the training of b diverged"):
+        fit_one(scaled, fit)
+
+
+@BOTH
+@pytest.mark.parametrize("part", ["x", "d"])
+def test_patterns_that_are_not_finite_are_refused(data, fit, part):
+    values = getattr(data, part).clone()
+    values[7, 1] = torch.nan
+    with pytest.raises(TrainingError, match=r"pattern 7 .* of a, b is not finite"):
+        fit_one(dataclasses.replace(data, **{part: values}), fit)
+
+
+@BOTH
+def test_resuming_a_training_that_had_ended_gives_the_same(data, fit, tmp_path):
+    fit = fit.model_copy(update={"epochs": 20})
+    first, energies = fit_one(data, fit, checkpoints=tmp_path, fingerprint="f")
+    second, again = fit_one(data, fit, checkpoints=tmp_path, fingerprint="f", resume=True)
+    assert_close(again, energies, atol=0)
+    assert_close(second.weight, first.weight, atol=0)
+    assert_close(second.bias, first.bias, atol=0)
+    with pytest.raises(TrainingError, match=r"of another recipe or other data"):
+        fit_one(data, fit, checkpoints=tmp_path, fingerprint="g", resume=True)
+
+
+def test_nothing_goes_to_stdout_or_to_the_working_folder(data, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    fit_one(data, DESCENT, show_progress=True, title="bar")
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    assert "bar" in captured.err
+    assert "Lightning" not in captured.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_threads_are_given_back(data):
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        fit_one(data, DESCENT)
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,139 @@
+"""A killed training resumes to the same model; Ctrl-C leaves nothing half written."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from testing.closeness import assert_close
+
+from pisigma.errors import OutputError, TrainingError
+from pisigma.training.checkpoints import find_checkpoint, prepare_checkpoints
+from pisigma.training.recipe import read_recipe
+from pisigma.training.run import RunOptions, load_measurements, train_recipe
+
+# Slow enough to be caught in the middle: every epoch waits, which changes no number.
+SLOW = """
+import sys, time
+from pisigma.training.lightning_module import PiSigmaTraining
+step = PiSigmaTraining.training_step
+def slow(self, batch, batch_idx):
+    time.sleep(WAIT)
+    return step(self, batch, batch_idx)
+WAIT = float(sys.argv.pop(1))
+PiSigmaTraining.training_step = slow
+from pisigma.cli.main import run
+run()
+"""
+EPOCHS = 60
+PAPER = ("kiro3_paper", ("epochs: 3000", f"epochs: {EPOCHS}"))
+DEFAULT = (
+    "kiro3",
+    ("epochs: 300", f"epochs: {EPOCHS}"),
+    ("starts: 6", "starts: 2"),
+    ("count: 2000", "count: 10"),
+)
+
+
+def command(wait: float, *arguments: str) -> list[str]:
+    return [sys.executable, "-c", SLOW, str(wait), *arguments]
+
+
+def train(cwd: Path, recipe: Path, *options: str, wait: float = 0.0) -> subprocess.CompletedProcess[str]:
+    arguments = command(wait, "train", str(recipe), "--out", "model", "--json", *options)
+    return subprocess.run(arguments, cwd=cwd, capture_output=True, text=True, check=False, env=environment())
+
+
+def environment() -> dict[str, str]:
+    return os.environ | {"OMP_NUM_THREADS": "1"}
+
+
+def start_and_wait_for_a_checkpoint(cwd: Path, recipe: Path) -> subprocess.Popen[bytes]:
+    process = subprocess.Popen(
+        command(0.1, "train", str(recipe), "--out", "model"),
+        cwd=cwd,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env=environment(),
+    )
+    checkpoint = cwd / ".model.training" / "last.ckpt"
+    for _ in range(600):
+        if checkpoint.is_file() or process.poll() is not None:
+            break
+        time.sleep(0.05)
+    assert process.poll() is None, process.communicate()[1].decode()
+    assert checkpoint.is_file()
+    return process
+
+
+def kill_after_a_checkpoint(folder: Path, recipe: Path) -> None:
+    folder.mkdir()
+    process = start_and_wait_for_a_checkpoint(folder, recipe)
+    process.send_signal(signal.SIGKILL)
+    process.communicate()
+    assert [entry.name for entry in folder.iterdir()] == [".model.training"]
+
+
+def test_killed_and_resumed_gives_the_same_model_folder(write_recipe, tmp_path):
+    recipe = write_recipe(*PAPER)
+    whole, broken = tmp_path / "whole", tmp_path / "broken"
+    whole.mkdir()
+    done = train(whole, recipe)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["model"] == "model"
+    assert [entry.name for entry in whole.iterdir()] == ["model"]  # no lightning_logs, no checkpoints
+
+    kill_after_a_checkpoint(broken, recipe)
+    resumed = train(broken, recipe, "--resume")
+    assert resumed.returncode == 0, resumed.stderr
+    assert [entry.name for entry in broken.iterdir()] == ["model"]
+    for name in ("model.safetensors", "energy.csv"):
+        assert (broken / "model" / name).read_bytes() == (whole / "model" / name).read_bytes()
+
+
+def test_killed_and_resumed_levenberg_marquardt_gives_the_same_weights(write_recipe, tmp_path):
+    path = write_recipe(*DEFAULT)
+    recipe = read_recipe(path)
+    kill_after_a_checkpoint(tmp_path / "broken", path)
+    options = RunOptions(tmp_path / "broken" / ".model.training", resume=True)
+    resumed = train_recipe(recipe, load_measurements(recipe, None), options)
+    whole = train_recipe(recipe, load_measurements(recipe, None))
+    assert 0 < resumed.history.resumed_from < EPOCHS
+    assert_close(resumed.history.energies, whole.history.energies, atol=0)
+    for name, value in whole.model.network.state_dict().items():
+        assert_close(resumed.model.network.state_dict()[name], value, atol=0)
+
+
+def test_ctrl_c_leaves_only_the_checkpoints(write_recipe, tmp_path):
+    recipe = write_recipe(*PAPER)
+    folder = tmp_path / "work"
+    folder.mkdir()
+    process = start_and_wait_for_a_checkpoint(folder, recipe)
+    process.send_signal(signal.SIGINT)
+    output, complaint = process.communicate()
+    assert process.returncode == 130, complaint.decode()
+    assert output == b""
+    assert b"Traceback" not in complaint
+    assert [entry.name for entry in folder.iterdir()] == [".model.training"]
+
+
+def test_resuming_nothing_or_something_else_is_refused(tmp_path):
+    with pytest.raises(TrainingError, match="no interrupted training to resume; run without --resume"):
+        find_checkpoint(tmp_path, "a")
+    (tmp_path / "last.ckpt").write_bytes(b"no checkpoint")
+    with pytest.raises(TrainingError, match="no whole checkpoint"):
+        find_checkpoint(tmp_path, "a")
+
+
+def test_a_folder_that_cannot_be_made_is_refused_and_old_checkpoints_go(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(OutputError, match="cannot be written"):
+        prepare_checkpoints(tmp_path / "file" / "checkpoints")
+    (tmp_path / "last.ckpt").write_text("")
+    (tmp_path / "mine.txt").write_text("")
+    prepare_checkpoints(tmp_path)
+    assert [entry.name for entry in sorted(tmp_path.iterdir())] == ["file", "mine.txt"]
