@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from pisigma.correction.corrected_ik import load as load
     from pisigma.correction.solution import Solution as Solution
     from pisigma.errors import PisigmaError as PisigmaError
+    from pisigma.identification.calibrator import GeometricCalibrator as GeometricCalibrator
+    from pisigma.identification.result import CalibrationResult as CalibrationResult
     from pisigma.kinematics.status import Status as Status
     from pisigma.measurement.dataset import Measurements as Measurements
     from pisigma.network.pi_sigma import PiSigma as PiSigma
@@ -19,7 +21,9 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _HOMES = {
+    "CalibrationResult": "pisigma.identification.result",
     "CorrectedIK": "pisigma.correction.corrected_ik",
+    "GeometricCalibrator": "pisigma.identification.calibrator",
     "Measurements": "pisigma.measurement.dataset",
     "PiSigma": "pisigma.network.pi_sigma",
     "PisigmaError": "pisigma.errors",
@@ -29,7 +33,18 @@ _HOMES = {
     "load": "pisigma.correction.corrected_ik",
 }
 
-__all__ = ["CorrectedIK", "Measurements", "PiSigma", "PisigmaError", "Robot", "Solution", "Status", "load"]
+__all__ = [
+    "CalibrationResult",
+    "CorrectedIK",
+    "GeometricCalibrator",
+    "Measurements",
+    "PiSigma",
+    "PisigmaError",
+    "Robot",
+    "Solution",
+    "Status",
+    "load",
+]
 
 
 def __getattr__(name: str) -> Any:

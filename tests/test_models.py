@@ -14,7 +14,7 @@ from pisigma.evaluation.joint_statistics import JointStatistics
 from pisigma.evaluation.tables import joint_table
 from pisigma.training.pairs import build_pairs
 from pisigma.training.recipe import SimulatedData, read_recipe, recipe_hash
-from pisigma.training.run import simulate_held_out, simulate_training
+from pisigma.training.recipe_data import simulate_held_out, simulate_training
 
 FOLDERS = sorted(path for path in (Path(__file__).parent.parent / "models").glob("*") if path.is_dir())
 SECTIONS = ("Joint errors", "Figures", "Domain", "Not validated", "Use", "Provenance")

@@ -8,8 +8,11 @@ import yaml
 from testing.closeness import assert_close
 
 from pisigma.evaluation.training_report import report_joints
+from pisigma.training.geometric_recipe import GeometricRecipe
 from pisigma.training.recipe import Recipe, SimulatedData, read_recipe
-from pisigma.training.run import TrainingRun, load_measurements, train_recipe
+from pisigma.training.recipe_data import load_measurements
+from pisigma.training.recipe_kinds import read_any_recipe
+from pisigma.training.run import TrainingRun, train_recipe
 
 FOLDER = Path(__file__).parent.parent / "training"
 INVERSE = sorted(p.stem for p in FOLDER.glob("*.yaml") if "network" in yaml.safe_load(p.read_text()))
@@ -28,6 +31,29 @@ def read(name: str) -> Recipe:
 def train(recipe: Recipe, seed: int = 0) -> TrainingRun:
     recipe = recipe.model_copy(update={"fit": recipe.fit.model_copy(update={"seed": seed})})
     return train_recipe(recipe, load_measurements(recipe, None))
+
+
+GEOMETRIC = sorted(
+    p.stem
+    for p in FOLDER.glob("*.yaml")
+    if yaml.safe_load(p.read_text()).get("kind") == "geometric_calibration"
+)
+
+
+def test_the_recipes_of_geometric_calibration_are_there():
+    assert {"rb5_redundancy", "panda_redundancy"} <= set(GEOMETRIC)
+    assert not set(INVERSE) & set(GEOMETRIC)
+
+
+@pytest.mark.parametrize("name", GEOMETRIC)
+def test_a_geometric_recipe_parses_and_says_what_it_is(name):
+    recipe = read_any_recipe(FOLDER / f"{name}.yaml")
+    assert isinstance(recipe, GeometricRecipe)
+    assert recipe.name == name
+    assert recipe.description
+    assert recipe.not_validated
+    assert recipe.held_out.poses.count >= 2000
+    assert recipe.held_out.poses.seed != recipe.measurements.poses.seed
 
 
 def test_the_recipes_of_inverse_calibration_are_there():

@@ -54,7 +54,7 @@ def test_texts_stay_texts(text):
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("name: a\ncuont: 2", "d.yaml, line 2: unknown key 'cuont' in 'the file'; did you mean 'count'? Valid:"),  # noqa: E501
+        ("name: a\ncuont: 2", "d.yaml, line 2: unknown key 'cuont' in 'the file'; did you mean 'count'? Valid:"),
         ("count: 2", "d.yaml, line 1: the key 'name' is missing in 'the file'; add it."),
         ("name: a\nname: b", "d.yaml, line 2: the key 'name' stands twice; correct the YAML there."),
         ("name: a\ncount: 2.5", "d.yaml, line 2: 'count': input should be a valid integer, but got 2.5."),
@@ -77,8 +77,8 @@ def test_texts_stay_texts(text):
         ("name: a\nshapes:\n- kind: square",
          "d.yaml, line 3: the key 'side_mm' is missing in 'shapes.0'; add it."),
         ("name: a\nsizes: {b: {kind: circle, radius: 1}}",
-         "d.yaml, line 2: unknown key 'radius' in 'sizes.b'; did you mean 'radius_mm'? Valid: kind, radius_mm."),  # noqa: E501
-        ("name: a\ncorner: [1, x]", "d.yaml, line 2: 'corner.1': input should be a valid number, but got 'x'."),  # noqa: E501
+         "d.yaml, line 2: unknown key 'radius' in 'sizes.b'; did you mean 'radius_mm'? Valid: kind, radius_mm."),
+        ("name: a\ncorner: [1, x]", "d.yaml, line 2: 'corner.1': input should be a valid number, but got 'x'."),
         ("5: a", "d.yaml, line 1: the key 5 is no text; correct the YAML there."),
         ("[a]: b", "d.yaml, line 1: the key ['a'] is no text; correct the YAML there."),
         ("- a\n- b", "d.yaml: a YAML mapping of keys to values was wanted, but it holds none."),

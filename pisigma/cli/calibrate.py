@@ -1,6 +1,8 @@
 """`pisigma calibrate`: geometric calibration of measured data."""
 
+import inspect
 import shlex
+import textwrap
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -43,27 +45,34 @@ def calibrate(
     from pisigma.correction.staging import check_replaceable, staged_folder
     from pisigma.evaluation.calibration_card import write_calibration_card
     from pisigma.evaluation.calibration_report import report_calibration
+    from pisigma.evaluation.geometric_validation import judge
     from pisigma.measurement.dataset import Measurements
     from pisigma.robot.description import Robot
     from pisigma.training.geometric_recipe import calibration_section
+    from pisigma.training.recipe_data import part_sets
 
     check_replaceable(out)
     nominal = Robot.load(robot)
-    measurements = Measurements.read_csv(data, nominal)
+    measurements, test = part_sets(Measurements.read_csv(data, nominal))
     calibrator = calibration_section(free, prior_mm, prior_mrad, robust).calibrator(nominal)
+    parts = _parts(measurements, folds, hold_out, seed, split)
     result = calibrator.fit(measurements)
-    validation = _validate(calibrator, measurements, _parts(measurements, folds, hold_out, seed, split))
-    report = report_calibration(result, validation)
-    model = replace(model_of_calibration(out.name, nominal, result, measurements), metrics=report)
+    validation = _validate(calibrator, measurements, parts)
+    kept_aside = None if test is None else judge(calibrator, result, measurements, test)
+    report = {"rows": measurements.rows, **report_calibration(result, validation, kept_aside)}
+    model = replace(model_of_calibration(out.resolve().name, nominal, result, measurements), metrics=report)
+    options = {"folds": folds, "hold-out": hold_out, "split": split, "seed": seed, "free": free}
+    options |= {"prior-mm": prior_mm, "prior-mrad": prior_mrad, "robust": robust}
     texts = {
-        "description": f"Geometric calibration of robot {nominal.name} ({nominal.maker}): DH and Hayati parameters, base "
-        "and tool by least squares.",
-        "command": shlex.join(["pisigma", "calibrate", robot, data.name, "--out", out.name]),
-        "not_validated": "Judged on rows of the same measurement only, not on other days, payloads or temperatures.",
+        "description": f"Geometric calibration of robot {nominal.name} ({nominal.maker}): DH and Hayati "
+        "parameters, base and tool by least squares.",
+        "command": _command_line(robot, data, out, options),
+        "not_validated": "Judged on rows of the same measurement only, not on other days, payloads or "
+        "temperatures.",
     }
     with staged_folder(out) as scratch:
         save_model(model, scratch)
-        write_calibration_card(model, result, validation, report, texts, scratch)
+        write_calibration_card(model, result, validation or kept_aside, report, texts, scratch)
     finished = {"model": str(out), "seconds": round(time.perf_counter() - started, 3), **report}
     if as_json:
         print_json(finished)
@@ -73,21 +82,40 @@ def calibrate(
 
 def print_calibration(result: dict[str, Any]) -> None:
     """Print what a calibration gave, for people."""
-    from pisigma.cli.output import print_table
-    from pisigma.evaluation.calibration_card import PARAMETER_COLUMNS, not_identified_text, parameter_table
+    from pisigma.cli.output import WIDTH_WITHOUT_TERMINAL, print_table
+    from pisigma.evaluation.calibration_card import PARAMETER_COLUMNS, not_identified_lines, parameter_table
     from pisigma.evaluation.tables import pose_rows
 
     print_table("parameters", PARAMETER_COLUMNS, parameter_table(result))
     typer.echo("What the data do not tell:")
-    typer.echo(not_identified_text(result))
-    if "cross_validation" in result:
-        figures = result["cross_validation"]
-        title = f"pose errors of held-out rows, {figures['folds']}-fold cross-validation"
-        print_table(title, *pose_rows({name: figures[name] for name in ("nominal", "geometric")}))
+    for line in not_identified_lines(result):
+        typer.echo(textwrap.fill(f"- {line}", WIDTH_WITHOUT_TERMINAL, subsequent_indent="  "))
+    for key, title in (
+        ("cross_validation", "pose errors of {rows} held-out rows ({folds} folds)"),
+        ("test", "pose errors of the {rows} rows of the set 'test', which were kept aside"),
+    ):
+        if key in result:
+            models = {name: result[key][name] for name in ("nominal", "geometric")}
+            print_table(title.format(**result[key]), *pose_rows(models))
     outliers = result["outliers"]
     worst = f"; the worst is {outliers[0]['place']}" if outliers else ""
     typer.echo(f"Rank {result['rank']}, {result['iterations']} iterations, {len(outliers)} outliers{worst}.")
     typer.echo(f"Model written to {result['model']} in {result['seconds']:.1f} s; read its README.md.")
+
+
+def _command_line(robot: str, data: Path, out: Path, options: dict[str, Any]) -> str:
+    """The command that gives this model again, with the options that are not the default."""
+    defaults = inspect.signature(calibrate).parameters
+    words = ["pisigma", "calibrate", Path(robot).name, data.name, "--out", out.name]
+    for name, value in options.items():
+        if value == defaults[name.replace("-", "_")].default:
+            continue
+        words += (
+            [f"--{name}" if value else f"--no-{name}"]
+            if isinstance(value, bool)
+            else [f"--{name}", str(value)]
+        )
+    return shlex.join(words)
 
 
 def _parts(

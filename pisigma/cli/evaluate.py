@@ -54,21 +54,15 @@ def evaluate(
 
 
 def _unseen(measurements: "Measurements") -> "Measurements":
-    """The rows that may be judged; all of one frame and one target, as one base and tool were fitted.
+    """The rows that may be judged.
 
     Raises:
-        MeasurementError: there are several frames or targets, or no row for tests.
+        MeasurementError: the column `set` leaves no row for tests.
     """
     import torch
 
     from pisigma.errors import MeasurementError
 
-    for name in ("frame", "target"):
-        if len(found := sorted(set(getattr(measurements, name)))) > 1:
-            raise MeasurementError(
-                f"{measurements.source}: column '{name}' names {', '.join(map(repr, found))}, but a model "
-                "has one base and one tool; give a file for each."
-            )
     if measurements.split is None:
         return measurements
     test = torch.tensor([name == "test" for name in measurements.split])

@@ -17,10 +17,10 @@ def simulate(
     """Write the simulated measurements of a recipe as a CSV file."""
     from pisigma.cli.output import print_json
     from pisigma.robot import Robot
-    from pisigma.training.recipe import read_recipe
-    from pisigma.training.run import simulate_held_out, simulate_training
+    from pisigma.training.recipe_data import simulate_held_out, simulate_training
+    from pisigma.training.recipe_kinds import read_any_recipe
 
-    stated = read_recipe(recipe)
+    stated = read_any_recipe(recipe)
     rows = simulate_held_out(stated) if held_out else simulate_training(stated)
     rows.write_csv(out, Robot.load(stated.robot))
     if as_json:

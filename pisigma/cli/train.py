@@ -28,27 +28,35 @@ def train(
 ) -> None:
     """Train the model of a recipe and write it as a model folder with card and figures."""
     started = time.perf_counter()
+    from pisigma.training.geometric_recipe import GeometricRecipe
+    from pisigma.training.jig_recipe import is_jig_recipe
+    from pisigma.training.recipe_kinds import read_any_recipe
+
+    if is_jig_recipe(recipe):
+        from pisigma.cli.train_jigs import train_jigs
+
+        return train_jigs(recipe, data, out, resume, as_json)
+    stated = read_any_recipe(recipe)
+    if isinstance(stated, GeometricRecipe):
+        from pisigma.cli.train_geometric import train_geometric
+
+        return train_geometric(stated, recipe, data, out, resume, as_json)
     from pisigma.cli.output import print_json
     from pisigma.correction.model_folder import save_model
     from pisigma.correction.staging import check_replaceable, staged_folder
     from pisigma.evaluation.card import write_card
     from pisigma.evaluation.training_report import report_training
     from pisigma.training.checkpoints import checkpoint_folder, discard_checkpoints
-    from pisigma.training.geometric_recipe import is_geometric
-    from pisigma.training.recipe import read_recipe, recipe_hash
-    from pisigma.training.run import RunOptions, load_measurements, train_recipe
+    from pisigma.training.recipe import recipe_hash
+    from pisigma.training.recipe_data import load_measurements, part_sets
+    from pisigma.training.run import RunOptions, train_recipe
 
-    if is_geometric(recipe):
-        from pisigma.cli.train_geometric import train_geometric
-
-        return train_geometric(recipe, data, out, resume, as_json)
-    stated = read_recipe(recipe)
     folder = out or Path("runs") / stated.name
     check_replaceable(folder)
-    measurements = load_measurements(stated, data)
+    measurements, test = part_sets(load_measurements(stated, data))
     checkpoints = checkpoint_folder(folder)
     run = train_recipe(stated, measurements, RunOptions(checkpoints, resume, True, recipe_hash(recipe)))
-    report = report_training(stated, run, _cross_validate(stated, measurements))
+    report = report_training(stated, run, _cross_validate(stated, measurements), test)
     command = shlex.join(["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])])
     with staged_folder(folder) as scratch:
         save_model(replace(run.model, metrics=report), scratch)
@@ -91,6 +99,10 @@ def _print_report(result: dict[str, Any]) -> None:
         title = f"pose errors of held-out rows, {figures['folds']}-fold cross-validation"
         print_table(title, *pose_rows({name: figures[name] for name in ("nominal", "corrected")}))
         typer.echo(result["verdict"])
+    if "test" in result:
+        test = result["test"]
+        title = f"pose errors of the {test['rows']} rows of the set 'test', which were kept aside"
+        print_table(title, *pose_rows({name: test[name] for name in ("nominal", "corrected")}))
     rows = result["rows"]
     reason = f" ({rows['rule']})" if rows["left_out"] else ""
     typer.echo(f"{rows['used']} rows used, {rows['left_out']} left out{reason}.")

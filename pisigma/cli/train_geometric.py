@@ -1,17 +1,33 @@
 """`pisigma train` with a recipe of the geometric calibrator."""
 
 import shlex
+import textwrap
 import time
 from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pisigma.identification.result import CalibrationResult
+    from pisigma.training.geometric_recipe import GeometricRecipe
+
+_WIDTH = 44
+"""Columns of a list of parameters."""
 
 
-def train_geometric(recipe: Path, data: Path | None, out: Path | None, resume: bool, as_json: bool) -> None:
+def train_geometric(
+    stated: "GeometricRecipe", recipe: Path, data: Path | None, out: Path | None, resume: bool, as_json: bool
+) -> None:
     """Calibrate the simulated robot of a recipe and write the model folder.
+
+    Args:
+        stated: the recipe.
+        recipe: its file.
+        data: not for this kind of recipe.
+        out: model folder to write; None: runs/NAME.
+        resume: not for this kind of recipe.
+        as_json: print one JSON object.
 
     Raises:
         RecipeError: the recipe does not fit, or options were given that it has no use for.
@@ -27,21 +43,20 @@ def train_geometric(recipe: Path, data: Path | None, out: Path | None, resume: b
     from pisigma.evaluation.calibration_report import report_calibration
     from pisigma.evaluation.geometric_validation import errors_under
     from pisigma.robot.description import Robot
-    from pisigma.training.geometric_recipe import read_geometric_recipe
     from pisigma.training.recipe import recipe_hash
+    from pisigma.training.recipe_data import simulate_held_out, simulate_training
 
-    stated = read_geometric_recipe(recipe)
     if data is not None or resume:
         given = "--data" if data is not None else "--resume"
         raise RecipeError(f"{recipe}: a recipe of kind {stated.kind} has no use for {given}; leave it out.")
     folder = out or Path("runs") / stated.name
     check_replaceable(folder)
-    rows, held_out = stated.simulate()
+    rows, held_out = simulate_training(stated), simulate_held_out(stated)
     result = stated.calibrate(rows)
     report = {
-        **report_calibration(result, None),
+        **report_calibration(result),
         **_redundancy(result),
-        "held_out": errors_under(result, held_out).in_file_units(),
+        "held_out": {"rows": held_out.rows, **errors_under(result, held_out).in_file_units()},
     }
     if stated.paper:
         report["paper"] = stated.model_dump()["paper"]
@@ -69,15 +84,41 @@ def print_redundancy(result: dict[str, Any]) -> None:
     from pisigma.cli.output import print_table
 
     paper = result.get("paper", {})
-    rows = [
-        (name.replace("_", " "), _short(result[name]), _short(paper.get(name, "")))
-        for name in ("redundant_sets", "no_effect", "pairwise_parameters", "rank")
-    ]
-    rows.append(("iterations", str(result["iterations"]), str(paper.get("iterations_to_converge", ""))))
-    rows.append(
-        ("RMSE after [mm]", f"{result['rmse_mm'][-1]:.2e}", f"{paper.get('rmse_after_mm', float('nan')):.2e}")
-    )
+    rows = _sets_side_by_side(result["redundant_sets"], paper.get("redundant_sets", []))
+    rows += _wrapped("no effect", _in_braces(result["no_effect"]), _in_braces(paper.get("no_effect", [])))
+    for label, name, key, form in (
+        ("parameters left by pairs", "pairwise_parameters", "pairwise_parameters", "{}"),
+        ("rank", "rank", "rank", "{}"),
+        ("iterations", "iterations", "iterations_to_converge", "{}"),
+        ("RMSE after [mm]", "rmse_mm", "rmse_after_mm", "{:.2e}"),
+    ):
+        ours = result[name][-1] if isinstance(result[name], list) else result[name]
+        rows.append((label, form.format(ours), form.format(paper[key]) if key in paper else ""))
     print_table("redundancy and convergence", ("what", "pisigma", "paper"), rows)
+
+
+def _sets_side_by_side(ours: list[list[str]], papers: list[list[str]]) -> list[tuple[str, str, str]]:
+    """A line per set, equal sets on one line."""
+    rows: list[tuple[str, str, str]] = []
+    left = list(papers)
+    for members in ours:
+        same = next((other for other in left if set(other) == set(members)), None)
+        if same is not None:
+            left.remove(same)
+        rows += _wrapped("", _in_braces(members), _in_braces(same or []))
+    for members in left:
+        rows += _wrapped("", "", _in_braces(members))
+    return [("redundant sets", *row[1:]) if number == 0 else row for number, row in enumerate(rows)]
+
+
+def _in_braces(names: list[str]) -> str:
+    return f"{{{', '.join(names)}}}" if names else ""
+
+
+def _wrapped(label: str, *cells: str) -> list[tuple[str, str, str]]:
+    """One row of a table as lines of bounded width."""
+    columns = [[label], *(textwrap.wrap(cell, _WIDTH) or [""] for cell in cells)]
+    return [(line[0], line[1], line[2]) for line in zip_longest(*columns, fillvalue="")]
 
 
 def _redundancy(result: "CalibrationResult") -> dict[str, Any]:
@@ -88,11 +129,3 @@ def _redundancy(result: "CalibrationResult") -> dict[str, Any]:
         "no_effect": list(pairwise.no_effect),
         "pairwise_parameters": len(pairwise.kept),
     }
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, list | tuple):
-        return "; ".join(
-            _short(item) if isinstance(item, list | tuple) else str(item) for item in value
-        ).replace("; ", " ")
-    return str(value)

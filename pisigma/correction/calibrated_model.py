@@ -59,10 +59,10 @@ class CalibratedModel:
             empty where there is no closed form.
         starts: commanded joint values [rad or m] of training rows: on the turns that the network knows, and
             where there is no closed form the starts of the numeric inverse.
-        calibrated: the robot with its geometry as identified, base and tool those of `robot`; None where the geometry
-            is the nominal one.
-        bases: per frame of the measurements x, y, z [m], roll, pitch, yaw [rad] of the base in it; empty where there
-            was one frame without a name.
+        calibrated: the robot with its geometry as identified, base and tool those of `robot`; None where the
+            geometry is the nominal one.
+        bases: per frame of the measurements ("" where it had no name) x, y, z [m], roll, pitch, yaw [rad] of
+            the base in it; the first is that of `robot`. Empty where frames were not told apart.
         tools: the same per target for the tool.
         provenance: recipe, data, versions.
         metrics: figures for the card, by name.
@@ -94,8 +94,8 @@ class CalibratedModel:
     def forward(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch 4 4"]:
         """Pose T_base_tool that the robot takes when commanded to q [rad or m], as far as the model knows.
 
-        With an identified geometry it is its forward kinematics. Else it is the pose whose corrected joint values are q: `q_nominal = q - Δ(FK(q_nominal), q_nominal)`,
-        solved by iteration.
+        With an identified geometry it is its forward kinematics. Else it is the pose whose corrected joint
+        values are q: `q_nominal = q - Δ(FK(q_nominal), q_nominal)`, solved by iteration.
 
         Returns:
             The poses; NaN where the iteration does not settle because the correction is steeper than the

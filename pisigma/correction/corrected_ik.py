@@ -9,18 +9,18 @@ import torch
 from torch import Tensor
 
 from pisigma.correction.calibrated_model import CalibratedModel
+from pisigma.correction.identified_arm import ATTEMPTS, IdentifiedArm, search
 from pisigma.correction.model_folder import load_model
 from pisigma.correction.solution import Solution
+from pisigma.correction.stored_starts import StoredStarts
 from pisigma.correction.turns import turn_near
 from pisigma.errors import ModelError, PoseError, nearest_choice
 from pisigma.kinematics.closed_form import closed_form_solver
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.joint_limits import turn_into_limits
-from pisigma.kinematics.numeric import SINGULAR_TOLERANCE, solve_numeric
+from pisigma.kinematics.numeric import SINGULAR_TOLERANCE
 from pisigma.kinematics.singularity import singularity_measure
 from pisigma.kinematics.status import Status
-from pisigma.robot.description import Robot
-from pisigma.se3 import check_transforms, wrap_to_pi
+from pisigma.se3 import check_transforms
 
 PoseLike = Tensor | np.ndarray | Sequence[Any]
 """Matrices `(*batch, 4, 4)`: a tensor, an array or nested lists."""
@@ -30,12 +30,6 @@ JointLike = Tensor | np.ndarray | Sequence[Any]
 
 NUMERIC = "numeric"
 """Name of the only branch of a robot without closed-form inverse: the one of the nearest training rows."""
-
-_ATTEMPTS = 4
-"""Starts that the numeric inverse tries for a pose, nearest first."""
-
-_CHUNK = 4096
-"""Poses whose distances to all starts are computed at once."""
 
 
 class CorrectedIK:
@@ -68,7 +62,10 @@ class CorrectedIK:
         trained = [self.branches.index(name) for name in model.branches] or list(range(len(self.branches)))
         self._default = trained[0]
         self._trained = torch.tensor(trained)
-        self._start_poses = forward_kinematics(model.robot, model.starts)
+        self._starts = StoredStarts(model.calibrated or model.robot, model.starts)
+        self._arm: IdentifiedArm | None = None
+        if model.calibrated is not None and self._solver is not None:
+            self._arm = IdentifiedArm(model.robot, model.calibrated, self._solver, self._starts)
         dof = model.robot.dof
         bounds = model.starts.aminmax(dim=0) if len(model.starts) else (torch.zeros(dof), torch.zeros(dof))
         self._centre = (bounds[0] + bounds[1]).double() / 2
@@ -84,7 +81,8 @@ class CorrectedIK:
                 that reach a pose the nearest is taken, and revolute joints come as near as full turns within
                 the limits bring them. Distances count radians and metres alike.
             branch: name of the branch to take; with `near` too, that only chooses the turns. With neither it
-                is the branch that most training rows lie on.
+                is the branch that most training rows lie on. With an identified geometry a pose that the
+                nominal arm has no branch for gets the branch on which the identified one reaches it.
 
         Returns:
             One solution per pose, computed on the CPU in float64 (the closed form in the dtype of the poses)
@@ -99,20 +97,25 @@ class CorrectedIK:
         start = None if near is None else self._as_near(near, T.shape[:-2])
         if self._solver is None:
             return self._numeric(T, start).like(given)
-        every = self._every_branch(T, given, start)
-        if branch is not None:
-            index = torch.full(T.shape[:-2], self.branches.index(branch))
-        elif start is not None:
-            index = self._nearest(every, start)
-        else:
-            index = torch.full(T.shape[:-2], self._default)
-        return every.on_branch(index).like(given)
+        index = self._default if branch is None else self.branches.index(branch)
+        free = start is not None and branch is None
+        few: Sequence[int] = [index] if self._arm is not None and not free else range(len(self.branches))
+        some = self._on_branches(T, given, start, few)
+        chosen = torch.full(T.shape[:-2], few.index(index))
+        found = some.on_branch(self._nearest(some, start) if start is not None and free else chosen)
+        if self._arm is not None:
+            found = self._recovered(T, given, found, start, any_branch=branch is None)
+        return found.like(given)
 
     def all_branches(self, T_base_tool: PoseLike) -> Solution:
         """Solutions on every branch, as `(*batch, branches)`; one for a robot without closed-form inverse."""
         T, given = _as_poses(T_base_tool)
         if self._solver is not None:
-            return self._every_branch(T, given, None).like(given)
+            every = self._on_branches(T, given, None, range(len(self.branches)))
+            if self._arm is not None:
+                each = T.unsqueeze(-3).expand(*every.status.shape, 4, 4)
+                every = self._recovered(each, given, every, None, any_branch=False)
+            return every.like(given)
         return self._numeric(T, None).with_branch_axis().like(given)
 
     def _as_near(self, near: JointLike, batch: tuple[int, ...]) -> Tensor:
@@ -131,48 +134,53 @@ class CorrectedIK:
                 f"{tuple(batch)} of the poses; give one row of joint values for each pose, or one for all."
             ) from None
 
-    def _every_branch(self, T: Tensor, given: Tensor, near: Tensor | None) -> Solution:
+    def _on_branches(self, T: Tensor, given: Tensor, near: Tensor | None, indices: Sequence[int]) -> Solution:
+        """Solutions on some branches, as a last batch axis, each from its nominal joint values on."""
         assert self._solver is not None
         found = self._solver.solve(given.detach().to("cpu"))
-        count = len(self.branches)
-        branch = torch.arange(count).expand(*T.shape[:-2], count)
-        each = T.unsqueeze(-3).expand(*T.shape[:-2], count, 4, 4)
-        beside = None if near is None else near.unsqueeze(-2).expand(*T.shape[:-2], count, -1)
-        return self._finish(each, found.q.double(), found.status, branch, beside)
+        branch = torch.tensor(indices).expand(*T.shape[:-2], len(indices))
+        q, status = found.q[..., indices, :].double(), found.status[..., indices]
+        each = T.unsqueeze(-3).expand(*branch.shape, 4, 4)
+        beside = None if near is None else near.unsqueeze(-2).expand(*branch.shape, -1)
+        if self._arm is None:
+            return self._finish(each, q, status, branch, beside)
+        reached, status = self._arm.follow(each, q)
+        return self._finish_identified(reached, q, status, branch, beside)
+
+    def _recovered(
+        self, T: Tensor, given: Tensor, found: Solution, near: Tensor | None, any_branch: bool
+    ) -> Solution:
+        """Look again for what was not found, where the identified arm reaches and the nominal one does not.
+
+        Another branch than the wanted one will do where `any_branch` and the nominal arm has none at all.
+        """
+        assert self._arm is not None
+        lost = (found.status == Status.UNREACHABLE).reshape(-1).nonzero()[:, 0]
+        if not len(lost):
+            return found
+        T_lost, branch = T.reshape(-1, 4, 4)[lost], found.branch.reshape(-1)[lost]
+        anywhere = torch.zeros(len(lost), dtype=torch.bool)
+        if any_branch:
+            closed = self._arm.solver.solve(given.detach().to("cpu").reshape(-1, 4, 4)[lost])
+            anywhere = (closed.status == Status.UNREACHABLE).all(-1)
+        q, status, branch = self._arm.recover(T_lost, branch, anywhere)
+        beside = None if near is None else near.reshape(-1, q.shape[-1])[lost]
+        nominal = torch.full_like(q, torch.nan)
+        return found.with_rows(lost, self._finish_identified(q, nominal, status, branch, beside))
 
     def _numeric(self, T: Tensor, near: Tensor | None) -> Solution:
         """Numeric inverse from `near`, or from the training rows whose poses are nearest."""
-        flat = T.reshape(-1, 4, 4)
+        flat, shape = T.reshape(-1, 4, 4), T.shape[:-2]
         dof = self.model.robot.dof
-        starts = self._nearest_starts(flat) if near is None else near.reshape(-1, 1, dof)
-        found = solve_numeric(self.model.robot, flat, starts[:, 0])
-        q, status = found.q.clone(), found.status.clone()
-        for attempt in range(1, starts.shape[1]):
-            left = (status == Status.NOT_CONVERGED).nonzero()[:, 0]
-            if not len(left):
-                break
-            again = solve_numeric(self.model.robot, flat[left], starts[left, attempt])
-            q[left], status[left] = again.q, again.status
-        lost = status == Status.NOT_CONVERGED
-        q[lost], status[lost] = torch.nan, int(Status.UNREACHABLE)
-        shape = T.shape[:-2]
+        nearest = self._starts.nearest(flat, ATTEMPTS if near is None else 0)
+        starts = self.model.starts[nearest] if near is None else near.reshape(-1, 1, dof)
+        q, status = search(self._starts.robot, flat, starts)
         branch = torch.zeros(shape, dtype=torch.int64)
-        return self._finish(T, q.reshape(*shape, dof), status.reshape(shape), branch, near)
-
-    def _nearest_starts(self, T: Tensor) -> Tensor:
-        """For every pose the joint values of the training rows whose poses are nearest, nearest first."""
-        count = min(_ATTEMPTS, len(self.model.starts))
-        poses, rows = self._as_points(T), self._as_points(self._start_poses)
-        nearest = [torch.zeros((0, count), dtype=torch.int64)]
-        for first in range(0, len(poses), _CHUNK):
-            distance = torch.cdist(poses[first : first + _CHUNK], rows)
-            nearest.append(distance.topk(count, largest=False).indices)
-        return self.model.starts[torch.cat(nearest)]
-
-    def _as_points(self, T: Tensor) -> Tensor:
-        """Poses as points; their distance is that of the tools [m], plus half a reach per radian of turn."""
-        lever = self.model.robot.reach / 2 / 2**0.5  # a small turn changes R by sqrt(2) times its angle
-        return torch.cat([T[:, :3, 3], lever * T[:, :3, :3].flatten(1)], -1)
+        if self.model.calibrated is None:
+            return self._finish(T, q.reshape(*shape, dof), status.reshape(shape), branch, near)
+        nominal, _ = search(self.model.robot, flat, q[:, None])
+        q, nominal = (values.reshape(*shape, dof) for values in (q, nominal))
+        return self._finish_identified(q, nominal, status.reshape(shape), branch, near)
 
     def _finish(self, T: Tensor, q: Tensor, status: Tensor, branch: Tensor, near: Tensor | None) -> Solution:
         """Add the correction to nominal joint values, and everything that limits the trust in it."""
@@ -182,12 +190,8 @@ class CorrectedIK:
         seen = turn_near(robot, safe, self._centre, within_limits=False)  # as the training rows were turned
         correction = torch.where(found[..., None], self.model.correction(T, seen), torch.nan)
         status = self._without_limits(safe, status)
-        if self.model.calibrated is not None:
-            correction, status, found = self._on_calibrated(self.model.calibrated, T, safe, status, found)
         corrected = q + correction
-        commanded, inside = turn_into_limits(robot, corrected)
-        if near is not None:
-            commanded = turn_near(robot, commanded, near, within_limits=True)
+        commanded, inside = self._turned(corrected, near)
         measure = torch.full(status.shape, torch.nan, dtype=torch.float64)
         if self.model.network is not None and self.model.domain is not None:
             measure = self.model.domain.measure(self.model.network.scaled_inputs(T, seen)).where(
@@ -199,25 +203,34 @@ class CorrectedIK:
         turned = commanded - corrected  # 0 where no turn was made
         return Solution(commanded, q + turned, correction, branch, self.branches, status, measure)
 
-    def _on_calibrated(
-        self, calibrated: Robot, T: Tensor, q: Tensor, status: Tensor, found: Tensor
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Correction that reaches the poses on the identified geometry, from the nominal joint values on."""
-        reached = solve_numeric(calibrated, T, q)
-        arrived = found & (reached.status != Status.NOT_CONVERGED)
-        difference = reached.q - q
-        turns = torch.tensor(calibrated.revolute)
-        difference = torch.where(turns, wrap_to_pi(difference), difference)
-        status = torch.where(found & (reached.status == Status.SINGULAR), int(Status.SINGULAR), status)
-        status = torch.where(arrived, status, int(Status.UNREACHABLE))
-        return torch.where(arrived[..., None], difference, torch.nan), status, arrived
+    def _finish_identified(
+        self, q: Tensor, q_nominal: Tensor, status: Tensor, branch: Tensor, near: Tensor | None
+    ) -> Solution:
+        """Put joint values of the identified arm beside the nominal ones, on the same turns."""
+        found = torch.isfinite(q).all(-1)
+        status = self._without_limits(torch.where(found[..., None], q, 0.0), status)
+        commanded, inside = self._turned(q, near)
+        status[~inside & found] = int(Status.OUTSIDE_JOINT_LIMITS)
+        q_nominal = torch.where(found[..., None], q_nominal, torch.nan)
+        q_nominal = turn_near(self.model.robot, q_nominal, commanded, within_limits=False)
+        measure = torch.full(status.shape, torch.nan, dtype=torch.float64)
+        correction = commanded - q_nominal
+        return Solution(commanded, q_nominal, correction, branch, self.branches, status, measure)
+
+    def _turned(self, q: Tensor, near: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Joint values on the turn to command, and whether they are inside the limits."""
+        commanded, inside = turn_into_limits(self.model.robot, q)
+        if near is not None:
+            commanded = turn_near(self.model.robot, commanded, near, within_limits=True)
+        return commanded, inside
 
     def _without_limits(self, q: Tensor, status: Tensor) -> Tensor:
         """A copy of the status as if there were no joint limits, which bind the corrected values only."""
         status = status.clone()
         limited = status == Status.OUTSIDE_JOINT_LIMITS
         if limited.any():
-            singular = singularity_measure(self.model.robot, q[limited]) < SINGULAR_TOLERANCE
+            robot = self.model.calibrated or self.model.robot
+            singular = singularity_measure(robot, q[limited]) < SINGULAR_TOLERANCE
             status[limited] = torch.where(singular, int(Status.SINGULAR), int(Status.REACHED))
         return status
 

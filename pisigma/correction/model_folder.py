@@ -161,6 +161,8 @@ def _calibrated_robot(document: ModelDocument, robot: Robot) -> Robot | None:
     calibrated = document.calibrated.to_robot()
     if [(row.name, row.type) for row in calibrated.rows] != [(row.name, row.type) for row in robot.rows]:
         raise ValueError("the calibrated robot has other rows than the nominal one")
+    if not (np.array_equal(calibrated.base, robot.base) and np.array_equal(calibrated.tool, robot.tool)):
+        raise ValueError("the calibrated robot has another base or tool than the nominal one")
     return calibrated
 
 

@@ -13,7 +13,8 @@ class Solution:
 
     Attributes:
         q: corrected joint values [rad or m], NaN where, and only where, the status is `UNREACHABLE`.
-        q_nominal: joint values of the nominal robot, on the same turn.
+        q_nominal: joint values of the nominal robot, on the same turn; NaN too where an identified geometry
+            reaches the pose and the nominal one, on the same base and with the same tool, does not.
         correction: `q - q_nominal`.
         branch: index into `branches`.
         branches: names of the branches.
@@ -48,6 +49,24 @@ class Solution:
     def with_branch_axis(self) -> "Solution":
         """The same with a last batch axis of one branch."""
         return self._map(lambda values: values.unsqueeze(-2), lambda values: values.unsqueeze(-1))
+
+    def with_rows(self, index: Int64[Tensor, " _rows"], rows: "Solution") -> "Solution":
+        """The same with other solutions at an index that counts through all batch axes."""
+        batch = self.status.ndim
+
+        def put(values: Tensor, others: Tensor) -> Tensor:
+            flat = values.reshape(-1, *values.shape[batch:])
+            return flat.index_copy(0, index, others).reshape(values.shape)
+
+        return Solution(
+            q=put(self.q, rows.q),
+            q_nominal=put(self.q_nominal, rows.q_nominal),
+            correction=put(self.correction, rows.correction),
+            branch=put(self.branch, rows.branch),
+            branches=self.branches,
+            status=put(self.status, rows.status),
+            domain_measure=put(self.domain_measure, rows.domain_measure),
+        )
 
     def like(self, poses: Tensor) -> "Solution":
         """The same in the dtype and on the device of the poses."""

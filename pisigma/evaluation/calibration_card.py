@@ -1,10 +1,9 @@
 """The card of a geometric calibration: the parameters, what the data do not tell, and how good it is."""
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from pisigma.correction.calibrated_model import CalibratedModel
 from pisigma.evaluation.calibration_figures import (
@@ -14,8 +13,8 @@ from pisigma.evaluation.calibration_figures import (
     draw_residuals,
 )
 from pisigma.evaluation.calibration_report import PARAMETERS_CSV, write_parameters
-from pisigma.evaluation.card import CARD
 from pisigma.evaluation.geometric_validation import GeometricValidation
+from pisigma.evaluation.markdown import CARD, markdown_table, use_text
 from pisigma.evaluation.tables import figure_text, pose_table
 from pisigma.identification.result import CalibrationResult
 
@@ -33,7 +32,7 @@ def write_calibration_card(
     Args:
         model: the model of the folder.
         result: the calibration.
-        validation: its cross-validation, or None.
+        validation: errors of held-out rows for the figure, or None.
         report: from `report_calibration`.
         texts: "description", "command" and "not_validated".
         folder: where to write.
@@ -43,99 +42,146 @@ def write_calibration_card(
         {} if validation is None else {"nominal": validation.nominal, "geometric": validation.geometric}
     )
     lengths = {name: errors.position.numpy() for name, errors in held_out.items()}
-    if "position" in result.residuals:
-        draw_residuals(np.asarray(result.residuals["position"]), lengths, folder / RESIDUALS_PNG)
+    draw_residuals(result.residuals, lengths, folder / RESIDUALS_PNG)
     draw_correlations((result.pairwise.lengths, result.pairwise.angles), folder / CORRELATION_PNG)
     (folder / CARD).write_text(_text(model, result, report, texts), encoding="utf-8")
 
 
-def parameter_table(report: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Rows of text: name, unit, nominal, estimated, change, standard error, remark."""
-    return [
-        (
-            row["name"],
-            row["unit"],
-            *(
-                "" if row[name] is None else figure_text(row[name])
-                for name in ("nominal", "estimated", "change")
-            ),
-            "" if row["standard_error"] is None else figure_text(row["standard_error"]),
-            row["remark"],
-        )
-        for row in report["parameters"]
-    ]
-
-
 PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")
+
+_SHORT_REMARKS = (
+    (r"^.* is identified, the single values are not", "in a sum, see below"),
+    ("the data hardly see it, the prior holds it", "held by the prior"),
+    (
+        "identified at the solution, though redundant at the nominal geometry",
+        "identified at the solution only",
+    ),
+    ("without effect on what was measured", "no effect"),
+)
+
+
+def parameter_table(report: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Rows of text: name, unit, nominal, estimated, change, standard error, remark in a few words."""
+    rows = []
+    for row in report["parameters"]:
+        figures = (row[name] for name in ("nominal", "estimated", "change", "standard_error"))
+        remark = row["remark"]
+        for long, short in _SHORT_REMARKS:
+            remark = re.sub(long, short, remark)
+        texts = ("" if value is None else figure_text(value + 0.0) for value in figures)
+        rows.append((row["name"], row["unit"], *texts, remark))
+    return rows
+
+
+def not_identified_lines(report: Mapping[str, Any]) -> list[str]:
+    """What is not identified, and what to measure next, in sentences."""
+    redundancy = report["redundancy"]
+    lines = list(redundancy["dependencies"])
+    if redundancy["no_effect"]:
+        lines.append(f"{', '.join(redundancy['no_effect'])} change no measured value")
+    lines += [*report["unseen"], *report["warnings"]]
+    return [f"{line.rstrip('.')}." for line in lines] or ["Nothing: every parameter is identified."]
 
 
 def _text(
     model: CalibratedModel, result: CalibrationResult, report: Mapping[str, Any], texts: Mapping[str, str]
 ) -> str:
     provenance = model.provenance
+    source = f"`{provenance.data_source}`" if "." in provenance.data_source else f"a {provenance.data_source}"
     parts = [
         f"# {model.name}",
         texts["description"].strip(),
-        f"Made by `{texts['command']}`, on {provenance.rows} rows of {provenance.data_source}.",
+        f"Made by `{texts['command']}`, on {provenance.rows} rows of {source}.",
+        *_held_out_parts(report),
     ]
-    if "cross_validation" in report:
-        figures = report["cross_validation"]
-        parts += [
-            "## Held-out pose errors",
-            f"{figures['folds']}-fold cross-validation; nominal is the robot as drawn with base and tool fitted.",
-            pose_table({name: figures[name] for name in ("nominal", "geometric")}),
-        ]
     if "position" in result.residuals:
-        parts.append(f"![residuals]({RESIDUALS_PNG})")
+        parts.append(f"![residuals of the calibration rows, and errors of held-out rows]({RESIDUALS_PNG})")
     parts += [
         "## Parameters",
-        f"As [CSV]({PARAMETERS_CSV}); standard errors are of the estimate given the noise found.",
-        _markdown(PARAMETER_COLUMNS, parameter_table(report)),
+        "DH rows `RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; base and tool "
+        "`Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`. A standard error is what the noise that was "
+        "found makes of the estimate; a parameter without one was left at its nominal value. "
+        f"In full digits and with full remarks: [{PARAMETERS_CSV}]({PARAMETERS_CSV}).",
+        markdown_table(PARAMETER_COLUMNS, parameter_table(report)),
         "## What the data do not tell",
-        not_identified_text(report),
+        "\n".join(f"- {line}" for line in not_identified_lines(report)),
+        "How alike the columns of the identification Jacobian are, lengths and angles apart "
+        "(Pearson correlation; only pairs show here, the sentences above count larger sets too):",
         f"![correlations of the identification Jacobian's columns]({CORRELATION_PNG})",
         "## Quality",
         _quality_text(result, report),
         "## Not validated",
         texts["not_validated"].strip(),
+        "## Use",
+        "Joint values that reach a pose on the identified geometry:",
+        use_text(model.name),
         "## Provenance",
-        f"Data sha256 `{provenance.data_sha256}`; "
-        + ", ".join(f"{name} {value}" for name, value in provenance.versions.items()),
+        _provenance_text(model),
     ]
     return "\n\n".join(parts) + "\n"
 
 
-def not_identified_text(report: Mapping[str, Any]) -> str:
-    """What is not identified, in sentences, as a Markdown list."""
-    redundancy = report["redundancy"]
-    lines = [f"- {sentence}." for sentence in redundancy["dependencies"]]
-    if redundancy["no_effect"]:
-        lines.append(f"- {', '.join(redundancy['no_effect'])} change no measured value.")
-    lines += [f"- {sentence.rstrip('.')}." for sentence in (*report["unseen"], *report["warnings"])]
-    return "\n".join(lines) or "Every parameter is identified."
+def _held_out_parts(report: Mapping[str, Any]) -> list[str]:
+    """Headings, sentences and tables of errors on rows that were not calibrated with."""
+    nominal = "nominal is the robot as drawn, with base and tool fitted to those other rows"
+    parts: list[str] = []
+    if "cross_validation" in report:
+        found = report["cross_validation"]
+        how = (
+            f"{found['folds']}-fold cross-validation: each of {found['rows']} rows is judged by a calibration "
+            "that never saw it"
+            if found["folds"] > 1
+            else f"Judged on {found['rows']} rows by a calibration on the others"
+        )
+        models = {name: found[name] for name in ("nominal", "geometric")}
+        parts += ["## Held-out pose errors", f"{how}; {nominal}.", pose_table(models)]
+    if "test" in report:
+        found = report["test"]
+        models = {name: found[name] for name in ("nominal", "geometric")}
+        how = f"The {found['rows']} rows that the file marks as test, with which nothing was calibrated"
+        parts += ["## Pose errors of the test set", f"{how}; {nominal}.", pose_table(models)]
+    if "held_out" in report:
+        figures = {name: value for name, value in report["held_out"].items() if name != "rows"}
+        how = f"{report['held_out']['rows']} other simulated rows."
+        parts += ["## Held-out pose errors", how, pose_table({"geometric": figures})]
+    return parts
 
 
 def _quality_text(result: CalibrationResult, report: Mapping[str, Any]) -> str:
     o = result.observability
-    noise = "; ".join(
-        ", ".join(
-            f"{key.replace('_', ' ')} {value if isinstance(value, str) else f'{value:.4g}'}"
-            for key, value in n.items()
-        )
-        for n in report["noise"]
-    )
+    count = len(result.outliers)
     return "\n".join(
         [
-            f"- {result.status.value} after {result.iterations} iterations; rank {result.rank} of {len(result.redundancy.names)} "
-            "parameters looked at",
-            f"- noise: {noise}",
-            f"- {len(result.outliers)} rows count for less than half (outliers)",
-            f"- observability (mm, mrad): O1 {o.O1:.4g}, O2 {o.O2:.4g}, O3 {o.O3:.4g}, O4 {o.O4:.4g}, O5 {o.O5:.4g}; "
-            f"condition number {result.condition_number:.4g}",
+            f"- The search {result.status.value}, after {result.iterations} iterations.",
+            f"- {len(result.redundancy.names)} parameters were looked at; the data see {result.rank} independent "
+            f"combinations of them (rank), and {len(result.free)} were estimated.",
+            *(f"- {_noise_text(noise)}" for noise in report["noise"]),
+            f"- {count or 'No'} row{'s' if count != 1 else ''} counted for less than half as outliers.",
+            f"- Condition number {result.condition_number:.4g}; observability indices O1 {o.O1:.4g}, O2 {o.O2:.4g}, "
+            f"O3 {o.O3:.4g}, O4 {o.O4:.4g}, O5 {o.O5:.4g} (columns per mm and mrad, rows in mm and mrad).",
         ]
     )
 
 
-def _markdown(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
-    lines = [head, ("---",) * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+def _noise_text(noise: Mapping[str, Any]) -> str:
+    if "factor_on_given_sigma" in noise:
+        found = f"{noise['factor_on_given_sigma']:.4g} times the standard deviation that the rows state"
+    else:
+        name = next(name for name in noise if name.startswith("sigma_"))
+        found = f"{noise[name]:.4g} {name.removeprefix('sigma_')} per value (one standard deviation)"
+    return (
+        f"Noise of {noise['sensor']}, as the residuals show it: {found}, from {noise['values']} values of which "
+        f"the parameters use up {noise['used_by_parameters']:.3g}."
+    )
+
+
+def _provenance_text(model: CalibratedModel) -> str:
+    provenance = model.provenance
+    versions = ", ".join(f"{name} {value}" for name, value in provenance.versions.items())
+    lines = [
+        f"- data `{provenance.data_source}`, sha256 of the values `{provenance.data_sha256}`",
+        f"- {versions}",
+    ]
+    if provenance.recipe:
+        lines.insert(0, f"- recipe `{provenance.recipe}`, sha256 `{provenance.recipe_sha256}`")
+    return "\n".join(lines)

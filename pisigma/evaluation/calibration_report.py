@@ -15,8 +15,18 @@ _UNITS = {"m": ("mm", 1e3), "rad": ("deg", math.degrees(1.0))}
 _FIGURES = ("nominal", "estimated", "change", "standard_error")
 
 
-def report_calibration(result: CalibrationResult, validation: GeometricValidation | None) -> dict[str, Any]:
-    """Everything that is said of a calibration, in millimetres and degrees; what is not known is None."""
+def report_calibration(
+    result: CalibrationResult,
+    validation: GeometricValidation | None = None,
+    test: GeometricValidation | None = None,
+) -> dict[str, Any]:
+    """Everything that is said of a calibration, in millimetres and degrees; what is not known is None.
+
+    Args:
+        result: the calibration.
+        validation: of rows held out in turn.
+        test: of rows that the file marks as test.
+    """
     report: dict[str, Any] = {
         "status": result.status.value,
         "iterations": result.iterations,
@@ -42,6 +52,9 @@ def report_calibration(result: CalibrationResult, validation: GeometricValidatio
     }
     if validation is not None:
         report["cross_validation"] = validation.in_file_units()
+    if test is not None:
+        figures = test.in_file_units()
+        report["test"] = {name: value for name, value in figures.items() if name != "folds"}
     return report
 
 
@@ -71,7 +84,7 @@ def report_redundancy(result: CalibrationResult) -> dict[str, Any]:
 def write_parameters(result: CalibrationResult, path: Path) -> None:
     """Write the parameter table as CSV; a cell is empty where there is no figure."""
     with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
+        writer = csv.writer(file, lineterminator="\n")
         writer.writerow(["name", "unit", *_FIGURES, "remark"])
         for row in parameter_rows(result):
             figures = ["" if row[name] is None else repr(row[name]) for name in _FIGURES]

@@ -13,11 +13,11 @@ from pisigma.evaluation.figures import (
     draw_errors_over_workspace,
     write_energy_csv,
 )
+from pisigma.evaluation.markdown import CARD as CARD
+from pisigma.evaluation.markdown import use_text
 from pisigma.evaluation.tables import joint_table, pose_table
 from pisigma.training.recipe import Recipe
 from pisigma.training.run import TrainingRun
-
-CARD = "README.md"
 
 
 def write_card(
@@ -61,6 +61,14 @@ def _card_text(recipe: Recipe, command: str, run: TrainingRun, report: Mapping[s
     if "cross_validation" in report:
         models = {name: report["cross_validation"][name] for name in ("nominal", "corrected")}
         parts += ["## Held-out pose errors", report["verdict"], pose_table(models)]
+    if "test" in report:
+        test = report["test"]
+        models = {name: test[name] for name in ("nominal", "corrected")}
+        parts += [
+            "## Pose errors of the test set",
+            f"The {test['rows']} rows that the file marks as test; nothing was trained on them.",
+            pose_table(models),
+        ]
     parts += [
         "## Figures",
         f"Training energy of every joint over the epochs ([values]({ENERGY_CSV})): half the mean square "
@@ -73,7 +81,7 @@ def _card_text(recipe: Recipe, command: str, run: TrainingRun, report: Mapping[s
         "## Not validated",
         recipe.not_validated.strip(),
         "## Use",
-        _use_text(recipe.name),
+        use_text(recipe.name),
         "## Provenance",
         _provenance_text(run),
     ]
@@ -116,14 +124,6 @@ def _domain_text(run: TrainingRun) -> str:
         "lie from each other (5 % margin); elsewhere the status is `OUTSIDE_DOMAIN` and the correction is "
         "extrapolated. Joints that are not in the table are not corrected, and poses that differ only in "
         "what is no input get the same correction."
-    )
-
-
-def _use_text(name: str) -> str:
-    return (
-        f'```python\nimport pisigma\n\nik = pisigma.load("models/{name}")\n'
-        "solution = ik(T_base_tool)  # (*batch, 4, 4) [m]\n"
-        "solution.q, solution.status  # joint values to command [rad or m], and whether to trust them\n```"
     )
 
 

@@ -39,16 +39,27 @@ class CrossValidation:
         """Whether the correction helps, in a sentence."""
         figures = self.comparison.in_file_units()
         nominal, corrected = figures["nominal"], figures["corrected"]
-        findings, harm, help_ = [], False, False
+        findings, harm, help_, careful = [], False, False, False
         for name, quantity, unit in (("position", "rms_mm", "mm"), ("orientation", "rms_deg", "deg")):
             if quantity in nominal:
                 before, after = nominal[quantity], corrected[quantity]
                 change = "lowers" if after < before * (1 - LEVEL) else "does not change"
                 change = "raises" if after > before * (1 + LEVEL) else change
                 harm, help_ = harm or change == "raises", help_ or change == "lowers"
-                findings.append(f"{change} the {name} error ({before:.3f} to {after:.3f} {unit} RMS)")
-        advice = "" if help_ and not harm else "; do not use it" if not help_ else "; use it with care"
+                rise = _rise(nominal[f"max_{unit}"], corrected[f"max_{unit}"], unit)
+                rise = rise and f", {'and' if change == 'raises' else 'but'} {rise}"
+                careful = careful or bool(rise)
+                findings.append(f"{change} the {name} error ({before:.3f} to {after:.3f} {unit} RMS{rise})")
+        advice = "; use it with care" if harm or careful else ""
+        advice = advice if help_ else "; do not use it"
         return f"On held-out rows the correction {' and '.join(findings)}{advice}."
+
+
+def _rise(before: float, after: float, unit: str) -> str:
+    """Say that the largest error rises, by however little; nothing where it does not."""
+    texts = f"{before:.3f}", f"{after:.3f}"
+    rises = after > before and texts[0] != texts[1]
+    return f"the largest rises from {texts[0]} to {texts[1]} {unit}" if rises else ""
 
 
 def cross_validate(
@@ -58,7 +69,7 @@ def cross_validate(
 
     Args:
         recipe: for measured data.
-        measurements: its rows.
+        measurements: its rows to train on; every one is held out once.
         on_fold: called before every fold with the number of folds done and of all.
 
     Raises:

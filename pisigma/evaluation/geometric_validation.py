@@ -19,8 +19,9 @@ TrainTest = tuple[Int64[Tensor, " train"], Int64[Tensor, " test"]]
 
 @dataclass(frozen=True, eq=False)
 class GeometricValidation:
-    """Errors of held-out rows, each under a calibration that never saw it; NaN in rows that were never held
-    out.
+    """Errors of held-out rows, each under a calibration that never saw it.
+
+    In rows that were never held out they are NaN.
 
     Attributes:
         folds: how many times the rows were parted.
@@ -33,9 +34,10 @@ class GeometricValidation:
     geometric: PoseErrors
 
     def in_file_units(self) -> dict[str, object]:
-        """The figures in mm and deg."""
+        """The figures in mm and deg; `rows` counts the held-out ones with a position."""
         return {
             "folds": self.folds,
+            "rows": int(torch.isfinite(self.geometric.position).sum()),
             "nominal": self.nominal.in_file_units(),
             "geometric": self.geometric.in_file_units(),
         }
@@ -60,13 +62,12 @@ def validate_geometric(
         IdentificationError: the training rows of a part do not determine what is asked for, or a test row has
             a frame or target that its training rows lack.
     """
-    base_and_tool = replace(calibrator, free=(), loss=SquaredLoss())
     nominal = torch.full((2, measurements.rows), torch.nan, dtype=torch.float64)
     geometric = nominal.clone()
     for done, (train, test) in enumerate(parts):
         on_fold(done, len(parts))
         seen, unseen = measurements.select(train), measurements.select(test)
-        for chosen, store in ((base_and_tool, nominal), (calibrator, geometric)):
+        for chosen, store in ((_base_and_tool(calibrator), nominal), (calibrator, geometric)):
             errors = errors_under(chosen.fit(seen), unseen)
             store[0, test] = errors.position
             if errors.rotation is not None:
@@ -74,6 +75,29 @@ def validate_geometric(
     rotated = measurements.rotation is not None
     before, after = (PoseErrors(store[0], store[1] if rotated else None) for store in (nominal, geometric))
     return GeometricValidation(len(parts), before, after)
+
+
+def judge(
+    calibrator: GeometricCalibrator, result: CalibrationResult, seen: Measurements, test: Measurements
+) -> GeometricValidation:
+    """Judge a calibration on rows that were kept aside.
+
+    Args:
+        calibrator: what calibrated, for the "nominal" figures; see `validate_geometric`.
+        result: what it gave.
+        seen: the rows that it was given.
+        test: other rows.
+
+    Raises:
+        IdentificationError: a test row has a frame or target that was not calibrated.
+    """
+    nominal = errors_under(_base_and_tool(calibrator).fit(seen), test)
+    return GeometricValidation(1, nominal, errors_under(result, test))
+
+
+def _base_and_tool(calibrator: GeometricCalibrator) -> GeometricCalibrator:
+    """The arm as drawn; only base and tool are fitted, and every row counts in full."""
+    return replace(calibrator, free=(), loss=SquaredLoss())
 
 
 def errors_under(result: CalibrationResult, measurements: Measurements) -> PoseErrors:

@@ -127,10 +127,10 @@ def seen_from_frames(
     before = _relative(model.bases, measurements.frame, "frame", measurements)
     behind = _relative(model.tools, measurements.target, "target", measurements)
     if before is not None:
-        own = transform_from_xyzrpy(torch.tensor(model.robot.base))
+        own = transform_from_xyzrpy(torch.tensor(model.robot.base.tolist(), dtype=torch.float64))
         T = before @ invert(own) @ T
     if behind is not None:
-        own = transform_from_xyzrpy(torch.tensor(model.robot.tool))
+        own = transform_from_xyzrpy(torch.tensor(model.robot.tool.tolist(), dtype=torch.float64))
         T = T @ invert(own) @ behind
     return T
 
@@ -141,14 +141,27 @@ def _relative(
     what: str,
     measurements: Measurements,
 ) -> Float64[Tensor, "rows 4 4"] | None:
-    """The frame or tool of every row; None where the model knows no names."""
-    if not known:
+    """The frame or tool of every row; None where the model and the rows have one, whatever its name.
+
+    A model that was fitted to rows without names takes rows of any one name, and one that was fitted to a
+    single name takes rows without.
+    """
+    if not set(known) - {""}:
+        other = next((row for row, name in enumerate(names) if name != names[0]), None)
+        if other is not None:
+            raise MeasurementError(
+                f"{measurements.place(other)}: {what} '{names[other]}' stands there, but "
+                f"{measurements.place(0)} has '{names[0]}', and the model knows one {what} only; give a file for each."
+            )
+        return None
+    if len(known) == 1 and not any(names):
         return None
     for row, name in enumerate(names):
         if name not in known:
             raise MeasurementError(
-                f"{measurements.place(row)}: the model was not fitted to {what} '{name}'; {nearest_choice(name, known)}"
+                f"{measurements.place(row)}: the model was not fitted to {what} '{name}'; "
+                f"{nearest_choice(name, known)}"
             )
     order = list(known)
     frames = transform_from_xyzrpy(torch.from_numpy(np.stack([known[name] for name in order])))
-    return frames[torch.tensor([order.index(name) for name in names])]
+    return frames[torch.tensor([order.index(name) for name in names], dtype=torch.int64)]

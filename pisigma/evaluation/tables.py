@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from pisigma.evaluation.markdown import markdown_table
+
 PARTS = (("training", "training"), ("held_out", "held-out"), ("paper", "paper"))
 """Keys of a joint's figures and what the tables call them."""
 
@@ -43,7 +45,7 @@ def joint_table(joints: Sequence[Mapping[str, Any]]) -> str:
         "rows",
         *(f"{when}: {name}" for when in ("before", "after") for name in _STATISTICS),
     ]
-    return _markdown(head, joint_rows(joints))
+    return markdown_table(head, joint_rows(joints))
 
 
 def pose_rows(models: Mapping[str, Mapping[str, float]]) -> tuple[list[str], list[tuple[str, ...]]]:
@@ -61,15 +63,10 @@ def pose_rows(models: Mapping[str, Mapping[str, float]]) -> tuple[list[str], lis
 
 def pose_table(models: Mapping[str, Mapping[str, float]]) -> str:
     """A Markdown table of pose errors, one column per model. See `pose_rows`."""
-    return _markdown(*pose_rows(models))
+    return markdown_table(*pose_rows(models))
 
 
 def _with_unit(name: str) -> tuple[str, str]:
     statistic, unit = name.rsplit("_", 1)
     quantity = "position" if unit == "mm" else "orientation"
     return f"{quantity}, {_SHOWN.get(statistic, statistic)}", unit
-
-
-def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)

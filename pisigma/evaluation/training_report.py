@@ -5,6 +5,8 @@ from typing import Any
 
 from pisigma.evaluation.cross_validation import CrossValidation
 from pisigma.evaluation.joint_statistics import JointStatistics
+from pisigma.evaluation.pose_statistics import compare_on
+from pisigma.measurement.dataset import Measurements
 from pisigma.training.recipe import Recipe
 from pisigma.training.run import JointErrors, TrainingRun
 
@@ -34,9 +36,22 @@ def report_joints(recipe: Recipe, run: TrainingRun) -> list[JointReport]:
 
 
 def report_training(
-    recipe: Recipe, run: TrainingRun, cross_validation: CrossValidation | None
+    recipe: Recipe,
+    run: TrainingRun,
+    cross_validation: CrossValidation | None,
+    test: Measurements | None = None,
 ) -> dict[str, Any]:
-    """Everything that is said of a training, apart from where it was written and how long it took."""
+    """Everything that is said of a training, apart from where it was written and how long it took.
+
+    Args:
+        recipe: what was trained.
+        run: what came out.
+        cross_validation: errors of held-out rows, for measured data.
+        test: rows of the file that were kept aside.
+
+    Raises:
+        MeasurementError: the test rows hold no positions.
+    """
     report: dict[str, Any] = {
         "rows": {"used": run.model.provenance.rows, "left_out": run.model.provenance.rows_left_out},
         "joints": report_joints(recipe, run),
@@ -46,6 +61,11 @@ def report_training(
     if cross_validation is not None:
         report["cross_validation"] = cross_validation.in_file_units()
         report["verdict"] = cross_validation.verdict
+    if test is not None:
+        report["rows"]["kept_aside"] = test.rows
+        comparison = compare_on(run.model, test)
+        counts = {"rows": test.rows, "rows_not_predicted": comparison.not_predicted}
+        report["test"] = {**counts, **comparison.in_file_units()}
     return report
 
 

@@ -1,6 +1,7 @@
 """The geometric calibrator."""
 
-from collections.abc import Sequence
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -14,17 +15,22 @@ from pisigma.identification.least_squares import Solution, levenberg_marquardt
 from pisigma.identification.loss import AbstractLoss, HampelLoss
 from pisigma.identification.pairwise import find_pairwise_redundancy
 from pisigma.identification.parameters import ParameterSpace, Prior
-from pisigma.identification.problem import CalibrationProblem, view_of
+from pisigma.identification.problem import CalibrationProblem, PriorSizes, view_of
 from pisigma.identification.redundancy import Redundancy, find_redundancy
 from pisigma.identification.result import CalibrationResult
 from pisigma.identification.result_assembly import Findings, assemble_result
-from pisigma.identification.setup import CalibrationSetup, build_setup, chosen_rows
+from pisigma.identification.sensor_building import PairOfSockets
+from pisigma.identification.setup import CalibrationSetup, SetupOptions, build_setup
+from pisigma.identification.starting import chosen_rows
 from pisigma.identification.sufficiency import check_sufficiency
+from pisigma.identification.untold import tells_scale, untold
 from pisigma.measurement.dataset import Measurements
-from pisigma.robot.description import Robot
+from pisigma.robot.description import FRAME_COLUMNS, Robot
 
 ROUGH_ROWS = 4_096
 """Rows that the first steps and the start are worked out from."""
+SEEN_AT_ALL = 1e-3
+"""A length whose column is shorter than this share of the longest does not hold the scale."""
 ROUGH_STEPS = 3
 """Steps without the prior, which show the noise before the prior is weighed against it."""
 
@@ -40,11 +46,18 @@ class GeometricCalibrator:
         free: "identifiable": all that the data can tell; "joint_offsets": theta of turning and d of sliding
             joints; or names of parameters, such as "a_2". Base and tool come on top, see below.
         base: "free", or "fixed" to the robot's own (then only parameters that `free` names are estimated).
-        tool: the same for the tool.
+        tool: the same for the tool; "position" frees x, y and z only.
         elimination: how redundant parameters are left out: "exact" (rank and pivoted QR), "pairwise" (the
             paper's Pearson correlation), or "none". The predicted poses do not depend on it.
         prior: standard deviations of the parameters' errors, or None. With it, what the data cannot see
             stays at its nominal value.
+        prior_sizes: "widened": wider where the errors are clearly larger than the prior says, one factor for
+            lengths and one for angles; "estimated": wider or narrower; "stated": as it is.
+        frames: per frame of touches, about where the robot's base is in it: x, y, z [m], roll, pitch, yaw
+            [rad], such as the planned placement of a jig. Needed only where the touches do not tell it.
+        socket_distances: known distances between two sockets [m], which give the scale:
+            `{("plate/0", "plate/1"): 0.05}`.
+        socket_sigma: standard deviation of these distances [m].
         loss: `HampelLoss()` gives rows that are far off less weight or none; `SquaredLoss()` does not.
         maximum_iterations: steps tried at most.
     """
@@ -57,13 +70,18 @@ class GeometricCalibrator:
     prior: Prior | None = field(default_factory=Prior)
     loss: AbstractLoss = field(default_factory=HampelLoss)
     maximum_iterations: int = 50
+    prior_sizes: PriorSizes = "widened"
+    frames: Mapping[str, Sequence[float]] = field(default_factory=dict)
+    socket_distances: Mapping[PairOfSockets, float] = field(default_factory=dict)
+    socket_sigma: float = 1e-5
 
     def __post_init__(self) -> None:
         """Refuse options that do not exist."""
         for name, choices in (
             ("base", ("free", "fixed")),
-            ("tool", ("free", "fixed")),
+            ("tool", ("free", "position", "fixed")),
             ("elimination", ("exact", "pairwise", "none")),
+            ("prior_sizes", ("stated", "widened", "estimated")),
         ):
             if getattr(self, name) not in choices:
                 raise IdentificationError(
@@ -73,6 +91,16 @@ class GeometricCalibrator:
             raise IdentificationError(
                 f"free='{self.free}' is no choice; valid: identifiable, joint_offsets, or a list of "
                 "parameter names."
+            )
+        for name, base in self.frames.items():
+            if len(base) != 6 or not all(math.isfinite(value) for value in base):
+                raise IdentificationError(
+                    f"frames: six numbers were wanted for '{name}', x, y, z [m], roll, pitch, yaw [rad], got "
+                    f"{tuple(base)}."
+                )
+        if not self.socket_sigma > 0:
+            raise IdentificationError(
+                f"socket_sigma={self.socket_sigma:g}: a positive length [m] was wanted."
             )
 
     def fit(self, measurements: Measurements) -> CalibrationResult:
@@ -84,16 +112,22 @@ class GeometricCalibrator:
             PoseError: the joint values do not fit the robot.
         """
         setup = self.build(measurements)
-        candidates = self.candidates(setup.problem.space)
-        seen = information(setup.problem, setup.start, candidates)
+        own = setup.own_candidates
+        candidates, seen = self._seen(setup, self.candidates(setup.problem.space))
         sizes = setup.start.cpu().numpy()[candidates]
         redundancy = find_redundancy(seen, sizes)
         warnings = check_sufficiency(
-            self.robot, setup.problem, redundancy, not isinstance(self.free, str), measurements.source
+            self.robot,
+            setup.problem,
+            redundancy,
+            not isinstance(self.free, str),
+            measurements.source,
+            len(own),
         )
-        active = self._chosen(setup.problem.space, seen, sizes, redundancy)
+        warnings = (*warnings, *untold(setup))
+        active = [*self._chosen(setup.problem.space, seen, sizes, redundancy), *own]
         problem = setup.problem.with_active(active)
-        solution, problem, extended = self._solved(problem, setup.start, candidates)
+        solution, problem, extended = self._solved(problem, setup.start, own + candidates)
         findings = Findings(seen, sizes, redundancy, extended, warnings)
         return assemble_result(measurements, setup, problem, solution, findings)
 
@@ -104,9 +138,25 @@ class GeometricCalibrator:
             IdentificationError: nothing usable was measured, or too little for base and tool.
             PoseError: the joint values do not fit the robot.
         """
-        return build_setup(
-            self.robot, measurements, self.base == "free", self.tool == "free", self.prior, self.loss
+        options = SetupOptions(
+            free_base=self._finds("base"),
+            free_tool=self._finds("tool"),
+            turn_tool=self.tool == "free",
+            frames={name: tuple(base) for name, base in self.frames.items()},
+            socket_distances=self.socket_distances,
+            socket_sigma=self.socket_sigma,
+            prior_sizes=self.prior_sizes,
         )
+        return build_setup(self.robot, measurements, options, self.prior, self.loss)
+
+    def _finds(self, group: str) -> bool:
+        """Whether a start of bases or tools is wanted: they are free, or named (of a base all six)."""
+        if getattr(self, group) != "fixed":
+            return True
+        if isinstance(self.free, str):
+            return False
+        columns = FRAME_COLUMNS if group == "base" else FRAME_COLUMNS[:3]
+        return {f"{group}_{column}" for column in columns} <= set(self.free)
 
     def candidates(self, space: ParameterSpace) -> list[int]:
         """Indices of the parameters that may be estimated.
@@ -115,15 +165,35 @@ class GeometricCalibrator:
             IdentificationError: `free` names a parameter that does not exist.
         """
         found = {i for i, p in enumerate(space.parameters) if p.group == "base" and self.base == "free"}
-        found |= {i for i, p in enumerate(space.parameters) if p.group == "tool" and self.tool == "free"}
+        tools = list(space.of("tool")) if self.tool != "fixed" else []
+        found |= {i for place, i in enumerate(tools) if self.tool == "free" or place % 6 < 3}
         if self.free == "identifiable":
             found |= set(range(space.arm_size))
         elif self.free == "joint_offsets":
             for row in self.robot.joint_rows:
                 found.add(5 * row + (1 if self.robot.rows[row].type == "prismatic" else 0))
         else:
-            found |= {space.index(name) for name in self.free}
+            found |= {place for name in self.free for place in space.indices(name)}
         return sorted(found)
+
+    def _seen(self, setup: CalibrationSetup, candidates: list[int]) -> tuple[list[int], Information]:
+        """What the data say of the candidates at the start, after the sensors' own unknowns.
+
+        Where they do not tell the scale, the longest length that they see keeps its nominal value: errors of the
+        nominal geometry would pretend to tell it, and a robot that shrinks to a point meets all sockets.
+        """
+        own = setup.own_candidates
+        seen = information(setup.problem, setup.start, own + candidates).after(list(range(len(own))))
+        if tells_scale(setup):
+            return candidates, seen
+        size = np.linalg.norm(seen.jacobian, axis=0)
+        values = np.abs(setup.start.cpu().numpy()[candidates])
+        arm = [parameter.group in ("d", "a") for parameter in seen.parameters]
+        lengths = np.where(np.array(arm) & (size > SEEN_AT_ALL * size.max(initial=0.0)), values, 0.0)
+        if not lengths.any():
+            return candidates, seen
+        longest = int(lengths.argmax())
+        return [i for i in candidates if i != candidates[longest]], seen.without(longest)
 
     def _chosen(
         self,

@@ -1,6 +1,6 @@
 """The identification Jacobian of a whole data set, condensed to a small triangular matrix."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,6 +10,9 @@ from torch import Tensor
 from pisigma.identification.noise import SensorView
 from pisigma.identification.parameters import Parameter
 from pisigma.identification.problem import CalibrationProblem
+
+SEEN = 1e-10
+"""Columns that lie in others but for this share are taken to lie in them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +54,33 @@ class Information:
         """The same after the mean of every column of J was taken off."""
         return self.root[1:, 1:-1]
 
+    def without(self, column: int) -> "Information":
+        """The same without one parameter."""
+        kept = [i for i in range(len(self.parameters)) if i != column]
+        root = self.root[:, [0, *(i + 1 for i in kept), -1]]
+        return replace(self, parameters=tuple(self.parameters[i] for i in kept), root=root)
+
+    def after(self, nuisance: list[int]) -> "Information":
+        """What is left for the other parameters when these columns may take any value.
+
+        Args:
+            nuisance: numbers of the columns; they are left out.
+        """
+        if not nuisance:
+            return self
+        taken = self.jacobian[:, nuisance]
+        lengths = np.linalg.norm(taken, axis=0)
+        U, singular, _ = np.linalg.svd(taken / np.where(lengths > 0, lengths, 1.0), full_matrices=False)
+        U = U[:, singular > SEEN * singular.max(initial=0.0)]
+        kept = [i for i in range(len(self.parameters)) if i not in set(nuisance)]
+        rest = self.root[:, [0, *(i + 1 for i in kept), -1]]
+        sizes = np.linalg.norm(rest, axis=0)
+        for _ in range(2):
+            rest = rest - U @ (U.T @ rest)
+        rest[:, np.linalg.norm(rest, axis=0) <= SEEN * sizes] = 0.0
+        root: np.ndarray = np.linalg.qr(rest, mode="r")  # type: ignore[assignment]
+        return replace(self, parameters=tuple(self.parameters[i] for i in kept), root=root)
+
 
 def information(
     problem: CalibrationProblem,
@@ -71,17 +101,18 @@ def information(
     index = torch.tensor(candidates, dtype=torch.int64, device=point.device)
     usual = torch.from_numpy(problem.space.usual_errors).to(point)[index, None]
     root = point.new_zeros((0, len(candidates) + 2))
+    own = problem.space.own(point)
     values = 0
     for rows in problem.chunks():
-        motion = problem.motion(point, rows)
+        motion = problem.motion(point, rows, index)
         blocks = [root]
         for k, sensor in enumerate(problem.sensors):
             seen = sensor.seen[rows]
             weight = (
                 1e3 if view is None else problem.row_weights(view, k, rows)[seen].repeat(sensor.components)
             )
-            J = problem.spread(sensor.derivative(motion), rows, index)[..., seen].flatten(1) * usual
-            r = sensor.residual(motion, rows)[..., seen].flatten()[None]
+            J = problem.derivative(sensor, motion, own, rows, index)[..., seen].flatten(1) * usual
+            r = sensor.residual(motion, own, rows)[..., seen].flatten()[None]
             blocks.append((torch.cat([torch.ones_like(r), J, r]) * weight).t())
             values += J.shape[1]
         root = torch.linalg.qr(torch.cat(blocks), mode="r").R

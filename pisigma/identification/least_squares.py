@@ -139,7 +139,7 @@ def levenberg_marquardt(
                 status = SolutionStatus.CONVERGED
                 break
             continue
-        if best.misfit <= 100 * best.rounding:
+        if best.misfit <= 1e4 * best.rounding:
             status = SolutionStatus.EXACT
             break
         if here is best and (decrement <= SHORTEST_STEP**2 or decrement <= 1e-10 * best.cost):

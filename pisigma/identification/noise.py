@@ -15,6 +15,9 @@ SMALLEST_NOISE = 1e-14
 ALWAYS_GOOD = 1e-10
 """[m or rad] Rows nearer to their prediction than this never count as wrong."""
 
+SMALLEST_PRIOR = 1e-3
+"""An estimated prior is not narrower than this share of the stated one."""
+
 
 @dataclass(frozen=True, eq=False)
 class SensorSums:
@@ -89,6 +92,9 @@ def loss_scale(
     """Standard deviation of every sensor's values; `refine` uses all good rows instead of the median."""
     found = []
     for k, sensor in enumerate(sensors):
+        if sensor.certain:
+            found.append(1.0)
+            continue
         distance = view.sums[k].distance[sensor.seen]
         if refine:
             found.append(loss.deviation(distance, sensor.components, used[k], view.scale(k)))
@@ -122,6 +128,9 @@ def group_variance_ratio(
     poses = int(pose.max()) + 1
     found = []
     for k, (sensor, sums) in enumerate(zip(sensors, view.sums, strict=True)):
+        if sensor.certain:
+            found.append(1.0)
+            continue
         weight = loss.weight(sums.distance / view.scale(k), sensor.components) * sensor.seen
         if sensor.sigma is not None:
             weight = torch.where(sensor.seen, weight / sensor.sigma.square(), 0.0)
@@ -140,11 +149,12 @@ def prior_widening(
     lengths: Tensor,
     view: SensorView,
     covariance: Float64[Tensor, "active active"],
+    floor: float = 1.0,
 ) -> tuple[float, float]:
     """How much larger than stated the parameters' errors turn out, for lengths and for angles.
 
     MacKay's update (1992, Neural Computation 4(3), eq. 4.7): every parameter counts by how much of it the
-    data tell. Smaller errors than stated do not tighten the prior.
+    data tell.
 
     Args:
         off: distance of the parameters from their nominal values [m or rad].
@@ -152,6 +162,7 @@ def prior_widening(
         lengths: which parameters are lengths.
         view: how far the prior is widened now.
         covariance: of the parameters.
+        floor: smallest answer; 1 where smaller errors than stated do not tighten the prior.
     """
     told = 1 - view.widened(precision, lengths) * covariance.diagonal()
     square = off.square() * precision
@@ -159,5 +170,5 @@ def prior_widening(
     for chosen in (lengths, ~lengths):
         chosen = chosen & (precision > 0)
         total = float(told[chosen].sum())
-        found.append(max(float(square[chosen].sum()) / total, 1.0) ** 0.5 if total > 1 else 1.0)
+        found.append(max(float(square[chosen].sum()) / total, floor**2) ** 0.5 if total > 1 else 1.0)
     return found[0], found[1]

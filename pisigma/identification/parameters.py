@@ -7,13 +7,16 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError, nearest_choice
+from pisigma.identification.sensors import OwnUnknowns
 from pisigma.robot.description import DH_COLUMNS, FRAME_COLUMNS, Robot
 
-LENGTHS = frozenset({"d", "a", "x", "y", "z"})
+SOCKET_COLUMNS = ("x", "y", "z")
+ANCHOR_COLUMNS = ("x", "y", "z", "zero")
+LENGTHS = frozenset({"d", "a", "x", "y", "z", "zero"})
 USUAL_LENGTH = 1e-3
 """[m] Scale of length parameters where no prior gives one."""
 USUAL_ANGLE = 1e-3
@@ -57,9 +60,9 @@ class Parameter:
 
     Attributes:
         name: such as "theta_1", "d_EE", "base_x" or, with several targets, "tool_B_x".
-        group: "theta", "d", "a", "alpha", "beta", "base" or "tool".
+        group: "theta", "d", "a", "alpha", "beta", "base", "tool", "socket" or "anchor".
         unit: "m" or "rad".
-        owner: the row, frame or target it belongs to.
+        owner: the row, frame, target, socket or anchor it belongs to.
     """
 
     name: str
@@ -81,15 +84,19 @@ class ParameterSpace:
         robot: the nominal robot.
         frames: names of the measuring frames, each with its own base.
         targets: names of the targets, each with its own tool.
+        sockets: names of the sockets, each with a place.
+        anchors: names of the anchors, each with a place and a zero offset.
     """
 
     robot: Robot
     frames: tuple[str, ...] = ("",)
     targets: tuple[str, ...] = ("",)
+    sockets: tuple[str, ...] = ()
+    anchors: tuple[str, ...] = ()
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Rows x (theta, d, a, alpha, beta), frames x base, targets x tool."""
+        """Rows x (theta, d, a, alpha, beta), frames x base, targets x tool, sockets x 3, anchors x 4."""
         found = []
         for label, row in zip(row_labels(self.robot), self.robot.rows, strict=True):
             found += [_parameter(column, f"{column}_{label}", column, row.name) for column in DH_COLUMNS]
@@ -97,6 +104,12 @@ class ParameterSpace:
             for owner in owners:
                 stem = f"{group}_{owner}" if len(owners) > 1 else group
                 found += [_parameter(column, f"{stem}_{column}", group, owner) for column in FRAME_COLUMNS]
+        for group, owners, columns in (
+            ("socket", self.sockets, SOCKET_COLUMNS),
+            ("anchor", self.anchors, ANCHOR_COLUMNS),
+        ):
+            for owner in owners:
+                found += [_parameter(column, f"{group}_{owner}_{column}", group, owner) for column in columns]
         return tuple(found)
 
     @cached_property
@@ -126,19 +139,69 @@ class ParameterSpace:
             )
         return self.names.index(name)
 
+    def indices(self, name: str) -> list[int]:
+        """Where a parameter stands; with several frames or targets "base_x" and "tool_x" mean all of theirs.
+
+        Raises:
+            IdentificationError: there is none of that name.
+        """
+        group, _, column = name.partition("_")
+        several = {"base": len(self.frames) > 1, "tool": len(self.targets) > 1}.get(group, False)
+        if name in self.names or not several or column not in FRAME_COLUMNS:
+            return [self.index(name)]
+        return list(self.of(group))[FRAME_COLUMNS.index(column) :: 6]
+
+    def of(self, group: str) -> range:
+        """Indices of all parameters of a group behind the arm's: "base", "tool", "socket" or "anchor"."""
+        sizes = {
+            "base": 6 * len(self.frames),
+            "tool": 6 * len(self.targets),
+            "socket": len(SOCKET_COLUMNS) * len(self.sockets),
+            "anchor": len(ANCHOR_COLUMNS) * len(self.anchors),
+        }
+        start = self.arm_size
+        for name, size in sizes.items():
+            if name == group:
+                break
+            start += size
+        return range(start, start + sizes[group])
+
     def values(
-        self, bases: Float64[np.ndarray, "frames 6"], tools: Float64[np.ndarray, "targets 6"]
+        self,
+        bases: Float64[np.ndarray, "frames 6"],
+        tools: Float64[np.ndarray, "targets 6"],
+        sockets: Float64[np.ndarray, "sockets 3"] | None = None,
+        anchors: Float64[np.ndarray, "anchors 4"] | None = None,
     ) -> Float64[Tensor, " parameters"]:
-        """All parameters as one vector: the robot's rows, and these bases and tools."""
-        return torch.from_numpy(np.concatenate([self.robot.dh.ravel(), bases.ravel(), tools.ravel()]))
+        """All parameters as one vector: the robot's rows, and these; sockets and anchors are 0 if not given."""
+        sockets = np.zeros((len(self.sockets), 3)) if sockets is None else sockets
+        anchors = np.zeros((len(self.anchors), 4)) if anchors is None else anchors
+        parts = (self.robot.dh, bases, tools, sockets, anchors)
+        return torch.from_numpy(np.concatenate([part.ravel() for part in parts]))
 
     def split(
         self, values: Float64[Tensor, " parameters"]
     ) -> tuple[Float64[Tensor, "rows 5"], Float64[Tensor, "frames 6"], Float64[Tensor, "targets 6"]]:
-        """The reverse of `values`: rows, bases, tools."""
-        tools = values[len(values) - 6 * len(self.targets) :]
-        bases = values[self.arm_size : len(values) - 6 * len(self.targets)]
+        """Rows, bases and tools of a vector of all parameters."""
+        bases, tools = (values[self.of(group).start : self.of(group).stop] for group in ("base", "tool"))
         return values[: self.arm_size].view(-1, 5), bases.view(-1, 6), tools.view(-1, 6)
+
+    def own(self, values: Float64[Tensor, " parameters"]) -> OwnUnknowns:
+        """What a vector of all parameters says of sockets and anchors."""
+        sockets, anchors = (
+            values[self.of(group).start : self.of(group).stop] for group in ("socket", "anchor")
+        )
+        return OwnUnknowns(sockets.view(-1, 3).t(), anchors.view(-1, 4).t())
+
+    def places_of(
+        self, group: str, active: Int64[Tensor, " active"]
+    ) -> tuple[Int64[Tensor, " own"], Int64[Tensor, " own"], Int64[Tensor, " own"]]:
+        """Where sockets' or anchors' parameters stand among some: place, number of the owner, and column."""
+        size = len(SOCKET_COLUMNS if group == "socket" else ANCHOR_COLUMNS)
+        stretch = self.of(group)
+        places = ((active >= stretch.start) & (active < stretch.stop)).nonzero()[:, 0]
+        number = active[places] - stretch.start
+        return places, number // size, number % size
 
     def precision(self, prior: Prior | None) -> Float64[np.ndarray, " parameters"]:
         """1 / variance of every parameter's error before anything is measured; 0 where nothing is known."""

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Literal
 
 import torch
 from jaxtyping import Float64, Int64
@@ -10,10 +11,11 @@ from torch import Tensor
 
 from pisigma.identification.jacobian import JACOBIAN_CHUNK, ToolMotion, motion_order, tool_motion
 from pisigma.identification.least_squares import AbstractLeastSquares, Linearisation
-from pisigma.identification.loss import AbstractLoss
+from pisigma.identification.loss import AbstractLoss, SquaredLoss
 from pisigma.identification.noise import (
     ALWAYS_GOOD,
     SMALLEST_NOISE,
+    SMALLEST_PRIOR,
     SensorSums,
     SensorView,
     group_variance_ratio,
@@ -23,7 +25,12 @@ from pisigma.identification.noise import (
     values_used,
 )
 from pisigma.identification.parameters import ParameterSpace
-from pisigma.identification.sensors import AbstractSensor
+from pisigma.identification.sensors import AbstractSensor, OwnUnknowns
+
+PriorSizes = Literal["stated", "widened", "estimated"]
+CERTAIN_LOSS = SquaredLoss()
+EVERYWHERE, NOWHERE = -1, -2
+"""Instead of a frame or a target: a parameter that moves the tool in all rows, or in none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +48,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         precision: 1 / variance of their errors, 0 where nothing is known.
         active: indices of the free parameters.
         pose: number of every row's pose (joint values, frame, target), None where no pose is repeated.
+        pairs: so many pairs of rows, the first ones, are measured together.
+        prior_sizes: "stated": the prior as it is; "widened": wider where the errors are larger than it says;
+            "estimated": wider or narrower.
     """
 
     space: ParameterSpace
@@ -53,6 +63,8 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     precision: Float64[Tensor, " parameters"]
     active: Int64[Tensor, " active"]
     pose: Int64[Tensor, " rows"] | None = None
+    pairs: int = 0
+    prior_sizes: PriorSizes = "widened"
 
     @cached_property
     def step_scale(self) -> Float64[Tensor, " active"]:
@@ -79,7 +91,10 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return replace(self, precision=torch.zeros_like(self.precision))
 
     def select(self, rows: Int64[Tensor, " chosen"]) -> "CalibrationProblem":
-        """Some of the rows."""
+        """Some of the rows; of a pair both."""
+        if self.pairs:
+            partner = torch.where(rows < 2 * self.pairs, rows ^ 1, rows)
+            rows = torch.unique(torch.cat([rows, partner]))
         return replace(
             self,
             q=self.q[rows],
@@ -87,6 +102,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             target=self.target[rows],
             sensors=tuple(sensor.select(rows) for sensor in self.sensors),
             pose=None if self.pose is None else renumbered(self.pose[rows]),
+            pairs=int((rows < 2 * self.pairs).sum()) // 2,
         )
 
     def moved(self, point: Tensor, step: Tensor) -> Tensor:
@@ -97,10 +113,11 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """Sum up the normal equations; rows are weighted by the noise of `like`."""
         known = None if like is None else view_of(like)
         sums = [self._empty(sensor) for sensor in self.sensors]
+        own = self.space.own(point)
         for rows in self.chunks():
-            motion = self.motion(point, rows)
+            motion = self.motion(point, rows, self.active)
             for k, (sensor, total) in enumerate(zip(self.sensors, sums, strict=True)):
-                self._add(sensor, total, float("inf") if known is None else known.noise[k], motion, rows)
+                self._add(sensor, total, float("inf") if known is None else known.noise[k], motion, own, rows)
         ones = (1.0,) * len(sums)
         view = SensorView(tuple(sums), ones, ones) if known is None else replace(known, sums=tuple(sums))
         return self.combined(point, view)
@@ -131,7 +148,10 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
                 self.sensors, self.loss, replace(view, noise=noise), used, self.pose
             )
         off = (linearisation.point - self.nominal)[self.active]
-        widening = prior_widening(off, self.precision[self.active], self.lengths, view, covariance)
+        widening = view.widening
+        if self.prior_sizes != "stated":
+            floor = 1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR
+            widening = prior_widening(off, self.precision[self.active], self.lengths, view, covariance, floor)
         old, new = (*view.noise, *view.repetition, *view.widening), (*noise, *repetition, *widening)
         settled = all(abs(b / a - 1) < 1e-2 for a, b in zip(old, new, strict=True))
         return self.combined(linearisation.point, SensorView(view.sums, noise, repetition, widening)), settled
@@ -140,31 +160,54 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """1 / standard deviation of each row for a sensor, 0 where it saw nothing [1/m or 1/rad]."""
         kind = self.sensors[sensor]
         distance = view.sums[sensor].distance[rows] / view.scale(sensor)
-        root = self.loss.weight(distance, kind.components).sqrt() / view.variance(sensor) ** 0.5
+        root = self.loss_of(kind).weight(distance, kind.components).sqrt() / view.variance(sensor) ** 0.5
         if kind.sigma is not None:
             root = root / kind.sigma[rows]
         return torch.where(kind.seen[rows], root, 0.0)
+
+    def loss_of(self, sensor: AbstractSensor) -> AbstractLoss:
+        """How a sensor's rows count."""
+        return CERTAIN_LOSS if sensor.certain else self.loss
 
     def chunks(self) -> list[slice]:
         """Rows that are worked on together."""
         return [slice(start, start + JACOBIAN_CHUNK) for start in range(0, self.q.shape[0], JACOBIAN_CHUNK)]
 
-    def motion(self, point: Tensor, rows: slice) -> ToolMotion:
-        """Tool pose of some rows and its derivative by all parameters of one frame and one target."""
+    def motion(self, point: Tensor, rows: slice, active: Tensor) -> ToolMotion:
+        """Tool pose of some rows and its derivative by some parameters.
+
+        The columns are 0 for base and tool in rows of other frames and targets, and for parameters that do not
+        move the tool.
+        """
         dh, bases, tools = self.space.split(point)
         base = bases.t() if len(bases) == 1 else bases.t()[:, self.frame[rows]]
         tool = tools.t() if len(tools) == 1 else tools.t()[:, self.target[rows]]
         turning = any(sensor.turning for sensor in self.sensors)
-        return tool_motion(self.space.robot, dh.cpu().numpy(), base, tool, self.q[rows], turning)
-
-    def spread(self, derivative: Tensor, rows: slice, active: Tensor) -> Tensor:
-        """Columns of `active` parameters: 0 for base and tool in rows of other frames and targets."""
+        motion = tool_motion(self.space.robot, dh.cpu().numpy(), base, tool, self.q[rows], turning)
         columns, frame, target = self._columns
-        J = derivative.index_select(0, columns[active])
-        if len(self.space.frames) > 1 or len(self.space.targets) > 1:
+        J = motion.derivative.index_select(0, columns[active])
+        if (
+            bool((frame[active] == NOWHERE).any())
+            or len(self.space.frames) > 1
+            or len(self.space.targets) > 1
+        ):
             f, t = frame[active][:, None], target[active][:, None]
-            own = ((f < 0) | (f == self.frame[rows])) & ((t < 0) | (t == self.target[rows]))
-            J = J * own[:, None, :]
+            moving = ((f == EVERYWHERE) | (f == self.frame[rows])) & (
+                (t == EVERYWHERE) | (t == self.target[rows])
+            )
+            J = J * moving[:, None, :]
+        return replace(motion, derivative=J)
+
+    def derivative(
+        self, sensor: AbstractSensor, motion: ToolMotion, own: OwnUnknowns, rows: slice, active: Tensor
+    ) -> Tensor:
+        """Derivative of a sensor's values by the parameters that the motion was made for."""
+        J = sensor.derivative(motion, own, rows)
+        for part in sensor.own_derivatives(motion, own, rows):
+            places, owner, column = self.space.places_of(part.group, active)
+            if len(places):
+                theirs = (owner[:, None] == part.owner)[:, None, :]
+                J = J.index_add(0, places, part.derivative[column] * theirs)
         return J
 
     def combined(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
@@ -175,7 +218,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True)):
             scale, variance = view.scale(k), view.variance(k)
             misfit += (
-                float(self.loss.cost(sums.distance / scale, sensor.components).sum()) * scale**2 / variance
+                float(self.loss_of(sensor).cost(sums.distance / scale, sensor.components).sum())
+                * scale**2
+                / variance
             )
             normal = normal + sums.normal / variance
             descent = descent + sums.descent / variance
@@ -190,12 +235,15 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     @cached_property
     def _columns(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Per parameter: its column in a tool motion, its frame and its target (-1: all)."""
+        """Per parameter: its column in a tool motion, its frame and its target."""
         order = motion_order(len(self.space.robot.rows))
         arm, frames, targets = order[:-12], len(self.space.frames), len(self.space.targets)
-        columns = arm + order[-12:-6] * frames + order[-6:] * targets
-        frame = [-1] * len(arm) + [f for f in range(frames) for _ in range(6)] + [-1] * 6 * targets
-        target = [-1] * (len(arm) + 6 * frames) + [t for t in range(targets) for _ in range(6)]
+        others = len(self.space.parameters) - len(arm) - 6 * (frames + targets)
+        columns = arm + order[-12:-6] * frames + order[-6:] * targets + [0] * others
+        in_frames = [f for f in range(frames) for _ in range(6)]
+        at_targets = [t for t in range(targets) for _ in range(6)]
+        frame = [EVERYWHERE] * len(arm) + in_frames + [EVERYWHERE] * 6 * targets + [NOWHERE] * others
+        target = [EVERYWHERE] * (len(arm) + 6 * frames) + at_targets + [NOWHERE] * others
         found = torch.tensor([columns, frame, target], device=self.q.device)
         return found[0], found[1], found[2]
 
@@ -210,18 +258,26 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         )
 
     def _add(
-        self, sensor: AbstractSensor, sums: SensorSums, sigma: float, motion: ToolMotion, rows: slice
+        self,
+        sensor: AbstractSensor,
+        sums: SensorSums,
+        sigma: float,
+        motion: ToolMotion,
+        own: OwnUnknowns,
+        rows: slice,
     ) -> None:
         """Add one sensor's part of some rows, in place."""
         seen = sensor.seen[rows]
-        residual = torch.where(seen, sensor.residual(motion, rows), 0.0)
+        residual = torch.where(seen, sensor.residual(motion, own, rows), 0.0)
         distance = residual.norm(dim=0)
         root = seen.to(residual.dtype)
         if sensor.sigma is not None:
             root = torch.where(seen, 1 / sensor.sigma[rows], 0.0)
             distance = distance * root
-        root = root * self.loss.weight(distance / max(sigma, ALWAYS_GOOD), sensor.components).sqrt()
-        A = (self.spread(sensor.derivative(motion), rows, self.active) * root).flatten(1)
+        root = (
+            root * self.loss_of(sensor).weight(distance / max(sigma, ALWAYS_GOOD), sensor.components).sqrt()
+        )
+        A = (self.derivative(sensor, motion, own, rows, self.active) * root).flatten(1)
         sums.normal.addmm_(A, A.t())
         sums.descent.addmv_(A, (residual * root).flatten())
         sums.residual[:, rows] = residual

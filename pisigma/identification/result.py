@@ -1,6 +1,6 @@
 """What a calibration comes to: the robot, its parameters with their errors, and what the data do not tell."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -12,7 +12,7 @@ from pisigma.identification.least_squares import SolutionStatus
 from pisigma.identification.observability import Observability
 from pisigma.identification.pairwise import PairwiseRedundancy, find_pairwise_redundancy
 from pisigma.identification.prediction import prediction_errors
-from pisigma.identification.redundancy import Redundancy
+from pisigma.identification.redundancy import Redundancy, find_redundancy
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 
@@ -50,7 +50,7 @@ class SensorNoise:
     """Noise of one kind of sensor, as the residuals show it.
 
     Attributes:
-        sensor: "position" or "rotation".
+        sensor: "position", "rotation", "touch", "socket", "distance", "pair" or "socket distance".
         sigma: standard deviation of one value [m or rad]; where the rows give their own, the factor on it.
         unit: "m" or "rad", or "given" for a factor.
         values: number of measured values.
@@ -107,8 +107,11 @@ class CalibrationResult:
         iterations: steps tried.
         cost: sum of squared residuals over variances, with loss and prior.
         status: why the search ended.
-        rms_path: RMS of the position residuals' lengths at every point passed [m], the start first.
+        rms_path: RMS of the first sensor's residuals' lengths at every point passed [m], the start first.
         warnings: what to measure next, in sentences.
+        sockets: per socket, its place in its frame [m].
+        anchors: per anchor, its place in its frame [m].
+        zeros: per anchor, what its sensor shows at no distance [m].
     """
 
     robot: Robot
@@ -130,11 +133,26 @@ class CalibrationResult:
     status: SolutionStatus
     rms_path: tuple[float, ...]
     warnings: tuple[str, ...]
+    sockets: dict[str, Float64[np.ndarray, " 3"]] = field(default_factory=dict)
+    anchors: dict[str, Float64[np.ndarray, " 3"]] = field(default_factory=dict)
+    zeros: dict[str, float] = field(default_factory=dict)
 
     @property
     def rank(self) -> int:
-        """How many independent combinations of the parameters the data see, at the nominal geometry."""
+        """How many independent combinations of the parameters the data see, at the nominal geometry.
+
+        Counted after the places of sockets and anchors and the zeros, which may take any value.
+        """
         return self.redundancy.rank
+
+    @cached_property
+    def arm_rank(self) -> int:
+        """The same of the arm's parameters alone, after bases and tools too."""
+        groups = [parameter.group for parameter in self.information.parameters]
+        nuisance = [k for k, group in enumerate(groups) if group in ("base", "tool")]
+        rest = self.information.after(nuisance)
+        sizes = np.zeros(len(rest.parameters))
+        return find_redundancy(rest, sizes, self.redundancy.tolerance).rank
 
     @property
     def condition_number(self) -> float:
@@ -162,13 +180,17 @@ class CalibrationResult:
                 return parameter
         raise KeyError(name)
 
-    def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows 3"]]:
+    def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
         """Measured - predicted of any measurements with known frames and targets, such as held-out ones.
 
         Returns:
-            "position" [m] and, where measured, "rotation" [rad]; NaN where a row has none.
+            What was measured of "position", "touch", "socket", "distance" and "pair" [m] and "rotation" [rad],
+            one value a row or three; NaN where a row has none. A socket that was not calibrated is where its
+            own rows meet on average.
 
         Raises:
-            IdentificationError: a row has a frame or a target that is not known.
+            IdentificationError: a row has a frame, a target or an anchor that is not known.
         """
-        return prediction_errors(self.robot, self.bases, self.tools, measurements)
+        return prediction_errors(
+            self.robot, self.bases, self.tools, measurements, self.sockets, self.anchors, self.zeros
+        )

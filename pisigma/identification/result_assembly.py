@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pisigma.identification.information import Information
 from pisigma.identification.least_squares import Linearisation, Solution
+from pisigma.identification.mixed_frames import frames_mixed_up
 from pisigma.identification.noise import values_used
 from pisigma.identification.observability import observability_of
 from pisigma.identification.problem import CalibrationProblem, covariance_of, view_of
@@ -30,11 +31,15 @@ class _Estimate:
     Attributes:
         bases: per frame, in its own coordinates.
         tools: per target.
+        sockets: places of the sockets in their frames [m].
+        anchors: places of the anchors in their frames, and their zeros [m].
         change: d(user's parameters) / d(problem's parameters).
     """
 
     bases: Float64[Tensor, "frames 6"]
     tools: Float64[Tensor, "targets 6"]
+    sockets: Float64[Tensor, "sockets 3"]
+    anchors: Float64[Tensor, "anchors 4"]
     change: Float64[Tensor, "parameters parameters"]
 
 
@@ -79,7 +84,10 @@ def assemble_result(
         ),
         bases={name: base.numpy() for name, base in zip(space.frames, estimate.bases, strict=True)},
         tools={name: tool.numpy() for name, tool in zip(space.targets, estimate.tools, strict=True)},
-        parameters=_table(problem, here, estimate, covariance, findings),
+        sockets={name: place.numpy() for name, place in zip(space.sockets, estimate.sockets, strict=True)},
+        anchors={name: end[:3].numpy() for name, end in zip(space.anchors, estimate.anchors, strict=True)},
+        zeros={name: float(end[3]) for name, end in zip(space.anchors, estimate.anchors, strict=True)},
+        parameters=_table(setup, problem, here, estimate, covariance, findings),
         covariance=covariance,
         residuals=_residuals(measurements, setup, problem, here),
         outliers=_outliers(measurements, setup, problem, here),
@@ -118,7 +126,17 @@ def _user_coordinates(setup: CalibrationSetup, point: Tensor, problem: Calibrati
         tools[k, 3:] = rpy_from_rotation(rotation_from_rpy(tools[k, 3:]) @ R_anchor)
         back = torch.linalg.pinv(turning_axes(tools[k, 3:]), rtol=1e-9)
         change[place : place + 3, place : place + 3] = back @ axes
-    return _Estimate(bases, tools, change)
+    sockets, ends = space.own(point).sockets.t().clone(), space.own(point).anchors.t().clone()
+    for places, numbers, group, size in (
+        (sockets, setup.socket_frame, "socket", 3),
+        (ends, setup.anchor_frame, "anchor", 4),
+    ):
+        for k, number in enumerate(numbers.tolist()):
+            anchor = anchors.bases[number].cpu()
+            places[k, :3] = anchor[:3, :3] @ places[k, :3] + anchor[:3, 3]
+            place = space.of(group).start + size * k
+            change[place : place + 3, place : place + 3] = anchor[:3, :3]
+    return _Estimate(bases, tools, sockets, ends, change)
 
 
 def turning_axes(rpy: Float64[Tensor, " 3"]) -> Float64[Tensor, "3 3"]:
@@ -154,10 +172,11 @@ def _warnings(
                 f"the {kind} errors are about {factor:.2g} times as large as the prior says, so it was "
                 "widened; check the nominal geometry, or give a wider prior."
             )
-    return tuple(found)
+    return (*found, *frames_mixed_up(problem, here))
 
 
 def _table(
+    setup: CalibrationSetup,
     problem: CalibrationProblem,
     here: Linearisation[Tensor],
     estimate: _Estimate,
@@ -166,9 +185,11 @@ def _table(
 ) -> tuple[ParameterEstimate, ...]:
     space, robot = problem.space, problem.space.robot
     bases, tools = np.tile(robot.base, (len(space.frames), 1)), np.tile(robot.tool, (len(space.targets), 1))
-    nominal = space.values(bases, tools)
+    start = _user_coordinates(setup, setup.start.cpu(), problem)
+    nominal = space.values(bases, tools, start.sockets.numpy(), start.anchors.numpy())
     arm = here.point.cpu()[: space.arm_size]
-    values = torch.cat([arm, estimate.bases.flatten(), estimate.tools.flatten()])
+    others = (estimate.bases, estimate.tools, estimate.sockets, estimate.anchors)
+    values = torch.cat([arm, *(part.flatten() for part in others)])
     change = values - nominal
     angle = torch.tensor([parameter.unit == "rad" for parameter in space.parameters])
     change = torch.where(angle, wrap_to_pi(change), change)
@@ -197,7 +218,7 @@ def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -
 
 def _remark(name: str, free: bool, extended: bool, redundancy: Redundancy) -> str:
     if name not in redundancy.names:
-        return "fixed"
+        return "identified" if free else "fixed"
     if extended:
         return "identified at the solution, though redundant at the nominal geometry"
     if name in redundancy.no_effect:
@@ -215,7 +236,9 @@ def _residuals(
     R = setup.anchors.bases[:, :3, :3].to(problem.frame.device)[problem.frame]
     found = {}
     for sensor, sums in zip(problem.sensors, view_of(here).sums, strict=True):
-        own = (R @ sums.residual.t()[..., None])[..., 0]
+        own = sums.residual.t()
+        if sensor.components == 3:
+            own = (R @ own[..., None])[..., 0]
         values = torch.full((measurements.q.shape[0], sensor.components), torch.nan, dtype=own.dtype)
         values[setup.rows.cpu()] = torch.where(sensor.seen[:, None], own, torch.nan).cpu()
         found[sensor.name] = values.numpy()
@@ -232,7 +255,9 @@ def _outliers(
     view = view_of(here)
     for number, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
         deviations = sums.distance / view.scale(number)
-        for k in (problem.loss.weight(deviations, sensor.components) < 0.5).nonzero()[:, 0].tolist():
+        for k in (
+            (problem.loss_of(sensor).weight(deviations, sensor.components) < 0.5).nonzero()[:, 0].tolist()
+        ):
             row = int(setup.rows[k])
             length = float(sums.residual[:, k].norm())
             found.append(Outlier(row, measurements.place(row), sensor.name, length, float(deviations[k])))

@@ -12,16 +12,47 @@ from pisigma.identification.jacobian import ToolMotion
 from pisigma.se3 import rotation_vector
 
 
+@dataclass(frozen=True, eq=False)
+class OwnUnknowns:
+    """What sensors have to find out about themselves; as seen from the base's anchor of their frame.
+
+    Attributes:
+        sockets: places of the sockets [m].
+        anchors: places of the anchors, and what their sensors show at no distance [m].
+    """
+
+    sockets: Float64[Tensor, "3 sockets"]
+    anchors: Float64[Tensor, "4 anchors"]
+
+
+@dataclass(frozen=True, eq=False)
+class OwnDerivative:
+    """Derivative of a sensor's values by its own unknowns.
+
+    Attributes:
+        group: "socket" or "anchor".
+        owner: per row, the number of the socket or anchor that has a part in it.
+        derivative: of the predicted value by each unknown of that owner.
+    """
+
+    group: Literal["socket", "anchor"]
+    owner: Int64[Tensor, " poses"]
+    derivative: Float[Tensor, "own components poses"]
+
+
 class AbstractSensor(ABC):
     """One kind of measurement; its rows are those of the problem, and `seen` says where it has one.
 
-    A new kind of sensor says how its value follows from the tool's motion. Values have the row index last.
+    A new kind of sensor says how its value follows from the tool's motion and, where it has any, from its own
+    unknowns. Values have the row index last.
 
     Attributes:
         name: such as "position"; one noise figure is estimated per name.
         unit: of its values.
         components: values a row.
         turning: whether it needs the tool's rotation.
+        certain: whether its values are known rather than measured: their standard deviation is as given, and none
+            of them counts as wrong.
         seen: whether a row has a value.
         sigma: standard deviation of a value where the rows give it, else None: it is estimated.
     """
@@ -30,11 +61,14 @@ class AbstractSensor(ABC):
     unit: ClassVar[Literal["m", "rad"]]
     components: ClassVar[int]
     turning: ClassVar[bool]
+    certain: ClassVar[bool] = False
     seen: Bool[Tensor, " rows"]
     sigma: Float64[Tensor, " rows"] | None
 
     @abstractmethod
-    def residual(self, motion: ToolMotion, rows: slice) -> Float[Tensor, "components poses"]:
+    def residual(
+        self, motion: ToolMotion, own: OwnUnknowns, rows: slice
+    ) -> Float[Tensor, "components poses"]:
         """Measured minus predicted; whatever it is where nothing was seen, it is not used."""
 
     @abstractmethod
@@ -42,8 +76,14 @@ class AbstractSensor(ABC):
         """The same sensor with some of the rows."""
 
     @abstractmethod
-    def derivative(self, motion: ToolMotion) -> Float[Tensor, "parameters components poses"]:
-        """Derivative of the predicted value by every parameter."""
+    def derivative(
+        self, motion: ToolMotion, own: OwnUnknowns, rows: slice
+    ) -> Float[Tensor, "parameters components poses"]:
+        """Derivative of the predicted value by every parameter that moves the tool."""
+
+    def own_derivatives(self, motion: ToolMotion, own: OwnUnknowns, rows: slice) -> tuple[OwnDerivative, ...]:
+        """Derivatives by the sensor's own unknowns; none where it has none."""
+        return ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +104,9 @@ class PositionSensor(AbstractSensor):
     seen: Bool[Tensor, " rows"]
     sigma: Float64[Tensor, " rows"] | None
 
-    def residual(self, motion: ToolMotion, rows: slice) -> Float[Tensor, "components poses"]:
+    def residual(
+        self, motion: ToolMotion, own: OwnUnknowns, rows: slice
+    ) -> Float[Tensor, "components poses"]:
         """Measured minus predicted position [m]."""
         return self.measured[:, rows] - motion.position
 
@@ -73,7 +115,9 @@ class PositionSensor(AbstractSensor):
         sigma = None if self.sigma is None else self.sigma[rows]
         return PositionSensor(self.measured[:, rows], self.seen[rows], sigma)
 
-    def derivative(self, motion: ToolMotion) -> Float[Tensor, "parameters components poses"]:
+    def derivative(
+        self, motion: ToolMotion, own: OwnUnknowns, rows: slice
+    ) -> Float[Tensor, "parameters components poses"]:
         """The tool's shift."""
         return motion.derivative[:, :3]
 
@@ -96,7 +140,9 @@ class RotationSensor(AbstractSensor):
     seen: Bool[Tensor, " rows"]
     sigma: Float64[Tensor, " rows"] | None
 
-    def residual(self, motion: ToolMotion, rows: slice) -> Float[Tensor, "components poses"]:
+    def residual(
+        self, motion: ToolMotion, own: OwnUnknowns, rows: slice
+    ) -> Float[Tensor, "components poses"]:
         """Rotation vector of measured · predicted^T [rad]."""
         difference = torch.einsum("ijn,kjn->nik", self.measured[..., rows], motion.rotation)
         return rotation_vector(difference).t()
@@ -106,7 +152,9 @@ class RotationSensor(AbstractSensor):
         sigma = None if self.sigma is None else self.sigma[rows]
         return RotationSensor(self.measured[..., rows], self.seen[rows], sigma)
 
-    def derivative(self, motion: ToolMotion) -> Float[Tensor, "parameters components poses"]:
+    def derivative(
+        self, motion: ToolMotion, own: OwnUnknowns, rows: slice
+    ) -> Float[Tensor, "parameters components poses"]:
         """The tool's turn.
 
         The residual r falls by `J_r(r)^-1 turn` rather than by the turn; as `J_r^-T r = r`, the cost's

@@ -1,6 +1,7 @@
-"""From measurements to a calibration problem with a start: nothing is guessed by the user."""
+"""From measurements to a calibration problem with a start: nothing has to be guessed by the user."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -8,21 +9,22 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
-from pisigma.identification.base_and_tool import BaseToolFit, fit_base_and_tool
 from pisigma.identification.loss import AbstractLoss
 from pisigma.identification.noise import renumbered
 from pisigma.identification.parameters import ParameterSpace, Prior
-from pisigma.identification.problem import CalibrationProblem
-from pisigma.identification.sensors import AbstractSensor, PositionSensor, RotationSensor
+from pisigma.identification.problem import CalibrationProblem, PriorSizes
+from pisigma.identification.sensor_building import (
+    PairOfSockets,
+    build_sensors,
+    build_socket_distances,
+    names_of,
+    numbers_of,
+)
+from pisigma.identification.starting import Start, find_start
 from pisigma.identification.sufficiency import check_poses
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert, rotation_from_rpy, transform_from_xyzrpy
-
-START_ROWS = 1_024
-"""Rows that base and tool start from."""
-START_STEPS = 2
-"""Steps by which their closed-form start is polished."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +32,8 @@ class Anchors:
     """Where base and tool started; parameters are changes from there, so no angle nears its singularity.
 
     Attributes:
-        bases: per frame, what stands before the base of the problem: `base = anchor · base_of_problem`.
+        bases: per frame, what stands before the base of the problem: `base = anchor · base_of_problem`. Places
+            of sockets and anchors in the problem are behind it too.
         tools: per target, what stands behind the tool's rotation: `R_tool = R_of_problem · anchor`.
     """
 
@@ -46,97 +49,137 @@ class CalibrationSetup:
         problem: with no parameter free yet.
         start: values of all parameters.
         anchors: what base and tool are relative to.
-        rows: which rows of the measurements the problem has.
+        rows: which rows of the measurements the problem has, in its order.
+        socket_frame: number of every socket's frame.
+        anchor_frame: number of every anchor's frame.
+        places_known: per anchor, whether its place is known.
+        measurements: the rows of the problem, in its order.
     """
 
     problem: CalibrationProblem
     start: Float64[Tensor, " parameters"]
     anchors: Anchors
     rows: Tensor
+    socket_frame: Int64[Tensor, " sockets"]
+    anchor_frame: Int64[Tensor, " anchors"]
+    places_known: tuple[bool, ...]
+    measurements: Measurements
+
+    @property
+    def own_candidates(self) -> list[int]:
+        """Indices of the sensors' own unknowns: places of sockets, and of anchors where they are not known."""
+        space = self.problem.space
+        known = [place for place in self.places_known for _ in range(4)]
+        anchors = space.of("anchor")
+        free = [i for i, told in zip(anchors, known, strict=True) if not told or (i - anchors.start) % 4 == 3]
+        return [*space.of("socket"), *free]
+
+
+@dataclass(frozen=True)
+class SetupOptions:
+    """What the user says of base, tool and sensors.
+
+    Attributes:
+        free_base: whether bases are to be found.
+        free_tool: whether tools are to be found.
+        turn_tool: whether their rotations are.
+        frames: starts of bases by frame; x, y, z [m], roll, pitch, yaw [rad].
+        socket_distances: known distances between two sockets [m].
+        socket_sigma: how well they are known [m].
+        prior_sizes: see `CalibrationProblem`.
+    """
+
+    free_base: bool
+    free_tool: bool
+    turn_tool: bool = True
+    frames: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
+    socket_distances: Mapping[PairOfSockets, float] = field(default_factory=dict)
+    socket_sigma: float = 1e-5
+    prior_sizes: PriorSizes = "widened"
 
 
 def build_setup(
     robot: Robot,
     measurements: Measurements,
-    free_base: bool,
-    free_tool: bool,
+    options: SetupOptions,
     prior: Prior | None,
     loss: AbstractLoss,
 ) -> CalibrationSetup:
-    """Fit base and tool, and state the problem relative to them.
+    """Find a start, and state the problem relative to it.
 
     Raises:
-        IdentificationError: nothing usable was measured, or too little for base and tool.
+        IdentificationError: nothing usable was measured, too little for what has to be found, or something
+            that cannot be.
         PoseError: the joint values do not fit the robot.
     """
     robot.check_joint_count(measurements.q.shape[1])
     rows, measurements = _usable(measurements)
-    frames = tuple(dict.fromkeys(measurements.frame))
-    targets = tuple(dict.fromkeys(measurements.target))
-    space = ParameterSpace(robot, frames, targets)
-    frame, target = _numbers(measurements.frame, frames), _numbers(measurements.target, targets)
-    fits = {
-        name: fit_base_and_tool(
-            robot, _part(measurements, frame == number), free_base, free_tool, START_STEPS
-        )
-        for number, name in enumerate(frames)
-    }
-    anchors, start = _start(space, fits, free_base, free_tool)
-    start = start.to(measurements.q.device)
+    space = ParameterSpace(
+        robot,
+        tuple(dict.fromkeys(measurements.frame)),
+        tuple(dict.fromkeys(measurements.target)),
+        names_of(measurements.socket),
+        names_of(measurements.anchor),
+    )
+    found = find_start(
+        space, measurements, options.free_base, options.free_tool, options.turn_tool, options.frames
+    )
+    device = measurements.q.device
+    frame = numbers_of(measurements.frame, space.frames, measurements.rows).to(device)
+    target = numbers_of(measurements.target, space.targets, measurements.rows).to(device)
+    socket_frame = _frame_of(measurements.socket, space.sockets, frame)
+    anchor_frame = _frame_of(measurements.anchor, space.anchors, frame)
+    anchors, start = _anchored(space, found, options, socket_frame, anchor_frame)
+    start = start.to(device)
+    known = build_socket_distances(measurements, options.socket_distances, options.socket_sigma)
+    sensors = build_sensors(measurements, anchors.bases, anchors.tools, frame, target)
     problem = CalibrationProblem(
         space=space,
         q=measurements.q,
-        frame=frame.to(start.device),
-        target=target.to(start.device),
-        sensors=_sensors(measurements, anchors, frame, target),
+        frame=frame,
+        target=target,
+        sensors=tuple(sensors if known is None else [*sensors, known]),
         loss=loss,
         nominal=start,
-        precision=torch.from_numpy(space.precision(prior)).to(start.device),
-        active=torch.zeros(0, dtype=torch.int64, device=start.device),
-        pose=repeated_poses(measurements.q, frame.to(start.device), target.to(start.device)),
+        precision=torch.from_numpy(space.precision(prior)).to(device),
+        active=torch.zeros(0, dtype=torch.int64, device=device),
+        pose=repeated_poses(measurements.q, frame, target),
+        pairs=len(names_of(measurements.pair)),
+        prior_sizes=options.prior_sizes,
     )
-    return CalibrationSetup(problem, start, anchors, rows)
+    return CalibrationSetup(
+        problem, start, anchors, rows, socket_frame, anchor_frame, found.places_known, measurements
+    )
 
 
 def _usable(measurements: Measurements) -> tuple[Tensor, Measurements]:
-    """The rows in which something was seen."""
-    if measurements.position is None:
+    """The rows in which something was seen; those of pairs come first, side by side."""
+    seen = torch.zeros(measurements.rows, dtype=torch.bool, device=measurements.q.device)
+    for kind in measurements.kinds:
+        seen = seen | measurements.seen(kind)
+    if not bool(seen.any()):
         raise IdentificationError(
-            f"{measurements.source}: measured positions or poses were wanted, but there are none; "
-            "give the columns x_mm, y_mm, z_mm."
+            f"{measurements.source}: none of its {len(seen)} rows has a measured value; give positions or poses "
+            "(columns x_mm, y_mm, z_mm), touches, sockets or distances."
         )
-    seen = torch.isfinite(measurements.position).all(-1)
-    if measurements.rotation is not None:
-        seen = seen | torch.isfinite(measurements.rotation).flatten(1).all(-1)
     rows = seen.nonzero()[:, 0]
-    if len(rows) == 0:
-        raise IdentificationError(
-            f"{measurements.source}: none of its {len(seen)} rows has a measured value; measure positions "
-            "or poses."
-        )
-    chosen = measurements.select(rows) if len(rows) < len(seen) else measurements
+    if measurements.pair is not None:
+        order = names_of(measurements.pair)
+        place = numbers_of(measurements.pair, order, measurements.rows).to(rows.device)[rows]
+        place = torch.where(place < 0, len(order), place)
+        rows = rows[torch.sort(place, stable=True).indices]
+    whole = len(rows) == len(seen) and measurements.pair is None
+    chosen = measurements if whole else measurements.select(rows)
     check_poses(chosen)
     return rows, chosen
 
 
-def _numbers(names: tuple[str, ...], order: tuple[str, ...]) -> Tensor:
-    numbers = {name: number for number, name in enumerate(order)}
-    return torch.tensor([numbers[name] for name in names], dtype=torch.int64)
-
-
-def chosen_rows(rows: int, most: int) -> Int64[Tensor, " chosen"]:
-    """All rows, or so many of them in a random order that is always the same."""
-    if rows <= most:
-        return torch.arange(rows)
-    return torch.randperm(rows, generator=torch.Generator().manual_seed(0))[:most]
-
-
-def _part(measurements: Measurements, chosen: Tensor) -> Measurements:
-    """The chosen rows, or enough of them for a start."""
-    if bool(chosen.all()) and len(chosen) <= START_ROWS:
-        return measurements
-    rows = chosen.nonzero()[:, 0]
-    return measurements.select(rows[chosen_rows(len(rows), START_ROWS).to(rows.device)])
+def _frame_of(
+    names: tuple[str, ...] | None, order: tuple[str, ...], frame: Tensor
+) -> Int64[Tensor, " names"]:
+    """The frame that every socket or anchor is in."""
+    first = [(names or ()).index(name) for name in order]
+    return frame[torch.tensor(first, dtype=torch.int64, device=frame.device)].cpu()
 
 
 def repeated_poses(q: Tensor, frame: Tensor, target: Tensor) -> Tensor | None:
@@ -149,60 +192,30 @@ def repeated_poses(q: Tensor, frame: Tensor, target: Tensor) -> Tensor | None:
     return None if int(found.max()) + 1 == len(q) else found
 
 
-def _start(
-    space: ParameterSpace, fits: dict[str, BaseToolFit], free_base: bool, free_tool: bool
+def _anchored(
+    space: ParameterSpace,
+    found: Start,
+    options: SetupOptions,
+    socket_frame: Int64[Tensor, " sockets"],
+    anchor_frame: Int64[Tensor, " anchors"],
 ) -> tuple[Anchors, Float64[Tensor, " parameters"]]:
     """Bases start at their anchor, tools at their place, turned like their anchor; what is fixed has none."""
-    robot = space.robot
-    bases, tools = np.tile(robot.base, (len(space.frames), 1)), np.tile(robot.tool, (len(space.targets), 1))
+    bases, tools = found.bases.copy(), found.tools.copy()
     anchors = Anchors(
         torch.eye(4).double().repeat(len(bases), 1, 1), torch.eye(3).double().repeat(len(tools), 1, 1)
     )
-    if free_base:
-        found = np.stack([fits[name].robot.base for name in space.frames])
-        anchors = Anchors(transform_from_xyzrpy(torch.from_numpy(found)), anchors.tools)
+    if options.free_base:
+        anchors = Anchors(transform_from_xyzrpy(torch.from_numpy(bases)), anchors.tools)
         bases = np.zeros_like(bases)
-    if free_tool:
-        known = {name: tool for fit in reversed(fits.values()) for name, tool in fit.tools.items()}
-        tools = np.stack([known.get(name, robot.tool) for name in space.targets])
+    if options.free_tool:
         anchors = Anchors(anchors.bases, rotation_from_rpy(torch.from_numpy(tools[:, 3:])))
         tools[:, 3:] = 0
-    return anchors, space.values(bases, tools)
+    back = invert(anchors.bases)
+    sockets = _moved(back[socket_frame], torch.from_numpy(found.sockets))
+    places = _moved(back[anchor_frame], torch.from_numpy(found.anchors[:, :3]))
+    ends = np.concatenate([places.numpy(), found.anchors[:, 3:]], 1)
+    return anchors, space.values(bases, tools, sockets.numpy(), ends)
 
 
-def _sensors(
-    measurements: Measurements, anchors: Anchors, frame: Tensor, target: Tensor
-) -> tuple[AbstractSensor, ...]:
-    """The measured values, seen from the bases' anchors and freed of the tools' anchors."""
-    assert measurements.position is not None
-    Ts = invert(anchors.bases).to(measurements.q.device)[frame]
-    R_anchor = Ts[:, :3, :3]
-    position = (R_anchor @ measurements.position[..., None])[..., 0] + Ts[:, :3, 3]
-    seen = torch.isfinite(position).all(-1)
-    sigma = _sigma(measurements, measurements.sigma_position, seen, "sigma_mm")
-    sensors: list[AbstractSensor] = [
-        PositionSensor(torch.where(seen, position.t(), 0.0).contiguous(), seen, sigma)
-    ]
-    if measurements.rotation is not None:
-        rotation = R_anchor @ measurements.rotation @ anchors.tools.to(R_anchor.device)[target].mT
-        seen = torch.isfinite(rotation).flatten(1).all(-1)
-        eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
-        rotation = torch.where(seen[:, None, None], rotation, eye).permute(1, 2, 0).contiguous()
-        sigma = _sigma(measurements, measurements.sigma_rotation, seen, "sigma_deg")
-        if bool(seen.any()):
-            sensors.append(RotationSensor(rotation, seen, sigma))
-    return tuple(sensors)
-
-
-def _sigma(measurements: Measurements, sigma: Tensor | None, seen: Tensor, column: str) -> Tensor | None:
-    """Standard deviations of the rows, all or none."""
-    if sigma is None or not bool(torch.isfinite(sigma[seen]).any()):
-        return None
-    lacking = seen & ~torch.isfinite(sigma)
-    if bool(lacking.any()):
-        row = int(lacking.nonzero()[0, 0])
-        raise IdentificationError(
-            f"{measurements.source}: {column} is given in some rows but not in {measurements.place(row)}; "
-            "give it in every row or in none, then it is estimated."
-        )
-    return sigma
+def _moved(T: Float64[Tensor, "points 4 4"], points: Float64[Tensor, "points 3"]) -> Tensor:
+    return (T[:, :3, :3] @ points[..., None])[..., 0] + T[:, :3, 3]

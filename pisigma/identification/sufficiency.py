@@ -33,7 +33,12 @@ def check_poses(measurements: Measurements) -> None:
 
 
 def check_sufficiency(
-    robot: Robot, problem: CalibrationProblem, redundancy: Redundancy, explicit: bool, source: str
+    robot: Robot,
+    problem: CalibrationProblem,
+    redundancy: Redundancy,
+    explicit: bool,
+    source: str,
+    own: int = 0,
 ) -> tuple[str, ...]:
     """Refuse data that cannot determine the free parameters; warn of data that hardly do.
 
@@ -43,6 +48,7 @@ def check_sufficiency(
         redundancy: of the candidates at the start.
         explicit: whether the candidates were named one by one.
         source: what complaints call the data.
+        own: number of the sensors' own unknowns, places of sockets and the like.
 
     Returns:
         Sentences that say what to measure next.
@@ -51,6 +57,7 @@ def check_sufficiency(
         IdentificationError: there are not more values than parameters.
     """
     wanted = len(redundancy.names) - len(redundancy.no_effect) if explicit else redundancy.rank
+    wanted += own
     values = distinct_values(problem)
     per_row = values / max(distinct_rows(problem), 1)
     if values <= wanted:

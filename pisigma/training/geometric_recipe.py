@@ -1,11 +1,11 @@
 """Recipes of the geometric calibrator on simulated robots."""
 
-import os
+import math
 from typing import Annotated, Literal
 
-from pydantic import ConfigDict, Field, PositiveFloat, PositiveInt
+from pydantic import Field, PositiveFloat, PositiveInt
 
-from pisigma.errors import IdentificationError, RecipeError
+from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.loss import HampelLoss, SquaredLoss
 from pisigma.identification.parameters import Prior
@@ -13,8 +13,8 @@ from pisigma.identification.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.simulation.measure import SimulatedMeasurements
-from pisigma.simulation.true_robot import ErrorSource, TrueRobot
-from pisigma.yaml_file import Section, read_yaml
+from pisigma.simulation.true_robot import ErrorSource
+from pisigma.yaml_file import Section
 
 
 class PriorSection(Section):
@@ -94,12 +94,7 @@ class GeometricRecipe(Section):
     measurements: SimulatedMeasurements
     held_out: SimulatedMeasurements
     calibration: CalibrationSection = CalibrationSection()
-    paper: dict[str, float | int | str | list[str] | list[list[str]]] = {}
-
-    def simulate(self) -> tuple[Measurements, Measurements]:
-        """Measure on the true robot: rows to calibrate with, and held-out rows."""
-        true_robot = TrueRobot(Robot.load(self.robot), self.errors)
-        return self.measurements.measure(true_robot), self.held_out.measure(true_robot)
+    paper: dict[str, float | int | str | list[str] | list[list[str]]] = Field(default_factory=dict)
 
     def calibrate(self, measurements: Measurements) -> CalibrationResult:
         """Calibrate the nominal robot on the rows.
@@ -120,9 +115,11 @@ def calibration_section(free: str, prior_mm: float, prior_mrad: float, robust: b
         robust: see `CalibrationSection`.
 
     Raises:
-        IdentificationError: one of the two standard deviations is 0 and the other is not, or one is below 0.
+        IdentificationError: one of the two standard deviations is 0 and the other is not, or one is below 0
+            or no finite number.
     """
-    if min(prior_mm, prior_mrad) < 0 or (prior_mm == 0) != (prior_mrad == 0):
+    given = (prior_mm, prior_mrad)
+    if not all(map(math.isfinite, given)) or min(given) < 0 or (prior_mm == 0) != (prior_mrad == 0):
         raise IdentificationError(
             f"the prior's standard deviations were wanted above 0, or both 0 for none, got {prior_mm:g} mm and "
             f"{prior_mrad:g} mrad."
@@ -130,30 +127,7 @@ def calibration_section(free: str, prior_mm: float, prior_mrad: float, robust: b
     prior = PriorSection(length_mm=prior_mm, angle_mrad=prior_mrad) if prior_mm else None
     named = free in ("identifiable", "joint_offsets")
     return CalibrationSection(
-        free=free if named else tuple(name.strip() for name in free.split(",")),  # type: ignore[arg-type]
+        free=free if named else tuple(name.strip() for name in free.split(",")),
         prior=prior,
         robust=robust,
     )
-
-
-class _KindOnly(Section):
-    model_config = ConfigDict(extra="ignore")
-    kind: Literal["inverse_calibration", "geometric_calibration"] = "inverse_calibration"
-
-
-def is_geometric(path: str | os.PathLike[str]) -> bool:
-    """Whether a recipe is one of the geometric calibrator.
-
-    Raises:
-        RecipeError: the file cannot be read, or its kind is none.
-    """
-    return read_yaml(path, _KindOnly, RecipeError).kind == "geometric_calibration"
-
-
-def read_geometric_recipe(path: str | os.PathLike[str]) -> GeometricRecipe:
-    """Read a recipe of the geometric calibrator.
-
-    Raises:
-        RecipeError: the file cannot be read or does not fit; the message names file, line and key.
-    """
-    return read_yaml(path, GeometricRecipe, RecipeError)

@@ -2,19 +2,19 @@
 
 import hashlib
 import os
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import AfterValidator, Field, NonNegativeFloat
 
-from pisigma.errors import RecipeError, RobotError
-from pisigma.robot.description import Robot
+from pisigma.errors import RecipeError
 from pisigma.simulation.measure import SimulatedMeasurements
 from pisigma.simulation.true_robot import ErrorSource
 from pisigma.training.fit_sections import FitSection, Seed
-from pisigma.training.recipe_checks import find_misfit
-from pisigma.yaml_file import Section, line_of, read_yaml
+from pisigma.training.recipe_checks import check_fit, inverse_checks
+from pisigma.yaml_file import Section, read_yaml
 
 _Row = tuple[float, float, float]
 
@@ -139,14 +139,7 @@ def read_recipe(path: str | os.PathLike[str]) -> Recipe:
         RobotError: its robot cannot be used; the message names file, line and key too.
     """
     recipe = read_yaml(path, Recipe, RecipeError)
-    try:
-        robot = Robot.load(recipe.robot)
-    except RobotError as problem:
-        raise type(problem)(f"{path}, line {line_of(path, ('robot',))}: 'robot': {problem}") from None
-    if misfit := find_misfit(recipe, robot):
-        keys, problem_text = misfit
-        place = ".".join(str(key) for key in keys)
-        raise RecipeError(f"{path}, line {line_of(path, keys)}: '{place}': {problem_text}")
+    check_fit(path, recipe.robot, partial(inverse_checks, recipe))
     return recipe
 
 

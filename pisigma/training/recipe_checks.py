@@ -1,34 +1,82 @@
 """What of a recipe only its robot can judge: names of joints, inputs and branches."""
 
-from collections.abc import Callable, Iterator, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
-from pisigma.errors import RecipeError, nearest_choice
+from pisigma.errors import IdentificationError, RecipeError, RobotError, nearest_choice
+from pisigma.identification.parameters import ParameterSpace
 from pisigma.network.inputs import Inputs
 from pisigma.robot.description import Robot
+from pisigma.simulation.measure import SimulatedMeasurements
 from pisigma.simulation.random_joints import JointsRandom
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.training.fit_sections import GradientDescentSection
+from pisigma.yaml_file import line_of
 
 if TYPE_CHECKING:
+    from pisigma.training.geometric_recipe import GeometricRecipe
     from pisigma.training.recipe import Recipe
 
 Place = tuple[str | int, ...]
 Check = tuple[Place, Callable[[], object]]
 
 
-def find_misfit(recipe: "Recipe", robot: Robot) -> tuple[Place, str] | None:
-    """First thing in a recipe that does not fit its robot: the keys that lead to it, and what to do."""
-    for place, check in (*_network_checks(recipe, robot), *_data_checks(recipe, robot)):
+def check_fit(
+    path: str | os.PathLike[str], robot: str, checks_of: Callable[[Robot], Iterable[Check]]
+) -> None:
+    """Check what a recipe says against its robot.
+
+    Args:
+        path: the recipe's file.
+        robot: name or file of its robot.
+        checks_of: gives, for the robot, the keys that lead to a part of the recipe and what to try with it.
+
+    Raises:
+        RecipeError: something does not fit; the message names file, line and key.
+        RobotError: the robot cannot be used; the message names file, line and key too.
+    """
+    try:
+        loaded = Robot.load(robot)
+    except RobotError as problem:
+        raise type(problem)(f"{path}, line {line_of(path, ('robot',))}: 'robot': {problem}") from None
+    for keys, check in checks_of(loaded):
         try:
             check()
-        except RecipeError as problem:
-            return place, str(problem)
-    return None
+        except (RecipeError, IdentificationError) as problem:
+            place = ".".join(str(key) for key in keys)
+            raise RecipeError(f"{path}, line {line_of(path, keys)}: '{place}': {problem}") from None
+
+
+def inverse_checks(recipe: "Recipe", robot: Robot) -> Iterator[Check]:
+    """What to try with a recipe of inverse calibration."""
+    yield from _network_checks(recipe, robot)
+    if recipe.data.kind == "simulated":
+        yield ("data", "errors"), partial(TrueRobot, robot, recipe.data.errors)
+        for part, section in (("training", recipe.data.training), ("held_out", recipe.data.held_out)):
+            yield from _where_checks(("data", part), section, robot)
+
+
+def geometric_checks(recipe: "GeometricRecipe", robot: Robot) -> Iterator[Check]:
+    """What to try with a recipe of the geometric calibrator."""
+    yield ("errors",), partial(TrueRobot, robot, recipe.errors)
+    yield from _where_checks(("measurements",), recipe.measurements, robot)
+    yield from _where_checks(("held_out",), recipe.held_out, robot)
+    yield ("held_out", "frame"), partial(_check_frames, recipe.measurements.frame, recipe.held_out.frame)
+    calibrator = recipe.calibration.calibrator(robot)
+    space = ParameterSpace(robot, (recipe.measurements.frame,), ("",))
+    yield ("calibration", "free"), partial(calibrator.candidates, space)
+
+
+def _check_frames(calibrated: str, judged: str) -> None:
+    if judged != calibrated:
+        raise RecipeError(
+            f"the frame '{judged}' is not calibrated, the measurements are in '{calibrated}'; name the same frame."
+        )
 
 
 def _network_checks(recipe: "Recipe", robot: Robot) -> Iterator[Check]:
@@ -47,17 +95,12 @@ def _network_checks(recipe: "Recipe", robot: Robot) -> Iterator[Check]:
         yield ("fit", "learning_rate"), partial(recipe.fit.rates, corrected)
 
 
-def _data_checks(recipe: "Recipe", robot: Robot) -> Iterator[Check]:
-    data = recipe.data
-    if data.kind == "measured":
-        return
-    yield ("data", "errors"), partial(TrueRobot, robot, data.errors)
-    none = torch.zeros(0, 4, 4, dtype=torch.float64)  # no poses: only the names are looked at
-    for part, section in (("training", data.training), ("held_out", data.held_out)):
-        if isinstance(section.poses, JointsRandom):
-            yield ("data", part, "poses"), partial(section.poses.joints, robot)
-        elif section.branch is not None:
-            yield ("data", part, "branch"), partial(section.branch.start, robot, none)
+def _where_checks(place: Place, section: SimulatedMeasurements, robot: Robot) -> Iterator[Check]:
+    if isinstance(section.poses, JointsRandom):
+        yield (*place, "poses"), partial(section.poses.joints, robot)
+    elif section.branch is not None:
+        none = torch.zeros(0, 4, 4, dtype=torch.float64)  # no poses: only the names are looked at
+        yield (*place, "branch"), partial(section.branch.start, robot, none)
 
 
 def _check_joints(names: Sequence[str], valid: Sequence[str], taken: Sequence[str]) -> None:

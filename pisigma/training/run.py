@@ -11,19 +11,18 @@ from torch import Tensor
 
 from pisigma.correction.calibrated_model import CalibratedModel, Provenance
 from pisigma.correction.domain import Domain
-from pisigma.errors import RecipeError
+from pisigma.correction.stored_starts import spread_rows
+from pisigma.errors import MeasurementError, RecipeError
 from pisigma.identification.base_and_tool import fit_base_and_tool
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import groups_of_equal_joints
 from pisigma.robot.description import Robot
-from pisigma.simulation.true_robot import TrueRobot
 from pisigma.training.fit_sections import LevenbergMarquardtSection
 from pisigma.training.fitting import TrainingHistory, fit_networks
 from pisigma.training.pairs import TrainingPairs, build_pairs
 from pisigma.training.patterns import build_network, build_patterns
 from pisigma.training.recipe import MeasuredData, Recipe, SimulatedData
-
-MAXIMUM_STARTS = 512
+from pisigma.training.recipe_data import part_sets, simulate_held_out
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,43 +78,6 @@ class RunOptions:
     recipe_sha256: str = ""
 
 
-def load_measurements(recipe: Recipe, data: Path | None) -> Measurements:
-    """Give the training rows of a recipe: simulated, or read from a file.
-
-    Raises:
-        RecipeError: a simulated recipe was given a file, or a measured one none.
-        MeasurementError: the file cannot be used.
-    """
-    robot = Robot.load(recipe.robot)
-    if isinstance(recipe.data, SimulatedData):
-        if data is not None:
-            raise RecipeError(f"recipe '{recipe.name}' simulates its data and takes no --data; leave it out.")
-        return simulate_training(recipe)
-    if data is None:
-        raise RecipeError(f"recipe '{recipe.name}' is for measured data; give the file with --data FILE.csv.")
-    return Measurements.read_csv(data, robot)
-
-
-def simulate_training(recipe: Recipe) -> Measurements:
-    """Measure the training rows of a recipe on its true robot.
-
-    Raises:
-        RecipeError: the recipe is for measured data.
-    """
-    data = _simulated(recipe)
-    return data.training.measure(TrueRobot(Robot.load(recipe.robot), data.errors))
-
-
-def simulate_held_out(recipe: Recipe) -> Measurements:
-    """Measure the held-out rows of a recipe on its true robot.
-
-    Raises:
-        RecipeError: the recipe is for measured data.
-    """
-    data = _simulated(recipe)
-    return data.held_out.measure(TrueRobot(Robot.load(recipe.robot), data.errors))
-
-
 def train_recipe(
     recipe: Recipe, measurements: Measurements, options: RunOptions = RunOptions()
 ) -> TrainingRun:
@@ -123,14 +85,16 @@ def train_recipe(
 
     Args:
         recipe: the recipe.
-        measurements: its rows, from `load_measurements`.
+        measurements: its rows, from `load_measurements`; rows of the set "test" are not trained on.
         options: checkpoints and progress.
 
     Raises:
         PisigmaError: the data or the recipe do not allow it; the message says what to do.
     """
+    measurements, _ = part_sets(measurements)
     robot = Robot.load(recipe.robot)
     if isinstance(recipe.data, MeasuredData):
+        check_one_pose(measurements)
         robot = fit_base_and_tool(robot, measurements).robot
     bound = recipe.singular_rows.below if recipe.singular_rows.rule == "leave_out" else None
     pairs = build_pairs(robot, measurements, bound)
@@ -159,11 +123,27 @@ def train_recipe(
         network=network,
         domain=Domain.around(network.scaled_inputs(pairs.T[used], pairs.q_nominal[used]), generator),
         branches=pairs.branches,
-        starts=_spread_rows(measurements.q[used]),
+        starts=spread_rows(measurements.q[used]),
         provenance=_provenance(recipe, measurements, pairs, options),
     )
     unseen = joint_errors(model, held_out) if held_out else None
     return TrainingRun(model, history, pairs, joint_errors(model, pairs), unseen, measurements)
+
+
+def check_one_pose(measurements: Measurements) -> None:
+    """Refuse rows of several frames or targets: the poses of a correction are those of one tool in one frame.
+
+    Raises:
+        MeasurementError: there are several; the message names the first row of another.
+    """
+    for what, names in (("frame", measurements.frame), ("target", measurements.target)):
+        other = next((row for row, name in enumerate(names) if name != names[0]), None)
+        if other is not None:
+            raise MeasurementError(
+                f"{measurements.place(other)}: {what} '{names[other]}' stands there, but "
+                f"{measurements.place(0)} has '{names[0]}'; inverse calibration wants the rows of one {what}, "
+                "so give a file for each, or use `pisigma calibrate`."
+            )
 
 
 def joint_errors(model: CalibratedModel, pairs: TrainingPairs) -> JointErrors:
@@ -183,17 +163,6 @@ def _held_out_pairs(recipe: Recipe, robot: Robot) -> TrainingPairs | None:
             "cannot be reached by the nominal robot and have no joint error; change their region."
         )
     return pairs
-
-
-def _spread_rows(q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "starts dof"]:
-    """All rows, or as many as are kept, evenly spread over them."""
-    return q[torch.linspace(0, len(q) - 1, min(len(q), MAXIMUM_STARTS)).round().long()].clone()
-
-
-def _simulated(recipe: Recipe) -> SimulatedData:
-    if not isinstance(recipe.data, SimulatedData):
-        raise RecipeError(f"recipe '{recipe.name}' is for measured data and simulates nothing; use another.")
-    return recipe.data
 
 
 def _provenance(

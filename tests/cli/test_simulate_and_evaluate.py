@@ -99,7 +99,8 @@ def test_training_rows_are_recognised(run, trained, tmp_path):
 def test_several_frames_or_targets_are_refused(refuses, trained, held_out, tmp_path, name):
     path = with_column(held_out, tmp_path / "mixed.csv", name, ["a", "b"])
     sentence = refuses("evaluate", trained[0] / "model", path)
-    assert f"column '{name}' names 'a', 'b', but a model has one base and one tool" in sentence
+    assert f"mixed.csv, line 3: {name} 'b' stands there, but " in sentence
+    assert f"has 'a', and the model knows one {name} only; give a file for each." in sentence
 
 
 def test_joints_of_another_robot_are_refused(refuses, models, trained, held_out):

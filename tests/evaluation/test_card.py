@@ -3,7 +3,8 @@
 import pytest
 from testing.models import trained_run
 
-from pisigma.evaluation.card import CARD, write_card
+from pisigma.evaluation.card import write_card
+from pisigma.evaluation.markdown import CARD
 from pisigma.evaluation.tables import joint_table
 from pisigma.evaluation.training_report import report_training
 

@@ -68,7 +68,7 @@ def test_every_robot_of_the_catalogue_loads_and_survives_its_file(name):
         ("type: fixed", "type: fixed, limits_mm: [0, 3]", "line 7: .*fixed and cannot have limits_mm"),
         ("d_mm: 100", "d_m: 0.1", r"line 5: unknown key 'd_m' in 'rows.0'; did you mean 'd_mm'"),
         ("alpha_deg", "alpha_rad", "line 5: unknown key 'alpha_rad'.*did you mean 'alpha_deg'"),
-        ("type: revolute", "type: revolut", "line 5: 'rows.0.type' cannot be 'revolut'; did you mean 'revolute'"),  # noqa: E501
+        ("type: revolute", "type: revolut", "line 5: 'rows.0.type' cannot be 'revolut'; did you mean 'revolute'"),
         ("name: d_2", "name: theta_1", "the row name 'theta_1' stands twice"),
         ("d_mm: 100", "d_mm: '100'", "line 5: 'rows.0.d_mm': .*number, but got '100'"),
         ("d_mm: 100", "d_mm: yes", "line 5: 'rows.0.d_mm': .*number, but got 'yes'"),
@@ -120,8 +120,8 @@ def test_one_limit_cannot_be_written():
         ({"rows": (Row("a", "fixed"), Row("b", "fixed"), Row("c", "fixed"))}, "no joint that moves"),
         ({"rows": (Row("a", "revolute"), Row("a", "fixed"), Row("c", "fixed"))}, "'a' stands twice"),
         ({"rows": (Row("a", "revolute", 0), Row("b", "fixed"), Row("c", "fixed"))}, "direction is"),
-        ({"rows": (Row("a", "revolute", 1, 2.0, 1.0), Row("b", "fixed"), Row("c", "fixed"))}, "lower limit 2"),  # noqa: E501
-        ({"rows": (Row("a", "revolute", 1, np.nan), Row("b", "fixed"), Row("c", "fixed"))}, "lower limit nan"),  # noqa: E501
+        ({"rows": (Row("a", "revolute", 1, 2.0, 1.0), Row("b", "fixed"), Row("c", "fixed"))}, "lower limit 2"),
+        ({"rows": (Row("a", "revolute", 1, np.nan), Row("b", "fixed"), Row("c", "fixed"))}, "lower limit nan"),
     ],
 )  # fmt: skip
 def test_parts_that_do_not_fit_are_refused(change, complaint):

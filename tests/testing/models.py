@@ -104,7 +104,8 @@ def trained_run(name: str):
     """What a short training of the shipped recipe gives: the recipe and the run."""
     from pisigma.errors import RecipeError
     from pisigma.training.recipe import Recipe
-    from pisigma.training.run import load_measurements, train_recipe
+    from pisigma.training.recipe_data import load_measurements
+    from pisigma.training.run import train_recipe
     from pisigma.yaml_file import parse_yaml
 
     recipe = parse_yaml(small_recipe_text(name), Recipe, RecipeError, name)

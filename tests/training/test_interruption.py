@@ -14,7 +14,8 @@ from testing.closeness import assert_close
 from pisigma.errors import OutputError, TrainingError
 from pisigma.training.checkpoints import find_checkpoint, prepare_checkpoints
 from pisigma.training.recipe import read_recipe
-from pisigma.training.run import RunOptions, load_measurements, train_recipe
+from pisigma.training.recipe_data import load_measurements
+from pisigma.training.run import RunOptions, train_recipe
 
 # Slow enough to be caught in the middle: every epoch waits, which changes no number.
 SLOW = """

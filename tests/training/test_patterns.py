@@ -101,7 +101,7 @@ def test_an_input_that_does_not_vary_is_refused(pairs):
 
 
 FITS = [
-    GradientDescentSection(method="gradient_descent", learning_rate={"theta_1": 0.1, "theta_2": 0.1}, epochs=20),  # noqa: E501
+    GradientDescentSection(method="gradient_descent", learning_rate={"theta_1": 0.1, "theta_2": 0.1}, epochs=20),
     LevenbergMarquardtSection(method="levenberg_marquardt", epochs=30, starts=1),
 ]  # fmt: skip
 

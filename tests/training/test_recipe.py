@@ -5,7 +5,7 @@ import pytest
 from pisigma.errors import RecipeError, RobotError, UnknownRobotError
 from pisigma.training.fit_sections import GradientDescentSection
 from pisigma.training.recipe import read_recipe, recipe_hash
-from pisigma.training.run import load_measurements, simulate_held_out, simulate_training
+from pisigma.training.recipe_data import load_measurements, simulate_held_out, simulate_training
 
 PAPER = "kiro3_paper"
 
@@ -23,9 +23,9 @@ PAPER = "kiro3_paper"
         ("orders: [3]", "orders: [0]", r"'network.0.orders.0': .*greater than or equal to 1"),
         ("orders: [3]", "orders: [3], reference: [[1, 0, 0], [0, 1, 0], [0, 0, 2]]", "'network.0.reference': .*no rotation"),  # noqa: E501
         ("orders: [3]", "orders: [3], reference: [[1, 0, 0], [0, 1, 0], [0, 0, -1]]", "no rotation"),
-        ("joints: [theta_1, theta_2]", "joints: [theta_1, theta_3]", "'network.0.joints': .*did you mean 'theta_"),  # noqa: E501
+        ("joints: [theta_1, theta_2]", "joints: [theta_1, theta_3]", "'network.0.joints': .*did you mean 'theta_"),
         ("joints: [theta_1, theta_2]", "joints: [theta_1, theta_1]", "'network.0.joints': .*stands twice"),
-        ("{theta_1: 0.05, theta_2: 0.5}", "{theta_1: 0.05}", "'fit.learning_rate' has no rate for joint 'theta_2'"),  # noqa: E501
+        ("{theta_1: 0.05, theta_2: 0.5}", "{theta_1: 0.05}", "'fit.learning_rate' has no rate for joint 'theta_2'"),
         ("theta_2: 0.5}\n", "theta_2: 0.5, theta_4: 1}\n", "'fit.learning_rate.theta_4': there is no joint 'theta_4' to correct"),  # noqa: E501
         ("{theta_1: 0.05,", "{theta_1: -0.05,", "'fit.learning_rate.theta_1': .*greater than 0"),
         ("  theta_2:\n    before", "  theta2:\n    before", "'paper.theta2': .*did you mean 'theta_2'"),

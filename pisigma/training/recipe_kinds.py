@@ -1,0 +1,42 @@
+"""Reading a recipe of whatever kind."""
+
+import os
+from functools import partial
+from typing import Literal
+
+from pydantic import ConfigDict
+
+from pisigma.errors import RecipeError
+from pisigma.training.geometric_recipe import GeometricRecipe
+from pisigma.training.recipe import Recipe, read_recipe
+from pisigma.training.recipe_checks import check_fit, geometric_checks
+from pisigma.yaml_file import Section, read_yaml
+
+
+class _KindOnly(Section):
+    model_config = ConfigDict(extra="ignore")
+    kind: Literal["inverse_calibration", "geometric_calibration"] = "inverse_calibration"
+
+
+def read_any_recipe(path: str | os.PathLike[str]) -> Recipe | GeometricRecipe:
+    """Read a recipe of the kind that it states, and check it against its robot.
+
+    Raises:
+        RecipeError: the file cannot be read or does not fit; the message names file, line and key.
+        RobotError: its robot cannot be used; the message names file, line and key too.
+    """
+    if read_yaml(path, _KindOnly, RecipeError).kind == "inverse_calibration":
+        return read_recipe(path)
+    return read_geometric_recipe(path)
+
+
+def read_geometric_recipe(path: str | os.PathLike[str]) -> GeometricRecipe:
+    """Read a recipe of the geometric calibrator and check it against its robot.
+
+    Raises:
+        RecipeError: the file cannot be read or does not fit; the message names file, line and key.
+        RobotError: its robot cannot be used; the message names file, line and key too.
+    """
+    recipe = read_yaml(path, GeometricRecipe, RecipeError)
+    check_fit(path, recipe.robot, partial(geometric_checks, recipe))
+    return recipe

@@ -1,0 +1,268 @@
+"""`pisigma calibrate`, and `train`, `simulate` and `evaluate` with geometric calibrations."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.models import no_type_checker
+from testing.simulated_arm import simulate
+
+import pisigma
+from pisigma.correction.model_folder import load_model
+from pisigma.kinematics.status import Status
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot import Robot
+
+POSITION = {"rms_mm", "mean_mm", "p95_mm", "max_mm"}
+POSE = POSITION | {name.replace("mm", "deg") for name in POSITION}
+FILES = {"README.md", "correlation.png", "model.safetensors", "model.yaml", "parameters.csv", "residuals.png"}
+RECIPES = {"rb5_redundancy": (28, 20, 6), "panda_redundancy": (35, 24, 5)}
+
+
+def write(path, measurements, split=None):
+    """Write rows, with a column `set` where one is given, and give the path."""
+    with no_type_checker():
+        replace(measurements, split=split).write_csv(path, revolute=[True] * measurements.dof)
+    return path
+
+
+@pytest.fixture(scope="module")
+def poses():
+    with no_type_checker():
+        return simulate("kiro4", rows=60, noise=5e-5, turn_noise=1e-4)
+
+
+@pytest.fixture(scope="module")
+def data(poses, tmp_path_factory):
+    return write(tmp_path_factory.mktemp("data") / "poses.csv", poses.measurements)
+
+
+@pytest.fixture(scope="module")
+def calibrated(run, data, tmp_path_factory):
+    """The folder of a calibration and what it printed."""
+    folder = tmp_path_factory.mktemp("calibrated") / "arm"
+    result = run("calibrate", "kiro4", data, "--out", folder, "--folds", 3, "--json")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.count("\n") == 1
+    return folder, json.loads(result.stdout)
+
+
+def test_json_has_the_agreed_shape(calibrated):
+    folder, printed = calibrated
+    assert printed["model"] == str(folder)
+    assert printed["seconds"] > 0
+    assert printed["rank"] == 30  # 4R + 2P + 6 of a 6R arm whose poses are measured
+    names = {"name", "unit", "nominal", "estimated", "change", "standard_error", "remark"}
+    assert all(set(row) == names for row in printed["parameters"])
+    assert [row["name"] for row in printed["parameters"]][:2] == ["theta_1", "d_1"]
+    assert printed["outliers"] == []
+    validation = printed["cross_validation"]
+    assert (validation["folds"], validation["rows"]) == (3, 60)
+    assert set(validation["nominal"]) == set(validation["geometric"]) == POSE
+    assert validation["geometric"]["rms_mm"] < validation["nominal"]["rms_mm"] / 3
+    assert "test" not in printed
+
+
+def test_the_folder_is_whole_and_loads(calibrated, poses):
+    folder, printed = calibrated
+    assert {entry.name for entry in folder.iterdir()} == FILES
+    assert load_model(folder).metrics["rank"] == printed["rank"]
+    ik = pisigma.load(folder)
+    with no_type_checker():
+        T = ik.model.forward(poses.measurements.q)
+        solution = ik(T, near=poses.measurements.q)
+        again = ik.model.forward(solution.q)
+    reached = solution.status == Status.REACHED
+    assert int(reached.sum()) > 50
+    assert_close(again[reached], T[reached], atol=1e-9)
+
+
+def test_the_card_says_everything(calibrated):
+    folder, printed = calibrated
+    card = (folder / "README.md").read_text()
+    assert card.startswith("# arm\n\nGeometric calibration of robot kiro4 (")
+    assert (
+        "Made by `pisigma calibrate kiro4 poses.csv --out arm --folds 3`, on 60 rows of `poses.csv`." in card
+    )
+    assert "3-fold cross-validation: each of 60 rows" in card
+    assert f"{printed['cross_validation']['geometric']['rms_mm']:.4f}" in card
+    for row in printed["parameters"]:
+        assert f"| {row['name']} | {row['unit']} |" in card
+    for sentence in printed["redundancy"]["dependencies"]:
+        assert f"- {sentence}." in card
+    assert load_model(folder).provenance.data_sha256 in card
+    lines = (folder / "parameters.csv").read_text().splitlines()
+    assert len(lines) == len(printed["parameters"]) + 1
+
+
+def test_what_is_printed_for_people_fits_in_120_columns(run, data, tmp_path):
+    text = run("calibrate", "kiro4", data, "--out", tmp_path / "arm", "--folds", 2).stdout
+    lines = text.splitlines()[:-1]  # the last one holds a path
+    assert max(map(len, lines)) <= 120
+    for part in ("theta_6", "in a sum, see below", "is identified, the single values are not.", "Rank 30, "):
+        assert part in text
+    assert "pose errors of 60 held-out rows (2 folds)" in text
+
+
+@pytest.mark.parametrize("split", ["joints", "time", "space"])
+def test_a_share_is_held_out_instead(run, data, tmp_path, split):
+    arguments = ("calibrate", "kiro4", data, "--out", tmp_path / "arm", "--hold-out", 0.25, "--split", split)
+    validation = json.loads(run(*arguments, "--json").stdout)["cross_validation"]
+    assert (validation["folds"], validation["rows"]) == (1, 15)
+    assert "Judged on 15 rows by a calibration on the others" in (tmp_path / "arm" / "README.md").read_text()
+
+
+def test_no_folds_no_cross_validation(run, data, tmp_path):
+    printed = json.loads(
+        run("calibrate", "kiro4", data, "--out", tmp_path / "arm", "--folds", 0, "--json").stdout
+    )
+    assert "cross_validation" not in printed
+    assert "Held-out" not in (tmp_path / "arm" / "README.md").read_text()
+
+
+def test_rows_of_the_test_set_are_kept_aside(run, refuses, poses, calibrated, tmp_path):
+    rows = poses.measurements
+    sets = tuple("test" if row % 3 == 0 else "train" for row in range(60))
+    position = rows.position.clone()
+    position[::3] += 1.0  # a metre: nobody who looks at these rows overlooks it
+    path = write(tmp_path / "sets.csv", replace(rows, position=position), sets)
+    printed = json.loads(
+        run("calibrate", "kiro4", path, "--out", tmp_path / "arm", "--folds", 2, "--json").stdout
+    )
+    assert (printed["rows"], printed["test"]["rows"], printed["cross_validation"]["rows"]) == (40, 20, 40)
+    assert set(printed["test"]["geometric"]) == POSE
+    assert printed["test"]["geometric"]["rms_mm"] > 1700
+    assert printed["cross_validation"]["geometric"]["rms_mm"] < 1
+    assert printed["outliers"] == []
+    assert "## Pose errors of the test set" in (tmp_path / "arm" / "README.md").read_text()
+    judged = json.loads(run("evaluate", tmp_path / "arm", path, "--json").stdout)
+    assert judged["rows"] == 20
+    assert_close(judged["corrected"]["rms_mm"], printed["test"]["geometric"]["rms_mm"], rtol=1e-9)
+    alone = write(tmp_path / "alone.csv", rows, ("test",) * 60)
+    sentence = refuses("calibrate", "kiro4", alone, "--out", tmp_path / "other")
+    assert "column 'set' marks all 60 rows as 'test', so nothing is left to train on" in sentence
+
+
+@pytest.fixture(scope="module")
+def targets(poses):
+    """Positions of three reflectors in two frames, each configuration three times."""
+    q = poses.measurements.q[:30].repeat_interleave(9, 0)
+    with no_type_checker():
+        T = pisigma.Robot.load("kiro4")
+        model = poses.true
+    from pisigma.kinematics.forward import forward_kinematics
+
+    names = ("A", "B", "C") * 90
+    frames = tuple("left" if row // 9 % 2 else "right" for row in range(270))
+    offsets = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.1, 0.02], [-0.05, -0.05, 0.1]], dtype=torch.float64)
+    shift = torch.tensor([[2.0 if name == "left" else 0.0, 0.0, 0.0] for name in frames], dtype=torch.float64)
+    with no_type_checker():
+        poses_there = forward_kinematics(model, q)
+    own = offsets[torch.tensor(["ABC".index(name) for name in names])]
+    position = poses_there[:, :3, 3] + (poses_there[:, :3, :3] @ own[..., None])[..., 0] + shift
+    noise = 1e-5 * torch.randn(
+        position.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    assert T.dof == q.shape[1]
+    return Measurements(q=q, position=position + noise, target=names, frame=frames)
+
+
+def test_several_targets_and_frames(run, refuses, targets, tmp_path):
+    path = write(tmp_path / "targets.csv", targets)
+    printed = json.loads(run("calibrate", "kiro4", path, "--out", tmp_path / "arm", "--json").stdout)
+    assert printed["cross_validation"]["geometric"]["rms_mm"] < 0.1
+    model = load_model(tmp_path / "arm")
+    assert (set(model.bases), set(model.tools)) == ({"left", "right"}, {"A", "B", "C"})
+    judged = json.loads(run("evaluate", tmp_path / "arm", path, "--json").stdout)
+    assert judged["trained_on"]
+    assert judged["corrected"]["rms_mm"] < 0.1 < judged["nominal"]["rms_mm"]
+    one = targets.select(torch.arange(9))
+    other = write(tmp_path / "other.csv", replace(one, target=("A", "B", "D") * 3))
+    assert "line 4: the model was not fitted to target 'D'; Valid: A, B, C." in refuses(
+        "evaluate", tmp_path / "arm", other
+    )
+    strange = write(tmp_path / "strange.csv", replace(one, frame=("lft",) * 9))
+    assert "frame 'lft'; did you mean 'left'?" in refuses("evaluate", tmp_path / "arm", strange)
+
+
+def test_inverse_calibration_wants_one_frame_and_target(refuses, repository, targets, tmp_path):
+    path = write(tmp_path / "targets.csv", targets)
+    text = (repository / "training" / "ur10_inverse.yaml").read_text().replace("robot: ur10", "robot: kiro4")
+    (tmp_path / "measured.yaml").write_text(text)
+    sentence = refuses("train", tmp_path / "measured.yaml", "--data", path, "--out", tmp_path / "model")
+    assert "line 11: frame 'left' stands there, but " in sentence
+    assert "inverse calibration wants the rows of one frame" in sentence
+    one = write(tmp_path / "one.csv", replace(targets, frame=()))
+    sentence = refuses("train", tmp_path / "measured.yaml", "--data", one, "--out", tmp_path / "model")
+    assert "line 3: target 'B' stands there, but " in sentence
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("--split", "tim"), "--split 'tim' is unknown; did you mean 'time'? Valid: joints, space, time."),
+        (("--folds", "1"), "1 folds were wanted"),
+        (("--hold-out", "2"), "between 0 and 1 was wanted, got 2."),
+        (("--free", "a_9"), "a_9"),
+        (("--prior-mm", "0"), "or both 0 for none, got 0 mm and 1 mrad."),
+        (("--prior-mm", "nan"), "got nan mm"),
+    ],
+)
+def test_options_at_fault(refuses, data, tmp_path, arguments, complaint):
+    assert complaint in refuses("calibrate", "kiro4", data, "--out", tmp_path / "arm", *arguments)
+    assert not (tmp_path / "arm").exists()
+
+
+def test_robots_and_files_at_fault(refuses, data, tmp_path):
+    assert "did you mean 'kiro4'" in refuses("calibrate", "kiro44", data, "--out", tmp_path / "arm")
+    assert "cannot be read" in refuses("calibrate", "kiro4", tmp_path / "no.csv", "--out", tmp_path / "arm")
+    assert "joint" in refuses("calibrate", "panda", data, "--out", tmp_path / "arm")
+
+
+@pytest.mark.parametrize("name", RECIPES)
+def test_the_papers_protocol(run, repository, tmp_path, name):
+    recipe = repository / "training" / f"{name}.yaml"
+    printed = json.loads(run("train", recipe, "--out", tmp_path / "model", "--json").stdout)
+    left, rank, sets = RECIPES[name]
+    paper = printed["paper"]
+    assert (printed["pairwise_parameters"], printed["rank"]) == (left, rank)
+    assert (paper["pairwise_parameters"], paper["rank"], len(paper["redundant_sets"])) == (left, rank, sets)
+    assert sorted(printed["redundant_sets"]) == sorted(paper["redundant_sets"])
+    assert set(printed["no_effect"]) == set(paper["no_effect"])
+    assert printed["iterations"] <= 10
+    assert 2 < len(printed["rmse_mm"]) <= printed["iterations"] + 1  # steps that were not taken have none
+    assert printed["rmse_mm"][-1] <= 1e-12 < printed["rmse_mm"][0]
+    assert printed["held_out"]["rows"] == 2000
+    assert printed["held_out"]["rms_mm"] < 1e-10
+    card = (tmp_path / "model" / "README.md").read_text()
+    assert "2000 other simulated rows." in card
+    assert pisigma.load(tmp_path / "model").model.provenance.recipe == name
+
+
+def test_sets_are_told_apart_in_the_table(run, repository, tmp_path):
+    text = run("train", repository / "training" / "rb5_redundancy.yaml", "--out", tmp_path / "model").stdout
+    lines = text.splitlines()
+    assert max(map(len, lines[:-1])) <= 120
+    for members in ("{a_6, a_EE}", "{d_2, d_3, d_4}", "{theta_4, -beta_4}"):
+        assert sum(line.count(members) == 2 for line in lines) == 1  # ours and the paper's side by side
+
+
+def test_options_that_a_geometric_recipe_has_no_use_for(refuses, repository, data, tmp_path):
+    recipe = repository / "training" / "rb5_redundancy.yaml"
+    for option in (("--data", data), ("--resume",)):
+        sentence = refuses("train", recipe, "--out", tmp_path / "model", *option)
+        assert f"has no use for {option[0]}; leave it out." in sentence
+
+
+def test_geometric_recipes_write_their_measurements(run, repository, tmp_path):
+    recipe = repository / "training" / "rb5_redundancy.yaml"
+    for option, rows in (((), 40), (("--held-out",), 2000)):
+        printed = json.loads(
+            run("simulate", recipe, "--out", tmp_path / "rows.csv", "--json", *option).stdout
+        )
+        assert printed["rows"] == rows
+        read = Measurements.read_csv(tmp_path / "rows.csv", Robot.load("rb5"))
+        assert read.rows == rows
+        assert read.kinds == {"position"}
