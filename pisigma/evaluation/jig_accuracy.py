@@ -22,6 +22,13 @@ DEFINITIONS = (
     "jig's base too",
     "RMS: over the x, y and z errors of all test points; deviation: the mean over x, y and z of the errors' "
     "standard deviation over the test points (both give the paper's figures from its Tables 3 to 7)",
+    "Move-L: both ends are taught with the true robot, so they are met; the deviation is where the true tool is "
+    "minus where it should be on the straight line between them, per axis the largest of the line",
+    "I-Move: only the start is taught, direction and distance are commanded; dL is the distance of the true ends "
+    "minus the distance commanded",
+    "nominal, one jig, both: the paper's parameters by plain least squares; default: all that the touches on both "
+    "jigs can tell, with pisigma's prior; planned and random: the paper's parameters from touches that were chosen "
+    "from many candidates, and from as many drawn from them",
     "workspace: distance of the true tool from where the parameters put it at the same joint values, over "
     "poses of the workspace, in the robot's frame",
 )

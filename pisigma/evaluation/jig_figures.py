@@ -9,7 +9,10 @@ import torch
 from jaxtyping import Float64, Int64
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
-from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
+from mpl_toolkits.mplot3d.art3d import (  # type: ignore[import-untyped]
+    Line3DCollection,
+    Poly3DCollection,
+)
 from torch import Tensor
 
 from pisigma.evaluation.figures import save_figure
@@ -176,7 +179,7 @@ def draw_seeds(
     values.set(ylim=(0, None), xlim=(-0.5, len(shown) - 0.2), ylabel="RMS error at the test points [mm]")
     values.set_title("one dot a seed, line: mean", fontsize=10)
     values.grid(alpha=0.3, axis="y")
-    mean = sum(seeds[name]["rms"] for name in single) / len(single)
+    mean = np.mean([seeds[name]["rms"] for name in single], axis=0)
     ratios = np.sort(seeds["both"]["rms"] / mean)
     ratio.step(ratios, np.arange(1, len(ratios) + 1) / len(ratios), where="post")
     ratio.axvline(1.0, color="black", linewidth=1, linestyle="--")

@@ -179,7 +179,7 @@ def seed_figures(
         setup: {f"{name}_mm": float(values.mean()) * 1e3 for name, values in figures.items()}
         for setup, figures in seeds.items()
     }
-    single = {name: sum(seeds[frame][name] for frame in frames) / len(frames) for name in FIGURES}
+    single = {name: np.mean([seeds[frame][name] for frame in frames], axis=0) for name in FIGURES}
     return {
         "count": len(seeds[BOTH]["rms"]),
         "averages": averages,

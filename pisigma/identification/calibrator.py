@@ -15,7 +15,7 @@ from pisigma.identification.least_squares import Solution, levenberg_marquardt
 from pisigma.identification.loss import AbstractLoss, HampelLoss
 from pisigma.identification.pairwise import find_pairwise_redundancy
 from pisigma.identification.parameters import ParameterSpace, Prior
-from pisigma.identification.problem import CalibrationProblem, PriorSizes, view_of
+from pisigma.identification.problem import CalibrationProblem, view_of
 from pisigma.identification.redundancy import Redundancy, find_redundancy
 from pisigma.identification.result import CalibrationResult
 from pisigma.identification.result_assembly import Findings, assemble_result
@@ -51,8 +51,9 @@ class GeometricCalibrator:
             paper's Pearson correlation), or "none". The predicted poses do not depend on it.
         prior: standard deviations of the parameters' errors, or None. With it, what the data cannot see
             stays at its nominal value.
-        prior_sizes: "widened": wider where the errors are clearly larger than the prior says, one factor for
-            lengths and one for angles; "estimated": wider or narrower; "stated": as it is.
+        prior_sizes: "estimated": by the data, one factor on the prior for each of theta, d, a, alpha and beta;
+            "widened": one for lengths and one for angles, and only where the errors are larger than the prior
+            says; "stated": as it is.
         frames: per frame of touches, about where the robot's base is in it: x, y, z [m], roll, pitch, yaw
             [rad], such as the planned placement of a jig. Needed only where the touches do not tell it.
         socket_distances: known distances between two sockets [m], which give the scale:
@@ -70,7 +71,7 @@ class GeometricCalibrator:
     prior: Prior | None = field(default_factory=Prior)
     loss: AbstractLoss = field(default_factory=HampelLoss)
     maximum_iterations: int = 50
-    prior_sizes: PriorSizes = "widened"
+    prior_sizes: str = "estimated"
     frames: Mapping[str, Sequence[float]] = field(default_factory=dict)
     socket_distances: Mapping[PairOfSockets, float] = field(default_factory=dict)
     socket_sigma: float = 1e-5
@@ -145,7 +146,7 @@ class GeometricCalibrator:
             frames={name: tuple(base) for name, base in self.frames.items()},
             socket_distances=self.socket_distances,
             socket_sigma=self.socket_sigma,
-            prior_sizes=self.prior_sizes,
+            prior_sizes=self.prior_sizes,  # type: ignore[arg-type]
         )
         return build_setup(self.robot, measurements, options, self.prior, self.loss)
 

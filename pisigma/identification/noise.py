@@ -15,7 +15,11 @@ SMALLEST_NOISE = 1e-14
 ALWAYS_GOOD = 1e-10
 """[m or rad] Rows nearer to their prediction than this never count as wrong."""
 
-SMALLEST_PRIOR = 1e-3
+PRIOR_GROUPS = 5
+"""Groups of parameters whose prior has one size: theta, d, a, alpha, beta, or angles and lengths."""
+LEAST_TOLD = 0.1
+"""A prior of which the data tell less than so many parameters stays as it is."""
+SMALLEST_PRIOR = 0.03
 """An estimated prior is not narrower than this share of the stated one."""
 
 
@@ -53,13 +57,13 @@ class SensorView:
             their own.
         repetition: per sensor, 1 or more: by how much repeats of a pose tell less than so many poses,
             because what the model gets wrong there is the same in all of them.
-        widening: 1 or more, of the prior's standard deviations, for lengths and for angles.
+        widening: of the prior's standard deviations, per group of parameters.
     """
 
     sums: tuple[SensorSums, ...]
     noise: tuple[float, ...]
     repetition: tuple[float, ...]
-    widening: tuple[float, float] = (1.0, 1.0)
+    widening: tuple[float, ...] = (1.0,) * PRIOR_GROUPS
 
     def scale(self, sensor: int) -> float:
         """What distances are divided by for the loss."""
@@ -69,10 +73,9 @@ class SensorView:
         """What a sensor's sums are divided by."""
         return self.noise[sensor] ** 2 * self.repetition[sensor]
 
-    def widened(self, precision: Float64[Tensor, " active"], lengths: Tensor) -> Float64[Tensor, " active"]:
+    def widened(self, precision: Float64[Tensor, " active"], group: Tensor) -> Float64[Tensor, " active"]:
         """1 / variance of parameters by the prior, as far as it was widened."""
-        length, angle = (1 / factor**2 for factor in self.widening)
-        return precision * torch.where(lengths, length, angle)
+        return precision / precision.new_tensor(self.widening).square()[group]
 
 
 def values_used(view: SensorView, covariance: Float64[Tensor, "active active"]) -> tuple[float, ...]:
@@ -146,12 +149,12 @@ def group_variance_ratio(
 def prior_widening(
     off: Float64[Tensor, " active"],
     precision: Float64[Tensor, " active"],
-    lengths: Tensor,
+    group: Tensor,
     view: SensorView,
     covariance: Float64[Tensor, "active active"],
     floor: float = 1.0,
-) -> tuple[float, float]:
-    """How much larger than stated the parameters' errors turn out, for lengths and for angles.
+) -> tuple[float, ...]:
+    """How much larger than stated the parameters' errors turn out, per group of parameters.
 
     MacKay's update (1992, Neural Computation 4(3), eq. 4.7): every parameter counts by how much of it the
     data tell.
@@ -159,16 +162,18 @@ def prior_widening(
     Args:
         off: distance of the parameters from their nominal values [m or rad].
         precision: 1 / variance as stated, 0 where nothing is known.
-        lengths: which parameters are lengths.
+        group: number of every parameter's group.
         view: how far the prior is widened now.
         covariance: of the parameters.
         floor: smallest answer; 1 where smaller errors than stated do not tighten the prior.
     """
-    told = 1 - view.widened(precision, lengths) * covariance.diagonal()
+    told = 1 - view.widened(precision, group) * covariance.diagonal()
     square = off.square() * precision
     found = []
-    for chosen in (lengths, ~lengths):
-        chosen = chosen & (precision > 0)
+    for number, now in enumerate(view.widening):
+        chosen = (group == number) & (precision > 0)
         total = float(told[chosen].sum())
-        found.append(max(float(square[chosen].sum()) / total, floor**2) ** 0.5 if total > 1 else 1.0)
-    return found[0], found[1]
+        least = 1.0 if floor == 1.0 else LEAST_TOLD
+        size = max(float(square[chosen].sum()) / total, floor**2) ** 0.5 if total > least else now
+        found.append(size)
+    return tuple(found)

@@ -26,6 +26,7 @@ from pisigma.identification.noise import (
 )
 from pisigma.identification.parameters import ParameterSpace
 from pisigma.identification.sensors import AbstractSensor, OwnUnknowns
+from pisigma.robot.description import DH_COLUMNS
 
 PriorSizes = Literal["stated", "widened", "estimated"]
 CERTAIN_LOSS = SquaredLoss()
@@ -77,10 +78,13 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return tuple(int(sensor.seen.sum()) * sensor.components for sensor in self.sensors)
 
     @cached_property
-    def lengths(self) -> Tensor:
-        """Which of the free parameters are lengths."""
-        units = [parameter.unit == "m" for parameter in self.space.parameters]
-        return torch.tensor(units, device=self.q.device)[self.active]
+    def prior_group(self) -> Int64[Tensor, " active"]:
+        """Which of the prior's sizes every free parameter has: one per class, or one for lengths, one for angles."""
+        found = []
+        for parameter in self.space.parameters:
+            own = DH_COLUMNS.index(parameter.group) if parameter.group in DH_COLUMNS else 0
+            found.append(own if self.prior_sizes == "estimated" else int(parameter.unit == "m"))
+        return torch.tensor(found, dtype=torch.int64, device=self.q.device)[self.active]
 
     def with_active(self, active: Sequence[int]) -> "CalibrationProblem":
         """The same with other free parameters."""
@@ -151,7 +155,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         widening = view.widening
         if self.prior_sizes != "stated":
             floor = 1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR
-            widening = prior_widening(off, self.precision[self.active], self.lengths, view, covariance, floor)
+            widening = prior_widening(
+                off, self.precision[self.active], self.prior_group, view, covariance, floor
+            )
         old, new = (*view.noise, *view.repetition, *view.widening), (*noise, *repetition, *widening)
         settled = all(abs(b / a - 1) < 1e-2 for a, b in zip(old, new, strict=True))
         return self.combined(linearisation.point, SensorView(view.sums, noise, repetition, widening)), settled
@@ -213,7 +219,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def combined(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
         """Divide the sums by their variances and add the prior."""
         off = (point - self.nominal)[self.active]
-        precision = view.widened(self.precision[self.active], self.lengths)
+        precision = view.widened(self.precision[self.active], self.prior_group)
         normal, descent, misfit, rounding = torch.diag(precision), -off * precision, 0.0, 0.0
         for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True)):
             scale, variance = view.scale(k), view.variance(k)

@@ -166,7 +166,11 @@ def _warnings(
     found = []
     if not solution.status.good:
         found.append(f"the search {solution.status.value}.")
-    for kind, factor in zip(("length", "angle"), view_of(here).widening, strict=True):
+    sizes = view_of(here).widening
+    units = [problem.space.parameters[i].unit for i in problem.active.tolist()]
+    groups = list(zip(units, problem.prior_group.tolist(), strict=True))
+    for kind, unit in (("length", "m"), ("angle", "rad")):
+        factor = max((sizes[group] for of, group in groups if of == unit), default=1.0)
         if factor > 2 and bool((problem.precision > 0).any()):
             found.append(
                 f"the {kind} errors are about {factor:.2g} times as large as the prior says, so it was "
@@ -211,7 +215,7 @@ def _table(
 def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -> np.ndarray:
     """1 / variance of all parameters by the prior, 0 where they are not free."""
     full = torch.zeros_like(problem.precision)
-    full[problem.active] = view_of(here).widened(problem.precision[problem.active], problem.lengths)
+    full[problem.active] = view_of(here).widened(problem.precision[problem.active], problem.prior_group)
     found: np.ndarray = full.cpu().numpy()
     return found
 

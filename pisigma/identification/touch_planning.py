@@ -1,5 +1,6 @@
 """Which touches to make: those after which the robot's position is known best over its workspace."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -53,7 +54,7 @@ class PlanningProblem:
 
     def predicted_error(self, chosen: Int64[Tensor, " chosen"]) -> float:
         """Predicted RMS position error over the workspace after these touches [m]."""
-        return self.criterion(chosen) ** 0.5 / 1e3
+        return math.sqrt(self.criterion(chosen)) / 1e3
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,7 +172,8 @@ def plan_touches(problem: PlanningProblem, count: int) -> TouchPlan:
             break
         chosen, best = trial, value
         path.append(best)
-    return TouchPlan(chosen.sort().values, best**0.5 / 1e3, tuple(value**0.5 / 1e3 for value in path))
+    lengths = tuple(math.sqrt(value) / 1e3 for value in path)
+    return TouchPlan(chosen.sort().values, lengths[-1], lengths)
 
 
 def _base_rows(

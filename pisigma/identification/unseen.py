@@ -1,5 +1,7 @@
 """Directions of the parameters that the data hardly see, in words."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -21,9 +23,12 @@ def unseen_directions(problem: CalibrationProblem, here: Linearisation[Tensor]) 
         problem: with its free parameters.
         here: its linearisation at the solution.
     """
-    precision = view_of(here).widened(problem.precision[problem.active], problem.lengths)
+    view, stated = view_of(here), problem.precision[problem.active]
+    precision = view.widened(stated, problem.prior_group)
     held = bool((precision > 0).any())
     data = here.normal - torch.diag(precision)
+    wide = replace(view, widening=tuple(max(factor, 1.0) for factor in view.widening))
+    precision = wide.widened(stated, problem.prior_group)
     usual = torch.where(precision > 0, precision.clamp(min=1e-30).rsqrt(), problem.step_scale)
     data = data * usual * usual[:, None]
     arm = problem.active < problem.space.arm_size

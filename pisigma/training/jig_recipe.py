@@ -160,7 +160,7 @@ class JigRecipe(Section):
     def calibrator(self, free: Free, jigs: Sequence[str]) -> GeometricCalibrator:
         """The calibrator for some jigs: the paper's parameters by plain least squares, or pisigma's default."""
         robot = Robot.load(self.robot)
-        frames = {name: base for name, base in self.believed_bases().items() if name in jigs}
+        frames = {name: base.tolist() for name, base in self.believed_bases().items() if name in jigs}
         if free == "default":
             return GeometricCalibrator(robot, frames=frames)
         return GeometricCalibrator(

@@ -7,6 +7,8 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.errors import IdentificationError, RecipeError
+from pisigma.se3 import wrap_to_pi
+from pisigma.simulation import JigPlacement
 from pisigma.training.jig_recipe import (
     JigRecipe,
     calibrate_on,
@@ -62,9 +64,22 @@ def test_without_noise_the_papers_parameters_come_back(recipe):
         assert_close(found.arm.tool, true.tool, atol=1e-9)
         for placement in stated.placements:
             if placement.name in frames:
-                difference = found.bases[placement.name] - placement.true_base.to_si()
-                difference[3:] = (difference[3:] + math.pi) % (2 * math.pi) - math.pi
+                difference = torch.from_numpy(found.bases[placement.name] - placement.true_base.to_si())
+                difference[3:] = wrap_to_pi(difference[3:])
                 assert_close(difference, torch.zeros(6), atol=1e-9)
+
+
+def test_a_third_jig_is_six_unknowns_more_and_nothing_else_to_change(recipe):
+    exact = recipe.noise.model_copy(update={"sensor_mm": 0.0, "repeatability_mm": 0.0})
+    believed, true = {"x_mm": 700, "y_mm": 250, "roll_deg": 180}, {"x_mm": 705, "y_mm": 247, "roll_deg": 181}
+    third = JigPlacement(name="jig_3", base=believed, true_base=true)
+    stated = small(recipe, noise=exact, placements=(*recipe.placements, third))
+    found = calibrate_on(stated, stated.measure(stated.draw_touches(0), 0), stated.frames)
+    assert len(found.result.free) == 29
+    assert_close(found.arm.dh, stated.true_robot().geometry.dh, atol=1e-9)
+    difference = torch.from_numpy(found.bases["jig_3"] - third.true_base.to_si())
+    difference[3:] = wrap_to_pi(difference[3:])
+    assert_close(difference, torch.zeros(6), atol=1e-9)
 
 
 def test_seeds_draw_other_touches_and_noise(recipe):

@@ -1,0 +1,51 @@
+"""README and training/README.md say what the models and recipes give."""
+
+import re
+
+import pytest
+
+from pisigma.cli.main import app
+from pisigma.correction.model_folder import load_model
+from pisigma.evaluation.tables import figure_text
+
+
+def _results(repository) -> dict[tuple[str, str], list[str]]:
+    """Rows of the README's table of joint errors, by robot and joint."""
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| KIRO-([34]) (theta_\d) \| (.+) \|$", text, flags=re.MULTILINE)
+    return {(f"kiro{number}", joint): cells.split(" | ") for number, joint, cells in rows}
+
+
+@pytest.mark.parametrize(("model", "joints"), [("kiro3", 2), ("kiro4", 6)])
+def test_the_results_table_is_that_of_the_models(repository, model, joints):
+    reports = load_model(repository / "models" / model).metrics["joints"]
+    table = _results(repository)
+    assert len(reports) == joints
+    for report in reports:
+        before, paper, _, fresh = table[model, report["name"]]
+        assert before == figure_text(report["training"]["before"]["average_deg"])
+        assert paper == figure_text(report["paper"]["after"]["average_deg"])
+        assert fresh == figure_text(report["held_out"]["after"]["average_deg"])
+
+
+def test_training_readme_names_every_recipe(repository):
+    text = (repository / "training" / "README.md").read_text(encoding="utf-8")
+    for recipe in sorted((repository / "training").glob("*.yaml")):
+        assert f"pisigma train training/{recipe.name}" in text
+
+
+def test_the_commands_of_the_readme_exist(repository):
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    known = {command.callback.__name__ for command in app.registered_commands}
+    used = set(re.findall(r"pisigma (robots|simulate|calibrate|train|evaluate|ik|export|report)\b", text))
+    assert used <= known
+
+
+def test_both_set_up_commands_are_there_and_short_enough(repository):
+    text = (repository / "README.md").read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 200
+    for mark in ("main command", "test command"):
+        block = text.split(f"<!-- {mark} -->", 1)[1].split("```", 2)[1]
+        commands = block.removeprefix("bash\n").strip().splitlines()
+        assert len(commands) == 1
+        assert commands[0].startswith("python3 -m venv .venv && ")
