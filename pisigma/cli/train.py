@@ -29,14 +29,14 @@ def train(
     """Train the model of a recipe and write it as a model folder with card and figures."""
     started = time.perf_counter()
     from pisigma.training.geometric_recipe import GeometricRecipe
-    from pisigma.training.jig_recipe import is_jig_recipe
+    from pisigma.training.jig_recipe import JigRecipe
     from pisigma.training.recipe_kinds import read_any_recipe
 
-    if is_jig_recipe(recipe):
+    stated = read_any_recipe(recipe)
+    if isinstance(stated, JigRecipe):
         from pisigma.cli.train_jigs import train_jigs
 
-        return train_jigs(recipe, data, out, resume, as_json)
-    stated = read_any_recipe(recipe)
+        return train_jigs(stated, recipe, data, out, resume, as_json)
     if isinstance(stated, GeometricRecipe):
         from pisigma.cli.train_geometric import train_geometric
 

@@ -4,9 +4,15 @@ import shlex
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pisigma.training.jig_recipe import JigRecipe
 
 
-def train_jigs(recipe: Path, data: Path | None, out: Path | None, resume: bool, as_json: bool) -> None:
+def train_jigs(
+    stated: "JigRecipe", recipe: Path, data: Path | None, out: Path | None, resume: bool, as_json: bool
+) -> None:
     """Calibrate the simulated robot of a recipe with touches and write the model folder.
 
     Raises:
@@ -23,10 +29,8 @@ def train_jigs(recipe: Path, data: Path | None, out: Path | None, resume: bool, 
     from pisigma.evaluation.jig_card import write_jig_card
     from pisigma.evaluation.jig_report import DEFAULT, report_jigs, run_jigs
     from pisigma.robot.description import Robot
-    from pisigma.training.jig_recipe import read_jig_recipe
     from pisigma.training.recipe import recipe_hash
 
-    stated = read_jig_recipe(recipe)
     if data is not None or resume:
         given = "--data" if data is not None else "--resume"
         raise RecipeError(f"{recipe}: a recipe of kind {stated.kind} has no use for {given}; leave it out.")

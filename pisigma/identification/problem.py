@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.identification.covariance import covariance_of
 from pisigma.identification.jacobian import JACOBIAN_CHUNK, ToolMotion, motion_order, tool_motion
 from pisigma.identification.least_squares import AbstractLeastSquares, Linearisation
 from pisigma.identification.loss import AbstractLoss, SquaredLoss
@@ -294,16 +295,3 @@ def view_of(linearisation: Linearisation[Tensor]) -> SensorView:
     """The sensors' part of a linearisation that a `CalibrationProblem` made."""
     assert isinstance(linearisation.detail, SensorView)
     return linearisation.detail
-
-
-def covariance_of(normal: Float64[Tensor, "active active"]) -> Float64[Tensor, "active active"]:
-    """Inverse of a normal matrix, with column scaling; directions that it does not hold get no variance."""
-    diagonal = normal.diagonal()
-    scale = torch.where(diagonal > 0, diagonal, torch.ones_like(diagonal)).rsqrt()
-    scaled = normal * scale * scale[:, None]
-    factor, failed = torch.linalg.cholesky_ex(scaled)
-    if not failed and float(factor.diagonal().min()) > 1e-6:
-        inverse = torch.cholesky_inverse(factor)
-    else:
-        inverse = torch.linalg.pinv(scaled, rtol=1e-12, hermitian=True)
-    return inverse * scale * scale[:, None]

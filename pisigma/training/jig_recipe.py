@@ -1,6 +1,5 @@
 """Recipes of a robot that touches jigs: what is wrong, what is touched, and what is looked at afterwards."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal
@@ -8,7 +7,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 import torch
 from jaxtyping import Float64
-from pydantic import ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 from torch import Tensor
 
 from pisigma.errors import IdentificationError, RecipeError
@@ -28,7 +27,7 @@ from pisigma.simulation.sensor_noise import SensorNoise
 from pisigma.simulation.touch_candidates import TouchCandidates, TouchCandidatesSection
 from pisigma.simulation.touching import simulate_touches
 from pisigma.simulation.true_robot import ErrorSource, TrueRobot
-from pisigma.yaml_file import Section, read_yaml
+from pisigma.yaml_file import Section
 
 Triple = tuple[float, float, float]
 Free = Literal["paper", "default"]
@@ -235,29 +234,6 @@ def calibrate_on(
         )
     result = recipe.calibrator(free, frames).fit(measurements.select(rows))
     return JigCalibration(result.robot.with_geometry(base=np.zeros(6)), dict(result.bases), result)
-
-
-class _KindOnly(Section):
-    model_config = ConfigDict(extra="ignore")
-    kind: str = ""
-
-
-def is_jig_recipe(path: str | os.PathLike[str]) -> bool:
-    """Whether a recipe is one of a robot that touches jigs.
-
-    Raises:
-        RecipeError: the file cannot be read.
-    """
-    return read_yaml(path, _KindOnly, RecipeError).kind == "jig_calibration"
-
-
-def read_jig_recipe(path: str | os.PathLike[str]) -> JigRecipe:
-    """Read a recipe of a robot that touches jigs.
-
-    Raises:
-        RecipeError: the file cannot be read or does not fit; the message names file, line and key.
-    """
-    return read_yaml(path, JigRecipe, RecipeError)
 
 
 def _pose(xyz_mm: Triple, rpy_deg: Triple) -> Float64[Tensor, "4 4"]:

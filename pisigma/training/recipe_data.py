@@ -9,6 +9,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.training.geometric_recipe import GeometricRecipe
+from pisigma.training.jig_recipe import JigRecipe
 from pisigma.training.recipe import Recipe, SimulatedData
 
 
@@ -52,22 +53,26 @@ def load_measurements(recipe: Recipe, data: Path | None) -> Measurements:
     return Measurements.read_csv(data, robot)
 
 
-def simulate_training(recipe: Recipe | GeometricRecipe) -> Measurements:
-    """Measure the training rows of a recipe on its true robot.
+def simulate_training(recipe: Recipe | GeometricRecipe | JigRecipe) -> Measurements:
+    """Measure the training rows of a recipe on its true robot; with jigs, the touches of the first seed.
 
     Raises:
         RecipeError: the recipe is for measured data.
     """
+    if isinstance(recipe, JigRecipe):
+        return recipe.measure(recipe.draw_touches(0), 0)
     section = recipe.measurements if isinstance(recipe, GeometricRecipe) else simulated_data(recipe).training
     return section.measure(_true_robot(recipe))
 
 
-def simulate_held_out(recipe: Recipe | GeometricRecipe) -> Measurements:
+def simulate_held_out(recipe: Recipe | GeometricRecipe | JigRecipe) -> Measurements:
     """Measure the held-out rows of a recipe on its true robot.
 
     Raises:
-        RecipeError: the recipe is for measured data.
+        RecipeError: the recipe is for measured data, or has no held-out rows.
     """
+    if isinstance(recipe, JigRecipe):
+        raise RecipeError(f"recipe '{recipe.name}' has no held-out rows; leave --held-out out.")
     section = recipe.held_out if isinstance(recipe, GeometricRecipe) else simulated_data(recipe).held_out
     return section.measure(_true_robot(recipe))
 

@@ -1,6 +1,7 @@
 """Reading a recipe of whatever kind."""
 
 import os
+from collections.abc import Callable
 from functools import partial
 from typing import Literal
 
@@ -8,26 +9,32 @@ from pydantic import ConfigDict
 
 from pisigma.errors import RecipeError
 from pisigma.training.geometric_recipe import GeometricRecipe
+from pisigma.training.jig_recipe import JigRecipe
 from pisigma.training.recipe import Recipe, read_recipe
 from pisigma.training.recipe_checks import check_fit, geometric_checks
 from pisigma.yaml_file import Section, read_yaml
 
+AnyRecipe = Recipe | GeometricRecipe | JigRecipe
+
 
 class _KindOnly(Section):
     model_config = ConfigDict(extra="ignore")
-    kind: Literal["inverse_calibration", "geometric_calibration"] = "inverse_calibration"
+    kind: Literal["inverse_calibration", "geometric_calibration", "jig_calibration"] = "inverse_calibration"
 
 
-def read_any_recipe(path: str | os.PathLike[str]) -> Recipe | GeometricRecipe:
+def read_any_recipe(path: str | os.PathLike[str]) -> AnyRecipe:
     """Read a recipe of the kind that it states, and check it against its robot.
 
     Raises:
         RecipeError: the file cannot be read or does not fit; the message names file, line and key.
         RobotError: its robot cannot be used; the message names file, line and key too.
     """
-    if read_yaml(path, _KindOnly, RecipeError).kind == "inverse_calibration":
-        return read_recipe(path)
-    return read_geometric_recipe(path)
+    readers: dict[str, Callable[[str | os.PathLike[str]], AnyRecipe]] = {
+        "inverse_calibration": read_recipe,
+        "geometric_calibration": read_geometric_recipe,
+        "jig_calibration": read_jig_recipe,
+    }
+    return readers[read_yaml(path, _KindOnly, RecipeError).kind](path)
 
 
 def read_geometric_recipe(path: str | os.PathLike[str]) -> GeometricRecipe:
@@ -40,3 +47,12 @@ def read_geometric_recipe(path: str | os.PathLike[str]) -> GeometricRecipe:
     recipe = read_yaml(path, GeometricRecipe, RecipeError)
     check_fit(path, recipe.robot, partial(geometric_checks, recipe))
     return recipe
+
+
+def read_jig_recipe(path: str | os.PathLike[str]) -> JigRecipe:
+    """Read a recipe of a robot that touches jigs.
+
+    Raises:
+        RecipeError: the file cannot be read or does not fit; the message names file, line and key.
+    """
+    return read_yaml(path, JigRecipe, RecipeError)

@@ -16,7 +16,8 @@ from pisigma.evaluation.jig_accuracy import Bench, deviation, measure_accuracy, 
 from pisigma.evaluation.jig_report import FIGURES, run_jigs, seed_figures
 from pisigma.evaluation.jig_tables import all_tables
 from pisigma.se3 import rotation_from_rpy
-from pisigma.training.jig_recipe import JigCalibration, nominal_calibration, read_jig_recipe
+from pisigma.training.jig_recipe import JigCalibration, nominal_calibration
+from pisigma.training.recipe_kinds import read_jig_recipe
 
 PICTURES = ("touches.png", "errors.png", "straight_lines.png", "seeds.png")
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
+from pisigma.identification.covariance import covariance_of
 from pisigma.identification.least_squares import (
     AbstractLeastSquares,
     Linearisation,
@@ -11,7 +12,6 @@ from pisigma.identification.least_squares import (
     levenberg_marquardt,
     solve_damped,
 )
-from pisigma.identification.problem import covariance_of
 
 SIGMA = 1e-8
 

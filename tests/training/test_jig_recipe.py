@@ -12,10 +12,9 @@ from pisigma.simulation import JigPlacement
 from pisigma.training.jig_recipe import (
     JigRecipe,
     calibrate_on,
-    is_jig_recipe,
     nominal_calibration,
-    read_jig_recipe,
 )
+from pisigma.training.recipe_kinds import read_any_recipe, read_jig_recipe
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +28,8 @@ def small(recipe: JigRecipe, **changes: object) -> JigRecipe:
 
 
 def test_it_is_of_its_own_kind(repository):
-    assert is_jig_recipe(repository / "training" / "jigs.yaml")
-    assert not is_jig_recipe(repository / "training" / "kiro3.yaml")
+    assert isinstance(read_any_recipe(repository / "training" / "jigs.yaml"), JigRecipe)
+    assert not isinstance(read_any_recipe(repository / "training" / "kiro3.yaml"), JigRecipe)
 
 
 def test_the_true_robot_has_the_papers_values(recipe):
