@@ -4,6 +4,9 @@ import os
 import sys
 from pathlib import Path
 
+# One thread: the tests' arrays are small, and threads that wait for each other on a busy machine cost minutes.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 import pytest
 import torch
 

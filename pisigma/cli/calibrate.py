@@ -35,6 +35,12 @@ def calibrate(
     ] = 1.0,
     prior_mrad: Annotated[float, typer.Option(help="The same of angle errors.")] = 1.0,
     robust: Annotated[bool, typer.Option(help="Let rows that are far off count less.")] = True,
+    socket_distance: Annotated[
+        str | None,
+        typer.Option(
+            help="Known distance of two sockets as A,B,MM; */0,*/1,50 means that of every placement."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Identify a robot's geometry from measurements and write it as a model folder with card and figures."""
@@ -48,13 +54,16 @@ def calibrate(
     from pisigma.evaluation.geometric_validation import judge
     from pisigma.measurement.dataset import Measurements
     from pisigma.robot.description import Robot
-    from pisigma.training.geometric_recipe import calibration_section
+    from pisigma.training.geometric_recipe import calibration_section, known_socket_distances
     from pisigma.training.recipe_data import part_sets
 
     check_replaceable(out)
     nominal = Robot.load(robot)
     measurements, test = part_sets(Measurements.read_csv(data, nominal))
-    calibrator = calibration_section(free, prior_mm, prior_mrad, robust).calibrator(nominal)
+    calibrator = replace(
+        calibration_section(free, prior_mm, prior_mrad, robust).calibrator(nominal),
+        socket_distances=known_socket_distances(socket_distance, measurements.socket or ()),
+    )
     parts = _parts(measurements, folds, hold_out, seed, split)
     result = calibrator.fit(measurements)
     validation = _validate(calibrator, measurements, parts)
@@ -63,6 +72,7 @@ def calibrate(
     model = replace(model_of_calibration(out.resolve().name, nominal, result, measurements), metrics=report)
     options = {"folds": folds, "hold-out": hold_out, "split": split, "seed": seed, "free": free}
     options |= {"prior-mm": prior_mm, "prior-mrad": prior_mrad, "robust": robust}
+    options |= {"socket-distance": socket_distance}
     texts = {
         "description": f"Geometric calibration of robot {nominal.name} ({nominal.maker}): DH and Hayati "
         "parameters, base and tool by least squares.",

@@ -10,7 +10,6 @@ from torch import Tensor
 from pisigma.evaluation.pose_statistics import PoseErrors
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.loss import SquaredLoss
-from pisigma.identification.prediction import predicted_poses
 from pisigma.identification.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
 
@@ -101,11 +100,21 @@ def _base_and_tool(calibrator: GeometricCalibrator) -> GeometricCalibrator:
 
 
 def errors_under(result: CalibrationResult, measurements: Measurements) -> PoseErrors:
-    """Errors of any rows under a calibration.
+    """Errors of any rows under a calibration, whatever sensor measured them.
+
+    Returns:
+        As "position" the length of the error of whatever length a row has: of a position or a ball in a socket the
+        distance, of a touch, a wire or a pair the difference [m].
 
     Raises:
-        IdentificationError: a row has a frame or target that was not calibrated.
+        IdentificationError: a row has a frame, target or anchor that was not calibrated.
     """
-    return PoseErrors.between(
-        measurements, predicted_poses(result.robot, result.bases, result.tools, measurements)
-    )
+    lengths = torch.full((measurements.rows,), torch.nan, dtype=torch.float64)
+    rotation: Tensor | None = None
+    for sensor, errors in result.errors_of(measurements).items():
+        size = torch.as_tensor(errors).norm(dim=-1)
+        if sensor == "rotation":
+            rotation = size
+        else:
+            lengths = torch.where(torch.isfinite(size), size, lengths)
+    return PoseErrors(lengths, rotation)
