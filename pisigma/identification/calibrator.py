@@ -15,6 +15,7 @@ from pisigma.identification.least_squares import Solution, levenberg_marquardt
 from pisigma.identification.loss import AbstractLoss, HampelLoss
 from pisigma.identification.pairwise import find_pairwise_redundancy
 from pisigma.identification.parameters import ParameterSpace, Prior
+from pisigma.identification.plausibility import refuse_implausible
 from pisigma.identification.problem import CalibrationProblem, view_of
 from pisigma.identification.redundancy import Redundancy, find_redundancy
 from pisigma.identification.result import CalibrationResult
@@ -108,8 +109,8 @@ class GeometricCalibrator:
         """Calibrate.
 
         Raises:
-            IdentificationError: the measurements do not determine what is asked for; the message says what to
-                measure or what to fix.
+            IdentificationError: the measurements do not determine what is asked for, or are so far from the best
+                fit that they cannot be of this robot; the message says what to measure or what to fix.
             PoseError: the joint values do not fit the robot.
         """
         setup = self.build(measurements)
@@ -129,6 +130,7 @@ class GeometricCalibrator:
         active = [*self._chosen(setup.problem.space, seen, sizes, redundancy), *own]
         problem = setup.problem.with_active(active)
         solution, problem, extended = self._solved(problem, setup.start, own + candidates)
+        refuse_implausible(problem, solution.linearisation, measurements.source)
         findings = Findings(seen, sizes, redundancy, extended, warnings)
         return assemble_result(measurements, setup, problem, solution, findings)
 

@@ -24,7 +24,7 @@ def frames_mixed_up(problem: CalibrationProblem, here: Linearisation[Tensor]) ->
     frames = problem.space.frames
     if len(frames) < 2:
         return ()
-    sizes = _sizes(problem, here)
+    sizes = residual_sizes(problem, here)
     off, others = [], []
     for number in range(len(frames)):
         theirs = sizes[(problem.frame == number) & torch.isfinite(sizes)]
@@ -44,7 +44,7 @@ def frames_mixed_up(problem: CalibrationProblem, here: Linearisation[Tensor]) ->
     )
 
 
-def _sizes(problem: CalibrationProblem, here: Linearisation[Tensor]) -> Tensor:
+def residual_sizes(problem: CalibrationProblem, here: Linearisation[Tensor]) -> Tensor:
     """Length of every row's residual per component [m], NaN where no length was measured."""
     found = torch.full_like(problem.q[:, 0], torch.nan)
     for sensor, sums in zip(problem.sensors, view_of(here).sums, strict=True):

@@ -174,8 +174,8 @@ def _warnings(
         factor = max((sizes[group] for of, group in groups if of == unit), default=1.0)
         if factor > 2 and bool((problem.precision > 0).any()):
             found.append(
-                f"the {kind} errors are about {factor:.2g} times as large as the prior says, so it was "
-                "widened; check the nominal geometry, or give a wider prior."
+                f"the {kind} errors are about {factor:.2g} times as large as the prior says, so their size was "
+                "taken from the data; check the nominal geometry and the robot, or give a wider prior."
             )
     return (*found, *frames_mixed_up(problem, here))
 
