@@ -7,6 +7,7 @@ import typer
 from pisigma import __version__
 from pisigma.cli.calibrate import calibrate
 from pisigma.cli.evaluate import evaluate
+from pisigma.cli.export import export
 from pisigma.cli.ik import ik
 from pisigma.cli.output import tell_problems
 from pisigma.cli.robots import robots
@@ -21,7 +22,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (robots, simulate, calibrate, train, evaluate, ik):
+for command in (robots, simulate, calibrate, train, evaluate, ik, export):
     app.command()(tell_problems(command))
 
 

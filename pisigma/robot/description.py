@@ -102,16 +102,21 @@ class Robot:
                 )
 
     @staticmethod
-    def load(robot: str | os.PathLike[str]) -> "Robot":
-        """Load a robot by catalogue name or from a YAML file.
+    def load(robot: str | os.PathLike[str], base: str | None = None, tip: str | None = None) -> "Robot":
+        """Load a robot by catalogue name, from a YAML or from a URDF file.
+
+        Args:
+            robot: name or file.
+            base: of a URDF file the link that poses are given in; its root where none is given.
+            tip: of a URDF file the link that is the tool; its only end where none is given.
 
         Raises:
             UnknownRobotError: neither a catalogue name nor a file; the message lists the catalogue.
-            RobotError: the file does not describe a robot.
+            RobotError: the file does not describe a robot, or links are named where there is no URDF file.
         """
         from pisigma.robot.loading import load_robot
 
-        return load_robot(robot)
+        return load_robot(robot, base, tip)
 
     @property
     def joints(self) -> tuple[Row, ...]:

@@ -18,14 +18,27 @@ def catalogue() -> tuple[str, ...]:
     )
 
 
-def load_robot(robot: str | os.PathLike[str]) -> Robot:
-    """Load a robot by catalogue name or from a YAML file. See `Robot.load`."""
+def load_robot(robot: str | os.PathLike[str], base: str | None = None, tip: str | None = None) -> Robot:
+    """Load a robot by catalogue name, from a YAML or from a URDF file. See `Robot.load`."""
     name = os.fspath(robot)
+    suffix = Path(name).suffix.lower()
+    if suffix == ".urdf" and name not in catalogue():
+        from pisigma.robot.urdf_rows import load_urdf
+
+        return load_urdf(name, base, tip)
+    for option, link in (("base", base), ("tip", tip)):
+        if link is not None:
+            raise RobotError(
+                f"{option}='{link}' names a link of a URDF file, but '{name}' is none; leave it out or give a "
+                ".urdf file."
+            )
     if name in catalogue():
         text = (resources.files("pisigma.robot") / "catalogue" / f"{name}.yaml").read_text(encoding="utf-8")
         return parse_yaml(text, RobotDocument, RobotError, source=f"catalogue/{name}.yaml").to_robot()
-    if Path(name).suffix.lower() in (".yaml", ".yml"):
+    if suffix in (".yaml", ".yml"):
         return read_yaml(name, RobotDocument, RobotError).to_robot()
+    if suffix == ".xacro":
+        raise RobotError(f"{name}: is xacro, which is not read; expand it first (`xacro FILE > robot.urdf`).")
     raise UnknownRobotError(
-        f"'{name}' is no robot of the catalogue and no .yaml file: {nearest_choice(name, catalogue())}"
+        f"'{name}' is no robot of the catalogue and no .yaml or .urdf file: {nearest_choice(name, catalogue())}"
     )

@@ -34,7 +34,7 @@ def test_help_imports_nothing_heavy(arguments):
     assert done.stdout.endswith("heavy: []\n")
 
 
-@pytest.mark.parametrize("name", ["robots", "simulate", "train", "evaluate", "ik"])
+@pytest.mark.parametrize("name", ["robots", "simulate", "train", "evaluate", "ik", "export"])
 def test_every_command_explains_itself(run, name):
     result = run(name, "--help")
     assert result.exit_code == 0

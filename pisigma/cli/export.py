@@ -1,0 +1,99 @@
+"""`pisigma export`: a model in the forms that other programs read."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from pisigma.correction.calibrated_model import CalibratedModel
+
+_SUFFIXES = {"urdf": (".urdf",), "dh": (".csv", ".yaml", ".yml"), "offsets": (".csv", ".yaml", ".yml")}
+_CONTENTS = {"urdf": "a URDF", "dh": "a DH table", "offsets": "a table of joint offsets"}
+
+
+def export(
+    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    out: Annotated[Path, typer.Option(help="File to write: .urdf, or .csv or .yaml for dh and offsets.")],
+    form: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            help="urdf: calibrated geometry; dh: its DH + Hayati table with base and tool; offsets: the best "
+            "joint offsets alone, with the accuracy that this gives up.",
+        ),
+    ],
+    like: Annotated[
+        Path | None,
+        typer.Option(
+            help="With urdf: the URDF file that the robot was loaded from; its links, meshes and limits stay."
+        ),
+    ] = None,
+    tip: Annotated[
+        str | None, typer.Option(help="With --like: link that is the tool, as it was given then.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Write a model for other programs, whole or not at all."""
+    from pisigma.cli.output import print_json
+    from pisigma.errors import OutputError, nearest_choice
+
+    if form not in _SUFFIXES:
+        raise OutputError(f"--format '{form}' is unknown; {nearest_choice(form, _SUFFIXES)}")
+    if like is not None and form != "urdf":
+        raise OutputError(f"--like goes with --format urdf, not with {form}; leave it out.")
+    if tip is not None and like is None:
+        raise OutputError("--tip names a link of the file that --like gives; give both or none.")
+    from pisigma.correction.model_folder import load_model
+    from pisigma.export.output_file import check_output, write_whole
+
+    check_output(out, _SUFFIXES[form], _CONTENTS[form])
+    loaded, as_csv = load_model(model), out.suffix.lower() == ".csv"
+    text, result = _urdf(loaded, like, tip) if form == "urdf" else _table(loaded, form, as_csv)
+    write_whole(out, text)
+    if as_json:
+        print_json({"file": str(out), "format": form, **result})
+        return
+    for remark in result["remarks"]:
+        typer.echo(remark)
+    typer.echo(
+        f"{_CONTENTS[form].capitalize().replace('urdf', 'URDF').replace('dh', 'DH')} written to {out}."
+    )
+
+
+def _urdf(model: "CalibratedModel", like: Path | None, tip: str | None) -> tuple[str, dict[str, Any]]:
+    """The text of the file, and what to tell about it."""
+    from pisigma.export.geometry import calibrated_geometry, remarks
+
+    robot, told = calibrated_geometry(model), remarks(model)
+    if like is None:
+        from pisigma.robot.urdf_writing import robot_to_urdf
+
+        text = robot_to_urdf(robot, told)
+    else:
+        from pisigma.robot.urdf_template import robot_into_urdf
+
+        text = robot_into_urdf(robot, model.robot, like, tip, told)
+    return text, {"robot": robot.name, "joints": robot.dof, "remarks": list(told)}
+
+
+def _table(model: "CalibratedModel", form: str, as_csv: bool) -> tuple[str, dict[str, Any]]:
+    """The text of the file, and what to tell about it."""
+    from pisigma.export.geometry import calibrated_geometry, offset_remarks, remarks
+
+    result: dict[str, Any] = {"robot": model.robot.name, "joints": model.robot.dof}
+    if form == "dh":
+        from pisigma.export.dh_table import dh_csv, dh_yaml
+
+        robot, told = calibrated_geometry(model), remarks(model)
+        return (dh_csv if as_csv else dh_yaml)(robot, told), result | {"remarks": list(told)}
+    from pisigma.export.joint_offsets import fit_joint_offsets
+    from pisigma.export.offsets_file import offset_sentences, offsets_csv, offsets_yaml
+
+    offsets, told = fit_joint_offsets(model), offset_remarks(model)
+    result |= {
+        "off_the_whole_model": offsets.lost.in_file_units(),
+        "robot_as_drawn": offsets.nominal.in_file_units(),
+        "remarks": [*told, *offset_sentences(offsets)],
+    }
+    return (offsets_csv if as_csv else offsets_yaml)(offsets, told), result

@@ -1,0 +1,1 @@
+"""Calibrated models in the forms that other programs read."""

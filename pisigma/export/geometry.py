@@ -1,0 +1,48 @@
+"""The geometry of a model as one robot, and what has to be said where only that leaves pisigma."""
+
+from dataclasses import replace
+
+from pisigma import __version__
+from pisigma.correction.calibrated_model import CalibratedModel
+from pisigma.robot.description import Robot
+
+
+def calibrated_geometry(model: CalibratedModel) -> Robot:
+    """The robot with its geometry as identified (as drawn where it was not), base and tool of the model."""
+    robot = model.calibrated or model.robot
+    return replace(
+        robot, source=f"model {model.name} of robot {robot.name}, written by pisigma {__version__}"
+    )
+
+
+def remarks(model: CalibratedModel) -> tuple[str, ...]:
+    """Sentences for the head of a file that holds the geometry of a model and nothing else."""
+    drawn = "as drawn, with the identified base and tool" if model.calibrated is None else "as identified"
+    said = [
+        f"Geometry {drawn}, of model {model.name} (robot {model.robot.name}), by pisigma {__version__}.",
+    ]
+    if model.network is not None:
+        said.append(
+            "The learned joint correction of the model is not in this file: a program that reads it gets the "
+            "geometry only, without the accuracy that the correction adds."
+        )
+    for what, names in (("frame", list(model.bases)), ("target", list(model.tools))):
+        if len(names) > 1:
+            part = "base" if what == "frame" else "tool"
+            said.append(
+                f"The {part} is that of the {what} '{names[0]}'; the model knows {len(names)} {what}s "
+                f"({', '.join(names)})."
+            )
+    return tuple(said)
+
+
+def offset_remarks(model: CalibratedModel) -> tuple[str, ...]:
+    """The same for a file that holds joint offsets and nothing else."""
+    title = f"Joint offsets of model {model.name} (robot {model.robot.name}), by pisigma {__version__}."
+    if model.network is None:
+        return (title,)
+    return (
+        title,
+        "The learned joint correction of the model is not in this file, but for the constant offsets that come "
+        "nearest to it.",
+    )

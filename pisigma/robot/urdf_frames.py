@@ -1,0 +1,88 @@
+"""Rigid transforms of single frames as NumPy matrices, and their exact way into and out of six numbers.
+
+Lengths in m, angles in rad. Multiples of 90 deg are exact both ways, so that a robot drawn with right angles
+keeps them.
+"""
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+Frame = Float64[np.ndarray, "4 4"]
+
+ROUNDING = 2e-14
+"""Lengths [m] and angles [rad], off 0 or off a multiple of 90 deg by less, are taken for rounding errors."""
+
+
+def turn(axis: int, angle: float) -> Frame:
+    """Rotation by an angle [rad] about the x (0), y (1) or z (2) axis."""
+    cosine, sine = _cosine_sine(angle)
+    T = np.eye(4)
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    T[first, first] = T[second, second] = cosine
+    T[second, first], T[first, second] = sine, -sine
+    return T
+
+
+def shift(x: float, y: float, z: float) -> Frame:
+    """Translation [m]."""
+    T = np.eye(4)
+    T[:3, 3] = x, y, z
+    return T
+
+
+def row_frame(theta: float, d: float, a: float, alpha: float, beta: float) -> Frame:
+    """`RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`."""
+    T: Frame = turn(2, theta) @ shift(a, 0.0, d) @ turn(0, alpha) @ turn(1, beta)
+    return T
+
+
+def frame_of(xyzrpy: Sequence[float] | Float64[np.ndarray, " 6"]) -> Frame:
+    """`Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`, pisigma's order of base and tool."""
+    x, y, z, roll, pitch, yaw = (float(value) for value in xyzrpy)
+    T: Frame = shift(x, y, z) @ turn(2, roll) @ turn(1, pitch) @ turn(0, yaw)
+    return T
+
+
+def xyzrpy_of(T: Frame) -> Float64[np.ndarray, " 6"]:
+    """Inverse of `frame_of`, pitch within ±90 deg; also beside ±90 deg it gives the rotation back to rounding.
+
+    There roll and yaw are only determined together: yaw is read from what is left when roll is undone.
+    """
+    R = T[:3, :3]
+    lying = math.hypot(R[0, 0], R[1, 0]) > ROUNDING
+    roll = math.atan2(R[1, 0], R[0, 0]) if lying else 0.0
+    left = turn(2, -roll)[:3, :3] @ R
+    pitch = math.atan2(-left[2, 0], left[0, 0])
+    yaw = math.atan2(-left[1, 2], left[1, 1])
+    return np.array([*(clean_length(v) for v in T[:3, 3]), *(clean_angle(v) for v in (roll, pitch, yaw))])
+
+
+def inverse(T: Frame) -> Frame:
+    """Inverse of a rigid transform."""
+    result = np.eye(4)
+    result[:3, :3] = T[:3, :3].T
+    result[:3, 3] = -T[:3, :3].T @ T[:3, 3]
+    return result
+
+
+def clean_length(value: float) -> float:
+    """The length, 0 where it is a rounding error."""
+    return 0.0 if abs(value) <= ROUNDING else float(value)
+
+
+def clean_angle(value: float) -> float:
+    """The angle [rad] in (-pi, pi], a multiple of 90 deg where it is that but for a rounding error."""
+    quarters = round(value / (math.pi / 2))
+    if abs(value - quarters * (math.pi / 2)) > ROUNDING:
+        return float(value)
+    return (2 if quarters == -2 else quarters) * (math.pi / 2)
+
+
+def _cosine_sine(angle: float) -> tuple[float, float]:
+    quarters = angle / (math.pi / 2)
+    if abs(quarters - round(quarters)) < 1e-15 * max(1.0, abs(quarters)):
+        return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[round(quarters) % 4]
+    return math.cos(angle), math.sin(angle)

@@ -1,0 +1,167 @@
+"""From a chain of joints with any axes to DH + Hayati rows with the same forward kinematics.
+
+Every joint i gets a frame whose z axis is the joint's axis. From one to the next leads a row
+`RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`, which has one number more than two lines need: beta
+is 0 (Denavit and Hartenberg 1955), unless the axes are nearly parallel; then d is 0 (Hayati and Mirmirani
+1985), because the common normal of nearly parallel lines may be anywhere.
+"""
+
+import math
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float64
+
+from pisigma.robot.description import Robot, Row
+from pisigma.robot.urdf_chain import Chain, ChainJoint, read_chain
+from pisigma.robot.urdf_frames import (
+    ROUNDING,
+    Frame,
+    clean_angle,
+    clean_length,
+    inverse,
+    row_frame,
+    turn,
+    xyzrpy_of,
+)
+
+NEARLY_PARALLEL = 0.1
+"""Sine of the angle between two axes below which their row is Hayati's: a common normal is then at most ten
+times as far away as the joints."""
+
+Vector = Float64[np.ndarray, " 3"]
+Parameters = tuple[float, float, float, float, float]
+
+
+def load_urdf(path: str | os.PathLike[str], base: str | None = None, tip: str | None = None) -> Robot:
+    """Load the robot between two links of a URDF file.
+
+    Args:
+        path: the file.
+        base: name of the link that poses are given in; the root where none is given.
+        tip: name of the link that is the tool; may be left out where the chain has one end.
+
+    Raises:
+        RobotError: the file does not describe a serial robot; see `read_chain`.
+    """
+    return rows_of_chain(read_chain(path, base, tip)).robot
+
+
+@dataclass(frozen=True, eq=False)
+class ChainRows:
+    """A chain as rows, and where these stand in its links.
+
+    Attributes:
+        robot: rows, base and tool.
+        frames: per joint, the frame of its row in that of the joint; they share the axis and move together.
+    """
+
+    robot: Robot
+    frames: tuple[Frame, ...]
+
+
+def rows_of_chain(chain: Chain) -> ChainRows:
+    """The chain as DH + Hayati rows, base and tool, equal in its forward kinematics to rounding.
+
+    Joints count as in the file. Where an axis points along the negative side of its largest coordinate, its
+    row has direction -1. The last row takes in the tip where that stands on its axis, else the tool does.
+    """
+    joints = chain.joints
+    axes = [_direction(joint) * joint.axis for joint in joints]
+    frame, dh = _first_frame(joints[0], axes[0]), []
+    frames = [inverse(joints[0].origin) @ frame]
+    for i in range(len(joints) - 1):
+        T_row_next = inverse(frames[i]) @ joints[i + 1].origin
+        point = _point_of_axis(joints, axes, i + 1, T_row_next)
+        parameters = _row_to(T_row_next[:3, :3] @ axes[i + 1], point)
+        dh.append(parameters)
+        frames.append(inverse(T_row_next) @ row_frame(*parameters))
+    T_row_tip = inverse(frames[-1]) @ chain.end
+    dh.append(_last_row(T_row_tip))
+    robot = Robot(
+        name=chain.name,
+        maker="not stated",
+        source=f"URDF file {Path(chain.source).name}, from link '{chain.base}' to link '{chain.tip}'",
+        rows=tuple(Row(j.name, j.type, _direction(j), j.lower, j.upper) for j in joints),
+        dh=np.array(dh),
+        base=xyzrpy_of(frame),
+        tool=xyzrpy_of(inverse(row_frame(*dh[-1])) @ T_row_tip),
+    )
+    return ChainRows(robot, tuple(frames))
+
+
+def _direction(joint: ChainJoint) -> int:
+    return 1 if joint.axis[np.argmax(np.abs(joint.axis))] > 0 else -1
+
+
+def _first_frame(joint: ChainJoint, axis: Vector) -> Frame:
+    """Frame of the first row in the base link: the base link itself where the axis is its z axis."""
+    z, point = joint.origin[:3, :3] @ axis, joint.origin[:3, 3]
+    upright = math.hypot(z[0], z[1]) <= ROUNDING
+    if upright and (joint.type == "prismatic" or math.hypot(point[0], point[1]) <= ROUNDING):
+        return np.eye(4) if z[2] > 0 else turn(0, math.pi)
+    T: Frame = joint.origin @ _turned_to(axis)
+    return T
+
+
+def _turned_to(axis: Vector) -> Frame:
+    """A rotation that takes the z axis to a given one, about the axes y and then x."""
+    x, y, z = (float(value) for value in axis)
+    about_x, about_y = math.atan2(-y, z), math.atan2(x, math.hypot(y, z))
+    T: Frame = turn(0, clean_angle(about_x)) @ turn(1, clean_angle(about_y))
+    return T
+
+
+def _point_of_axis(joints: tuple[ChainJoint, ...], axes: list[Vector], index: int, T: Frame) -> Vector:
+    """A point of a joint's axis in the frame of the row before.
+
+    A sliding joint has a direction only, and its axis may be put anywhere: on that of the next joint where
+    they are parallel, else through the row before.
+
+    Args:
+        joints: all joints.
+        axes: all axes, in the frames of the joints.
+        index: of the joint.
+        T: the joint's frame at rest in that of the row before.
+    """
+    point: Vector = T[:3, 3]
+    if joints[index].type == "revolute":
+        return point
+    if index + 1 < len(joints) and joints[index + 1].type == "revolute":
+        following = joints[index + 1].origin
+        sine = np.linalg.norm(np.cross(axes[index], following[:3, :3] @ axes[index + 1]))
+        if sine < NEARLY_PARALLEL:
+            found: Vector = (T @ following)[:3, 3]
+            return found
+    return np.zeros(3)
+
+
+def _row_to(z: Vector, point: Vector) -> Parameters:
+    """Row that leads from the z axis to a line, given by its direction and a point, in the row's frame."""
+    sine = math.hypot(z[0], z[1])
+    if sine < NEARLY_PARALLEL:
+        foot = point - point[2] / z[2] * z
+        a = clean_length(math.hypot(foot[0], foot[1]))
+        theta, d = (math.atan2(foot[1], foot[0]) if a else 0.0), 0.0
+    else:
+        normal = np.array([-z[1], z[0]]) / sine
+        a = clean_length(float(normal @ point[:2]))
+        if a < 0 or (a == 0 and (normal[0] < -ROUNDING or (normal[0] <= ROUNDING and normal[1] < 0))):
+            normal, a = -normal, abs(a)
+        theta = math.atan2(normal[1], normal[0])
+        d = clean_length(point[2] - (z[0] * point[0] + z[1] * point[1]) / sine**2 * z[2])
+    theta = clean_angle(theta)
+    x, y, up = turn(2, -theta)[:3, :3] @ z
+    beta = clean_angle(math.atan2(x, math.hypot(y, up))) if sine < NEARLY_PARALLEL else 0.0
+    return theta, d, a, clean_angle(math.atan2(-y, up)), beta
+
+
+def _last_row(T_row_tip: Frame) -> Parameters:
+    """Row that leads to the tip where it stands on the last axis, else to the end of the last joint."""
+    off_axis = max(math.hypot(*T_row_tip[:2, 2]), math.hypot(*T_row_tip[:2, 3]))
+    if off_axis > ROUNDING:
+        return 0.0, 0.0, 0.0, 0.0, 0.0
+    theta = clean_angle(math.atan2(T_row_tip[1, 0], T_row_tip[0, 0]))
+    return theta, clean_length(T_row_tip[2, 3]), 0.0, 0.0 if T_row_tip[2, 2] > 0 else math.pi, 0.0

@@ -1,0 +1,183 @@
+"""`pisigma export`: URDF, DH table and joint offsets of a model."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from testing.closeness import assert_close
+from testing.models import joints_around
+from testing.urdf import peer_poses
+
+from pisigma.correction.calibrated_model import CalibratedModel
+from pisigma.correction.model_folder import load_model, save_model
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot import Robot
+from pisigma.robot.urdf_writing import robot_to_urdf
+
+NOT_TOLD = "The learned joint correction of the model is not in this file"
+
+
+@pytest.fixture(scope="module")
+def geometric(tmp_path_factory):
+    """A model folder of a UR10 with all parameters off their nominal values."""
+    nominal, random = Robot.load("ur10"), np.random.default_rng(4)
+    robot = nominal.with_geometry(base=random.normal(0, 1, 6), tool=random.normal(0, 0.2, 6))
+    model = CalibratedModel(
+        name="cell_3",
+        kind="geometric_calibration",
+        robot=robot,
+        network=None,
+        domain=None,
+        branches=(),
+        starts=joints_around("ur10", 50, spread=0.6),
+        calibrated=robot.with_geometry(nominal.dh + random.normal(0, 1e-3, nominal.dh.shape)),
+        bases={"tracker": robot.base, "arm": robot.base},
+        tools={"": robot.tool},
+    )
+    folder = tmp_path_factory.mktemp("models") / "cell_3"
+    folder.mkdir()
+    save_model(model, folder)
+    return folder
+
+
+def test_urdf(run, geometric, tmp_path):
+    out = tmp_path / "robot.urdf"
+    printed = run("export", geometric, "--format", "urdf", "--out", out)
+    assert printed.exit_code == 0
+    assert f"written to {out}." in printed.stdout
+    assert (
+        "The base is that of the frame 'tracker'; the model knows 2 frames (tracker, arm)." in printed.stdout
+    )
+    assert NOT_TOLD not in out.read_text()
+    calibrated = load_model(geometric).calibrated
+    q = joints_around("ur10", 100, spread=2.0)
+    expected = forward_kinematics(calibrated, q)
+    again = Robot.load(out)
+    assert_close(forward_kinematics(again, q), expected, atol=1e-12)
+    assert_close(peer_poses(out, "tool0", q), expected, atol=1e-10)
+    assert [joint.name for joint in again.joints] == [joint.name for joint in calibrated.joints]
+    assert_close(again.limits, calibrated.limits, atol=0)
+
+
+def test_urdf_in_calibrated_and_out_again(run, tmp_path):
+    """A robot from a URDF with other errors than it was drawn with; its file, calibrated, is the true robot's."""
+    nominal, random = Robot.load("ur10"), np.random.default_rng(5)
+    (tmp_path / "drawn.urdf").write_text(robot_to_urdf(nominal))
+    drawn = Robot.load(tmp_path / "drawn.urdf")
+    true = drawn.with_geometry(
+        drawn.dh + random.normal(0, 1e-3, drawn.dh.shape), random.normal(0, 1, 6), random.normal(0, 0.1, 6)
+    )
+    q = joints_around("ur10", 120, spread=1.5)
+    T = forward_kinematics(true, q)
+    rows = Measurements(q=q, position=T[:, :3, 3], rotation=T[:, :3, :3])
+    rows.write_csv(tmp_path / "data.csv", drawn)
+    command = ("calibrate", tmp_path / "drawn.urdf", tmp_path / "data.csv", "--out", tmp_path / "model")
+    assert run(*command, "--folds", "0", "--prior-mm", "0", "--prior-mrad", "0").exit_code == 0
+    assert load_model(tmp_path / "model").robot.joints == drawn.joints
+    out = tmp_path / "calibrated.urdf"
+    assert run("export", tmp_path / "model", "--format", "urdf", "--out", out).exit_code == 0
+    new = joints_around("ur10", 50, seed=1, spread=2.0)
+    model = load_model(tmp_path / "model").calibrated
+    assert_close(peer_poses(out, "tool0", new), forward_kinematics(model, new), atol=1e-10)
+    assert_close(peer_poses(out, "tool0", new), forward_kinematics(true, new), atol=1e-8)
+    like = ("--like", tmp_path / "drawn.urdf", "--tip", "tool0")
+    assert run("export", tmp_path / "model", "--format", "urdf", "--out", out, *like).exit_code == 0
+    assert_close(peer_poses(out, "calibrated_tool", new), forward_kinematics(model, new), atol=1e-10)
+
+
+def test_dh_as_yaml_and_csv(run, geometric, tmp_path):
+    calibrated = load_model(geometric).calibrated
+    for name in ("dh.yaml", "dh.csv"):
+        result = run("export", geometric, "--format", "dh", "--out", tmp_path / name, "--json")
+        assert result.exit_code == 0
+        told = json.loads(result.stdout)
+        assert (told["file"], told["format"], told["robot"]) == (str(tmp_path / name), "dh", "ur10")
+    again = Robot.load(tmp_path / "dh.yaml")
+    for part in ("dh", "base", "tool"):
+        assert_close(getattr(again, part), getattr(calibrated, part), atol=1e-15, rtol=1e-15)
+    rows = [line for line in (tmp_path / "dh.csv").read_text().splitlines() if line.startswith("row,")]
+    assert len(rows) == 6
+
+
+def test_offsets(run, geometric, tmp_path):
+    result = run("export", geometric, "--format", "offsets", "--out", tmp_path / "o.yaml", "--json")
+    told = json.loads(result.stdout)
+    lost, drawn = told["off_the_whole_model"], told["robot_as_drawn"]
+    assert 0 < lost["mean_mm"] < lost["p95_mm"] < lost["max_mm"]
+    assert lost["mean_mm"] < drawn["mean_mm"]
+    text = (tmp_path / "o.yaml").read_text()
+    assert f"off the whole model by {lost['mean_mm']:.4g} mm" in text
+    written = yaml.safe_load(text)
+    assert written["off_the_whole_model"] == lost
+    printed = run("export", geometric, "--format", "offsets", "--out", tmp_path / "o.csv")
+    assert f"{lost['mean_mm']:.4g} mm in the mean" in printed.stdout
+    lines = (tmp_path / "o.csv").read_text().splitlines()
+    assert f"{lost['max_mm']:.4g} mm at most" in "".join(line for line in lines if line.startswith("#"))
+    *joints, base, tool = csv.DictReader(line for line in lines if not line.startswith("#"))
+    assert [float(joint["offset_deg"]) for joint in joints] == [j["offset_deg"] for j in written["joints"]]
+    model = load_model(geometric)
+    frames = [
+        np.array([*np.array([float(line[f"{c}_mm"]) for c in "xyz"]) / 1e3,
+                  *np.deg2rad([float(line[f"{c}_deg"]) for c in ("roll", "pitch", "yaw")])])
+        for line in (base, tool)
+    ]  # fmt: skip
+    moved = model.robot.with_geometry(base=frames[0], tool=frames[1])
+    offset = torch.tensor([np.deg2rad(float(joint["offset_deg"])) for joint in joints])
+    way = forward_kinematics(moved, model.starts + offset) - forward_kinematics(
+        model.calibrated, model.starts
+    )
+    assert float(way[:, :3, 3].norm(dim=-1).max()) < 1.5e-3 * lost["max_mm"]
+
+
+@pytest.mark.parametrize(
+    ("form", "suffix"), [("urdf", "urdf"), ("dh", "csv"), ("dh", "yaml"), ("offsets", "csv")]
+)
+def test_a_learned_correction_is_said_to_be_missing(run, models, tmp_path, form, suffix):
+    out = tmp_path / f"out.{suffix}"
+    result = run("export", models / "kiro3", "--format", form, "--out", out)
+    assert result.exit_code == 0
+    assert NOT_TOLD in result.stdout
+    assert NOT_TOLD in out.read_text()
+    told = json.loads(run("export", models / "kiro3", "--format", form, "--out", out, "--json").stdout)
+    assert any(NOT_TOLD in remark for remark in told["remarks"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("--format", "urd", "--out", "x.urdf"), "--format 'urd' is unknown; did you mean 'urdf'?"),
+        (("--format", "urdf", "--out", "x.xml"), "x.xml: a URDF goes into a .urdf file"),
+        (("--format", "dh", "--out", "x.urdf"), "x.urdf: a DH table goes into a .csv or .yaml or .yml file"),
+        (
+            ("--format", "dh", "--out", "x.csv", "--like", "x.urdf"),
+            "--like goes with --format urdf, not with dh",
+        ),
+        (
+            ("--format", "urdf", "--out", "x.urdf", "--tip", "a"),
+            "--tip names a link of the file that --like gives",
+        ),
+        (("--format", "urdf", "--out", "x.urdf", "--like", "y.urdf"), "y.urdf: cannot be read"),
+        (("--format", "offsets", "--out", "none/x.csv"), "none/x.csv: there is no folder none"),
+    ],
+)
+def test_what_cannot_be_written(refuses, models, arguments, complaint, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert refuses("export", models / "ur10", *arguments).startswith(complaint)
+    assert not list(tmp_path.iterdir())
+
+
+def test_no_model(refuses, tmp_path):
+    sentence = refuses("export", tmp_path / "none", "--format", "urdf", "--out", tmp_path / "x.urdf")
+    assert "there is no such model folder" in sentence
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command_explains_itself(run):
+    result = run("export", "--help")
+    assert result.exit_code == 0
+    assert all(word in result.stdout for word in ("urdf", "offsets", "--json"))
+    assert "export" in run("--help").stdout

@@ -1,0 +1,113 @@
+"""Joint offsets alone: found where the model is nothing else, and honest where it is more."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.models import hand_made_model, joints_around
+
+from pisigma.correction.calibrated_model import CalibratedModel
+from pisigma.errors import ModelError
+from pisigma.export.joint_offsets import fit_joint_offsets
+from pisigma.export.offset_fit import OffsetProblem, solve_offsets
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.robot import Robot
+
+
+def geometric_model(name: str, calibrated: Robot) -> CalibratedModel:
+    nominal = Robot.load(name)
+    return CalibratedModel(
+        name="made",
+        kind="geometric_calibration",
+        robot=nominal,
+        network=None,
+        domain=None,
+        branches=(),
+        starts=joints_around(name, 100, spread=0.6),
+        calibrated=calibrated,
+    )
+
+
+def with_offsets(robot: Robot, offsets: list[float]) -> Robot:
+    dh = robot.dh.copy()
+    for joint, row, offset in zip(robot.joints, robot.joint_rows, offsets, strict=True):
+        dh[row, 0 if joint.type == "revolute" else 1] += joint.direction * offset
+    return robot.with_geometry(dh)
+
+
+@pytest.mark.parametrize("name", ["kiro4", "ur10"])
+def test_offsets_come_back(name):
+    """Those of the first and the last joint are base and tool."""
+    nominal = Robot.load(name)
+    flipped = dataclasses.replace(
+        nominal,
+        rows=tuple(dataclasses.replace(row, direction=(-1) ** i) for i, row in enumerate(nominal.rows)),
+    )
+    offsets = [0.01, -0.02, 0.015, 0.03, -0.01, 0.02]
+    model = dataclasses.replace(geometric_model(name, with_offsets(flipped, offsets)), robot=flipped)
+    found = fit_joint_offsets(model)
+    assert_close(found.values, [0, *offsets[1:5], 0], atol=1e-9)
+    assert found.unseen == ("theta_1", "theta_6")
+    assert found.lost.maximum < 1e-9
+    assert found.nominal.mean > 1e-3
+    assert found.nominal.mean < found.nominal.p95 < found.nominal.maximum
+    q = joints_around(name, 20)
+    T = forward_kinematics(model.calibrated, q)
+    assert_close(forward_kinematics(found.robot, q), T, atol=1e-9)
+    shifted = flipped.with_geometry(base=found.robot.base, tool=found.robot.tool)
+    assert_close(forward_kinematics(shifted, q + torch.from_numpy(found.values)), T, atol=1e-9)
+
+
+def test_parallel_axes_leave_base_and_tool_open():
+    """On a SCARA the second joint alone is told from base and tool, which share two directions themselves."""
+    model = geometric_model("kiro3", with_offsets(Robot.load("kiro3"), [0.0, 0.02, 0.0, 0.0]))
+    found = fit_joint_offsets(model)
+    assert found.unseen == ("theta_1", "d_3", "theta_4")
+    assert_close(found.values, [0, 0.02, 0, 0], atol=1e-6)
+    assert found.lost.maximum < 1e-7
+    assert np.abs(found.robot.base).max() < 0.1
+
+
+@pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur10"])
+def test_a_learned_correction_is_followed_in_part(name):
+    found = fit_joint_offsets(hand_made_model(name))
+    assert 0 < found.lost.mean < found.nominal.mean
+    assert found.lost.in_file_units()["mean_mm"] == found.lost.mean * 1e3
+
+
+def test_the_fit_is_the_best_there_is():
+    """No small change of the free numbers makes the sum of squares smaller."""
+    nominal, random = Robot.load("ur10"), np.random.default_rng(0)
+    true = nominal.with_geometry(nominal.dh + random.normal(0, 2e-3, nominal.dh.shape))
+    q = joints_around("ur10", 200, spread=0.8)
+    problem = OffsetProblem(nominal, q, forward_kinematics(true, q))
+    fitted, seen = solve_offsets(problem)
+    assert seen == (False, True, True, True, True, False)
+    missing, J = problem.residual(fitted)
+    free = torch.tensor([*seen, *[True] * 12])
+    slope = (J[:, free].T @ missing) / (J[:, free].norm(dim=0) * missing.norm())
+    assert slope.abs().max() < 1e-6
+    assert missing.norm() < problem.residual(nominal)[0].norm() / 1.5
+
+
+def test_the_derivative_is_that_of_finite_differences():
+    robot, q = Robot.load("kiro3"), joints_around("kiro3", 4)
+    problem = OffsetProblem(robot, q, forward_kinematics(robot, q))
+    _, J = problem.residual(robot)
+    for i in range(J.shape[1]):
+        step = torch.zeros(J.shape[1], dtype=torch.float64)
+        step[i] = 1e-6
+        there, back = (problem.residual(problem.moved(robot, s * step))[0] for s in (1, -1))
+        assert_close((back - there) / 2e-6, J[:, i], atol=1e-8)
+
+
+def test_a_model_without_a_region_is_refused():
+    model = hand_made_model("kiro4")
+    with pytest.raises(ModelError, match="stores no joint values"):
+        fit_joint_offsets(dataclasses.replace(model, starts=model.starts[:0]))
+    far = model.starts.clone()
+    far[:] = torch.nan
+    with pytest.raises(ModelError, match="predicts no pose"):
+        fit_joint_offsets(dataclasses.replace(model, starts=far))

@@ -1,0 +1,137 @@
+"""A calibrated robot in the file that it was drawn in: exact from end to end, all else as it was."""
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from lxml import etree
+from testing.closeness import assert_close
+from testing.urdf import DrawnJoint, peer_poses, urdf_text
+
+from pisigma.errors import RobotError
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.robot import Robot
+from pisigma.robot.urdf_template import robot_into_urdf
+
+TEXT = """\
+<robot name="arm">
+  <!-- meshes stay -->
+  <link name="world"/>
+  <link name="base"><visual><geometry><mesh filename="package://arm/base.stl"/></geometry></visual></link>
+  <link name="a"/><link name="bracket"/><link name="b"/><link name="c"/><link name="tool0"/><link name="camera"/>
+  <joint name="stand" type="fixed"><origin xyz="0 0 0.5"/><parent link="world"/><child link="base"/></joint>
+  <joint name="one" type="revolute">
+    <origin xyz="0 0 0.2" rpy="0 0 0.3"/><parent link="base"/><child link="a"/><axis xyz="0 0 1"/>
+    <limit lower="-2" upper="1.5" effort="10" velocity="3"/>
+  </joint>
+  <joint name="screwed" type="fixed">
+    <origin xyz="0.1 0 0.1" rpy="1.5707963267948966 0 0"/><parent link="a"/><child link="bracket"/>
+  </joint>
+  <joint name="two" type="continuous">
+    <origin xyz="0.2 0 0.1"/><parent link="bracket"/><child link="b"/><axis xyz="0 -0.6 0.8"/>
+  </joint>
+  <joint name="three" type="prismatic">
+    <parent link="b"/><child link="c"/><axis xyz="0 -1 0"/><limit lower="0" upper="0.3" effort="7" velocity="2"/>
+  </joint>
+  <joint name="flange" type="fixed"><origin xyz="0 0.1 0"/><parent link="c"/><child link="tool0"/></joint>
+  <joint name="eye" type="fixed"><origin xyz="0 0.2 0"/><parent link="a"/><child link="camera"/></joint>
+  <gazebo reference="base"><mu1>0.2</mu1></gazebo>
+</robot>
+"""
+
+
+def calibrated_like(drawn: Robot, seed: int, size: float = 1e-3) -> Robot:
+    random = np.random.default_rng(seed)
+    dh = drawn.dh + random.normal(0, size, drawn.dh.shape)
+    return drawn.with_geometry(dh, random.normal(0, 1, 6), random.normal(0, 0.1, 6))
+
+
+def joint_values(robot: Robot) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(2)
+    return 4 * torch.rand((20, robot.dof), generator=generator, dtype=torch.float64) - 2
+
+
+@pytest.fixture
+def path(tmp_path):
+    found = tmp_path / "arm.urdf"
+    found.write_text(TEXT)
+    return found
+
+
+def test_only_origins_change(path, tmp_path):
+    drawn = Robot.load(path, tip="tool0")
+    robot = calibrated_like(drawn, 1)
+    out = tmp_path / "out.urdf"
+    out.write_text(robot_into_urdf(robot, drawn, path, "tool0", ("said -- once",)))
+    q = joint_values(robot)
+    again = Robot.load(out, base="calibrated_frame", tip="calibrated_tool")
+    assert_close(forward_kinematics(again, q), forward_kinematics(robot, q), atol=1e-12)
+    assert_close(peer_poses(out, "calibrated_tool", q), forward_kinematics(robot, q), atol=1e-10)
+    assert [joint.name for joint in again.joints] == ["one", "two", "three"]
+    before, after = etree.fromstring(TEXT), etree.fromstring(out.read_text())
+    for tag in ("visual", "limit", "axis", "parent", "child", "gazebo"):
+        old = [etree.tostring(e, with_tail=False) for e in before.iter(tag)]
+        new = [etree.tostring(e, with_tail=False) for e in after.iter(tag)]
+        assert [b"".join(text.split()) for text in new[: len(old)]] == [
+            b"".join(text.split()) for text in old
+        ]
+    moved = {
+        joint.get("name")
+        for joint in before.iter("joint")
+        if etree.tostring(
+            joint.find("origin") if joint.find("origin") is not None else joint, with_tail=False
+        )
+        != etree.tostring(after.find(f"joint[@name='{joint.get('name')}']/origin"), with_tail=False)
+    }
+    assert moved == {"two", "three"}
+    assert "<!-- said - - once -->" in out.read_text()
+    assert "<!-- meshes stay -->" in out.read_text()
+    origin = after.find("joint[@name='two']/origin")
+    assert_close([float(word) for word in origin.get("xyz").split()], [0.2, 0, 0.1], atol=0.01)
+
+
+def test_the_nominal_robot_changes_nothing(path, tmp_path):
+    drawn = Robot.load(path, tip="tool0")
+    out = tmp_path / "out.urdf"
+    out.write_text(robot_into_urdf(drawn, drawn, path, "tool0"))
+    again = Robot.load(out, tip="tool0", base="world")
+    assert_close(again.dh, drawn.dh, atol=1e-14)
+    for name, origin in (("calibrated_frame_joint", np.zeros(6)), ("calibrated_tool_joint", np.zeros(6))):
+        part = etree.fromstring(out.read_text()).find(f"joint[@name='{name}']/origin")
+        numbers = [float(word) for key in ("xyz", "rpy") for word in part.get(key).split()]
+        assert_close(numbers, origin, atol=1e-14)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.integers(0, 10_000), st.integers(1, 8))
+def test_any_chain(tmp_path_factory, seed, count):
+    random = np.random.default_rng(seed)
+    chain = [
+        DrawnJoint(
+            random.choice(["revolute", "continuous", "prismatic", "fixed"]) if i else "revolute",
+            random.uniform(-1, 1, 3),
+            random.choice([0.0, np.pi / 2, -np.pi / 2, 0.3], 3),
+            random.permutation([1.0, 0.0, 0.0]) * random.choice([-1, 1]),
+        )
+        for i in range(count)
+    ]
+    path = tmp_path_factory.mktemp("chain") / "chain.urdf"
+    path.write_text(urdf_text(chain))
+    drawn = Robot.load(path)
+    robot = calibrated_like(drawn, seed)
+    path.write_text(robot_into_urdf(robot, drawn, path))
+    q = joint_values(robot)
+    assert_close(peer_poses(path, "calibrated_tool", q), forward_kinematics(robot, q), atol=1e-10)
+    assert_close(forward_kinematics(Robot.load(path), q), forward_kinematics(robot, q), atol=1e-12)
+
+
+def test_files_of_other_robots_are_refused(path):
+    drawn = Robot.load(path, tip="tool0")
+    with pytest.raises(RobotError, match="has the joints one, two, three, but the model those of theta_1"):
+        robot_into_urdf(Robot.load("ur10"), Robot.load("ur10"), path, "tool0")
+    longer = drawn.with_geometry(drawn.dh + 0.01)
+    with pytest.raises(RobotError, match=r"nominal geometry is not the model's \(off by 0\.01 m or rad\)"):
+        robot_into_urdf(longer, longer, path, "tool0")
+    with pytest.raises(RobotError, match="has 2 ends"):
+        robot_into_urdf(drawn, drawn, path)
