@@ -67,6 +67,27 @@ def fit_base_and_tool(
         IdentificationError: no positions, several frames, or too few rows for what has to be found.
         PoseError: the joint values do not fit the robot.
     """
+    problem, solution = _solved(robot, measurements, free_base, free_tool, maximum_iterations)
+    return _result(robot, problem, solution)
+
+
+def find_base_and_tool(
+    robot: Robot, measurements: Measurements, free_base: bool, free_tool: bool, maximum_iterations: int
+) -> tuple[Float64[np.ndarray, " 6"], dict[str, Float64[np.ndarray, " 6"]]]:
+    """Base and tools alone that `fit_base_and_tool` finds.
+
+    Raises:
+        IdentificationError: as there.
+        PoseError: as there.
+    """
+    problem, solution = _solved(robot, measurements, free_base, free_tool, maximum_iterations)
+    return _base_and_tools(robot, problem, solution.linearisation.point)
+
+
+def _solved(
+    robot: Robot, measurements: Measurements, free_base: bool, free_tool: bool, maximum_iterations: int
+) -> tuple[BaseToolProblem, Solution[BaseToolState]]:
+    """The problem, and the best end of a search from any start."""
     problem = build_base_and_tool_problem(robot, measurements, free_base, free_tool)
     best: Solution[BaseToolState] | None = None
     for start in base_and_tool_starts(robot, problem):
@@ -76,22 +97,21 @@ def fit_base_and_tool(
         if _rms_position(problem, best) < CLEAR_FIT * robot.reach:
             break
     assert best is not None
-    return _result(robot, problem, best)
+    return problem, best
 
 
 def _rms_position(problem: BaseToolProblem, solution: Solution[BaseToolState]) -> float:
-    return float(problem.residuals(solution.linearisation.point)[0].square().sum(-1).mean().sqrt())
+    return float(problem.position_residual(solution.linearisation.point).square().sum(-1).mean().sqrt())
+
+
+def _rms_rotation(problem: BaseToolProblem, state: BaseToolState) -> float:
+    turn = problem.rotation_residual(state)[problem.rotated]
+    return float(turn.square().sum(-1).mean().sqrt())
 
 
 def _result(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolState]) -> BaseToolFit:
     state = solution.linearisation.point
-    turn = problem.residuals(state)[1][problem.rotated]
-    rpy_tool = rpy_from_rotation(state.R_tool).cpu().numpy() if problem.turned else robot.tool[3:]
-    tools = {
-        name: np.concatenate([point.cpu().numpy(), rpy_tool])
-        for name, point in zip(problem.targets, state.points, strict=True)
-    }
-    base = torch.cat([state.p_base, rpy_from_rotation(state.R_base)]).cpu().numpy()
+    base, tools = _base_and_tools(robot, problem, state)
     return BaseToolFit(
         robot=robot.with_geometry(
             base=base if problem.free_base else None,
@@ -99,10 +119,21 @@ def _result(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolS
         ),
         tools=tools,
         rms_position=_rms_position(problem, solution),
-        rms_rotation=float(turn.square().sum(-1).mean().sqrt()) if problem.turned else float("nan"),
+        rms_rotation=_rms_rotation(problem, state) if problem.turned else float("nan"),
         iterations=solution.iterations,
         status=_status(solution),
     )
+
+
+def _base_and_tools(
+    robot: Robot, problem: BaseToolProblem, state: BaseToolState
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    rpy_tool = rpy_from_rotation(state.R_tool).cpu().numpy() if problem.turned else robot.tool[3:]
+    tools = {
+        name: np.concatenate([point.cpu().numpy(), rpy_tool])
+        for name, point in zip(problem.targets, state.points, strict=True)
+    }
+    return torch.cat([state.p_base, rpy_from_rotation(state.R_base)]).cpu().numpy(), tools
 
 
 def _status(solution: Solution[BaseToolState]) -> str:

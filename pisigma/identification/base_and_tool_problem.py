@@ -10,10 +10,11 @@ from torch import Tensor
 from pisigma.errors import IdentificationError
 from pisigma.identification.least_squares import AbstractLeastSquares, Linearisation
 from pisigma.identification.noise import SMALLEST_NOISE
+from pisigma.identification.rotation_difference import rotation_difference
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
-from pisigma.se3 import rotation_from_vector, rotation_vector, skew
+from pisigma.se3 import rotation_from_vector, skew
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,32 +90,38 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         free[-3:] = self.free_tool and self.turned
         return free.nonzero()[:, 0].to(self.position.device)
 
-    @property
+    @cached_property
     def step_scale(self) -> Float64[Tensor, " active"]:
         """1 mm and 1 mrad."""
         return torch.full((len(self.active),), 1e-3, dtype=torch.float64, device=self.position.device)
 
     def residuals(self, state: BaseToolState) -> tuple[Float64[Tensor, "rows 3"], Float64[Tensor, "rows 3"]]:
         """Measured minus predicted: positions [m] and rotation vectors [rad], in the measuring frame."""
-        predicted = self._arm(state) @ state.R_base.mT + state.p_base
-        if not self.turned:
-            return self.position - predicted, torch.zeros_like(predicted)
-        R_predicted = state.R_base @ self.R_flange @ state.R_tool
-        turn = rotation_vector(self.rotation @ R_predicted.mT) * self.rotated[:, None]
-        return self.position - predicted, turn
+        position = self.position_residual(state)
+        return position, self.rotation_residual(state) if self.turned else torch.zeros_like(position)
+
+    def position_residual(self, state: BaseToolState) -> Float64[Tensor, "rows 3"]:
+        """Measured minus predicted positions [m]."""
+        return self.position - (self._arm(state) @ state.R_base.mT + state.p_base)
+
+    def rotation_residual(self, state: BaseToolState) -> Float64[Tensor, "rows 3"]:
+        """Rotation vectors from the predicted to the measured rotation [rad], 0 where none was measured."""
+        predicted = state.R_base @ self.R_flange @ state.R_tool
+        turn = rotation_difference(self.rotation.permute(1, 2, 0), predicted.permute(1, 2, 0))
+        return (turn * self.rotated).t()
 
     def linearise(
         self, point: BaseToolState, like: Linearisation[BaseToolState] | None
     ) -> Linearisation[BaseToolState]:
         """Sum up the normal equations of positions and of rotations, apart."""
         noise = (1.0, 1.0) if like is None else _view_of(like).noise
-        J = self._jacobian(point)
+        R_base_flange = point.R_base @ self.R_flange
+        blocks = [(self._shifts(point, R_base_flange), self.position_residual(point), self.sigma_position)]
+        if self.turned:
+            blocks.append((self._turns(R_base_flange), self.rotation_residual(point), self.sigma_rotation))
         parts = []
-        given = (self.sigma_position, self.sigma_rotation)
-        for k, (residual, sigma) in enumerate(zip(self.residuals(point), given, strict=True)):
-            if k == 1 and not self.turned:
-                continue
-            A, r = J[:, 3 * k : 3 * k + 3].flatten(0, 1), residual.flatten()
+        for J, residual, sigma in blocks:
+            A, r = J[..., self.active].flatten(0, 1), residual.flatten()
             if sigma is not None:
                 weight = (1 / sigma).repeat_interleave(3)
                 A, r = A * weight[:, None], r * weight
@@ -126,7 +133,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
     ) -> tuple[Linearisation[BaseToolState], bool]:
         """Weight positions and rotations by 1 / their own scatter, where no sigma is given."""
         view = _view_of(linearisation)
-        values = (3 * len(self.position), 3 * int(self.rotated.sum()))
+        values = (3 * len(self.position), 3 * self._rotations)
         given = (self.sigma_position is not None, self.sigma_rotation is not None)
         found = [1.0, 1.0]
         for k, part in enumerate(view.parts):
@@ -136,15 +143,12 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         return self._combined(linearisation.point, _View(view.parts, (found[0], found[1]))), settled
 
     def _combined(self, point: BaseToolState, view: "_View") -> Linearisation[BaseToolState]:
-        normal = sum(
-            (part[0] / s**2 for part, s in zip(view.parts, view.noise, strict=False)), torch.zeros(())
-        )
-        descent = sum(
-            (part[1] / s**2 for part, s in zip(view.parts, view.noise, strict=False)), torch.zeros(())
-        )
-        cost = sum(part[2] / s**2 for part, s in zip(view.parts, view.noise, strict=False))
-        size = 2 * torch.finfo(self.position.dtype).eps * (float(self.p_flange.abs().max()) + 1e-3)
-        rounding = sum(3 * len(self.position) * (size / s) ** 2 for s in view.noise[: len(view.parts)])
+        noise = view.noise[: len(view.parts)]
+        pairs = list(zip(view.parts, noise, strict=True))
+        normal = torch.stack([part[0] / s**2 for part, s in pairs]).sum(0)
+        descent = torch.stack([part[1] / s**2 for part, s in pairs]).sum(0)
+        cost = sum(part[2] / s**2 for part, s in pairs)
+        rounding = sum(3 * len(self.position) * (self._rounding / s) ** 2 for s in noise)
         return Linearisation(point, cost, descent, normal, cost, rounding, view)
 
     def moved(self, point: BaseToolState, step: Float64[Tensor, " active"]) -> BaseToolState:
@@ -161,18 +165,35 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         """Where the target is in the first row's frame."""
         return self.p_flange + (self.R_flange @ state.points[self.target, :, None])[..., 0]
 
-    def _jacobian(self, state: BaseToolState) -> Tensor:
+    @cached_property
+    def _rotations(self) -> int:
+        return int(self.rotated.sum())
+
+    @cached_property
+    def _rounding(self) -> float:
+        """What rounding may do to a position [m]."""
+        return 2 * torch.finfo(self.position.dtype).eps * (float(self.p_flange.abs().max()) + 1e-3)
+
+    def _shifts(self, state: BaseToolState, R_base_flange: Tensor) -> Tensor:
+        """Derivative of the positions by all unknowns."""
         rows, targets = self.position.shape[0], len(self.targets)
-        R_base_flange = state.R_base @ self.R_flange
-        J = self.position.new_zeros((rows, 6, 9 + 3 * targets))
-        eye = torch.eye(3, dtype=J.dtype, device=J.device)
-        J[:, :3, :3] = eye
-        J[:, :3, 3:6] = -skew(self._arm(state) @ state.R_base.mT)
-        J[:, 3:, 3:6] = self.rotated[:, None, None] * eye
-        own = torch.nn.functional.one_hot(self.target, targets).to(J.dtype)
-        J[:, :3, 6:-3] = (R_base_flange[:, :, None, :] * own[:, None, :, None]).reshape(rows, 3, 3 * targets)
-        J[:, 3:, -3:] = self.rotated[:, None, None] * R_base_flange
-        return J[..., self.active]
+        J = self.position.new_zeros((rows, 3, 9 + 3 * targets))
+        J[..., :3] = torch.eye(3, dtype=J.dtype, device=J.device)
+        J[..., 3:6] = -skew(self._arm(state) @ state.R_base.mT)
+        own = R_base_flange
+        if targets > 1:
+            seen = torch.nn.functional.one_hot(self.target, targets).to(J.dtype)
+            own = (own[:, :, None, :] * seen[:, None, :, None]).reshape(rows, 3, 3 * targets)
+        J[..., 6:-3] = own
+        return J
+
+    def _turns(self, R_base_flange: Tensor) -> Tensor:
+        """Derivative of the rotations by all unknowns."""
+        J = self.position.new_zeros((self.position.shape[0], 3, 9 + 3 * len(self.targets)))
+        rotated = self.rotated[:, None, None]
+        J[..., 3:6] = rotated * torch.eye(3, dtype=J.dtype, device=J.device)
+        J[..., -3:] = rotated * R_base_flange
+        return J
 
 
 def _view_of(linearisation: Linearisation[BaseToolState]) -> _View:

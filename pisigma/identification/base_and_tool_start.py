@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Iterator
 
+import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
@@ -126,12 +127,13 @@ def starts_from_positions(
 
 
 def nearest_rotation(M: Float64[Tensor, "*batch 3 3"]) -> Float64[Tensor, "*batch 3 3"]:
-    """The rotation nearest to a matrix, in the Frobenius norm (orthogonal Procrustes, Kabsch's sign)."""
-    U, _, Vh = torch.linalg.svd(M)
-    last = torch.ones_like(M[..., 0])
-    last[..., 2] = torch.linalg.det(U @ Vh).sign()
-    found: Tensor = (U * last[..., None, :]) @ Vh
-    return found
+    """The rotation nearest to a matrix, in the Frobenius norm (orthogonal Procrustes, Kabsch's sign).
+
+    It is worked out on the host: there are few such matrices, and what costs is the number of operations.
+    """
+    U, _, Vh = np.linalg.svd(M.cpu().numpy())
+    U[..., 2] *= np.sign(np.linalg.det(U @ Vh))[..., None]
+    return torch.from_numpy(U @ Vh).to(M)
 
 
 def _tool_start(

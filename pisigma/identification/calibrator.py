@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 from torch import Tensor
 
@@ -19,7 +20,7 @@ from pisigma.identification.plausibility import refuse_implausible
 from pisigma.identification.problem import CalibrationProblem, view_of
 from pisigma.identification.redundancy import Redundancy, find_redundancy
 from pisigma.identification.result import CalibrationResult
-from pisigma.identification.result_assembly import Findings, assemble_result
+from pisigma.identification.result_assembly import Findings, SolvedCalibration
 from pisigma.identification.sensor_building import PairOfSockets
 from pisigma.identification.setup import CalibrationSetup, SetupOptions, build_setup
 from pisigma.identification.starting import chosen_rows
@@ -52,9 +53,9 @@ class GeometricCalibrator:
             paper's Pearson correlation), or "none". The predicted poses do not depend on it.
         prior: standard deviations of the parameters' errors, or None. With it, what the data cannot see
             stays at its nominal value.
-        prior_sizes: "estimated": by the data, one factor on the prior for each of theta, d, a, alpha and beta;
-            "widened": one for lengths and one for angles, and only where the errors are larger than the prior
-            says; "stated": as it is.
+        prior_sizes: "estimated": by the data, one factor on the prior for each of joint offsets, lengths, lengths
+            drawn as 0, and angles between axes; "widened": one for lengths and one for angles, and only where
+            the errors are larger than the prior says; "stated": as it is.
         frames: per frame of touches, about where the robot's base is in it: x, y, z [m], roll, pitch, yaw
             [rad], such as the planned placement of a jig. Needed only where the touches do not tell it.
         socket_distances: known distances between two sockets [m], which give the scale:
@@ -105,8 +106,13 @@ class GeometricCalibrator:
                 f"socket_sigma={self.socket_sigma:g}: a positive length [m] was wanted."
             )
 
+    @torch.inference_mode()
     def fit(self, measurements: Measurements) -> CalibrationResult:
-        """Calibrate.
+        """Calibrate; see `solve` for what is raised."""
+        return self.solve(measurements).result()
+
+    def solve(self, measurements: Measurements) -> SolvedCalibration:
+        """Calibrate, and keep the problem and its solution for what is built upon them.
 
         Raises:
             IdentificationError: the measurements do not determine what is asked for, or are so far from the best
@@ -132,7 +138,7 @@ class GeometricCalibrator:
         solution, problem, extended = self._solved(problem, setup.start, own + candidates)
         refuse_implausible(problem, solution.linearisation, measurements.source)
         findings = Findings(seen, sizes, redundancy, extended, warnings)
-        return assemble_result(measurements, setup, problem, solution, findings)
+        return SolvedCalibration(measurements, setup, problem, solution, findings)
 
     def build(self, measurements: Measurements) -> CalibrationSetup:
         """The problem and its start, without solving it.

@@ -108,6 +108,8 @@ def check_frame_values(measurements: Measurements, names: tuple[str, ...]) -> No
     Raises:
         IdentificationError: see above.
     """
+    if measurements.touch is None:
+        return
     touch = measurements.seen("touch").tolist()
     other = (measurements.seen("position") | measurements.seen("pose")).tolist()
     for name in names:

@@ -99,23 +99,26 @@ def information(
         view: gives the rows' weights, in 1 / standard deviations; in 1/mm and 1/mrad where None.
     """
     index = torch.tensor(candidates, dtype=torch.int64, device=point.device)
-    usual = torch.from_numpy(problem.space.usual_errors).to(point)[index, None]
+    usual = torch.from_numpy(problem.space.usual_errors).to(point)[index, None, None]
     root = point.new_zeros((0, len(candidates) + 2))
     own = problem.space.own(point)
     values = 0
     for rows in problem.chunks():
         motion = problem.motion(point, rows, index)
-        blocks = [root]
+        blocks = [root.t()]
         for k, sensor in enumerate(problem.sensors):
-            seen = sensor.seen[rows]
-            weight = (
-                1e3 if view is None else problem.row_weights(view, k, rows)[seen].repeat(sensor.components)
-            )
-            J = problem.derivative(sensor, motion, own, rows, index)[..., seen].flatten(1) * usual
-            r = sensor.residual(motion, own, rows)[..., seen].flatten()[None]
-            blocks.append((torch.cat([torch.ones_like(r), J, r]) * weight).t())
-            values += J.shape[1]
-        root = torch.linalg.qr(torch.cat(blocks), mode="r").R
+            J, r = problem.derivative(sensor, motion, own, rows, index), sensor.residual(motion, own, rows)
+            weight = torch.full_like(r[0], 1e3) if view is None else problem.row_weights(view, k, rows)
+            if not problem.all_seen[k]:
+                seen = sensor.seen[rows]
+                J, r, weight = J[..., seen], r[..., seen], weight[seen]
+            block = r.new_empty((len(candidates) + 2, *r.shape))
+            block[0] = weight
+            torch.mul(J, usual * weight, out=block[1:-1])
+            torch.mul(r, weight, out=block[-1])
+            blocks.append(block.flatten(1))
+            values += r.numel()
+        root = torch.linalg.qr(torch.cat(blocks, 1).t(), mode="r").R
     seen = torch.stack([sensor.seen for sensor in problem.sensors]).any(0)
     parameters = tuple(problem.space.parameters[i] for i in candidates)
     return Information(parameters, root.cpu().numpy(), values, int(seen.sum()))

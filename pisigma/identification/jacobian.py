@@ -10,24 +10,26 @@ A shift along u moves the tool by u; a turn about u through o moves it by `u × 
 u. This is the error propagation of Lim et al. 1999, eqs. (8) to (33), written in the base frame instead of
 the tool's.
 
-Frames are kept as four `(3, poses)` tensors (columns x, y, z of the rotation, and the origin): few
-operations for small batches, whole cache lines for large ones.
+Axes and origins are kept as `(3, poses)` blocks of few large tensors: few operations for small batches, whole
+cache lines for large ones.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from pisigma.robot.description import Robot
 
-Columns = tuple[Tensor, Tensor, Tensor, Tensor]
-
 JACOBIAN_CHUNK = 2_048
 """Poses worked on together, so that their Jacobian stays in the processor's cache."""
+
+
+AXES, ORIGIN, FRAME = slice(6, 9), 9, slice(8, 13)
+"""Where `_frame_axes` has x, y, z; the origin; and z, the origin, x, y, -x."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,99 +101,131 @@ def tool_motion(
     tool: Float[Tensor, "6 tools"],
     q: Float[Tensor, "poses dof"],
     turning: bool,
+    frame: Int64[Tensor, " poses"] | None = None,
+    target: Int64[Tensor, " poses"] | None = None,
 ) -> ToolMotion:
     """Tool pose and its derivative, with the batch index last.
 
     Args:
         robot: says which rows move.
         dh: the parameters of the rows.
-        base: x, y, z [m], roll, pitch, yaw [rad]; one for all poses or one a pose.
-        tool: the same.
+        base: x, y, z [m], roll, pitch, yaw [rad]; one for all poses, or one a frame.
+        tool: the same; one for all poses, or one a target.
         q: joint values [rad or m].
         turning: whether the derivative of the rotation is wanted too.
+        frame: per pose the number of its base, where there is one a frame.
+        target: per pose the number of its tool, where there is one a target.
     """
-    shape = (3, q.shape[0])
-    x, y, z = (axis.expand(shape) for axis in torch.eye(3, dtype=q.dtype, device=q.device)[:, :, None])
-    base_steps = _walk_frame((x, y, z, torch.zeros_like(x)), base)
-    rows = _walk_rows(robot, dh, q, base_steps[-1])
-    tool_steps = _walk_frame(rows.last, tool)
-    x, y, z, position = tool_steps[-1]
-    base_turns, tool_turns = _turning_axes(base_steps), _turning_axes(tool_steps)
-    turns = torch.stack([*rows.z, *rows.x, *rows.y, *base_turns, *tool_turns])
-    origins = [*rows.before, *rows.moved, *rows.moved, *[base_steps[1][3]] * 3, *[position] * 3]
-    arms = position - torch.stack(origins)
-    shifts = [*rows.z, *rows.x, *base_steps[0][:3], *tool_steps[0][:3]]
-    J = q.new_empty((turns.shape[0] + len(shifts), 6 if turning else 3, shape[1]))
+    count, poses = len(robot.rows), q.shape[0]
+    base_axes, tool_axes = _frame_axes(base, frame, q), _frame_axes(tool, target, q)
+    walked = _walk_rows(robot, dh, q, base_axes)
+    tool_steps = _behind(walked.last, tool_axes)
+    position = tool_steps[ORIGIN]
+    number = 3 * count + 6
+    J = q.new_empty((number + 2 * count + 6, 6 if turning else 3, poses))
+    turns = J[:number, 3:] if turning else q.new_empty((number, 3, poses))
+    base_turns = base_axes[:3, :3].expand(3, 3, poses)
+    torch.cat([walked.z, walked.x, walked.y, base_turns, tool_steps[:3]], out=turns)
+    arms = q.new_empty((number, 3, poses))
+    torch.sub(position, walked.before, out=arms[:count])
+    torch.sub(position, walked.moved, out=arms[count : 2 * count])
+    arms[2 * count : 3 * count] = arms[count : 2 * count]
+    arms[-6:-3] = position - base_axes[ORIGIN, :3]
+    arms[-3:] = 0
+    u, v, shift = turns.unbind(1), arms.unbind(1), J[:number].unbind(1)
     for k in range(3):  # the cross product turns x arms
         i, j = (k + 1) % 3, (k + 2) % 3
-        J[: len(turns), k] = torch.addcmul(turns[:, i] * arms[:, j], turns[:, j], arms[:, i], value=-1)
-    torch.stack(shifts, out=J[len(turns) :, :3])
+        torch.mul(u[i], v[j], out=shift[k]).addcmul_(u[j], v[i], value=-1)
+    base_shifts = base_axes[3:6, :3].expand(3, 3, poses)
+    torch.cat([walked.z, walked.x, base_shifts, tool_steps[3:6]], out=J[number:, :3])
     if turning:
-        J[: len(turns), 3:] = turns
-        J[len(turns) :, 3:] = 0
-    return ToolMotion(position, torch.stack([x, y, z], 1), J)
+        J[number:, 3:] = 0
+    return ToolMotion(position, tool_steps[AXES].transpose(0, 1), J)
 
 
 @dataclass(frozen=True, eq=False)
-class _RowAxes:
-    """Per row the axes z before, x turned and y twisted, and the origins before and moved."""
+class _Walked:
+    """Per row the axes z before, x turned and y twisted, and the origins before and moved.
 
-    z: list[Tensor]
-    x: list[Tensor]
-    y: list[Tensor]
-    before: list[Tensor]
-    moved: list[Tensor]
-    last: Columns
-
-
-def _walk_rows(robot: Robot, dh: Float64[np.ndarray, "rows 5"], q: Tensor, frame: Columns) -> _RowAxes:
-    offsets = dh[list(robot.joint_rows), [0 if turns else 1 for turns in robot.revolute]]
-    values = q.t() * q.new_tensor(robot.directions)[:, None] + q.new_tensor(offsets)[:, None]
-    joints = iter(zip(values.unbind(), values.cos().unbind(), values.sin().unbind(), strict=True))
-    walked = _RowAxes([], [], [], [], [], frame)
-    x, y, z, p = frame
-    for row, (theta, d, a, alpha, beta) in zip(robot.rows, dh.tolist(), strict=True):
-        value, cosine, sine = next(joints) if row.type != "fixed" else (d, math.cos(theta), math.sin(theta))
-        if row.type == "prismatic":
-            cosine, sine = math.cos(theta), math.sin(theta)
-        walked.z.append(z)
-        walked.before.append(p)
-        x, y = _turn(x, y, cosine, sine)
-        p = torch.add(torch.add(p, z * (d if row.type == "revolute" else value)), x, alpha=a)
-        walked.x.append(x)
-        walked.moved.append(p)
-        y, z = _turn(y, z, math.cos(alpha), math.sin(alpha))
-        walked.y.append(y)
-        z, x = _turn(z, x, math.cos(beta), math.sin(beta))
-    return replace(walked, last=(x, y, z, p))
-
-
-def _turn(u: Tensor, v: Tensor, cosine: float | Tensor, sine: float | Tensor) -> tuple[Tensor, Tensor]:
-    """The two axes `(u, v)` after a turn from u towards v."""
-    if isinstance(cosine, Tensor) and isinstance(sine, Tensor):
-        return torch.addcmul(u * cosine, v, sine), torch.addcmul(v * cosine, u, sine, value=-1)
-    assert isinstance(sine, float)
-    if sine == 0.0 and cosine == 1.0:
-        return u, v
-    return torch.add(u * cosine, v, alpha=sine), torch.add(v * cosine, u, alpha=-sine)
-
-
-def _walk_frame(frame: Columns, xyzrpy: Tensor) -> tuple[Columns, Columns, Columns, Columns]:
-    """Walk along `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
-
-    Returns:
-        The frame before, after the shift and the roll, after the pitch, after the yaw.
+    Attributes:
+        last: axes x, y, z and origin after the last row.
     """
-    x, y, z, p = frame
-    cosine, sine = xyzrpy[3:].cos(), xyzrpy[3:].sin()
-    p = p + x * xyzrpy[0] + y * xyzrpy[1] + z * xyzrpy[2]
-    x1, y1 = _turn(x, y, cosine[0], sine[0])
-    z2, x2 = _turn(z, x1, cosine[1], sine[1])
-    y3, z3 = _turn(y1, z2, cosine[2], sine[2])
-    return frame, (x1, y1, z, p), (x2, y1, z2, p), (x2, y3, z3, p)
+
+    z: Float[Tensor, "rows 3 poses"]
+    x: Float[Tensor, "rows 3 poses"]
+    y: Float[Tensor, "rows 3 poses"]
+    before: Float[Tensor, "rows 3 poses"]
+    moved: Float[Tensor, "rows 3 poses"]
+    last: Float[Tensor, "4 3 poses"]
 
 
-def _turning_axes(steps: tuple[Columns, Columns, Columns, Columns]) -> tuple[Tensor, Tensor, Tensor]:
-    """The axes that roll, pitch and yaw turn about."""
-    before, rolled, pitched, _ = steps
-    return before[2], rolled[1], pitched[0]
+def _walk_rows(robot: Robot, dh: Float64[np.ndarray, "rows 5"], q: Tensor, base_axes: Tensor) -> _Walked:
+    """Walk from the base to the last row.
+
+    Per row are kept, one after the other: x and y turned; z, the origin, x, y and -x before. The turn about z
+    then is `(x, y) cos + (y, -x) sin`, and one small matrix leads from the first four to the next row.
+    """
+    count, poses = len(robot.rows), q.shape[0]
+    frames = q.new_empty((count + 1, 7, 3, poses))
+    frames[0, 2:] = base_axes[FRAME, :3]
+    turning = np.zeros((count, robot.dof))
+    turning[robot.joint_rows, range(robot.dof)] = robot.directions * robot.revolute
+    angles = torch.addmm(q.new_tensor(dh[:, :1]), q.new_tensor(turning), q.t())
+    before, flat = frames[:-1], frames.flatten(2)
+    turns = zip(before[:, :2], before[:, 4:6], before[:, 5:], angles.cos(), angles.sin(), strict=True)
+    steps = zip(_row_matrices(dh, q), flat[:-1, :4], flat[1:, 2:], strict=True)
+    for row, ((turned, xy, side, cosine, sine), (matrix, state, after)) in enumerate(
+        zip(turns, steps, strict=True)
+    ):
+        torch.mul(xy, cosine, out=turned).addcmul_(side, sine)
+        torch.mm(matrix, state, out=after)
+        if robot.rows[row].type == "prismatic":
+            joint = robot.joint_rows.index(row)
+            frames[row + 1, 3].addcmul_(frames[row, 2], q[:, joint], value=robot.directions[joint])
+    last = torch.cat([frames[-1, 4:6], frames[-1, 2:4]])
+    return _Walked(before[:, 2], before[:, 0], frames[1:, 5], before[:, 3], frames[1:, 3], last)
+
+
+def _row_matrices(dh: Float64[np.ndarray, "rows 5"], like: Tensor) -> Float[Tensor, "rows 5 4"]:
+    """Per row z, origin, x, y and -x after it, by x and y turned, z and the origin before.
+
+    `Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; a joint that slides comes on top.
+    """
+    found = []
+    for _, d, a, alpha, beta in dh.tolist():
+        ca, cb, sa, sb = math.cos(alpha), math.cos(beta), math.sin(alpha), math.sin(beta)
+        z, origin = (sb, -sa * cb, ca * cb, 0.0), (a, 0.0, d, 1.0)
+        x, x_back = (cb, sa * sb, -ca * sb, 0.0), (-cb, -sa * sb, ca * sb, 0.0)
+        found.append((z, origin, x, (0.0, ca, sa, 0.0), x_back))
+    return like.new_tensor(found)
+
+
+def _frame_axes(
+    xyzrpy: Float[Tensor, "6 frames"], index: Int64[Tensor, " poses"] | None, like: Tensor
+) -> Float[Tensor, "13 4 ways"]:
+    """What bases or tools turn about (roll, pitch, yaw), shift along (x, y, z) and end as.
+
+    The end is x, y, z, the origin, x, y, -x, so that `AXES` and `FRAME` are stretches of it. All are given by
+    the axes x, y, z and the origin before `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`; with an index
+    one a pose.
+    """
+    found = []
+    for x, y, z, *angles in xyzrpy.t().tolist():
+        (cr, cp, cy), (sr, sp, sy) = (tuple(map(turn, angles)) for turn in (math.cos, math.sin))
+        x_axis = (cr * cp, sr * cp, -sp, 0.0)
+        y_axis = (cr * sp * sy - sr * cy, sr * sp * sy + cr * cy, cp * sy, 0.0)
+        z_axis = (cr * sp * cy + sr * sy, sr * sp * cy - cr * sy, cp * cy, 0.0)
+        turns = ((0.0, 0.0, 1.0, 0.0), (-sr, cr, 0.0, 0.0), x_axis)
+        shifts = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
+        origin, x_back = (x, y, z, 1.0), tuple(-part for part in x_axis)
+        found.append((*turns, *shifts, x_axis, y_axis, z_axis, origin, x_axis, y_axis, x_back))
+    axes = like.new_tensor(found).permute(1, 2, 0)
+    return axes if index is None else axes[..., index]
+
+
+def _behind(frame: Float[Tensor, "4 3 poses"], axes: Float[Tensor, "13 4 frames"]) -> Tensor:
+    """Axes and origins that are given in a frame, seen from outside of it."""
+    if axes.shape[-1] == 1:
+        return (axes[..., 0] @ frame.flatten(1)).view(13, *frame.shape[1:])
+    found: Tensor = (axes[:, :, None] * frame).sum(1)
+    return found

@@ -162,10 +162,12 @@ def solve_damped(
     """Solve `(normal + damping / step_scale²) step = descent` by Cholesky with column scaling."""
     normal = linearisation.normal
     while True:
-        damped = normal + torch.diag(damping / step_scale.square())
+        damped = normal.clone()
+        damped.diagonal().add_(damping / step_scale.square())
         scale = damped.diagonal().rsqrt()
-        scaled = damped * scale * scale[:, None]
-        factor, failed = torch.linalg.cholesky_ex(scaled + 1e-14 * torch.eye(len(scale)).to(scaled))
+        scaled = damped * (scale * scale[:, None])
+        scaled.diagonal().add_(1e-14)
+        factor, failed = torch.linalg.cholesky_ex(scaled)
         if not failed:
             return scale * torch.cholesky_solve((scale * linearisation.descent)[:, None], factor)[:, 0]
         damping = max(10 * damping, 1e-6)

@@ -89,9 +89,9 @@ class HampelLoss(AbstractLoss):
         """Square, line, parabola, constant."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
-        falling = 2 * a * b - a * a + a * (c - b) * (1 - ((c - distance.clamp(max=c)) / (c - b)).square())
-        beyond = torch.where(distance < b, 2 * a * distance - a * a, falling)
-        return torch.where(distance < a, distance.square(), beyond)
+        straight, bent = distance.clamp(a, c) - a, distance.clamp(b, c) - b
+        cost: Tensor = distance.clamp(max=a).square().add_(straight, alpha=2 * a)
+        return cost.add_(bent.square(), alpha=-a / (c - b))
 
     def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
         """One, a / distance, falling, zero."""

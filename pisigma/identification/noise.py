@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 
 import torch
 from jaxtyping import Float64, Int64
@@ -15,8 +16,25 @@ SMALLEST_NOISE = 1e-14
 ALWAYS_GOOD = 1e-10
 """[m or rad] Rows nearer to their prediction than this never count as wrong."""
 
-PRIOR_GROUPS = 5
-"""Groups of parameters whose prior has one size: theta, d, a, alpha, beta, or angles and lengths."""
+
+class PriorGroup(IntEnum):
+    """Parameters whose errors are believed to be of one size, because they come from the same cause.
+
+    Few groups, because a size is only told by several parameters: one for every parameter (relevance vectors,
+    Tipping 2001) fits the noise. Lengths that are drawn and that are not are apart, because joining them made
+    weak data worse, while it made no difference whether d and a, or alpha and beta, are apart.
+    """
+
+    JOINT_OFFSET = 0
+    """theta: where the zeros of the joints were set."""
+    LENGTH = 1
+    """d and a that are drawn: how long parts are."""
+    NO_LENGTH = 2
+    """d and a drawn as 0, or shorter than their tolerance: how nearly axes meet or are in line."""
+    BETWEEN_AXES = 3
+    """alpha and beta: how square and parallel axes are."""
+
+
 LEAST_TOLD = 0.1
 """A prior of which the data tell less than so many parameters stays as it is."""
 SMALLEST_PRIOR = 0.03
@@ -63,7 +81,7 @@ class SensorView:
     sums: tuple[SensorSums, ...]
     noise: tuple[float, ...]
     repetition: tuple[float, ...]
-    widening: tuple[float, ...] = (1.0,) * PRIOR_GROUPS
+    widening: tuple[float, ...] = (1.0,) * len(PriorGroup)
 
     def scale(self, sensor: int) -> float:
         """What distances are divided by for the loss."""
@@ -81,7 +99,8 @@ class SensorView:
 def values_used(view: SensorView, covariance: Float64[Tensor, "active active"]) -> tuple[float, ...]:
     """How many values of every sensor the parameters use up (Förstner 1979); the prior spares some."""
     return tuple(
-        float((sums.normal * covariance).sum()) / view.variance(k) for k, sums in enumerate(view.sums)
+        float(sums.normal.flatten().dot(covariance.flatten())) / view.variance(k)
+        for k, sums in enumerate(view.sums)
     )
 
 
@@ -98,7 +117,9 @@ def loss_scale(
         if sensor.certain:
             found.append(1.0)
             continue
-        distance = view.sums[k].distance[sensor.seen]
+        distance = view.sums[k].distance
+        if view.sums[k].seen < len(distance):
+            distance = distance[sensor.seen]
         if refine:
             found.append(loss.deviation(distance, sensor.components, used[k], view.scale(k)))
         else:
@@ -146,6 +167,18 @@ def group_variance_ratio(
     return tuple(found)
 
 
+def prior_group_of(column: str, drawn: bool) -> int:
+    """The group of a parameter whose prior is sized by the data.
+
+    Args:
+        column: "theta", "d", "a", "alpha" or "beta"; of others, which have no prior, any group will do.
+        drawn: whether its nominal value is larger than its tolerance.
+    """
+    if column in ("d", "a"):
+        return PriorGroup.LENGTH if drawn else PriorGroup.NO_LENGTH
+    return PriorGroup.BETWEEN_AXES if column in ("alpha", "beta") else PriorGroup.JOINT_OFFSET
+
+
 def prior_widening(
     off: Float64[Tensor, " active"],
     precision: Float64[Tensor, " active"],
@@ -167,13 +200,11 @@ def prior_widening(
         covariance: of the parameters.
         floor: smallest answer; 1 where smaller errors than stated do not tighten the prior.
     """
-    told = 1 - view.widened(precision, group) * covariance.diagonal()
+    told = (1 - view.widened(precision, group) * covariance.diagonal()) * (precision > 0)
     square = off.square() * precision
-    found = []
-    for number, now in enumerate(view.widening):
-        chosen = (group == number) & (precision > 0)
-        total = float(told[chosen].sum())
-        least = 1.0 if floor == 1.0 else LEAST_TOLD
-        size = max(float(square[chosen].sum()) / total, floor**2) ** 0.5 if total > least else now
-        found.append(size)
-    return tuple(found)
+    sums = off.new_zeros((2, len(view.widening))).index_add(1, group, torch.stack([told, square]))
+    least = 1.0 if floor == 1.0 else LEAST_TOLD
+    return tuple(
+        max(off_square / total, floor**2) ** 0.5 if total > least else now
+        for total, off_square, now in zip(*sums.tolist(), view.widening, strict=True)
+    )

@@ -11,12 +11,15 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError, nearest_choice
+from pisigma.identification.jacobian import motion_order
 from pisigma.identification.sensors import OwnUnknowns
 from pisigma.robot.description import DH_COLUMNS, FRAME_COLUMNS, Robot
 
 SOCKET_COLUMNS = ("x", "y", "z")
 ANCHOR_COLUMNS = ("x", "y", "z", "zero")
 LENGTHS = frozenset({"d", "a", "x", "y", "z", "zero"})
+EVERYWHERE, NOWHERE = -1, -2
+"""Instead of a frame or a target: a parameter that moves the tool in all rows, or in none."""
 USUAL_LENGTH = 1e-3
 """[m] Scale of length parameters where no prior gives one."""
 USUAL_ANGLE = 1e-3
@@ -127,6 +130,24 @@ class ParameterSpace:
         """Scale of every parameter [m or rad]."""
         return np.array([parameter.usual_error for parameter in self.parameters])
 
+    @cached_property
+    def motion_columns(self) -> Int64[Tensor, "3 parameters"]:
+        """Per parameter: its column in a `ToolMotion`, the number of its frame and that of its target."""
+        order = motion_order(len(self.robot.rows))
+        arm, frames, targets = order[:-12], len(self.frames), len(self.targets)
+        others = len(self.parameters) - len(arm) - 6 * (frames + targets)
+        columns = arm + order[-12:-6] * frames + order[-6:] * targets + [0] * others
+        in_frames = [f for f in range(frames) for _ in range(6)]
+        at_targets = [t for t in range(targets) for _ in range(6)]
+        frame = [EVERYWHERE] * len(arm) + in_frames + [EVERYWHERE] * 6 * targets + [NOWHERE] * others
+        target = [EVERYWHERE] * (len(arm) + 6 * frames) + at_targets + [NOWHERE] * others
+        return torch.tensor([columns, frame, target])
+
+    @property
+    def always_moving(self) -> bool:
+        """Whether every parameter moves the tool in all rows."""
+        return len(self.frames) == len(self.targets) == 1 and not self.sockets and not self.anchors
+
     def index(self, name: str) -> int:
         """Where a parameter stands.
 
@@ -153,18 +174,21 @@ class ParameterSpace:
 
     def of(self, group: str) -> range:
         """Indices of all parameters of a group behind the arm's: "base", "tool", "socket" or "anchor"."""
+        return self._stretches[group]
+
+    @cached_property
+    def _stretches(self) -> dict[str, range]:
         sizes = {
             "base": 6 * len(self.frames),
             "tool": 6 * len(self.targets),
             "socket": len(SOCKET_COLUMNS) * len(self.sockets),
             "anchor": len(ANCHOR_COLUMNS) * len(self.anchors),
         }
-        start = self.arm_size
+        start, found = self.arm_size, {}
         for name, size in sizes.items():
-            if name == group:
-                break
+            found[name] = range(start, start + size)
             start += size
-        return range(start, start + sizes[group])
+        return found
 
     def values(
         self,

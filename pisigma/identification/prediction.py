@@ -69,6 +69,20 @@ def prediction_errors(
         IdentificationError: a row has a frame or a target that is not known, or an anchor whose place is not.
     """
     T = predicted_poses(robot, bases, tools, measurements)
+    return errors_of_poses(T, measurements, sockets, anchors, zeros)
+
+
+def errors_of_poses(
+    T: Float64[Tensor, "rows 4 4"],
+    measurements: Measurements,
+    sockets: Mapping[str, Float64[np.ndarray, " 3"]] = MappingProxyType({}),
+    anchors: Mapping[str, Float64[np.ndarray, " 3"]] = MappingProxyType({}),
+    zeros: Mapping[str, float] = MappingProxyType({}),
+) -> dict[str, Float64[Tensor, "rows components"]]:
+    """Measured minus predicted for poses that some model predicts, each in the frame of its row.
+
+    For arguments, results and errors see `prediction_errors`.
+    """
     point = T[:, :3, 3]
     found = {}
     if measurements.position is not None:

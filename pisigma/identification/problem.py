@@ -1,7 +1,7 @@
 """The calibration as a least-squares problem: normal equations summed over chunks of poses."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Literal
 
@@ -10,9 +10,10 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.identification.covariance import covariance_of
-from pisigma.identification.jacobian import JACOBIAN_CHUNK, ToolMotion, motion_order, tool_motion
+from pisigma.identification.jacobian import JACOBIAN_CHUNK, ToolMotion, tool_motion
 from pisigma.identification.least_squares import AbstractLeastSquares, Linearisation
 from pisigma.identification.loss import AbstractLoss, SquaredLoss
+from pisigma.identification.motion_memory import MotionMemory
 from pisigma.identification.noise import (
     ALWAYS_GOOD,
     SMALLEST_NOISE,
@@ -21,18 +22,16 @@ from pisigma.identification.noise import (
     SensorView,
     group_variance_ratio,
     loss_scale,
+    prior_group_of,
     prior_widening,
     renumbered,
     values_used,
 )
-from pisigma.identification.parameters import ParameterSpace
+from pisigma.identification.parameters import EVERYWHERE, ParameterSpace
 from pisigma.identification.sensors import AbstractSensor, OwnUnknowns
-from pisigma.robot.description import DH_COLUMNS
 
 PriorSizes = Literal["stated", "widened", "estimated"]
 CERTAIN_LOSS = SquaredLoss()
-EVERYWHERE, NOWHERE = -1, -2
-"""Instead of a frame or a target: a parameter that moves the tool in all rows, or in none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,6 +52,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         pairs: so many pairs of rows, the first ones, are measured together.
         prior_sizes: "stated": the prior as it is; "widened": wider where the errors are larger than it says;
             "estimated": wider or narrower.
+        memory: the last motion; shared with problems that differ in their free parameters or prior only.
     """
 
     space: ParameterSpace
@@ -67,6 +67,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     pose: Int64[Tensor, " rows"] | None = None
     pairs: int = 0
     prior_sizes: PriorSizes = "widened"
+    memory: MotionMemory = field(default_factory=MotionMemory, repr=False)
 
     @cached_property
     def step_scale(self) -> Float64[Tensor, " active"]:
@@ -80,10 +81,11 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     @cached_property
     def prior_group(self) -> Int64[Tensor, " active"]:
-        """Which of the prior's sizes every free parameter has: one per class, or one for lengths, one for angles."""
+        """Which size of the prior every free parameter has: of its `PriorGroup`, or for lengths and for angles."""
+        drawn = (self.nominal.square() * self.precision > 1).tolist()
         found = []
-        for parameter in self.space.parameters:
-            own = DH_COLUMNS.index(parameter.group) if parameter.group in DH_COLUMNS else 0
+        for parameter, is_drawn in zip(self.space.parameters, drawn, strict=True):
+            own = prior_group_of(parameter.group, is_drawn)
             found.append(own if self.prior_sizes == "estimated" else int(parameter.unit == "m"))
         return torch.tensor(found, dtype=torch.int64, device=self.q.device)[self.active]
 
@@ -108,6 +110,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             sensors=tuple(sensor.select(rows) for sensor in self.sensors),
             pose=None if self.pose is None else renumbered(self.pose[rows]),
             pairs=int((rows < 2 * self.pairs).sum()) // 2,
+            memory=MotionMemory(),
         )
 
     def moved(self, point: Tensor, step: Tensor) -> Tensor:
@@ -117,12 +120,12 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def linearise(self, point: Tensor, like: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
         """Sum up the normal equations; rows are weighted by the noise of `like`."""
         known = None if like is None else view_of(like)
-        sums = [self._empty(sensor) for sensor in self.sensors]
+        sums = [self._empty(k) for k in range(len(self.sensors))]
         own = self.space.own(point)
         for rows in self.chunks():
             motion = self.motion(point, rows, self.active)
-            for k, (sensor, total) in enumerate(zip(self.sensors, sums, strict=True)):
-                self._add(sensor, total, float("inf") if known is None else known.noise[k], motion, own, rows)
+            for k, total in enumerate(sums):
+                self._add(k, total, float("inf") if known is None else known.noise[k], motion, own, rows)
         ones = (1.0,) * len(sums)
         view = SensorView(tuple(sums), ones, ones) if known is None else replace(known, sums=tuple(sums))
         return self.combined(point, view)
@@ -156,9 +159,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         widening = view.widening
         if self.prior_sizes != "stated":
             floor = 1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR
-            widening = prior_widening(
-                off, self.precision[self.active], self.prior_group, view, covariance, floor
-            )
+            widening = prior_widening(off, self._prior, self.prior_group, view, covariance, floor)
         old, new = (*view.noise, *view.repetition, *view.widening), (*noise, *repetition, *widening)
         settled = all(abs(b / a - 1) < 1e-2 for a, b in zip(old, new, strict=True))
         return self.combined(linearisation.point, SensorView(view.sums, noise, repetition, widening)), settled
@@ -186,24 +187,28 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         The columns are 0 for base and tool in rows of other frames and targets, and for parameters that do not
         move the tool.
         """
-        dh, bases, tools = self.space.split(point)
-        base = bases.t() if len(bases) == 1 else bases.t()[:, self.frame[rows]]
-        tool = tools.t() if len(tools) == 1 else tools.t()[:, self.target[rows]]
-        turning = any(sensor.turning for sensor in self.sensors)
-        motion = tool_motion(self.space.robot, dh.cpu().numpy(), base, tool, self.q[rows], turning)
-        columns, frame, target = self._columns
-        J = motion.derivative.index_select(0, columns[active])
-        if (
-            bool((frame[active] == NOWHERE).any())
-            or len(self.space.frames) > 1
-            or len(self.space.targets) > 1
-        ):
-            f, t = frame[active][:, None], target[active][:, None]
+        if self.chunks() == [rows]:
+            made_from = (point, self.space, self.q, self.frame, self.target, self._turning)
+            motion = self.memory.motion(made_from, lambda: self._whole_motion(point, rows))
+        else:
+            motion = self._whole_motion(point, rows)
+        columns = self.space.motion_columns.to(active.device)
+        J = motion.derivative.index_select(0, columns[0, active])
+        if not self.space.always_moving:
+            f, t = columns[1:, active, None]
             moving = ((f == EVERYWHERE) | (f == self.frame[rows])) & (
                 (t == EVERYWHERE) | (t == self.target[rows])
             )
             J = J * moving[:, None, :]
-        return replace(motion, derivative=J)
+        return ToolMotion(motion.position, motion.rotation, J)
+
+    def _whole_motion(self, point: Tensor, rows: slice) -> ToolMotion:
+        """Tool pose of some rows and its derivative by every kind of parameter."""
+        dh, bases, tools = self.space.split(point)
+        frame = None if len(bases) == 1 else self.frame[rows]
+        target = None if len(tools) == 1 else self.target[rows]
+        where = (dh.cpu().numpy(), bases.t(), tools.t(), self.q[rows])
+        return tool_motion(self.space.robot, *where, self._turning, frame, target)
 
     def derivative(
         self, sensor: AbstractSensor, motion: ToolMotion, own: OwnUnknowns, rows: slice, active: Tensor
@@ -220,70 +225,67 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def combined(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
         """Divide the sums by their variances and add the prior."""
         off = (point - self.nominal)[self.active]
-        precision = view.widened(self.precision[self.active], self.prior_group)
-        normal, descent, misfit, rounding = torch.diag(precision), -off * precision, 0.0, 0.0
+        precision = view.widened(self._prior, self.prior_group)
+        pull = off * precision
+        normal, descent, misfit, rounding = torch.diag(precision), -pull, 0.0, 0.0
         for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True)):
             scale, variance = view.scale(k), view.variance(k)
-            misfit += (
-                float(self.loss_of(sensor).cost(sums.distance / scale, sensor.components).sum())
-                * scale**2
-                / variance
-            )
-            normal = normal + sums.normal / variance
-            descent = descent + sums.descent / variance
+            cost = self.loss_of(sensor).cost(sums.distance / scale, sensor.components)
+            misfit += float(cost.sum()) * scale**2 / variance
+            normal.add_(sums.normal, alpha=1 / variance)
+            descent.add_(sums.descent, alpha=1 / variance)
             size = self._reach if sensor.unit == "m" else 1.0
             rounding += self.values_seen[k] * (torch.finfo(point.dtype).eps * size) ** 2 / variance
-        cost = misfit + float((off.square() * precision).sum())
-        return Linearisation(point, cost, descent, normal, misfit, rounding, view)
+        return Linearisation(point, misfit + float(off.dot(pull)), descent, normal, misfit, rounding, view)
 
     @cached_property
     def _reach(self) -> float:
         return self.space.robot.reach
 
     @cached_property
-    def _columns(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Per parameter: its column in a tool motion, its frame and its target."""
-        order = motion_order(len(self.space.robot.rows))
-        arm, frames, targets = order[:-12], len(self.space.frames), len(self.space.targets)
-        others = len(self.space.parameters) - len(arm) - 6 * (frames + targets)
-        columns = arm + order[-12:-6] * frames + order[-6:] * targets + [0] * others
-        in_frames = [f for f in range(frames) for _ in range(6)]
-        at_targets = [t for t in range(targets) for _ in range(6)]
-        frame = [EVERYWHERE] * len(arm) + in_frames + [EVERYWHERE] * 6 * targets + [NOWHERE] * others
-        target = [EVERYWHERE] * (len(arm) + 6 * frames) + at_targets + [NOWHERE] * others
-        found = torch.tensor([columns, frame, target], device=self.q.device)
-        return found[0], found[1], found[2]
+    def _turning(self) -> bool:
+        """Whether any sensor needs the tool's rotation."""
+        return any(sensor.turning for sensor in self.sensors)
 
-    def _empty(self, sensor: AbstractSensor) -> SensorSums:
-        rows, size = self.q.shape[0], len(self.active)
+    @cached_property
+    def _prior(self) -> Float64[Tensor, " active"]:
+        return self.precision[self.active]
+
+    @cached_property
+    def all_seen(self) -> tuple[bool, ...]:
+        """Per sensor, whether it has a value in every row."""
+        rows = self.q.shape[0]
+        return tuple(
+            seen == rows * sensor.components
+            for seen, sensor in zip(self.values_seen, self.sensors, strict=True)
+        )
+
+    def _empty(self, sensor: int) -> SensorSums:
+        rows, size, components = self.q.shape[0], len(self.active), self.sensors[sensor].components
         return SensorSums(
             normal=self.q.new_zeros((size, size)),
             descent=self.q.new_zeros(size),
-            residual=self.q.new_zeros((sensor.components, rows)),
-            distance=self.q.new_zeros(rows),
-            seen=int(sensor.seen.sum()),
+            residual=self.q.new_empty((components, rows)),
+            distance=self.q.new_empty(rows),
+            seen=self.values_seen[sensor] // components,
         )
 
     def _add(
-        self,
-        sensor: AbstractSensor,
-        sums: SensorSums,
-        sigma: float,
-        motion: ToolMotion,
-        own: OwnUnknowns,
-        rows: slice,
+        self, number: int, sums: SensorSums, sigma: float, motion: ToolMotion, own: OwnUnknowns, rows: slice
     ) -> None:
         """Add one sensor's part of some rows, in place."""
-        seen = sensor.seen[rows]
-        residual = torch.where(seen, sensor.residual(motion, own, rows), 0.0)
-        distance = residual.norm(dim=0)
-        root = seen.to(residual.dtype)
+        sensor = self.sensors[number]
+        residual = sensor.residual(motion, own, rows)
+        if not self.all_seen[number]:
+            residual = torch.where(sensor.seen[rows], residual, 0.0)
+        distance = residual.square().sum(0).sqrt()
         if sensor.sigma is not None:
-            root = torch.where(seen, 1 / sensor.sigma[rows], 0.0)
-            distance = distance * root
-        root = (
-            root * self.loss_of(sensor).weight(distance / max(sigma, ALWAYS_GOOD), sensor.components).sqrt()
-        )
+            distance = torch.where(sensor.seen[rows], distance / sensor.sigma[rows], 0.0)
+        root = self.loss_of(sensor).weight(distance / max(sigma, ALWAYS_GOOD), sensor.components).sqrt()
+        if sensor.sigma is not None:
+            root = root / sensor.sigma[rows]
+        if not self.all_seen[number]:
+            root = torch.where(sensor.seen[rows], root, 0.0)
         A = (self.derivative(sensor, motion, own, rows, self.active) * root).flatten(1)
         sums.normal.addmm_(A, A.t())
         sums.descent.addmv_(A, (residual * root).flatten())

@@ -117,7 +117,7 @@ def pivoted_columns(A: Float64[np.ndarray, "rows columns"], count: int) -> Int64
         lengths[pivots] = -1.0
         pivots.append(int(lengths.argmax()))
         direction = A[:, pivots[-1]] / np.sqrt(lengths[pivots[-1]])
-        A -= np.outer(direction, direction @ A)
+        A -= direction[:, None] * (direction @ A)
     return np.array(pivots, dtype=np.int64)
 
 

@@ -18,30 +18,17 @@ from pisigma.identification.redundancy import Redundancy
 from pisigma.identification.result import CalibrationResult, Outlier, ParameterEstimate, SensorNoise
 from pisigma.identification.setup import CalibrationSetup
 from pisigma.identification.unseen import unseen_directions
+from pisigma.identification.user_coordinates import (
+    UserCoordinates,
+    named_geometry,
+    own_places,
+    user_coordinates,
+)
 from pisigma.measurement.dataset import Measurements
-from pisigma.se3 import rotation_from_rpy, rpy_from_rotation, wrap_to_pi
+from pisigma.se3 import wrap_to_pi
 
 HELD = 0.7
 """A parameter whose standard error is more than this share of its prior's is not told by the data."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Estimate:
-    """Parameters in the user's coordinates.
-
-    Attributes:
-        bases: per frame, in its own coordinates.
-        tools: per target.
-        sockets: places of the sockets in their frames [m].
-        anchors: places of the anchors in their frames, and their zeros [m].
-        change: d(user's parameters) / d(problem's parameters).
-    """
-
-    bases: Float64[Tensor, "frames 6"]
-    tools: Float64[Tensor, "targets 6"]
-    sockets: Float64[Tensor, "sockets 3"]
-    anchors: Float64[Tensor, "anchors 4"]
-    change: Float64[Tensor, "parameters parameters"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +50,29 @@ class Findings:
     warnings: tuple[str, ...]
 
 
+@dataclass(frozen=True, eq=False)
+class SolvedCalibration:
+    """A calibration problem with its solution.
+
+    Attributes:
+        measurements: as given.
+        setup: start, and what base and tool are relative to.
+        problem: with its free parameters.
+        solution: of it.
+        findings: on the parameters.
+    """
+
+    measurements: Measurements
+    setup: CalibrationSetup
+    problem: CalibrationProblem
+    solution: Solution[Tensor]
+    findings: Findings
+
+    def result(self) -> CalibrationResult:
+        """The calibration in the user's coordinates."""
+        return assemble_result(self.measurements, self.setup, self.problem, self.solution, self.findings)
+
+
 def assemble_result(
     measurements: Measurements,
     setup: CalibrationSetup,
@@ -73,21 +83,19 @@ def assemble_result(
     """Make the result; see `CalibrationResult` for its parts."""
     here = problem.refined(solution.linearisation)
     space, point = problem.space, here.point.cpu()
-    estimate = _user_coordinates(setup, point, problem)
-    dh = space.split(point)[0].numpy()
+    estimate = user_coordinates(setup, point, problem)
+    found = named_geometry(space, point, estimate)
     covariance = _covariance(here, problem, estimate)
     gram = sum((sums.normal for sums in view_of(here).sums), torch.zeros_like(here.normal))
     usual = problem.step_scale * 1e3  # to rows in mm and mrad, columns per 1 mm and 1 mrad
     poses = int(torch.stack([sensor.seen for sensor in problem.sensors]).any(0).sum())
     return CalibrationResult(
-        robot=space.robot.with_geometry(
-            dh=dh, base=estimate.bases[0].numpy(), tool=estimate.tools[0].numpy()
-        ),
-        bases={name: base.numpy() for name, base in zip(space.frames, estimate.bases, strict=True)},
-        tools={name: tool.numpy() for name, tool in zip(space.targets, estimate.tools, strict=True)},
-        sockets={name: place.numpy() for name, place in zip(space.sockets, estimate.sockets, strict=True)},
-        anchors={name: end[:3].numpy() for name, end in zip(space.anchors, estimate.anchors, strict=True)},
-        zeros={name: float(end[3]) for name, end in zip(space.anchors, estimate.anchors, strict=True)},
+        robot=found.robot,
+        bases=found.bases,
+        tools=found.tools,
+        sockets=found.sockets,
+        anchors=found.anchors,
+        zeros=found.zeros,
         parameters=_table(setup, problem, here, estimate, covariance, findings),
         covariance=covariance,
         residuals=_residuals(measurements, setup, problem, here),
@@ -107,51 +115,8 @@ def assemble_result(
     )
 
 
-def _user_coordinates(setup: CalibrationSetup, point: Tensor, problem: CalibrationProblem) -> _Estimate:
-    """Put the anchors back; as rotation vectors, small turns mean the same with and without them."""
-    space = problem.space
-    _, bases, tools = (part.clone() for part in space.split(point))
-    change = torch.eye(len(point), dtype=point.dtype)
-    anchors = setup.anchors
-    for k, anchor in enumerate(anchors.bases.cpu()):
-        axes = turning_axes(bases[k, 3:])
-        place = space.arm_size + 6 * k
-        bases[k, :3] = anchor[:3, :3] @ bases[k, :3] + anchor[:3, 3]
-        bases[k, 3:] = rpy_from_rotation(anchor[:3, :3] @ rotation_from_rpy(bases[k, 3:]))
-        change[place : place + 3, place : place + 3] = anchor[:3, :3]
-        back = torch.linalg.pinv(turning_axes(bases[k, 3:]), rtol=1e-9)
-        change[place + 3 : place + 6, place + 3 : place + 6] = back @ anchor[:3, :3] @ axes
-    for k, R_anchor in enumerate(anchors.tools.cpu()):
-        axes = turning_axes(tools[k, 3:])
-        place = space.arm_size + 6 * (len(space.frames) + k) + 3
-        tools[k, 3:] = rpy_from_rotation(rotation_from_rpy(tools[k, 3:]) @ R_anchor)
-        back = torch.linalg.pinv(turning_axes(tools[k, 3:]), rtol=1e-9)
-        change[place : place + 3, place : place + 3] = back @ axes
-    sockets, ends = space.own(point).sockets.t().clone(), space.own(point).anchors.t().clone()
-    for places, numbers, group, size in (
-        (sockets, setup.socket_frame, "socket", 3),
-        (ends, setup.anchor_frame, "anchor", 4),
-    ):
-        for k, number in enumerate(numbers.tolist()):
-            anchor = anchors.bases[number].cpu()
-            places[k, :3] = anchor[:3, :3] @ places[k, :3] + anchor[:3, 3]
-            place = space.of(group).start + size * k
-            change[place : place + 3, place : place + 3] = anchor[:3, :3]
-    return _Estimate(bases, tools, sockets, ends, change)
-
-
-def turning_axes(rpy: Float64[Tensor, " 3"]) -> Float64[Tensor, "3 3"]:
-    """The axes that roll, pitch and yaw turn about, as columns: `RotZ(roll) · RotY(pitch) · RotX(yaw)`."""
-    roll, pitch, _ = rpy.unbind()
-    zero, one = torch.zeros_like(roll), torch.ones_like(roll)
-    z = torch.stack([zero, zero, one])
-    y = torch.stack([-roll.sin(), roll.cos(), zero])
-    x = torch.stack([roll.cos() * pitch.cos(), roll.sin() * pitch.cos(), -pitch.sin()])
-    return torch.stack([z, y, x], 1)
-
-
 def _covariance(
-    here: Linearisation[Tensor], problem: CalibrationProblem, estimate: _Estimate
+    here: Linearisation[Tensor], problem: CalibrationProblem, estimate: UserCoordinates
 ) -> Float64[np.ndarray, "parameters parameters"]:
     size = len(problem.space.parameters)
     full = torch.zeros(size, size, dtype=torch.float64)
@@ -168,8 +133,14 @@ def _warnings(
     if not solution.status.good:
         found.append(f"the search {solution.status.value}.")
     sizes = view_of(here).widening
-    units = [problem.space.parameters[i].unit for i in problem.active.tolist()]
-    groups = list(zip(units, problem.prior_group.tolist(), strict=True))
+    active = problem.active.tolist()
+    groups = [
+        (problem.space.parameters[i].unit, group)
+        for i, group, known in zip(
+            active, problem.prior_group.tolist(), problem.precision[problem.active].tolist(), strict=True
+        )
+        if known > 0
+    ]
     for kind, unit in (("length", "m"), ("angle", "rad")):
         factor = max((sizes[group] for of, group in groups if of == unit), default=1.0)
         if factor > 2 and bool((problem.precision > 0).any()):
@@ -184,14 +155,14 @@ def _table(
     setup: CalibrationSetup,
     problem: CalibrationProblem,
     here: Linearisation[Tensor],
-    estimate: _Estimate,
+    estimate: UserCoordinates,
     covariance: np.ndarray,
     findings: Findings,
 ) -> tuple[ParameterEstimate, ...]:
     space, robot = problem.space, problem.space.robot
     bases, tools = np.tile(robot.base, (len(space.frames), 1)), np.tile(robot.tool, (len(space.targets), 1))
-    start = _user_coordinates(setup, setup.start.cpu(), problem)
-    nominal = space.values(bases, tools, start.sockets.numpy(), start.anchors.numpy())
+    sockets, anchors = own_places(setup, setup.start.cpu(), space)
+    nominal = space.values(bases, tools, sockets.numpy(), anchors.numpy())
     arm = here.point.cpu()[: space.arm_size]
     others = (estimate.bases, estimate.tools, estimate.sockets, estimate.anchors)
     values = torch.cat([arm, *(part.flatten() for part in others)])
@@ -202,14 +173,15 @@ def _table(
     held = errors * np.sqrt(_prior_precision(problem, here)) > HELD
     active = set(problem.active.tolist())
     rows = []
-    for index, parameter in enumerate(space.parameters):
+    columns = (nominal.tolist(), values.tolist(), change.tolist())
+    for index, (parameter, before, after, moved) in enumerate(zip(space.parameters, *columns, strict=True)):
         free = index in active or bool(errors[index] > 0)
         remark = _remark(parameter.name, free, index in findings.extended, findings.redundancy)
         if free and held[index]:
             remark += "; the data hardly see it, the prior holds it"
-        numbers = (float(nominal[index]), float(values[index]), float(change[index]))
         error = float(errors[index]) if free else float("nan")
-        rows.append(ParameterEstimate(parameter.name, parameter.unit, *numbers, error, remark))
+        name, unit = parameter.name, parameter.unit
+        rows.append(ParameterEstimate(name, unit, before, after, moved, error, remark))
     return tuple(rows)
 
 

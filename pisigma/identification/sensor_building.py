@@ -44,7 +44,10 @@ def build_sensors(
 def numbers_of(names: tuple[str, ...] | None, order: tuple[str, ...], rows: int) -> Int64[Tensor, " rows"]:
     """Where every row's name stands in an order, -1 where it is in none."""
     numbers = {name: number for number, name in enumerate(order)}
-    return torch.tensor([numbers.get(name, -1) for name in names or ("",) * rows], dtype=torch.int64)
+    different = set(names or ("",))
+    if len(different) == 1:
+        return torch.full((rows,), numbers.get(different.pop(), -1), dtype=torch.int64)
+    return torch.tensor([numbers.get(name, -1) for name in names or ()], dtype=torch.int64)
 
 
 def names_of(names: tuple[str, ...] | None) -> tuple[str, ...]:

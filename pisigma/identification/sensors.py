@@ -4,12 +4,11 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
-import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from pisigma.identification.jacobian import ToolMotion
-from pisigma.se3 import rotation_vector
+from pisigma.identification.rotation_difference import rotation_difference
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,8 +143,7 @@ class RotationSensor(AbstractSensor):
         self, motion: ToolMotion, own: OwnUnknowns, rows: slice
     ) -> Float[Tensor, "components poses"]:
         """Rotation vector of measured · predicted^T [rad]."""
-        difference = torch.einsum("ijn,kjn->nik", self.measured[..., rows], motion.rotation)
-        return rotation_vector(difference).t()
+        return rotation_difference(self.measured[..., rows], motion.rotation)
 
     def select(self, rows: Int64[Tensor, " chosen"]) -> "RotationSensor":
         """Some of the rows."""

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import get_args
 
 import numpy as np
 import torch
@@ -22,7 +23,7 @@ from pisigma.identification.sensor_building import (
 )
 from pisigma.identification.starting import Start, find_start
 from pisigma.identification.sufficiency import check_poses
-from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.dataset import Kind, Measurements
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert, rotation_from_rpy, transform_from_xyzrpy
 
@@ -155,7 +156,7 @@ def build_setup(
 def _usable(measurements: Measurements) -> tuple[Tensor, Measurements]:
     """The rows in which something was seen; those of pairs come first, side by side."""
     seen = torch.zeros(measurements.rows, dtype=torch.bool, device=measurements.q.device)
-    for kind in measurements.kinds:
+    for kind in get_args(Kind):
         seen = seen | measurements.seen(kind)
     if not bool(seen.any()):
         raise IdentificationError(

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.identification.base_and_tool import fit_base_and_tool
+from pisigma.identification.base_and_tool import find_base_and_tool
 from pisigma.identification.frame_start import (
     check_frame_names,
     check_frame_values,
@@ -91,13 +91,18 @@ def find_start(
     for name in space.frames:
         if name not in bases and name not in touched:
             bases[name] = space.robot.base
-    arm = space.robot.with_geometry(base=np.zeros(6), tool=np.zeros(6))
-    T_flange = forward_kinematics(arm, measurements.q.cpu())
-    if free_tool:
+    T_flange = None
+    if any(part is not None for part in (measurements.touch, measurements.socket, measurements.distance)):
+        arm = space.robot.with_geometry(base=np.zeros(6), tool=np.zeros(6))
+        T_flange = forward_kinematics(arm, measurements.q.cpu())
+    if free_tool and T_flange is not None:
         tools = _from_sockets(space, measurements, T_flange, bases, tools)
     if not turn_tool:
         tools = {name: np.concatenate([tool[:3], space.robot.tool[3:]]) for name, tool in tools.items()}
     all_tools = np.stack([tools.get(name, space.robot.tool) for name in space.targets])
+    if T_flange is None:  # nothing but poses: nothing else has to start
+        all_bases = np.stack([bases[name] for name in space.frames])
+        return Start(all_bases, all_tools, np.zeros((0, 3)), np.zeros((0, 4)), ())
     target = numbers_of(measurements.target, space.targets, measurements.rows)
     T_tool = T_flange @ transform_from_xyzrpy(torch.from_numpy(all_tools))[target]
     for name, rows in touched.items():
@@ -142,11 +147,12 @@ def _from_positions(
             part = measurements.select(rows[chosen_rows(len(rows), START_ROWS)].to(measurements.q.device))
         if part.pair is not None:
             part = replace(part, pair=None, distance=None)
-        fit = fit_base_and_tool(robot, part, free_base and name not in given, free_tool, START_STEPS)
+        find_base = free_base and name not in given
+        base, found = find_base_and_tool(robot, part, find_base, free_tool, START_STEPS)
         if free_base:
-            bases[name] = fit.robot.base
+            bases[name] = base if find_base else robot.base
         if free_tool:
-            tools = {**fit.tools, **tools}
+            tools = {**found, **tools}
     return bases, tools
 
 
@@ -161,6 +167,8 @@ def _touched_rows(
     space: ParameterSpace, measurements: Measurements, bases: Mapping[str, np.ndarray]
 ) -> dict[str, Bool[Tensor, " rows"]]:
     """The touches of frames whose base is not known yet."""
+    if measurements.touch is None:
+        return {}
     touches = measurements.seen("touch").cpu()
     frame = numbers_of(measurements.frame, space.frames, measurements.rows)
     found = {name: touches & (frame == number) for number, name in enumerate(space.frames)}

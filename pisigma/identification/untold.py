@@ -1,5 +1,7 @@
 """What a set-up cannot tell whatever its poses are: the scale, or where a frame stands."""
 
+import torch
+
 from pisigma.identification.setup import CalibrationSetup
 
 SAME_FACE = 1e-6
@@ -16,7 +18,7 @@ SOCKETS_WITHOUT_SCALE = (
 
 def untold(setup: CalibrationSetup) -> tuple[str, ...]:
     """Say what the set-up cannot tell, and what to measure for it."""
-    return (*_scale(setup), *_frames(setup))
+    return (*_scale(setup), *_frames(setup), *_adrift(setup))
 
 
 def _scale(setup: CalibrationSetup) -> list[str]:
@@ -33,6 +35,8 @@ def tells_scale(setup: CalibrationSetup) -> bool:
     alone have none, but do not pretend to.
     """
     data = setup.measurements
+    if data.touch is None and data.socket is None:
+        return True
     certain = any(sensor.certain for sensor in setup.problem.sensors)
     if certain or not data.kinds & {"touch", "socket"} or data.kinds & {"pose", "position", "distance"}:
         return True
@@ -62,3 +66,24 @@ def _frames(setup: CalibrationSetup) -> list[str]:
                 f"{'it' if len(lacking) == 1 else 'them'} too."
             )
     return found
+
+
+def _adrift(setup: CalibrationSetup) -> list[str]:
+    """Frames in which nothing that was measured stands at a known place."""
+    data = setup.measurements
+    if data.socket is None and data.distance is None:
+        return []
+    held = data.seen("position") | data.seen("pose") | data.seen("touch") | data.seen("rotation")
+    if data.anchor_place is not None:
+        held |= torch.isfinite(data.anchor_place).all(-1)
+    known = {frame for frame, told in zip(data.frame, held.tolist(), strict=True) if told}
+    adrift = [frame for frame in setup.problem.space.frames if frame not in known]
+    if not adrift or not data.kinds & {"socket", "distance"}:
+        return []
+    names = " and ".join(f"'{frame}'" for frame in adrift)
+    where = f"frame{'s' if len(adrift) > 1 else ''} {names}" if any(adrift) else "the frame"
+    return [
+        f"nothing that was measured in {where} stands at a known place, so where the robot's base is there is not "
+        "told: predicted positions are right among each other, up to one motion of them all; measure three "
+        "positions, touches, or distances from anchors at known places for that."
+    ]

@@ -10,7 +10,7 @@ from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.observability import observability_of
 from pisigma.identification.result import CalibrationResult
-from pisigma.identification.result_assembly import turning_axes
+from pisigma.identification.user_coordinates import turning_axes
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot

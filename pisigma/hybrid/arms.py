@@ -1,0 +1,61 @@
+"""The geometric and the hybrid arm as one: the hybrid where joints were measured, the geometric one beyond."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from pisigma.hybrid.coverage import JointCoverage
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.network.joint_correction import JointCorrection
+from pisigma.robot.description import Robot
+from pisigma.se3 import rotation_from_vector, rotation_vector
+
+
+@dataclass(frozen=True, eq=False)
+class HybridArm:
+    """`T(q) = base · Π A_i(q_i + Δ_i(q)) · tool` with the geometry and Δ that were fitted together.
+
+    Beyond the joint values that were measured it goes over into the arm of the geometric calibration.
+
+    Attributes:
+        geometric: the arm of the geometric calibration.
+        hybrid: the arm whose geometry goes with the correction.
+        correction: Δ.
+        coverage: the joint values that were measured.
+    """
+
+    geometric: Robot
+    hybrid: Robot
+    correction: JointCorrection
+    coverage: JointCoverage
+
+    def forward(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch 4 4"]:
+        """Pose T_base_tool at commanded joint values q [rad or m]."""
+        with torch.no_grad():
+            delta = self.correction(q)
+        return blend(
+            forward_kinematics(self.geometric, q),
+            forward_kinematics(self.hybrid, q + delta),
+            self.coverage.share(q),
+        )
+
+
+def blend(
+    T_from: Float[Tensor, "*batch 4 4"], T_to: Float[Tensor, "*batch 4 4"], share: Float[Tensor, "*batch"]
+) -> Float[Tensor, "*batch 4 4"]:
+    """Poses between two that lie near each other: positions on the straight line, rotations on the shortest arc.
+
+    Args:
+        T_from: at share 0.
+        T_to: at share 1.
+        share: between.
+    """
+    T = T_to.clone()
+    way = share[..., None]
+    T[..., :3, 3] = T_from[..., :3, 3] + way * (T_to[..., :3, 3] - T_from[..., :3, 3])
+    turn = rotation_vector(T_from[..., :3, :3].mT @ T_to[..., :3, :3])
+    turned = T_from[..., :3, :3] @ rotation_from_vector(way * turn)
+    T[..., :3, :3] = torch.where((share == 1)[..., None, None], T_to[..., :3, :3], turned)
+    return T

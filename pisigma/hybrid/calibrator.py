@@ -1,0 +1,162 @@
+"""The hybrid calibrator: geometry, base, tool, sensor unknowns and a Pi-Sigma joint correction together."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from pisigma.errors import IdentificationError, nearest_choice
+from pisigma.hybrid.coverage import JointCoverage
+from pisigma.hybrid.extrapolation import fade_angle
+from pisigma.hybrid.refinement import refine
+from pisigma.hybrid.result import HybridResult, LearnedPart
+from pisigma.hybrid.rows import Rows
+from pisigma.hybrid.search import Additive, Search, described
+from pisigma.hybrid.sensor_values import sensor_values
+from pisigma.hybrid.uncertainty import position_uncertainty
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.problem import view_of
+from pisigma.identification.result_assembly import SolvedCalibration
+from pisigma.identification.starting import chosen_rows
+from pisigma.identification.user_coordinates import identified_geometry
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import groups_of_equal_joints
+from pisigma.network.features import AbstractFeatures, FourierSeries, GravityTorques, SharedFeatures
+
+FEATURES = ("series", "gravity", *SharedFeatures.CHOICES)
+"""Features that may be chosen."""
+SEARCHED_ROWS = 4_000
+"""Features and product units are chosen on so many rows at most; everything is fitted to all in the end."""
+
+
+@dataclass(frozen=True)
+class HybridCalibrator:
+    """Fits `T(q) = base · Π A_i(q_i + Δ_i(q); dh_i + ε_i) · tool` to measurements, Δ a Pi-Sigma network.
+
+    All unknowns are normal with means at nominal and prior sizes that maximise the evidence. Whatever does not
+    raise the evidence, or predicts left-out rows no better, is left out; if nothing is left the result is that of
+    the geometric calibration.
+
+    Attributes:
+        geometric: the geometric calibrator, whose robot, sensors, priors and loss are used.
+        features: of the unit of order 1 that are tried, of `FEATURES`.
+        harmonics: of the Fourier series, tried in this order.
+        orders: numbers of factors of product units, tried in this order; none for an additive correction.
+        gravity: direction in which things fall, in the frame of the robot's first row.
+    """
+
+    geometric: GeometricCalibrator
+    features: tuple[str, ...] = ("gravity", "series")
+    harmonics: tuple[int, ...] = (8, 24, 56, 110)
+    orders: tuple[tuple[int, ...], ...] = ((2,), (2, 2), (2, 2, 2, 2))
+    gravity: tuple[float, float, float] = (0.0, 0.0, -1.0)
+
+    def __post_init__(self) -> None:
+        """Refuse choices that do not exist."""
+        for name in self.features:
+            if name not in FEATURES:
+                raise IdentificationError(
+                    f"features: '{name}' is no choice; {nearest_choice(name, FEATURES)}"
+                )
+        if "series" in self.features and (not self.harmonics or min(self.harmonics) < 1):
+            raise IdentificationError(
+                f"harmonics={self.harmonics}: whole numbers of at least 1 were wanted for the series; leave "
+                "'series' out of features for none."
+            )
+        if any(min(orders, default=0) < 2 for orders in self.orders):
+            raise IdentificationError(
+                f"orders={self.orders}: a product unit has two factors or more; give tuples such as (2,)."
+            )
+
+    def fit(
+        self, measurements: Measurements, progress: Callable[[str], None] = lambda what: None
+    ) -> HybridResult:
+        """Calibrate.
+
+        Args:
+            measurements: what was measured.
+            progress: called with what is being tried.
+
+        Raises:
+            IdentificationError: see `GeometricCalibrator.solve`.
+            PoseError: the joint values do not fit the robot.
+        """
+        solved = self.geometric.solve(measurements)
+        geometric = solved.result()
+        search, additive, orders = self._chosen(solved, progress)
+        features = additive.design.features
+        trials = tuple(search.trials)
+        if not features and not orders:
+            verdict = "Nothing beyond the geometry was found in the data: the geometric calibration stands."
+            drawn = identified_geometry(solved.setup, solved.solution.linearisation.point)
+            first = search.geometry
+            known = position_uncertainty(search.rows, first.design, first.posterior, first.sums, drawn)
+            return HybridResult(geometric, None, known, trials, verdict)
+        progress("solving for everything")
+        refined = refine(solved, additive, orders, self.geometric.loss)
+        geometry = identified_geometry(solved.setup, refined.point)
+        progress("looking beyond the measured joint values")
+        fade = fade_angle(refined.rows, refined.design, refined.posterior, refined.sums)
+        learned = LearnedPart(
+            geometry=geometry,
+            correction=refined.correction,
+            coverage=JointCoverage.of(self.geometric.robot, solved.problem.q, fade),
+            noise={
+                n.sensor: sigma for n, sigma in zip(geometric.noise, refined.posterior.noise, strict=True)
+            },
+            unknowns=refined.design.unknowns,
+            effective=refined.effective,
+            rounds=refined.rounds,
+        )
+        names = [described(chosen) for chosen in features]
+        names += [f"product units of orders {orders}"] if orders else []
+        share = [trial.left_out for trial in trials if trial.kept][-1]
+        verdict = (
+            f"A joint correction was kept ({' + '.join(names)}): left-out rows are predicted with {share:.2f} "
+            "times the error of the geometric calibration."
+        )
+        known = position_uncertainty(refined.rows, refined.design, refined.posterior, refined.sums, geometry)
+        return HybridResult(geometric, learned, known, trials, verdict)
+
+    def _chosen(
+        self, solved: SolvedCalibration, progress: Callable[[str], None]
+    ) -> tuple[Search, Additive, tuple[int, ...]]:
+        """Features and orders of product units, on at most `SEARCHED_ROWS` rows."""
+        problem = solved.problem
+        if problem.q.shape[0] > SEARCHED_ROWS:
+            problem = problem.select(chosen_rows(problem.q.shape[0], SEARCHED_ROWS).to(problem.q.device))
+        here = solved.solution.linearisation
+        view = view_of(here)
+        values = sensor_values(problem, here.point)
+        weighted = []
+        for number, sensor in enumerate(values):
+            distance = sensor.residual.norm(dim=1) * sensor.root / view.scale(number)
+            loss = problem.loss_of(problem.sensors[number])
+            weighted.append(sensor.weighted(loss.weight(distance, sensor.components)))
+        if problem.pose is not None:
+            weighted = [sensor.collapsed(problem.pose) for sensor in weighted]
+        rows = Rows(
+            problem,
+            tuple(weighted),
+            (here.point - problem.nominal)[problem.active],
+            groups_of_equal_joints(problem.q),
+        )
+        series, others = self._features(rows.configurations)
+        largest = [*others, *series[-1:]]
+        search = Search(rows, view.noise, view.widening, largest, progress)
+        additive = search.best_additive(series, others)
+        orders = search.best_products(additive, self.orders)
+        return search, additive, orders
+
+    def _features(self, configurations: int) -> tuple[list[FourierSeries], list[AbstractFeatures]]:
+        """Series of ever more harmonics, not many more than there are joint values; and the other features."""
+        robot = self.geometric.robot
+        series: list[FourierSeries] = []
+        others: list[AbstractFeatures] = []
+        for name in self.features:
+            if name == "series":
+                most = max(2 * configurations, min(self.harmonics))
+                series = [FourierSeries(robot, k) for k in self.harmonics if k <= most]
+            elif name == "gravity":
+                others.append(GravityTorques(robot, self.gravity))
+            else:
+                others.append(SharedFeatures(robot, name))
+        return series, others

@@ -1,0 +1,144 @@
+"""From linearised values and chosen features to normal equations, chunk by chunk."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.hybrid.evidence import FIRST_SIZE, GaussianPrior, Sums
+from pisigma.hybrid.sensor_values import SensorValues
+from pisigma.identification.problem import CalibrationProblem
+from pisigma.network.features import AbstractFeatures
+
+CHUNK = 1_024
+"""Rows whose columns are in memory at a time."""
+
+
+@dataclass(frozen=True, eq=False)
+class Design:
+    """Which unknowns there are: the free parameters, and a weight for every used column of the features.
+
+    Attributes:
+        problem: rows and free parameters.
+        features: of the joint corrections.
+    """
+
+    problem: CalibrationProblem
+    features: tuple[AbstractFeatures, ...]
+
+    @property
+    def active(self) -> int:
+        """Number of free parameters, which come first."""
+        return len(self.problem.active)
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns."""
+        return self.active + sum(int(chosen.used.sum()) for chosen in self.features)
+
+    def stretch(self, number: int) -> slice:
+        """Where the weights of a choice of features stand."""
+        start = self.active + sum(int(chosen.used.sum()) for chosen in self.features[:number])
+        return slice(start, start + int(self.features[number].used.sum()))
+
+    def columns(self, values: SensorValues, rows: slice) -> Float64[Tensor, "seen components unknowns"]:
+        """Derivative of a sensor's values by all unknowns, not weighted."""
+        joints = values.joints[rows]
+        blocks = [values.geometry[rows]]
+        q = self.problem.q[values.row[rows]]
+        for chosen in self.features:
+            block = (joints[..., None] * chosen.columns(q)[:, None]).flatten(2)
+            used = chosen.used.flatten()
+            blocks.append(block if bool(used.all()) else block[..., used])
+        return torch.cat(blocks, -1)
+
+    def prior(self, widening: Sequence[float]) -> GaussianPrior:
+        """Prior of all unknowns, the classes' factors as the geometric calibration left them.
+
+        A prismatic joint's weights are lengths; their sizes count in radians times the reach.
+        """
+        problem, robot = self.problem, self.problem.space.robot
+        base, group = [problem.precision[problem.active]], [problem.prior_group]
+        sizes = [problem.q.new_tensor(list(widening))]
+        classes = len(widening)
+        unit = torch.where(torch.tensor(robot.revolute), 1.0, robot.reach**-2).to(problem.q)
+        following = classes
+        for chosen in self.features:
+            used = chosen.used
+            base.append(unit[:, None].expand(used.shape)[used])
+            group.append(chosen.group[used] + following)
+            count = len(chosen.group_names)
+            sizes.append(torch.full((count,), FIRST_SIZE, dtype=torch.float64))
+            following += count
+        fixed = problem.prior_sizes != "estimated"
+        return GaussianPrior(torch.cat(base), torch.cat(group), torch.cat(sizes), classes, fixed)
+
+    def places(self, features: Sequence[AbstractFeatures]) -> Int64[Tensor, " chosen"]:
+        """Where the unknowns stand that a design with some of the features has.
+
+        A Fourier series with fewer harmonics than the one here counts as a part of it.
+        """
+        chosen = [torch.arange(self.active)]
+        for wanted in features:
+            number = next(k for k, own in enumerate(self.features) if own.name == wanted.name)
+            own, start = self.features[number], self.stretch(number).start
+            place = torch.cumsum(own.used.flatten(), 0).view(own.used.shape) - 1 + start
+            if wanted.count == own.count:
+                chosen.append(place[own.used])
+            else:  # sines first, then cosines
+                half, whole = wanted.count // 2, own.count // 2
+                chosen.append(torch.cat([place[:, :half], place[:, whole : whole + half]], 1).flatten())
+        return torch.cat(chosen)
+
+
+def weighted_columns(
+    design: Design, values: Sequence[SensorValues], here: Float64[Tensor, " unknowns"] | None = None
+) -> tuple[list[Float64[Tensor, "seen components unknowns"]], list[Float64[Tensor, "seen components"]]]:
+    """Columns and targets of all rows of every sensor at once, weighted; for data that fit into memory."""
+    columns, targets = [], []
+    for sensor in values:
+        X = design.columns(sensor, slice(None))
+        y = sensor.residual + (0.0 if here is None else X @ here)
+        columns.append(X * sensor.root[:, None, None])
+        targets.append(y * sensor.root[:, None])
+    return columns, targets
+
+
+def sum_up(
+    design: Design,
+    values: Sequence[SensorValues],
+    here: Float64[Tensor, " unknowns"] | None,
+) -> Sums:
+    """Normal equations of all rows.
+
+    Args:
+        design: the unknowns.
+        values: per sensor; rows that count not at all are left out already.
+        here: the unknowns' values that the values were linearised at, counted from nominal.
+    """
+    size = design.unknowns
+    normal = design.problem.q.new_zeros((len(values), size, size))
+    descent = design.problem.q.new_zeros((len(values), size))
+    square = []
+    for k, sensor in enumerate(values):
+        total = 0.0
+        for start in range(0, len(sensor.row), CHUNK):
+            rows = slice(start, min(start + CHUNK, len(sensor.row)))
+            X = design.columns(sensor, rows)
+            y = sensor.residual[rows] + (0.0 if here is None else X @ here)
+            root = sensor.root[rows, None]
+            X, y = (X * root[..., None]).flatten(0, 1), (y * root).flatten()
+            normal[k].addmm_(X.t(), X)
+            descent[k].addmv_(X.t(), y)
+            total += float(y @ y)
+        square.append(total)
+    return Sums(
+        normal=normal,
+        descent=descent,
+        square=tuple(square),
+        count=tuple(float(sensor.residual.numel()) for sensor in values),
+        known=tuple(sensor.given for sensor in values),
+        exact=tuple(sensor.certain for sensor in values),
+    )

@@ -1,0 +1,137 @@
+"""Product units with all factors but one held: linear in that one."""
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from pisigma.network.features import AbstractFeatures, unit_inputs
+from pisigma.network.pi_sigma import sum_of_products
+from pisigma.robot.description import Robot
+
+Factors = Float64[Tensor, "dof factors inputs"]
+"""Weights of every factor of every joint's product units, the bias first."""
+
+
+class HeldProducts(AbstractFeatures):
+    """Columns `Π_{others} h · [1, φ]` of the free factor of every unit: asynchronous learning, solved exactly.
+
+    Attributes:
+        orders: number of factors of every unit.
+        factors: weights of all of them, the bias first.
+        free: per unit, number of its free factor among all.
+    """
+
+    name = "products"
+
+    def __init__(
+        self, robot: Robot, orders: Sequence[int], factors: Float64[Tensor, "dof factors inputs"], turn: int
+    ) -> None:
+        """Hold all factors but those whose turn it is: factor `turn` modulo its unit's order."""
+        self.orders = tuple(orders)
+        self.factors = factors
+        starts = [sum(orders[:u]) for u in range(len(orders))]
+        self.free = tuple(start + turn % order for start, order in zip(starts, orders, strict=True))
+        self._robot = robot
+        dof, inputs = factors.shape[0], factors.shape[2]
+        self.used = torch.ones(dof, len(orders) * inputs, dtype=torch.bool)
+        self.group = torch.arange(dof)[:, None].expand(self.used.shape)
+        self.group_names = tuple(f"products, {joint.name}" for joint in robot.joints)
+
+    def columns(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof columns"]:
+        """The inputs of the free factors times what the held ones come to."""
+        x = with_bias(self._robot, q)
+        held = torch.einsum("...i,jsi->...js", x, self.factors.to(q))
+        parts = []
+        start = 0
+        for order, free in zip(self.orders, self.free, strict=True):
+            product = torch.ones_like(held[..., 0])
+            for factor in range(start, start + order):
+                if factor != free:
+                    product = product * held[..., factor]
+            parts.append(product[..., None] * x[..., None, :])
+            start += order
+        return torch.cat(parts, -1)
+
+    def solved(self, weights: Float64[Tensor, " weights"]) -> Float64[Tensor, "dof factors inputs"]:
+        """All factors, the free ones as solved."""
+        dof, _, inputs = self.factors.shape
+        found = self.factors.clone()
+        found[:, list(self.free)] = weights.reshape(dof, len(self.orders), inputs)
+        return found
+
+
+class InputPairs(AbstractFeatures):
+    """Products of two inputs of different joints: from their weights the product units start."""
+
+    name = "pairs"
+
+    def __init__(self, robot: Robot) -> None:
+        """All pairs of inputs that do not belong to the same joint."""
+        turning = [j for j, turns in enumerate(robot.revolute) if turns]
+        sliding = [j for j, turns in enumerate(robot.revolute) if not turns]
+        joint = [*turning, *turning, *sliding]
+        self.pairs = tuple(
+            (a, b) for a in range(len(joint)) for b in range(a + 1, len(joint)) if joint[a] != joint[b]
+        )
+        self.inputs = len(joint)
+        self._robot = robot
+        self.used = torch.ones(robot.dof, len(self.pairs), dtype=torch.bool)
+        self.group = torch.arange(robot.dof)[:, None].expand(self.used.shape)
+        self.group_names = tuple(f"pairs, {row.name}" for row in robot.joints)
+
+    def columns(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof columns"]:
+        """The products."""
+        phi = unit_inputs(self._robot, q)
+        first, second = (torch.tensor(side, device=q.device) for side in zip(*self.pairs, strict=True))
+        values = phi.index_select(-1, first) * phi.index_select(-1, second)
+        return values.unsqueeze(-2).expand(*q.shape, values.shape[-1])
+
+    def factors(
+        self, weights: Float64[Tensor, " weights"], orders: Sequence[int]
+    ) -> Float64[Tensor, "dof factors inputs"]:
+        """Factors of product units that come nearest to `Σ weight · φ_a φ_b`, the largest parts first.
+
+        A symmetric matrix with eigenvalues of both signs is a sum of products: of the largest positive and the
+        largest negative one, `λ₊ (e₊·φ)² - |λ₋| (e₋·φ)²` is `(r · φ)(s · φ)` with r, s = √λ₊ e₊ ± √|λ₋| e₋.
+        Further factors of a unit start as the constant 1.
+        """
+        dof, size = self.used.shape[0], self.inputs
+        found = weights.new_zeros((dof, sum(orders), size + 1))
+        first, second = (torch.tensor(side) for side in zip(*self.pairs, strict=True))
+        for j, own in enumerate(weights.reshape(dof, -1)):
+            M = weights.new_zeros((size, size))
+            M[first, second] = own / 2
+            eigenvalues, vectors = torch.linalg.eigh(M + M.t())
+            start = 0
+            for u, order in enumerate(orders):
+                low, high = min(u, size - 1), max(size - 1 - u, 0)
+                plus = eigenvalues[high].clamp(min=0).sqrt() * vectors[:, high]
+                minus = (-eigenvalues[low]).clamp(min=0).sqrt() * vectors[:, low]
+                found[j, start, 1:], found[j, start + 1, 1:] = plus + minus, plus - minus
+                found[j, start + 2 : start + order, 0] = 1.0
+                start += order
+        return found
+
+
+def with_bias(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch inputs"]:
+    """1, and the inputs of the product units."""
+    phi = unit_inputs(robot, q)
+    return torch.cat([torch.ones_like(phi[..., :1]), phi], -1)
+
+
+def normalised(factors: Float64[Tensor, "dof factors inputs"]) -> Float64[Tensor, "dof factors inputs"]:
+    """Factors of length 1; those of no length are the constant 1."""
+    length = factors.norm(dim=-1, keepdim=True)
+    constant = torch.zeros_like(factors)
+    constant[..., 0] = 1.0
+    return torch.where(length > 1e-12, factors / length.clamp(min=1e-12), constant)
+
+
+def product_values(
+    robot: Robot, factors: Float64[Tensor, "dof factors inputs"], orders: Sequence[int], q: Tensor
+) -> Tensor:
+    """What the product units come to [rad or m]."""
+    held = torch.einsum("...i,jsi->...js", with_bias(robot, q), factors.to(q))
+    return sum_of_products(held, orders)

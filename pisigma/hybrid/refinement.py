@@ -1,0 +1,150 @@
+"""Solve the chosen model on all rows: weights, linearisation and posterior in turn until they agree."""
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.hybrid.design import Design, sum_up
+from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence
+from pisigma.hybrid.held_products import HeldProducts
+from pisigma.hybrid.products import ProductFit
+from pisigma.hybrid.rows import Rows, weigh
+from pisigma.hybrid.search import Additive
+from pisigma.hybrid.sensor_values import sensor_values
+from pisigma.identification.loss import AbstractLoss
+from pisigma.identification.result_assembly import SolvedCalibration
+from pisigma.measurement.groups import groups_of_equal_joints
+from pisigma.network.joint_correction import JointCorrection
+
+MOST_ROUNDS = 5
+SETTLED = 0.02
+"""[standard deviations] Rounds end when no unknown moves by more, on average."""
+PRODUCT_CONFIGURATIONS = 3_000
+"""Factors of product units are found on so many configurations at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refined:
+    """A solved hybrid.
+
+    Attributes:
+        rows: as last linearised and weighted.
+        design: all unknowns, the free factors of product units last.
+        posterior: of them.
+        sums: normal equations of the rows.
+        point: all parameters of the problem.
+        correction: the network.
+        rounds: linearisations made.
+    """
+
+    rows: Rows
+    design: Design
+    posterior: Posterior
+    sums: Sums
+    point: Float64[Tensor, " parameters"]
+    correction: JointCorrection
+    rounds: int
+
+    @property
+    def effective(self) -> float:
+        """Number of unknowns that the data tell."""
+        held = self.posterior.prior.precision * self.posterior.covariance.diagonal()
+        return float((1 - held).sum())
+
+
+def refine(
+    solved: SolvedCalibration, additive: Additive, orders: tuple[int, ...], loss: AbstractLoss
+) -> Refined:
+    """Fit the chosen features and product units to all rows.
+
+    Args:
+        solved: the geometric calibration, where it starts.
+        additive: the chosen unit of order 1, as fitted in the search.
+        orders: of the chosen product units.
+        loss: how far-off rows count.
+    """
+    problem = solved.problem
+    design = Design(problem, additive.design.features)
+    posterior, point = additive.posterior, solved.solution.linearisation.point
+    correction: JointCorrection | None = None
+    rows, sums, rounds = None, None, 0
+    for rounds in range(1, MOST_ROUNDS + 1):
+        rows = _rows(solved, point, correction, design, posterior, loss)
+        before = posterior.x
+        if orders and correction is None:
+            design, posterior, sums = _with_products(rows, design, posterior, orders)
+        else:
+            sums = sum_up(design, rows.values, rows.start(design))
+            posterior = maximise_evidence(sums, posterior.prior, posterior.noise)
+        active = len(problem.active)
+        point = problem.nominal.index_add(0, problem.active, posterior.x[:active])
+        correction = network(design, posterior)
+        if rounds > 1:
+            moved = (posterior.x - before) / posterior.covariance.diagonal().clamp(min=1e-300).sqrt()
+            if float(moved.square().mean().sqrt()) < SETTLED:
+                break
+    assert rows is not None and correction is not None and sums is not None
+    return Refined(rows, design, posterior, sums, point, correction, rounds)
+
+
+def network(design: Design, posterior: Posterior) -> JointCorrection:
+    """The network with the weights of a posterior."""
+    robot = design.problem.space.robot
+    held = design.features[-1] if design.features else None
+    products = held if isinstance(held, HeldProducts) else None
+    features = design.features[:-1] if products else design.features
+    made = JointCorrection(robot, features, products.orders if products else ())
+    with torch.no_grad():
+        for number, chosen in enumerate(features):
+            made.linear[number][chosen.used] = posterior.x[design.stretch(number)].cpu()
+        if products:
+            factors = products.solved(posterior.x[design.stretch(len(features))])
+            made.bias.copy_(factors[..., 0])
+            made.weight.copy_(factors[..., 1:])
+    made.requires_grad_(False)
+    return made
+
+
+def _rows(
+    solved: SolvedCalibration,
+    point: Tensor,
+    correction: JointCorrection | None,
+    design: Design,
+    posterior: Posterior,
+    loss: AbstractLoss,
+) -> Rows:
+    """All rows linearised at a point, weighted by their distance from what the posterior predicts."""
+    problem = solved.problem
+    values = sensor_values(problem, point, correction)
+    here = (point - problem.nominal)[problem.active]
+    active = len(here)
+    weights = None if correction is None else posterior.x[active:]
+    rows = Rows(problem, values, here, groups_of_equal_joints(problem.q), weights)
+    change = rows.start(design) - posterior.x
+    used = [0.0] * len(values) if correction is None else _used(rows, design, posterior)
+    weighed = weigh(values, design, change, used, loss)
+    kept = [sensor.weighted(weight) for sensor, weight in zip(values, weighed, strict=True)]
+    if problem.pose is not None:
+        kept = [sensor.collapsed(problem.pose) for sensor in kept]
+    return replace(rows, values=tuple(kept))
+
+
+def _used(rows: Rows, design: Design, posterior: Posterior) -> list[float]:
+    """Values of every sensor that the unknowns use up: those told, shared out by the sensors' values."""
+    told = float((1 - posterior.prior.precision * posterior.covariance.diagonal()).sum())
+    counts = [0.0 if sensor.certain else float(sensor.residual.numel()) for sensor in rows.values]
+    return [told * count / max(sum(counts), 1.0) for count in counts]
+
+
+def _with_products(
+    rows: Rows, design: Design, additive: Posterior, orders: tuple[int, ...]
+) -> tuple[Design, Posterior, Sums]:
+    """Fit product units beside the unit of order 1; the factors on a sample of the rows, the rest on all."""
+    few = rows.sample(PRODUCT_CONFIGURATIONS)
+    sums = sum_up(design, few.values, few.start(design))
+    additive = maximise_evidence(sums, additive.prior, additive.noise)
+    found = ProductFit(design, few.values, few.start(design), additive, sums).fit(orders)
+    sums = sum_up(found.design, rows.values, rows.start(found.design))
+    return found.design, maximise_evidence(sums, found.posterior.prior, found.posterior.noise), sums

@@ -1,0 +1,140 @@
+"""All measured values seen from one point: residuals and their derivatives by geometry and by joint values."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.identification.noise import renumbered
+from pisigma.identification.parameters import ParameterSpace
+from pisigma.identification.problem import CalibrationProblem
+
+Shift = Callable[[Tensor], Tensor]
+"""Joint corrections [rad or m] of joint values."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorValues:
+    """The rows in which one sensor saw something.
+
+    Attributes:
+        name: of the sensor.
+        row: number of every row in the problem.
+        geometry: derivative of the predicted values by the free parameters.
+        joints: the same by the joint values.
+        residual: measured minus predicted.
+        root: 1 / standard deviation where the rows give their own, else 1.
+        given: whether the rows give their own.
+        certain: whether the values are known rather than measured.
+    """
+
+    name: str
+    row: Int64[Tensor, " seen"]
+    geometry: Float64[Tensor, "seen components active"]
+    joints: Float64[Tensor, "seen components dof"]
+    residual: Float64[Tensor, "seen components"]
+    root: Float64[Tensor, " seen"]
+    given: bool
+    certain: bool
+
+    @property
+    def components(self) -> int:
+        """Values a row."""
+        return self.residual.shape[1]
+
+    def select(self, chosen: Tensor) -> "SensorValues":
+        """Some of the rows, by index or mask."""
+        return replace(
+            self,
+            row=self.row[chosen],
+            geometry=self.geometry[chosen],
+            joints=self.joints[chosen],
+            residual=self.residual[chosen],
+            root=self.root[chosen],
+        )
+
+    def weighted(self, weight: Float64[Tensor, " seen"]) -> "SensorValues":
+        """The same with rows that count more or less; those that do not count at all are left out."""
+        kept = weight > 0
+        return replace(self.select(kept), root=(self.root * weight.sqrt())[kept])
+
+    def collapsed(self, pose: Int64[Tensor, " rows"]) -> "SensorValues":
+        """Repeats of a pose as one row that counts for all of them.
+
+        What a model gets wrong at a pose is the same in all its repeats; counted one by one they would tell
+        more than they do.
+        """
+        key = renumbered(pose[self.row])
+        poses = int(key.max()) + 1 if len(key) else 0
+        if poses == len(key):
+            return self
+        weight = self.root.square()
+        total = weight.new_zeros(poses).index_add(0, key, weight)
+
+        def mean(values: Tensor) -> Tensor:
+            shape = (-1, *[1] * (values.ndim - 1))
+            summed = values.new_zeros(poses, *values.shape[1:]).index_add(0, key, values * weight.view(shape))
+            return summed / total.view(shape)
+
+        first = torch.full((poses,), len(self.row), dtype=torch.int64, device=key.device)
+        first = first.scatter_reduce(0, key, torch.arange(len(key), device=key.device), "amin")
+        return replace(
+            self,
+            row=self.row[first],
+            geometry=mean(self.geometry),
+            joints=mean(self.joints),
+            residual=mean(self.residual),
+            root=total.sqrt(),
+        )
+
+
+def sensor_values(
+    problem: CalibrationProblem, point: Float64[Tensor, " parameters"], shift: Shift | None = None
+) -> tuple[SensorValues, ...]:
+    """Linearise every sensor at a point.
+
+    Args:
+        problem: rows, sensors and free parameters.
+        point: values of all parameters.
+        shift: joint corrections that are in force already; None for none.
+    """
+    robot = problem.space.robot
+    moved = problem if shift is None else replace(problem, q=problem.q + shift(problem.q))
+    index = torch.cat([problem.active, joint_columns(problem.space).to(problem.q.device)])
+    direction = problem.q.new_tensor(robot.directions)
+    own = problem.space.own(point)
+    parts: list[list[tuple[Tensor, ...]]] = [[] for _ in problem.sensors]
+    for rows in moved.chunks():
+        motion = moved.motion(point, rows, index)
+        for sensor, found in zip(moved.sensors, parts, strict=True):
+            seen = sensor.seen[rows].nonzero()[:, 0]
+            J = moved.derivative(sensor, motion, own, rows, index)[..., seen].permute(2, 1, 0)
+            r = sensor.residual(motion, own, rows)[:, seen].t()
+            found.append((seen + rows.start, J, r))
+    values = []
+    for sensor, found in zip(problem.sensors, parts, strict=True):
+        row, J, r = (torch.cat(column) for column in zip(*found, strict=True))
+        root = torch.ones_like(r[:, 0]) if sensor.sigma is None else 1 / sensor.sigma[row]
+        values.append(
+            SensorValues(
+                name=sensor.name,
+                row=row,
+                geometry=J[..., : len(problem.active)].contiguous(),
+                joints=J[..., len(problem.active) :] * direction,
+                residual=r.contiguous(),
+                root=root,
+                given=sensor.sigma is not None,
+                certain=sensor.certain,
+            )
+        )
+    return tuple(values)
+
+
+def joint_columns(space: ParameterSpace) -> Int64[Tensor, " dof"]:
+    """Which parameter moves like the value of every joint: theta of turning, d of sliding ones."""
+    robot = space.robot
+    return torch.tensor(
+        [5 * row + (0 if turns else 1) for row, turns in zip(robot.joint_rows, robot.revolute, strict=True)]
+    )

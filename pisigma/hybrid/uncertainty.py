@@ -1,0 +1,180 @@
+"""Standard deviations of predicted positions, from the posterior of parameters and weights."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.hybrid.design import Design
+from pisigma.hybrid.evidence import Posterior, Sums
+from pisigma.hybrid.left_out import LeftOut, folds_left_out, left_out
+from pisigma.hybrid.rows import Rows
+from pisigma.hybrid.sensor_values import joint_columns
+from pisigma.identification.jacobian import identification_jacobian
+from pisigma.identification.parameters import ParameterSpace
+from pisigma.identification.sensor_building import numbers_of
+from pisigma.identification.user_coordinates import IdentifiedGeometry
+from pisigma.measurement.dataset import Measurements
+from pisigma.network.features import AbstractFeatures
+
+CHUNK = 512
+"""Rows whose columns are in memory at a time."""
+MOST_CONFIGURATIONS = 2_000
+"""Left-out rows are looked at on so many configurations at most."""
+FEW_CONFIGURATIONS = 600
+"""Up to so many, whole parts are left out instead of single configurations."""
+LEAST_TOLD = 0.5
+"""Prior sizes of groups of which the data tell less than so many unknowns do not matter."""
+MOST_WIDENING = 1e4
+"""Largest factor on variances."""
+
+
+@dataclass(frozen=True, eq=False)
+class PositionUncertainty:
+    """How well positions are known: `sqrt(x C x^T)` with x the derivative of a coordinate by all unknowns.
+
+    Attributes:
+        space: the parameters.
+        geometry: where the derivative is taken.
+        features: what the weights belong to.
+        root: `R` with `C = R R^T`, of all parameters of the space (0 for those that were not free) and then all
+            weights, widened so that left-out rows are missed by as much as it says.
+        widening: factor on the variances that this took.
+    """
+
+    space: ParameterSpace
+    geometry: IdentifiedGeometry
+    features: tuple[AbstractFeatures, ...]
+    root: Float64[Tensor, "unknowns directions"]
+    widening: float
+
+    def deviation(
+        self, measurements: Measurements, q_moved: Float64[Tensor, "rows dof"]
+    ) -> Float64[Tensor, "rows 3"]:
+        """Standard deviation of every row's position along the axes of its frame [m].
+
+        Args:
+            measurements: joint values, frames and targets.
+            q_moved: the joint values with their corrections.
+        """
+        frame = numbers_of(measurements.frame, self.space.frames, measurements.rows)
+        target = numbers_of(measurements.target, self.space.targets, measurements.rows)
+        found = torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
+        for f in range(len(self.space.frames)):
+            for t in range(len(self.space.targets)):
+                rows = ((frame == f) & (target == t)).nonzero()[:, 0]
+                for part in torch.split(rows, CHUNK):
+                    found[part] = self._of_rows(measurements.q[part], q_moved[part], f, t)
+        return found
+
+    def _of_rows(
+        self, q: Float64[Tensor, "rows dof"], q_moved: Float64[Tensor, "rows dof"], frame: int, target: int
+    ) -> Float64[Tensor, "rows 3"]:
+        space = self.space
+        base, tool = list(self.geometry.bases.values())[frame], list(self.geometry.tools.values())[target]
+        robot = self.geometry.robot.with_geometry(base=base, tool=tool)
+        J = identification_jacobian(robot, q_moved)[1][:, :3]
+        columns = J.new_zeros((len(q), 3, self.root.shape[0]))
+        columns[..., : space.arm_size] = J[..., : space.arm_size]
+        for group, number, place in (("base", frame, space.arm_size), ("tool", target, space.arm_size + 6)):
+            start = space.of(group).start + 6 * number
+            columns[..., start : start + 6] = J[..., place : place + 6]
+        columns[..., len(space.parameters) :] = self._weight_columns(J, q)
+        return (columns @ self.root).square().sum(-1).sqrt()
+
+    def _weight_columns(self, J: Tensor, q: Tensor) -> Float64[Tensor, "rows 3 weights"]:
+        joints = J[..., joint_columns(self.space)] * J.new_tensor(self.space.robot.directions)
+        blocks = [joints[..., :0]]
+        for chosen in self.features:
+            block = (joints[..., None] * chosen.columns(q)[:, None]).flatten(2)
+            blocks.append(block[..., chosen.used.flatten()])
+        return torch.cat(blocks, -1)
+
+
+def covariance_root(
+    covariance: Float64[Tensor, "unknowns unknowns"], change: Float64[Tensor, "parameters active"]
+) -> Float64[Tensor, "all_unknowns directions"]:
+    """Root of the covariance of all parameters in the user's coordinates and of the weights.
+
+    Args:
+        covariance: of the free parameters and the weights.
+        change: d(user's parameters) / d(free parameters).
+    """
+    scale = covariance.diagonal().clamp(min=1e-300).sqrt()
+    scaled = covariance / scale / scale[:, None]
+    scaled.diagonal().add_(1e-12)
+    root = scale[:, None] * torch.linalg.cholesky(scaled)
+    active = change.shape[1]
+    return torch.cat([change @ root[:active], root[active:]])
+
+
+def covariance_of_sizes(posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
+    """What the uncertainty of the prior's own sizes adds to the covariance of the unknowns.
+
+    With `dx / d log s_g = 2 C Λ_g x` for the unknowns of group g and `var(log s_g) = 1 / (2 told_g)`, where told_g of
+    them are told by the data (first order; Kass and Steffey 1989, J. Amer. Statist. Assoc. 84(407), 717-726).
+    """
+    prior, x = posterior.prior, posterior.x
+    held = prior.precision * posterior.covariance.diagonal()
+    groups = torch.zeros(len(x), len(prior.sizes), dtype=x.dtype, device=x.device)
+    groups[torch.arange(len(x)), prior.group] = 1.0
+    told = (groups * ((1 - held) * (prior.base > 0))[:, None]).sum(0)
+    moved = 2 * posterior.covariance @ (groups * (prior.precision * x)[:, None])
+    moved = moved[:, told > LEAST_TOLD] * (2 * told[told > LEAST_TOLD]).rsqrt()
+    return moved @ moved.t()
+
+
+def left_out_widening(errors: LeftOut) -> float:
+    """Factor on the unknowns' covariance with which left-out values are missed by as much as predicted; 1 or more.
+
+    With errors e and predicted deviations s in units of the noise, it solves `mean(e² / (1 + f (s² - 1))) = 1`.
+    What the model cannot express makes it larger than 1.
+    """
+    square, extra = errors.error.square(), errors.spread.square() - 1
+    low, high = 0.0, math.log(MOST_WIDENING)
+    if float((square / (1 + extra)).mean()) <= 1:
+        return 1.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        if float((square / (1 + math.exp(middle) * extra)).mean()) > 1:
+            low = middle
+        else:
+            high = middle
+    return math.exp(high)
+
+
+def degrees_of_freedom_factor(posterior: Posterior, sums: Sums) -> float:
+    """`n / (n - told)` with n values of which the unknowns use up `told`.
+
+    Features, prior sizes and noise are chosen on the same rows, which makes the posterior a little too sure; new rows
+    err by about so much more (as in generalised cross-validation, Craven and Wahba 1979).
+    """
+    held = posterior.prior.precision * posterior.covariance.diagonal()
+    values = sum(count for count, exact in zip(sums.count, sums.exact, strict=True) if not exact)
+    return values / max(values - float((1 - held).sum()), 0.2 * values)
+
+
+def position_uncertainty(
+    rows: Rows, design: Design, posterior: Posterior, sums: Sums, geometry: IdentifiedGeometry
+) -> PositionUncertainty:
+    """Of the positions that a posterior predicts, widened by what left-out rows show.
+
+    Args:
+        rows: linearised values.
+        design: the unknowns.
+        posterior: of them.
+        sums: normal equations of the rows.
+        geometry: in the user's coordinates.
+    """
+    if rows.configurations <= FEW_CONFIGURATIONS:
+        missed = folds_left_out(rows, design, posterior, sums)
+    else:
+        missed = left_out(rows.sample(MOST_CONFIGURATIONS), design, posterior)
+    widening = max(left_out_widening(missed), degrees_of_freedom_factor(posterior, sums))
+    space = design.problem.space
+    active = design.problem.active.cpu()
+    covariance = posterior.covariance + covariance_of_sizes(posterior)
+    root = covariance_root(widening * covariance.cpu(), geometry.change[:, active])
+    return PositionUncertainty(space, geometry, design.features, root, widening)

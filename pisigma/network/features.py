@@ -1,0 +1,265 @@
+"""Functions of the joint values that a joint's correction is a weighted sum of: one interface, named choices."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Int64
+from torch import Tensor
+
+from pisigma.errors import nearest_choice
+from pisigma.kinematics.forward import Geometry, forward_kinematics, iterate_rows
+from pisigma.network.inputs import Inputs
+from pisigma.robot.description import Robot
+
+BAND_STARTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
+"""First harmonic of every band: about two bands an octave."""
+UNIT = 1e-12
+"""A direction whose length is this near to 1 is one of length 1."""
+
+
+class AbstractFeatures(ABC):
+    """Columns for every joint: the correction of joint j is `Σ_m weight[j, m] · columns(q)[..., j, m]`.
+
+    Attributes:
+        name: of the choice, as recipes and models write it.
+        used: `(dof, m)`: which columns a joint has; the others are not to be given weights.
+        group: `(dof, m)`: number of the prior size that a column's weight has, from 0 on.
+        group_names: of the prior sizes.
+    """
+
+    name: ClassVar[str]
+    used: Bool[Tensor, "dof columns"]
+    group: Int64[Tensor, "dof columns"]
+    group_names: tuple[str, ...]
+
+    @abstractmethod
+    def columns(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof columns"]:
+        """Values of the columns, of the order of 1."""
+
+    def describe(self) -> dict[str, Any]:
+        """The name and what else `features_from` needs to make the same features again."""
+        return {"name": self.name}
+
+    @property
+    def count(self) -> int:
+        """Number of columns of a joint."""
+        return self.used.shape[1]
+
+
+def turning_rate(robot: Robot) -> Float[np.ndarray, " dof"]:
+    """Angle of a joint's periodic functions per joint value: 1 for a revolute joint [rad/rad].
+
+    A prismatic joint repeats after twice its travel, [rad/m]; without limits its unit of travel is the reach.
+    """
+    travel = np.diff(robot.limits)[:, 0]
+    travel = np.where(np.isfinite(travel) & (travel > 0), travel, max(robot.reach, 1e-3))
+    return np.where(robot.revolute, 1.0, np.pi / travel)
+
+
+class FourierSeries(AbstractFeatures):
+    """sin(k q_j) and cos(k q_j) of the joint's own value, k = 1 … K: gears and encoders that run out of true.
+
+    Weights of neighbouring harmonics share a prior size (see `BAND_STARTS`), so that the data say how the
+    error's spectrum falls with k. Source of the model: Judd and Knasinski, IEEE Transactions on Robotics and
+    Automation 6(1), 1990, 20-30.
+    """
+
+    name = "series"
+
+    def __init__(self, robot: Robot, harmonics: int) -> None:
+        """Take the first `harmonics` harmonics, at least one."""
+        if harmonics < 1:
+            raise ValueError(f"a Fourier series needs at least one harmonic, got {harmonics}.")
+        self.harmonics = harmonics
+        self._rate = torch.from_numpy(turning_rate(robot))
+        k = torch.arange(1, harmonics + 1)
+        band = torch.bucketize(k, torch.tensor(BAND_STARTS), right=True) - 1
+        self.used = torch.ones(robot.dof, 2 * harmonics, dtype=torch.bool)
+        self.group = torch.cat([band, band]).expand(robot.dof, -1)
+        ends = [*(start - 1 for start in BAND_STARTS[1:]), harmonics]
+        self.group_names = tuple(
+            f"harmonics {BAND_STARTS[b]} to {min(ends[b], harmonics)}" for b in range(int(band.max()) + 1)
+        )
+
+    def columns(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof columns"]:
+        """All sines, sin(q) first, and then all cosines."""
+        k = torch.arange(1, self.harmonics + 1, dtype=q.dtype, device=q.device)
+        angle = (q * self._rate.to(q))[..., None] * k
+        return torch.cat([angle.sin(), angle.cos()], -1)
+
+
+class GravityTorques(AbstractFeatures):
+    """What gravity turns a joint with, for masses that are not known: joints and gears give way to it.
+
+    The torque on joint j is linear in the masses beyond it. For every moved row k from joint j on it has four
+    columns, a mass in the origin p_k of the row's frame and first moments along its axes u [1/m, scaled by
+    `ARM` as a usual distance]::
+
+        z_j · ((p_k - p_j) × g) / reach        z_j · (u_k × g) · ARM / reach
+
+    with g the direction of gravity; a weight is then compliance times mass. On a prismatic joint, the force
+    `z_j · g`. Taken on the nominal geometry.
+
+    Source: Whitney, Lozinski and Rourke, ASME Journal of Dynamic Systems, Measurement, and Control 108(1),
+    1986, 1-8; regressors linear in the masses as in Khalil and Dombre, "Modeling, Identification and Control
+    of Robots", 2002, chapter 9.
+    """
+
+    name = "gravity"
+    ARM = 0.2
+    """Centres of mass lie about this share of the reach from the frames' origins."""
+    group_names = ("gravity",)
+
+    def __init__(self, robot: Robot, gravity: tuple[float, float, float] = (0.0, 0.0, -1.0)) -> None:
+        """Prepare for a robot.
+
+        Args:
+            robot: the nominal robot; its base and tool do not matter.
+            gravity: direction in which things fall, in the frame of the robot's first row.
+        """
+        norm = float(np.linalg.norm(gravity))
+        if not norm > 0 or not np.isfinite(norm):
+            raise ValueError(f"gravity needs a direction, got {gravity}.")
+        unit = abs(norm - 1) < UNIT  # kept as it is, so that features made again are the same to the last bit
+        self.gravity = tuple(float(x if unit else x / norm) for x in gravity)
+        self._robot = robot
+        beyond = np.arange(robot.dof)[None] >= np.arange(robot.dof)[:, None]
+        self.used = torch.from_numpy(np.repeat(beyond, 4, axis=1))
+        self.group = torch.zeros_like(self.used, dtype=torch.int64)
+
+    def describe(self) -> dict[str, Any]:
+        """See `AbstractFeatures.describe`."""
+        return {"name": self.name, "gravity": list(self.gravity)}
+
+    def columns(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof columns"]:
+        """Torques of unit masses and moments over the reach; 0 for masses before the joint."""
+        frames = self._frames(q.reshape(-1, self._robot.dof))
+        g = q.new_tensor(self.gravity)
+        joints = []
+        for j, joint in enumerate(self._robot.joints):
+            z, p = frames[j][0] * joint.direction, frames[j][1]
+            cells = []
+            for k in range(self._robot.dof):
+                axes, origin = frames[k][2], frames[k][3]
+                if k < j:
+                    cells += [torch.zeros_like(p[0])] * 4
+                elif joint.type == "prismatic":
+                    force = z[0] * g[0] + z[1] * g[1] + z[2] * g[2]
+                    cells += [force, *[torch.zeros_like(force)] * 3]
+                else:
+                    cells.append(_torque(z, origin - p, g) / self._robot.reach)
+                    cells += [_torque(z, u, g) * self.ARM for u in axes]
+            joints.append(torch.stack(cells, -1))
+        return torch.stack(joints, -2).reshape(*q.shape, 4 * self._robot.dof)
+
+    def _frames(self, q: Float[Tensor, "poses dof"]) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
+        """Per joint its axis and origin, then the axes and the origin of its row's frame, all `(3, poses)`."""
+        geometry = Geometry(self._robot.dh.tolist(), [0.0] * 6, [0.0] * 6)
+        one = torch.ones_like(q[:, 0])
+
+        def vector(values: tuple[float | Tensor, ...]) -> Tensor:
+            return torch.stack([value * one for value in values])
+
+        found = []
+        columns = q.t().contiguous().unbind(0)
+        for row, step in zip(self._robot.rows, iterate_rows(self._robot, geometry, columns), strict=True):
+            if row.type != "fixed":
+                axes = torch.stack([vector(axis) for axis in step.after[:3]])
+                z, p = vector(step.before[2]), vector(step.before[3])
+                found.append((z, p, axes, vector(step.after[3])))
+        return found
+
+
+def _torque(z: Tensor, arm: Tensor, g: Tensor) -> Tensor:
+    """`z · (arm × g)`, the pose index last."""
+    x = arm[1] * g[2] - arm[2] * g[1]
+    y = arm[2] * g[0] - arm[0] * g[2]
+    return z[0] * x + z[1] * y + z[2] * (arm[0] * g[1] - arm[1] * g[0])
+
+
+class SharedFeatures(AbstractFeatures):
+    """The same columns for every joint: scaled joints, sines and cosines of all joints, or the paper's inputs.
+
+    Attributes:
+        name: "joints": scaled joint values (0 in the middle of the limits, ±1 at them); "sin_cos": sine and
+            cosine of every revolute joint, scaled value of every prismatic one; "pose": the nominal pose's x,
+            y, z over the reach, and roll, pitch, yaw (Jeong et al. 1998, section 3.2) [rad].
+    """
+
+    CHOICES = ("joints", "sin_cos", "pose")
+
+    def __init__(self, robot: Robot, name: str) -> None:
+        """Choose the columns by name."""
+        if name not in self.CHOICES:
+            raise ValueError(f"shared features are {', '.join(self.CHOICES)}; got '{name}'.")
+        self.name = name  # type: ignore[misc]
+        self._robot = robot
+        self._inputs = Inputs.of(robot, ("x", "y", "z", "roll", "pitch", "yaw")) if name == "pose" else None
+        count = self._values(torch.zeros(robot.dof, dtype=torch.float64)).shape[-1]
+        self.used = torch.ones(robot.dof, count, dtype=torch.bool)
+        self.group = torch.zeros(robot.dof, count, dtype=torch.int64)
+        self.group_names = (name,)
+
+    def columns(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof columns"]:
+        """The values, once for every joint."""
+        values = self._values(q)
+        return values.unsqueeze(-2).expand(*q.shape, values.shape[-1])
+
+    def _values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:
+        if self._inputs is not None:
+            T = forward_kinematics(self._robot, q)
+            values = self._inputs(T, q)
+            return values / values.new_tensor([self._robot.reach] * 3 + [1.0] * 3)
+        if self.name == "joints":
+            return scaled_joints(self._robot, q)
+        return unit_inputs(self._robot, q)
+
+
+def scaled_joints(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+    """Joint values, 0 in the middle of the limits and ±1 at them; without limits over pi or the reach."""
+    middle = robot.limits.mean(1)
+    half = np.diff(robot.limits)[:, 0] / 2
+    half = np.where(np.isfinite(half), half, np.where(robot.revolute, np.pi, robot.reach))
+    middle = np.where(np.isfinite(middle), middle, 0.0)
+    return (q - q.new_tensor(middle)) / q.new_tensor(half)
+
+
+def unit_inputs(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch inputs"]:
+    """What product units see: sines, then cosines of the revolute joints, then scaled prismatic joints."""
+    turning = torch.from_numpy(np.flatnonzero(robot.revolute)).to(q.device)
+    sliding = torch.from_numpy(np.flatnonzero(~np.asarray(robot.revolute))).to(q.device)
+    angle = q.index_select(-1, turning)
+    parts = [angle.sin(), angle.cos()]
+    if len(sliding):
+        parts.append(scaled_joints(robot, q).index_select(-1, sliding))
+    return torch.cat(parts, -1)
+
+
+def features_from(robot: Robot, description: Mapping[str, Any]) -> AbstractFeatures:
+    """Features from what their `describe` gave.
+
+    Args:
+        robot: the nominal robot.
+        description: "name", and "harmonics" of a series or the direction "gravity" of gravity.
+
+    Raises:
+        ValueError: there are no features of that name, or what they need is missing, too much or wrong.
+    """
+    name = description.get("name")
+    names = (FourierSeries.name, GravityTorques.name, *SharedFeatures.CHOICES)
+    if name not in names:
+        raise ValueError(f"there are no features '{name}'; {nearest_choice(str(name), names)}")
+    needed = {FourierSeries.name: {"harmonics"}, GravityTorques.name: {"gravity"}}.get(name, set())
+    if wrong := needed ^ (set(description) - {"name"}):
+        raise ValueError(
+            f"the features '{name}' need {sorted(needed) or 'a name only'}; see {sorted(wrong)}."
+        )
+    if name == FourierSeries.name:
+        return FourierSeries(robot, description["harmonics"])
+    if name == GravityTorques.name:
+        x, y, z = description["gravity"]
+        return GravityTorques(robot, (x, y, z))
+    return SharedFeatures(robot, name)
