@@ -6,7 +6,8 @@ from dataclasses import dataclass
 from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.hybrid.coverage import JointCoverage
 from pisigma.hybrid.extrapolation import fade_angle
-from pisigma.hybrid.refinement import refine
+from pisigma.hybrid.product_search import best_products
+from pisigma.hybrid.refinement import refine, with_held_factors
 from pisigma.hybrid.result import HybridResult, LearnedPart
 from pisigma.hybrid.rows import Rows
 from pisigma.hybrid.search import Additive, Search, described
@@ -113,7 +114,8 @@ class HybridCalibrator:
             f"A joint correction was kept ({' + '.join(names)}): left-out rows are predicted with {share:.2f} "
             "times the error of the geometric calibration."
         )
-        known = position_uncertainty(refined.rows, refined.design, refined.posterior, refined.sums, geometry)
+        whole = with_held_factors(refined)
+        known = position_uncertainty(whole.rows, whole.design, whole.posterior, whole.sums, geometry)
         return HybridResult(geometric, learned, known, trials, verdict)
 
     def _chosen(
@@ -143,7 +145,7 @@ class HybridCalibrator:
         largest = [*others, *series[-1:]]
         search = Search(rows, view.noise, view.widening, largest, progress)
         additive = search.best_additive(series, others)
-        orders = search.best_products(additive, self.orders)
+        additive, orders = best_products(search, additive, self.orders)
         return search, additive, orders
 
     def _features(self, configurations: int) -> tuple[list[FourierSeries], list[AbstractFeatures]]:

@@ -62,6 +62,7 @@ class GaussianPrior:
         classes: the first so many groups are classes of geometric parameters, whose sizes are factors on what
             was stated; they move only within limits.
         fixed: whether the sizes of these classes stand.
+        standing: other groups whose sizes stand.
     """
 
     base: Float64[Tensor, " unknowns"]
@@ -69,6 +70,7 @@ class GaussianPrior:
     sizes: Float64[Tensor, " groups"]
     classes: int
     fixed: bool = False
+    standing: tuple[int, ...] = ()
 
     @property
     def precision(self) -> Float64[Tensor, " unknowns"]:
@@ -91,6 +93,7 @@ class GaussianPrior:
         floor = torch.where(is_class, SMALLEST_PRIOR, SMALLEST_SIZE)
         sizes = torch.maximum((square / count.clamp(min=1e-12)).sqrt(), floor)
         stands = (count <= least) | (is_class & self.fixed)
+        stands[list(self.standing)] = True
         return replace(self, sizes=torch.where(stands, self.sizes, sizes))
 
 

@@ -20,6 +20,7 @@ class HeldProducts(AbstractFeatures):
     Attributes:
         orders: number of factors of every unit.
         factors: weights of all of them, the bias first.
+        turn: whose turn it is.
         free: per unit, number of its free factor among all.
     """
 
@@ -31,6 +32,7 @@ class HeldProducts(AbstractFeatures):
         """Hold all factors but those whose turn it is: factor `turn` modulo its unit's order."""
         self.orders = tuple(orders)
         self.factors = factors
+        self.turn = turn
         starts = [sum(orders[:u]) for u in range(len(orders))]
         self.free = tuple(start + turn % order for start, order in zip(starts, orders, strict=True))
         self._robot = robot

@@ -75,7 +75,12 @@ class ProductFit:
         X, y = weighted_columns(design, values, here)
         self._X = [columns.flatten(0, 1) for columns in X]
         self._y = [target.flatten() for target in y]
-        self._reduce(additive)
+        self._additive = additive
+
+    @property
+    def inputs(self) -> int:
+        """Number of weights of a factor."""
+        return InputPairs(self.design.problem.space.robot).inputs + 1
 
     def fit(self, orders: Sequence[int], final_iterations: int = 15) -> FittedProducts:
         """Fit product units, from a start in the pairs of inputs.
@@ -84,6 +89,7 @@ class ProductFit:
             orders: number of factors of every unit.
             final_iterations: updates of all prior sizes and noise at the end; 0 leaves them.
         """
+        self._reduce(self._additive)
         robot = self.design.problem.space.robot
         pairs = InputPairs(robot)
         weights, _, _ = self._reduced(pairs, None, 8)

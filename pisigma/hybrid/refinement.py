@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.hybrid.design import Design, sum_up
-from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence
+from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence, solve_posterior
 from pisigma.hybrid.held_products import HeldProducts
 from pisigma.hybrid.products import ProductFit
 from pisigma.hybrid.rows import Rows, weigh
@@ -85,7 +85,9 @@ def refine(
             moved = (posterior.x - before) / posterior.covariance.diagonal().clamp(min=1e-300).sqrt()
             if float(moved.square().mean().sqrt()) < SETTLED:
                 break
-    assert rows is not None and correction is not None and sums is not None
+    assert rows is not None
+    assert correction is not None
+    assert sums is not None
     return Refined(rows, design, posterior, sums, point, correction, rounds)
 
 
@@ -148,3 +150,37 @@ def _with_products(
     found = ProductFit(design, few.values, few.start(design), additive, sums).fit(orders)
     sums = sum_up(found.design, rows.values, rows.start(found.design))
     return found.design, maximise_evidence(sums, found.posterior.prior, found.posterior.noise), sums
+
+
+def with_held_factors(refined: Refined) -> Refined:
+    """The same with the factors of product units that were held free too, for what is uncertain in them.
+
+    Their columns are the derivatives at the solution, their changes normal about 0 with the size of a weight among
+    all of a factor of length 1.
+    """
+    held = refined.design.features[-1] if refined.design.features else None
+    if not isinstance(held, HeldProducts):
+        return refined
+    weights = refined.posterior.x[refined.design.stretch(len(refined.design.features) - 1)]
+    factors = held.solved(weights)
+    others = [
+        HeldProducts(refined.design.problem.space.robot, held.orders, factors, held.turn + k)
+        for k in range(1, max(held.orders))
+    ]
+    design = replace(refined.design, features=(*refined.design.features, *others))
+    extra = design.unknowns - refined.design.unknowns
+    known = refined.rows.weights
+    known = refined.posterior.x[refined.design.active :] if known is None else known
+    rows = replace(refined.rows, weights=torch.cat([known, known.new_zeros(extra)]))
+    sums = sum_up(design, rows.values, rows.start(design))
+    prior = refined.posterior.prior
+    size = len(prior.sizes)
+    prior = replace(
+        prior,
+        base=torch.cat([prior.base, prior.base.new_ones(extra)]),
+        group=torch.cat([prior.group, torch.full((extra,), size)]),
+        sizes=torch.cat([prior.sizes, prior.sizes.new_tensor([factors.shape[-1] ** -0.5])]),
+        standing=(size,),
+    )
+    posterior = solve_posterior(sums, prior, refined.posterior.noise)
+    return replace(refined, rows=rows, design=design, posterior=posterior, sums=sums)

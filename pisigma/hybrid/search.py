@@ -4,22 +4,12 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import torch
-from torch import Tensor
-
 from pisigma.hybrid.design import Design, sum_up
-from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence, solve_posterior
+from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence
 from pisigma.hybrid.left_out import left_out
-from pisigma.hybrid.products import ProductFit
 from pisigma.hybrid.rows import Rows
 from pisigma.network.features import AbstractFeatures, FourierSeries
 
-FOLDS = 4
-"""Parts of the training rows on which product units are judged."""
-MOST_CONFIGURATIONS = 600
-"""Product units are chosen on so many configurations at most."""
-BETTER = 0.99
-"""Held-out RMS must fall below this share for product units to be kept."""
 LEVEL = 1.03
 """Features that the evidence is for are kept unless the left-out RMS rises above so many times what it was."""
 CLEARLY = 5.0
@@ -67,6 +57,16 @@ class Additive:
     sums: Sums
     posterior: Posterior
 
+    @property
+    def name(self) -> str:
+        """What it has, in a table."""
+        return " + ".join(described(chosen) for chosen in self.design.features) or "geometry"
+
+    @property
+    def harmonics(self) -> int:
+        """Of its Fourier series; 0 without one."""
+        return sum(c.harmonics for c in self.design.features if isinstance(c, FourierSeries))
+
 
 class Search:
     """Tries one model after the other on the same rows."""
@@ -90,10 +90,11 @@ class Search:
         """
         self.rows, self.noise, self.widening = rows, noise, widening
         self.trials: list[Trial] = []
-        self._progress = progress
+        self.progress = progress
         self._largest = Design(rows.problem, tuple(largest))
         self._sums = sum_up(self._largest, rows.values, rows.start(self._largest))
         self._unit = 1.0
+        self.fitted: list[Additive] = []
         self.geometry = self.additive(())
 
     def additive(self, features: Sequence[AbstractFeatures], near: Additive | None = None) -> Additive:
@@ -103,7 +104,9 @@ class Search:
         sums = self._sums.select(places)
         noise = self.noise if near is None else near.posterior.noise
         posterior = maximise_evidence(sums, design.prior(self.widening), noise, tolerance=ROUGHLY)
-        return Additive(design, sums, posterior)
+        found = Additive(design, sums, posterior)
+        self.fitted.append(found)
+        return found
 
     def left_out_rms(self, design: Design, posterior: Posterior) -> float:
         """RMS of left-out values over the noise of the geometric calibration."""
@@ -160,75 +163,14 @@ class Search:
         self, features: Sequence[AbstractFeatures], best: Additive, rms: float
     ) -> tuple[Additive, float, bool]:
         """The better of a new unit of order 1 and the best so far, by evidence and by left-out rows."""
-        name = " + ".join(described(chosen) for chosen in features)
-        self._progress(name)
+        self.progress(" + ".join(described(chosen) for chosen in features))
         began = time.monotonic()
         found = self.additive(features, best)
         own = self.left_out_rms(found.design, found.posterior)
         gain = found.posterior.log_evidence - best.posterior.log_evidence
         better = gain > CLEARLY and own < rms * LEVEL
-        self.note(name, found.design, found.posterior, own, began, better)
+        self.note(found.name, found.design, found.posterior, own, began, better)
         return (found, own, True) if better else (best, rms, False)
-
-    def best_products(self, additive: Additive, choices: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
-        """Orders of the product units that predict held-out rows best; none where they do not help.
-
-        Every choice is fitted to all but one of `FOLDS` parts of the rows at a time, and judged on that part.
-        """
-        best: tuple[int, ...] = ()
-        folds = self._folds()
-        squares = self._held_out(additive, (), folds)
-        first = squares
-        for orders in choices:
-            name = f"{self._name(additive)} + products {orders}"
-            self._progress(name)
-            began = time.monotonic()
-            own = self._held_out(additive, orders, folds)
-            better = own < squares * BETTER**2
-            rms = self.trials[-1].left_out if first == 0 else self._kept_rms() * (own / first) ** 0.5
-            self.trials.append(
-                Trial(name, additive.design.unknowns, float("nan"), rms, time.monotonic() - began, better)
-            )
-            if not better:
-                break
-            best, squares = orders, own
-        return best
-
-    def _kept_rms(self) -> float:
-        return next(
-            trial.left_out for trial in reversed(self.trials) if trial.kept and "products" not in trial.name
-        )
-
-    def _name(self, additive: Additive) -> str:
-        return " + ".join(described(chosen) for chosen in additive.design.features) or "geometry"
-
-    def _folds(self) -> list[Tensor]:
-        """Masks over the configurations, of `FOLDS` parts of at most `MOST_CONFIGURATIONS`."""
-        generator = torch.Generator().manual_seed(0)
-        order = torch.randperm(self.rows.configurations, generator=generator)[:MOST_CONFIGURATIONS]
-        parts = []
-        for k in range(FOLDS):
-            mask = torch.zeros(self.rows.configurations, dtype=torch.bool)
-            mask[order[k::FOLDS]] = True
-            parts.append(mask.to(self.rows.configuration.device))
-        return parts
-
-    def _held_out(self, additive: Additive, orders: tuple[int, ...], folds: Sequence[Tensor]) -> float:
-        """Sum of squared residuals over variances of held-out rows."""
-        everything = torch.stack(list(folds)).any(0)
-        total = 0.0
-        for fold in folds:
-            train, test = self.rows.of(everything & ~fold), self.rows.of(fold)
-            sums = sum_up(additive.design, train.values, train.start(additive.design))
-            prior = additive.posterior.prior
-            base = solve_posterior(sums, prior, additive.posterior.noise)
-            if orders:
-                fit = ProductFit(additive.design, train.values, train.start(additive.design), base, sums)
-                products = fit.fit(orders, 0)
-                total += float(test.left(products.design, products.posterior, additive.posterior.noise).sum())
-            else:
-                total += float(test.left(additive.design, base, additive.posterior.noise).sum())
-        return total
 
 
 def described(features: AbstractFeatures) -> str:
