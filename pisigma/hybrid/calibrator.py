@@ -7,22 +7,28 @@ from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.hybrid.coverage import JointCoverage
 from pisigma.hybrid.extrapolation import fade_angle
 from pisigma.hybrid.product_search import best_products
-from pisigma.hybrid.refinement import refine, with_held_factors
+from pisigma.hybrid.refinement import Refinement, refine, with_held_factors
 from pisigma.hybrid.result import HybridResult, LearnedPart
 from pisigma.hybrid.rows import Rows
 from pisigma.hybrid.search import Additive, Search, described
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.problem import view_of
+from pisigma.identification.problem import CalibrationProblem, view_of
 from pisigma.identification.result_assembly import SolvedCalibration
 from pisigma.identification.starting import chosen_rows
 from pisigma.identification.user_coordinates import identified_geometry
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints
-from pisigma.network.features import AbstractFeatures, FourierSeries, GravityTorques, SharedFeatures
+from pisigma.network.features import (
+    AbstractFeatures,
+    ConditionFeatures,
+    FourierSeries,
+    GravityTorques,
+    SharedFeatures,
+)
 
-FEATURES = ("series", "gravity", *SharedFeatures.CHOICES)
+FEATURES = ("series", "gravity", "conditions", *SharedFeatures.CHOICES)
 """Features that may be chosen."""
 SEARCHED_ROWS = 4_000
 """Features and product units are chosen on so many rows at most; everything is fitted to all in the end."""
@@ -45,7 +51,7 @@ class HybridCalibrator:
     """
 
     geometric: GeometricCalibrator
-    features: tuple[str, ...] = ("gravity", "series")
+    features: tuple[str, ...] = ("gravity", "conditions", "series")
     harmonics: tuple[int, ...] = (8, 24, 56, 110)
     orders: tuple[tuple[int, ...], ...] = ((2,), (2, 2), (2, 2, 2, 2))
     gravity: tuple[float, float, float] = (0.0, 0.0, -1.0)
@@ -68,13 +74,17 @@ class HybridCalibrator:
             )
 
     def fit(
-        self, measurements: Measurements, progress: Callable[[str], None] = lambda what: None
+        self,
+        measurements: Measurements,
+        progress: Callable[[str], None] = lambda what: None,
+        refinement: Refinement = refine,
     ) -> HybridResult:
         """Calibrate.
 
         Args:
             measurements: what was measured.
             progress: called with what is being tried.
+            refinement: fits the chosen model to all rows.
 
         Raises:
             IdentificationError: see `GeometricCalibrator.solve`.
@@ -92,7 +102,7 @@ class HybridCalibrator:
             known = position_uncertainty(search.rows, first.design, first.posterior, first.sums, drawn)
             return HybridResult(geometric, None, known, trials, verdict)
         progress("solving for everything")
-        refined = refine(solved, additive, orders, self.geometric.loss)
+        refined = refinement(solved, additive, orders, self.geometric.loss)
         geometry = identified_geometry(solved.setup, refined.point)
         progress("looking beyond the measured joint values")
         fade = fade_angle(refined.rows, refined.design, refined.posterior, refined.sums)
@@ -122,9 +132,7 @@ class HybridCalibrator:
         self, solved: SolvedCalibration, progress: Callable[[str], None]
     ) -> tuple[Search, Additive, tuple[int, ...]]:
         """Features and orders of product units, on at most `SEARCHED_ROWS` rows."""
-        problem = solved.problem
-        if problem.q.shape[0] > SEARCHED_ROWS:
-            problem = problem.select(chosen_rows(problem.q.shape[0], SEARCHED_ROWS).to(problem.q.device))
+        problem = searched_rows(solved.problem)
         here = solved.solution.linearisation
         view = view_of(here)
         values = sensor_values(problem, here.point)
@@ -141,14 +149,16 @@ class HybridCalibrator:
             (here.point - problem.nominal)[problem.active],
             groups_of_equal_joints(problem.q),
         )
-        series, others = self._features(rows.configurations)
+        series, others = self._features(problem, rows.configurations)
         largest = [*others, *series[-1:]]
         search = Search(rows, view.noise, view.widening, largest, progress)
         additive = search.best_additive(series, others)
         additive, orders = best_products(search, additive, self.orders)
         return search, additive, orders
 
-    def _features(self, configurations: int) -> tuple[list[FourierSeries], list[AbstractFeatures]]:
+    def _features(
+        self, problem: CalibrationProblem, configurations: int
+    ) -> tuple[list[FourierSeries], list[AbstractFeatures]]:
         """Series of ever more harmonics, not many more than there are joint values; and the other features."""
         robot = self.geometric.robot
         series: list[FourierSeries] = []
@@ -159,6 +169,18 @@ class HybridCalibrator:
                 series = [FourierSeries(robot, k) for k in self.harmonics if k <= most]
             elif name == "gravity":
                 others.append(GravityTorques(robot, self.gravity))
+            elif name == "conditions":
+                if problem.conditions is not None:
+                    mean, spread = problem.conditions.mean(0).tolist(), problem.conditions.std(0).tolist()
+                    names = problem.condition_names
+                    others.append(ConditionFeatures(robot, names, mean, spread, self.gravity))
             else:
                 others.append(SharedFeatures(robot, name))
         return series, others
+
+
+def searched_rows(problem: CalibrationProblem) -> CalibrationProblem:
+    """The problem with the rows that features and product units are chosen on."""
+    if problem.q.shape[0] <= SEARCHED_ROWS:
+        return problem
+    return problem.select(chosen_rows(problem.q.shape[0], SEARCHED_ROWS).to(problem.q.device))

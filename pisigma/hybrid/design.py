@@ -47,9 +47,9 @@ class Design:
         """Derivative of a sensor's values by all unknowns, not weighted."""
         joints = values.joints[rows]
         blocks = [values.geometry[rows]]
-        q = self.problem.q[values.row[rows]]
+        state = self.problem.state[values.row[rows]]
         for chosen in self.features:
-            block = (joints[..., None] * chosen.columns(q)[:, None]).flatten(2)
+            block = (joints[..., None] * chosen.columns(state)[:, None]).flatten(2)
             used = chosen.used.flatten()
             blocks.append(block if bool(used.all()) else block[..., used])
         return torch.cat(blocks, -1)

@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.errors import IdentificationError
 from pisigma.identification.noise import LEAST_TOLD, SMALLEST_NOISE, SMALLEST_PRIOR
 
 SMALLEST_SIZE = 1e-9
@@ -24,8 +25,8 @@ class Sums:
         descent: `Σ X^T y`.
         square: `Σ y^T y`.
         count: number of values that count as independent.
-        known: per sensor None where its noise is to be estimated, else the smallest factor on what is given.
-        exact: per sensor whether that factor is 1.
+        known: per sensor whether its rows give their noise, which then is at least as given.
+        exact: per sensor whether it is exactly as given.
     """
 
     normal: Float64[Tensor, "sensors unknowns unknowns"]
@@ -150,7 +151,11 @@ def solve_mean(sums: Sums, prior: GaussianPrior, noise: tuple[float, ...]) -> Fl
 
 
 def _factored(normal: Float64[Tensor, "unknowns unknowns"]) -> tuple[Tensor, Tensor]:
-    """Column scale, and Cholesky factor of the scaled matrix."""
+    """Column scale, and Cholesky factor of the scaled matrix.
+
+    Raises:
+        IdentificationError: the matrix is not finite.
+    """
     scale = normal.diagonal().clamp(min=1e-300).rsqrt()
     scaled = normal * scale * scale[:, None]
     jitter = 1e-14
@@ -158,6 +163,10 @@ def _factored(normal: Float64[Tensor, "unknowns unknowns"]) -> tuple[Tensor, Ten
         factor, failed = torch.linalg.cholesky_ex(scaled + jitter * torch.eye(len(scale)).to(scaled))
         if not failed:
             return scale, factor
+        if not bool(torch.isfinite(scaled).all()):
+            raise IdentificationError(
+                "the normal equations are not finite; look for values without limit in the measurements."
+            )
         jitter *= 10
 
 

@@ -41,7 +41,7 @@ class HeldProducts(AbstractFeatures):
         self.group = torch.arange(dof)[:, None].expand(self.used.shape)
         self.group_names = tuple(f"products, {joint.name}" for joint in robot.joints)
 
-    def columns(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof columns"]:
+    def columns(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof columns"]:
         """The inputs of the free factors times what the held ones come to."""
         x = with_bias(self._robot, q)
         held = torch.einsum("...i,jsi->...js", x, self.factors.to(q))
@@ -83,12 +83,12 @@ class InputPairs(AbstractFeatures):
         self.group = torch.arange(robot.dof)[:, None].expand(self.used.shape)
         self.group_names = tuple(f"pairs, {row.name}" for row in robot.joints)
 
-    def columns(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof columns"]:
+    def columns(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof columns"]:
         """The products."""
         phi = unit_inputs(self._robot, q)
         first, second = (torch.tensor(side, device=q.device) for side in zip(*self.pairs, strict=True))
         values = phi.index_select(-1, first) * phi.index_select(-1, second)
-        return values.unsqueeze(-2).expand(*q.shape, values.shape[-1])
+        return values.unsqueeze(-2).expand(*values.shape[:-1], len(self.used), values.shape[-1])
 
     def factors(
         self, weights: Float64[Tensor, " weights"], orders: Sequence[int]
@@ -117,7 +117,7 @@ class InputPairs(AbstractFeatures):
         return found
 
 
-def with_bias(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch inputs"]:
+def with_bias(robot: Robot, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch inputs"]:
     """1, and the inputs of the product units."""
     phi = unit_inputs(robot, q)
     return torch.cat([torch.ones_like(phi[..., :1]), phi], -1)

@@ -197,7 +197,7 @@ class ProductFit:
         """Weighted columns of one more choice of features."""
         values = self.values[sensor]
         joints = values.joints * values.root[:, None, None]
-        columns = features.columns(self.design.problem.q[values.row])
+        columns = features.columns(self.design.problem.state[values.row])
         return (joints[..., None] * columns[:, None]).flatten(2).flatten(0, 1)
 
     def _solve_root(self, right: Tensor) -> Tensor:

@@ -1,5 +1,6 @@
 """Solve the chosen model on all rows: weights, linearisation and posterior in turn until they agree."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -54,6 +55,10 @@ class Refined:
         return float((1 - held).sum())
 
 
+Refinement = Callable[[SolvedCalibration, Additive, tuple[int, ...], AbstractLoss], Refined]
+"""Fits a chosen model to all rows, as `refine` does."""
+
+
 def refine(
     solved: SolvedCalibration, additive: Additive, orders: tuple[int, ...], loss: AbstractLoss
 ) -> Refined:
@@ -89,6 +94,27 @@ def refine(
     assert correction is not None
     assert sums is not None
     return Refined(rows, design, posterior, sums, point, correction, rounds)
+
+
+def seen_from(
+    solved: SolvedCalibration, design: Design, posterior: Posterior, loss: AbstractLoss, rounds: int
+) -> Refined:
+    """All rows linearised and weighted at the most probable values of a posterior, and the posterior seen there.
+
+    Args:
+        solved: the geometric calibration.
+        design: all unknowns.
+        posterior: where to look from, with prior sizes and noise, which stand.
+        loss: how far-off rows count.
+        rounds: rounds that it took to get there.
+    """
+    problem, active = solved.problem, design.active
+    point = problem.nominal.index_add(0, problem.active, posterior.x[:active])
+    correction = network(design, posterior)
+    rows = _rows(solved, point, correction, design, posterior, loss)
+    sums = sum_up(design, rows.values, rows.start(design))
+    there = solve_posterior(sums, posterior.prior, posterior.noise)
+    return Refined(rows, design, there, sums, point, correction, rounds)
 
 
 def network(design: Design, posterior: Posterior) -> JointCorrection:

@@ -1,5 +1,6 @@
 """What a hybrid calibration comes to."""
 
+import math
 from dataclasses import dataclass, replace
 
 import torch
@@ -82,7 +83,7 @@ class HybridResult:
             return T
         geometry, q = self.learned.geometry, measurements.q
         with torch.no_grad():
-            moved = replace(measurements, q=q + self.learned.correction(q))
+            moved = replace(measurements, q=q + self.learned.correction.of_rows(measurements))
         T_learned = predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)
         return blend(T, T_learned, self.learned.coverage.share(q))
 
@@ -97,8 +98,7 @@ class HybridResult:
     def deviation(self, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
         """Standard deviation of the predicted positions along the axes of the row's frame [m], without noise.
 
-        Outside the measured joint values it goes over into the noise of the geometric calibration, which
-        holds what that model gets wrong.
+        Outside the measured joint values it goes over into what the geometric calibration does not explain.
 
         Raises:
             IdentificationError: nothing was measured in metres.
@@ -107,7 +107,23 @@ class HybridResult:
         if self.learned is None:
             return self.uncertainty.deviation(measurements, q)
         with torch.no_grad():
-            inside = self.uncertainty.deviation(measurements, q + self.learned.correction(q))
-        outside = max(noise.sigma for noise in self.geometric.noise if noise.unit != "rad")
+            inside = self.uncertainty.deviation(
+                measurements, q + self.learned.correction.of_rows(measurements)
+            )
+        outside = unexplained_length(self.geometric)
         share = self.learned.coverage.share(q)[:, None]
         return ((share * inside).square() + ((1 - share) * outside) ** 2).sqrt()
+
+
+def unexplained_length(result: CalibrationResult) -> float:
+    """What a geometric calibration does not explain of one coordinate of the measured lengths [m]; 0 without any.
+
+    The noise that was found; where the rows give their own, the RMS of the residuals.
+    """
+    found = []
+    for noise in result.noise:
+        if noise.unit == "m":
+            found.append(noise.sigma)
+        elif noise.sensor != "rotation" and noise.unit == "given":
+            found.append(noise.rms / math.sqrt(3 if noise.sensor in ("position", "socket") else 1))
+    return max(found, default=0.0)

@@ -12,7 +12,7 @@ from pisigma.identification.parameters import ParameterSpace
 from pisigma.identification.problem import CalibrationProblem
 
 Shift = Callable[[Tensor], Tensor]
-"""Joint corrections [rad or m] of joint values."""
+"""Joint corrections [rad or m] as a function of joint values and, behind them, conditions."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,7 +101,7 @@ def sensor_values(
         shift: joint corrections that are in force already; None for none.
     """
     robot = problem.space.robot
-    moved = problem if shift is None else replace(problem, q=problem.q + shift(problem.q))
+    moved = problem if shift is None else replace(problem, q=problem.q + shift(problem.state))
     index = torch.cat([problem.active, joint_columns(problem.space).to(problem.q.device)])
     direction = problem.q.new_tensor(robot.directions)
     own = problem.space.own(point)

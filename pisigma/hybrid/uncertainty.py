@@ -16,8 +16,9 @@ from pisigma.identification.jacobian import identification_jacobian
 from pisigma.identification.parameters import ParameterSpace
 from pisigma.identification.sensor_building import numbers_of
 from pisigma.identification.user_coordinates import IdentifiedGeometry
+from pisigma.measurement.conditions import with_conditions
 from pisigma.measurement.dataset import Measurements
-from pisigma.network.features import AbstractFeatures
+from pisigma.network.features import AbstractFeatures, ConditionFeatures
 
 CHUNK = 512
 """Rows whose columns are in memory at a time."""
@@ -59,6 +60,8 @@ class PositionUncertainty:
             measurements: joint values, frames and targets.
             q_moved: the joint values with their corrections.
         """
+        names = next((c.names for c in self.features if isinstance(c, ConditionFeatures)), ())
+        state = with_conditions(measurements, names)
         frame = numbers_of(measurements.frame, self.space.frames, measurements.rows)
         target = numbers_of(measurements.target, self.space.targets, measurements.rows)
         found = torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
@@ -66,29 +69,29 @@ class PositionUncertainty:
             for t in range(len(self.space.targets)):
                 rows = ((frame == f) & (target == t)).nonzero()[:, 0]
                 for part in torch.split(rows, CHUNK):
-                    found[part] = self._of_rows(measurements.q[part], q_moved[part], f, t)
+                    found[part] = self._of_rows(state[part], q_moved[part], f, t)
         return found
 
     def _of_rows(
-        self, q: Float64[Tensor, "rows dof"], q_moved: Float64[Tensor, "rows dof"], frame: int, target: int
+        self, state: Tensor, q_moved: Float64[Tensor, "rows dof"], frame: int, target: int
     ) -> Float64[Tensor, "rows 3"]:
         space = self.space
         base, tool = list(self.geometry.bases.values())[frame], list(self.geometry.tools.values())[target]
         robot = self.geometry.robot.with_geometry(base=base, tool=tool)
         J = identification_jacobian(robot, q_moved)[1][:, :3]
-        columns = J.new_zeros((len(q), 3, self.root.shape[0]))
+        columns = J.new_zeros((len(q_moved), 3, self.root.shape[0]))
         columns[..., : space.arm_size] = J[..., : space.arm_size]
         for group, number, place in (("base", frame, space.arm_size), ("tool", target, space.arm_size + 6)):
             start = space.of(group).start + 6 * number
             columns[..., start : start + 6] = J[..., place : place + 6]
-        columns[..., len(space.parameters) :] = self._weight_columns(J, q)
+        columns[..., len(space.parameters) :] = self._weight_columns(J, state)
         return (columns @ self.root).square().sum(-1).sqrt()
 
-    def _weight_columns(self, J: Tensor, q: Tensor) -> Float64[Tensor, "rows 3 weights"]:
+    def _weight_columns(self, J: Tensor, state: Tensor) -> Float64[Tensor, "rows 3 weights"]:
         joints = J[..., joint_columns(self.space)] * J.new_tensor(self.space.robot.directions)
         blocks = [joints[..., :0]]
         for chosen in self.features:
-            block = (joints[..., None] * chosen.columns(q)[:, None]).flatten(2)
+            block = (joints[..., None] * chosen.columns(state)[:, None]).flatten(2)
             blocks.append(block[..., chosen.used.flatten()])
         return torch.cat(blocks, -1)
 

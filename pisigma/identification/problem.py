@@ -50,6 +50,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         active: indices of the free parameters.
         pose: number of every row's pose (joint values, frame, target), None where no pose is repeated.
         pairs: so many pairs of rows, the first ones, are measured together.
+        conditions: what else was different from row to row (see `pisigma.measurement.conditions`), for joint
+            corrections that depend on it; None where nothing was stated.
+        condition_names: of their columns.
         prior_sizes: "stated": the prior as it is; "widened": wider where the errors are larger than it says;
             "estimated": wider or narrower.
         memory: the last motion; shared with problems that differ in their free parameters or prior only.
@@ -66,6 +69,8 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     active: Int64[Tensor, " active"]
     pose: Int64[Tensor, " rows"] | None = None
     pairs: int = 0
+    conditions: Float64[Tensor, "rows _conditions"] | None = None
+    condition_names: tuple[str, ...] = ()
     prior_sizes: PriorSizes = "widened"
     memory: MotionMemory = field(default_factory=MotionMemory, repr=False)
 
@@ -110,8 +115,14 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             sensors=tuple(sensor.select(rows) for sensor in self.sensors),
             pose=None if self.pose is None else renumbered(self.pose[rows]),
             pairs=int((rows < 2 * self.pairs).sum()) // 2,
+            conditions=None if self.conditions is None else self.conditions[rows],
             memory=MotionMemory(),
         )
+
+    @property
+    def state(self) -> Float64[Tensor, "rows _state"]:
+        """Joint values of the rows, and behind them their conditions."""
+        return self.q if self.conditions is None else torch.cat([self.q, self.conditions], 1)
 
     def moved(self, point: Tensor, step: Tensor) -> Tensor:
         """The parameters after a step of the free ones."""

@@ -23,6 +23,7 @@ from pisigma.identification.sensor_building import (
 )
 from pisigma.identification.starting import Start, find_start
 from pisigma.identification.sufficiency import check_poses
+from pisigma.measurement.conditions import conditions_of, told_conditions
 from pisigma.measurement.dataset import Kind, Measurements
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert, rotation_from_rpy, transform_from_xyzrpy
@@ -146,6 +147,8 @@ def build_setup(
         active=torch.zeros(0, dtype=torch.int64, device=device),
         pose=repeated_poses(measurements.q, frame, target),
         pairs=len(names_of(measurements.pair)),
+        conditions=conditions_of(measurements, told) if (told := told_conditions(measurements)) else None,
+        condition_names=told,
         prior_sizes=options.prior_sizes,
     )
     return CalibrationSetup(

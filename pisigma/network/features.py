@@ -1,7 +1,7 @@
 """Functions of the joint values that a joint's correction is a weighted sum of: one interface, named choices."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -28,16 +28,22 @@ class AbstractFeatures(ABC):
         used: `(dof, m)`: which columns a joint has; the others are not to be given weights.
         group: `(dof, m)`: number of the prior size that a column's weight has, from 0 on.
         group_names: of the prior sizes.
+        periodic: whether a full turn of a revolute joint changes nothing.
     """
 
     name: ClassVar[str]
     used: Bool[Tensor, "dof columns"]
     group: Int64[Tensor, "dof columns"]
     group_names: tuple[str, ...]
+    periodic: bool = True
 
     @abstractmethod
-    def columns(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof columns"]:
-        """Values of the columns, of the order of 1."""
+    def columns(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof columns"]:
+        """Values of the columns, of the order of 1.
+
+        Args:
+            q: joint values [rad or m], and behind them conditions, which only `ConditionFeatures` look at.
+        """
 
     def describe(self) -> dict[str, Any]:
         """The name and what else `features_from` needs to make the same features again."""
@@ -84,10 +90,14 @@ class FourierSeries(AbstractFeatures):
             f"harmonics {BAND_STARTS[b]} to {min(ends[b], harmonics)}" for b in range(int(band.max()) + 1)
         )
 
-    def columns(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof columns"]:
+    def describe(self) -> dict[str, Any]:
+        """See `AbstractFeatures.describe`."""
+        return {"name": self.name, "harmonics": self.harmonics}
+
+    def columns(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof columns"]:
         """All sines, sin(q) first, and then all cosines."""
         k = torch.arange(1, self.harmonics + 1, dtype=q.dtype, device=q.device)
-        angle = (q * self._rate.to(q))[..., None] * k
+        angle = (q[..., : len(self._rate)] * self._rate.to(q))[..., None] * k
         return torch.cat([angle.sin(), angle.cos()], -1)
 
 
@@ -134,8 +144,9 @@ class GravityTorques(AbstractFeatures):
         """See `AbstractFeatures.describe`."""
         return {"name": self.name, "gravity": list(self.gravity)}
 
-    def columns(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof columns"]:
+    def columns(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof columns"]:
         """Torques of unit masses and moments over the reach; 0 for masses before the joint."""
+        q = q[..., : self._robot.dof]
         frames = self._frames(q.reshape(-1, self._robot.dof))
         g = q.new_tensor(self.gravity)
         joints = []
@@ -196,6 +207,7 @@ class SharedFeatures(AbstractFeatures):
         if name not in self.CHOICES:
             raise ValueError(f"shared features are {', '.join(self.CHOICES)}; got '{name}'.")
         self.name = name  # type: ignore[misc]
+        self.periodic = name != "joints"
         self._robot = robot
         self._inputs = Inputs.of(robot, ("x", "y", "z", "roll", "pitch", "yaw")) if name == "pose" else None
         count = self._values(torch.zeros(robot.dof, dtype=torch.float64)).shape[-1]
@@ -203,8 +215,9 @@ class SharedFeatures(AbstractFeatures):
         self.group = torch.zeros(robot.dof, count, dtype=torch.int64)
         self.group_names = (name,)
 
-    def columns(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof columns"]:
+    def columns(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof columns"]:
         """The values, once for every joint."""
+        q = q[..., : self._robot.dof]
         values = self._values(q)
         return values.unsqueeze(-2).expand(*q.shape, values.shape[-1])
 
@@ -218,6 +231,68 @@ class SharedFeatures(AbstractFeatures):
         return unit_inputs(self._robot, q)
 
 
+class ConditionFeatures(AbstractFeatures):
+    """Payload and temperature: each times 1, sine and cosine of the joint's own value (prismatic: scaled value).
+
+    A condition counts in standard deviations from its mean over the measured rows, so that joint values alone stand
+    for the usual conditions. The payload also goes with the gravity torques of a mass at the last row's frame.
+
+    Attributes:
+        names: of the conditions, in the order in which they stand behind the joint values.
+        mean: over the measured rows [kg, deg C].
+        spread: standard deviation over them.
+    """
+
+    name = "conditions"
+    periodic = True
+
+    def __init__(
+        self,
+        robot: Robot,
+        names: Sequence[str],
+        mean: Sequence[float],
+        spread: Sequence[float],
+        gravity: tuple[float, float, float] = (0.0, 0.0, -1.0),
+    ) -> None:
+        """Take some conditions.
+
+        Raises:
+            ValueError: there is none, or one does not vary.
+        """
+        if not names or not len(names) == len(mean) == len(spread) or min(spread) <= 0:
+            raise ValueError(
+                f"conditions need names, means and positive spreads, got {tuple(names)}, {tuple(mean)}, "
+                f"{tuple(spread)}."
+            )
+        self.names, self.mean, self.spread = tuple(names), tuple(mean), tuple(spread)
+        self._robot = robot
+        self._torques = GravityTorques(robot, gravity)
+        self.gravity = self._torques.gravity
+        loaded = 4 if "payload_kg" in self.names else 0
+        self.used = torch.ones(robot.dof, 3 * len(self.names) + loaded, dtype=torch.bool)
+        group = [k for k in range(len(self.names)) for _ in range(3)]
+        group += [self.names.index("payload_kg")] * 4 if loaded else []
+        self.group = torch.tensor(group).expand(self.used.shape)
+        self.group_names = self.names
+
+    def columns(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof columns"]:
+        """The products; 0 under the usual conditions, and for conditions that are NaN or not there."""
+        joints, found = q[..., : self._robot.dof], q[..., self._robot.dof :]
+        if found.shape[-1] == 0:
+            return joints.new_zeros((*joints.shape, self.count))
+        scaled = (found - q.new_tensor(self.mean)) / q.new_tensor(self.spread)
+        scaled = torch.where(torch.isfinite(scaled), scaled, 0.0)
+        turning = torch.tensor(self._robot.revolute, device=q.device)
+        sine = torch.where(turning, joints.sin(), scaled_joints(self._robot, joints))
+        cosine = torch.where(turning, joints.cos(), torch.zeros_like(joints))
+        own = torch.stack([torch.ones_like(joints), sine, cosine], -1)
+        parts = [own * scaled[..., k, None, None] for k in range(len(self.names))]
+        if "payload_kg" in self.names:
+            torques = self._torques.columns(joints)[..., -4:]
+            parts.append(torques * scaled[..., self.names.index("payload_kg"), None, None])
+        return torch.cat(parts, -1)
+
+
 def scaled_joints(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
     """Joint values, 0 in the middle of the limits and ±1 at them; without limits over pi or the reach."""
     middle = robot.limits.mean(1)
@@ -227,8 +302,9 @@ def scaled_joints(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor,
     return (q - q.new_tensor(middle)) / q.new_tensor(half)
 
 
-def unit_inputs(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch inputs"]:
+def unit_inputs(robot: Robot, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch inputs"]:
     """What product units see: sines, then cosines of the revolute joints, then scaled prismatic joints."""
+    q = q[..., : robot.dof]
     turning = torch.from_numpy(np.flatnonzero(robot.revolute)).to(q.device)
     sliding = torch.from_numpy(np.flatnonzero(~np.asarray(robot.revolute))).to(q.device)
     angle = q.index_select(-1, turning)

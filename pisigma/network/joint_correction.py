@@ -6,7 +6,9 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pisigma.network.features import AbstractFeatures, unit_inputs
+from pisigma.measurement.conditions import with_conditions
+from pisigma.measurement.dataset import Measurements
+from pisigma.network.features import AbstractFeatures, ConditionFeatures, unit_inputs
 from pisigma.network.pi_sigma import sum_of_products, weigh_sums
 from pisigma.robot.description import Robot
 
@@ -57,9 +59,24 @@ class JointCorrection(nn.Module):
         self.bias = nn.Parameter(torch.zeros(robot.dof, factors, dtype=torch.float64))
         self.register_buffer("fixed", torch.ones(robot.dof, factors, dtype=torch.float64))
 
-    def forward(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
-        """Corrections to add to joint values q [rad or m]."""
-        total = torch.zeros_like(q)
+    @property
+    def conditions(self) -> tuple[str, ...]:
+        """Names of the conditions, besides the joint values, that it depends on."""
+        return next((c.names for c in self.features if isinstance(c, ConditionFeatures)), ())
+
+    def of_rows(self, measurements: Measurements) -> Float[Tensor, "rows dof"]:
+        """Corrections under the conditions of measured rows; where a row states none, under the usual ones."""
+        found: Tensor = self(with_conditions(measurements, self.conditions))
+        return found
+
+    def forward(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof"]:
+        """Corrections to add to joint values [rad or m].
+
+        Args:
+            q: joint values [rad or m], and behind them `conditions`; without these they are as usual when
+                it was fitted.
+        """
+        total = torch.zeros_like(q[..., : self.robot.dof])
         for chosen, weight in zip(self.features, self.linear, strict=True):
             total = total + (chosen.columns(q) * weight.to(q)).sum(-1)
         if not self.orders:
@@ -67,7 +84,7 @@ class JointCorrection(nn.Module):
         factors = self.factors(q)
         return total + sum_of_products(factors, self.orders)
 
-    def factors(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof factors"]:
+    def factors(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof factors"]:
         """Values of all factors of the product units of all joints."""
         phi = unit_inputs(self.robot, q)
         return weigh_sums(phi, self.weight.to(q), self.bias.to(q), self.fixed.to(q))
