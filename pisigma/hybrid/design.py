@@ -1,7 +1,7 @@
 """From linearised values and chosen features to normal equations, chunk by chunk."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float64, Int64
@@ -74,6 +74,24 @@ class Design:
             following += count
         fixed = problem.prior_sizes != "estimated"
         return GaussianPrior(torch.cat(base), torch.cat(group), torch.cat(sizes), classes, fixed)
+
+    def prior_like(self, other: "Design", prior: GaussianPrior) -> GaussianPrior:
+        """The prior with sizes to start from that another design's fit came to; new bands as its last one."""
+        own = self.prior(prior.sizes[: prior.classes].tolist())
+        sizes = own.sizes.clone()
+        starts = dict(zip((c.name for c in other.features), other.group_starts(prior.classes), strict=True))
+        for chosen, start in zip(self.features, self.group_starts(prior.classes), strict=True):
+            if chosen.name in starts:
+                known = next(c for c in other.features if c.name == chosen.name)
+                count = len(known.group_names)
+                for number in range(len(chosen.group_names)):
+                    sizes[start + number] = prior.sizes[starts[chosen.name] + min(number, count - 1)]
+        return replace(own, sizes=sizes)
+
+    def group_starts(self, classes: int) -> list[int]:
+        """Number of the first prior size of every choice of features."""
+        counts = [len(chosen.group_names) for chosen in self.features]
+        return [classes + sum(counts[:k]) for k in range(len(counts))]
 
     def places(self, features: Sequence[AbstractFeatures]) -> Int64[Tensor, " chosen"]:
         """Where the unknowns stand that a design with some of the features has.

@@ -104,7 +104,7 @@ class Posterior:
 
     Attributes:
         x: most probable values.
-        covariance: of the unknowns.
+        covariance: of the unknowns; empty where it was not asked for.
         log_evidence: of the data under the prior, up to a constant of the data.
         prior: with its sizes as estimated.
         noise: standard deviation per sensor [m or rad], or a factor on the given ones.
@@ -112,7 +112,7 @@ class Posterior:
     """
 
     x: Float64[Tensor, " unknowns"]
-    covariance: Float64[Tensor, "unknowns unknowns"]
+    covariance: Float64[Tensor, "uncertain uncertain"]
     log_evidence: float
     prior: GaussianPrior
     noise: tuple[float, ...]
@@ -160,7 +160,8 @@ def _factored(normal: Float64[Tensor, "unknowns unknowns"]) -> tuple[Tensor, Ten
     scaled = normal * scale * scale[:, None]
     jitter = 1e-14
     while True:
-        factor, failed = torch.linalg.cholesky_ex(scaled + jitter * torch.eye(len(scale)).to(scaled))
+        scaled.diagonal().fill_(1 + jitter)
+        factor, failed = torch.linalg.cholesky_ex(scaled)
         if not failed:
             return scale, factor
         if not bool(torch.isfinite(scaled).all()):
@@ -182,7 +183,7 @@ def maximise_evidence(
     prior: GaussianPrior,
     noise: tuple[float, ...],
     iterations: int = 40,
-    tolerance: float = 1e-2,
+    tolerance: float = 5e-2,
 ) -> Posterior:
     """Estimate prior sizes and noise together with the unknowns.
 

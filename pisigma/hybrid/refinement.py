@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.hybrid.design import Design, sum_up
-from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence, solve_posterior
+from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence, renewed_noise, solve_posterior
 from pisigma.hybrid.held_products import HeldProducts
 from pisigma.hybrid.products import ProductFit
 from pisigma.hybrid.rows import Rows, weigh
@@ -104,7 +104,7 @@ def seen_from(
     Args:
         solved: the geometric calibration.
         design: all unknowns.
-        posterior: where to look from, with prior sizes and noise, which stand.
+        posterior: where to look from, with prior sizes, which stand, and noise, which is renewed.
         loss: how far-off rows count.
         rounds: rounds that it took to get there.
     """
@@ -114,6 +114,7 @@ def seen_from(
     rows = _rows(solved, point, correction, design, posterior, loss)
     sums = sum_up(design, rows.values, rows.start(design))
     there = solve_posterior(sums, posterior.prior, posterior.noise)
+    there = solve_posterior(sums, posterior.prior, renewed_noise(sums, there))
     return Refined(rows, design, there, sums, point, correction, rounds)
 
 

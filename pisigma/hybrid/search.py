@@ -102,8 +102,10 @@ class Search:
         places = self._largest.places(features)
         design = Design(self.rows.problem, tuple(features))
         sums = self._sums.select(places)
-        noise = self.noise if near is None else near.posterior.noise
-        posterior = maximise_evidence(sums, design.prior(self.widening), noise, tolerance=ROUGHLY)
+        noise, prior = self.noise, design.prior(self.widening)
+        if near is not None:
+            noise, prior = near.posterior.noise, design.prior_like(near.design, near.posterior.prior)
+        posterior = maximise_evidence(sums, prior, noise, tolerance=ROUGHLY)
         found = Additive(design, sums, posterior)
         self.fitted.append(found)
         return found
