@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from pisigma.correction.corrected_ik import load as load
     from pisigma.correction.solution import Solution as Solution
     from pisigma.errors import PisigmaError as PisigmaError
+    from pisigma.hybrid.calibrator import HybridCalibrator as HybridCalibrator
+    from pisigma.hybrid.result import HybridResult as HybridResult
     from pisigma.identification.calibrator import GeometricCalibrator as GeometricCalibrator
     from pisigma.identification.result import CalibrationResult as CalibrationResult
     from pisigma.kinematics.status import Status as Status
@@ -24,6 +26,8 @@ _HOMES = {
     "CalibrationResult": "pisigma.identification.result",
     "CorrectedIK": "pisigma.correction.corrected_ik",
     "GeometricCalibrator": "pisigma.identification.calibrator",
+    "HybridCalibrator": "pisigma.hybrid.calibrator",
+    "HybridResult": "pisigma.hybrid.result",
     "Measurements": "pisigma.measurement.dataset",
     "PiSigma": "pisigma.network.pi_sigma",
     "PisigmaError": "pisigma.errors",
@@ -37,6 +41,8 @@ __all__ = [
     "CalibrationResult",
     "CorrectedIK",
     "GeometricCalibrator",
+    "HybridCalibrator",
+    "HybridResult",
     "Measurements",
     "PiSigma",
     "PisigmaError",
