@@ -9,6 +9,9 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.correction.domain import Domain
+from pisigma.correction.hybrid_motion import hybrid_poses
+from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.network.correction_network import CorrectionNetwork
 from pisigma.robot.description import Robot
@@ -64,6 +67,13 @@ class CalibratedModel:
         bases: per frame of the measurements ("" where it had no name) x, y, z [m], roll, pitch, yaw [rad] of
             the base in it; the first is that of `robot`. Empty where frames were not told apart.
         tools: the same per target for the tool.
+        hybrid: the arm with a joint correction that was fitted through the kinematics, its geometric part being
+            `calibrated`; None where there is none.
+        hybrid_bases: the bases that go with the hybrid's geometry, by the names of `bases`.
+        hybrid_tools: the same for the tools.
+        uncertainty: of predicted positions, or None.
+        unexplained: standard deviation of what the geometric calibration does not explain [m]: noise and all
+            that it cannot express.
         provenance: recipe, data, versions.
         metrics: figures for the card, by name.
     """
@@ -78,13 +88,25 @@ class CalibratedModel:
     calibrated: Robot | None = None
     bases: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
     tools: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
+    hybrid: HybridArm | None = None
+    hybrid_bases: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
+    hybrid_tools: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
+    uncertainty: PositionUncertainty | None = None
+    unexplained: float = 0.0
     provenance: Provenance = field(default_factory=Provenance)
     metrics: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def drawn(self) -> Robot | None:
+        """The robot as drawn, with its own base and tool, where a hybrid calibration knows it."""
+        if self.hybrid is not None:
+            return self.hybrid.correction.robot
+        return None if self.uncertainty is None else self.uncertainty.space.robot
 
     def correction(
         self, T: Float64[Tensor, "*batch 4 4"], q_nominal: Float64[Tensor, "*batch dof"]
     ) -> Float64[Tensor, "*batch dof"]:
-        """Correction [rad or m] to add to the nominal joint values of poses T; 0 without a network."""
+        """Correction [rad or m] that `network` adds to the nominal joint values of poses T; 0 without one."""
         if self.network is None:
             return torch.zeros_like(q_nominal)
         with torch.no_grad():
@@ -94,13 +116,16 @@ class CalibratedModel:
     def forward(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch 4 4"]:
         """Pose T_base_tool that the robot takes when commanded to q [rad or m], as far as the model knows.
 
-        With an identified geometry it is its forward kinematics. Else it is the pose whose corrected joint
-        values are q: `q_nominal = q - Δ(FK(q_nominal), q_nominal)`, solved by iteration.
+        With an identified geometry it is its forward kinematics, with the joint correction of a hybrid. Else
+        it is the pose whose corrected joint values are q: `q_nominal = q - Δ(FK(q_nominal), q_nominal)`, solved
+        by iteration.
 
         Returns:
             The poses; NaN where the iteration does not settle because the correction is steeper than the
             joints, as it may be far outside the domain, and where a joint value is NaN.
         """
+        if self.hybrid is not None:
+            return hybrid_poses(self.hybrid, q)
         if self.calibrated is not None:
             return forward_kinematics(self.calibrated, q)
         q_nominal, moved = q, torch.zeros_like(q)

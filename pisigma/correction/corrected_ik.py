@@ -2,15 +2,15 @@
 
 import os
 from collections.abc import Sequence
-from typing import Any
+from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from pisigma.correction.calibrated_model import CalibratedModel
 from pisigma.correction.identified_arm import ATTEMPTS, IdentifiedArm, search
 from pisigma.correction.model_folder import load_model
+from pisigma.correction.pose_input import JointLike, PoseLike, as_numbers, as_poses
 from pisigma.correction.solution import Solution
 from pisigma.correction.stored_starts import StoredStarts
 from pisigma.correction.turns import turn_near
@@ -20,16 +20,12 @@ from pisigma.kinematics.joint_limits import turn_into_limits
 from pisigma.kinematics.numeric import SINGULAR_TOLERANCE
 from pisigma.kinematics.singularity import singularity_measure
 from pisigma.kinematics.status import Status
-from pisigma.se3 import check_transforms
-
-PoseLike = Tensor | np.ndarray | Sequence[Any]
-"""Matrices `(*batch, 4, 4)`: a tensor, an array or nested lists."""
-
-JointLike = Tensor | np.ndarray | Sequence[Any]
-"""Joint values `(*batch, dof)`: a tensor, an array or nested lists."""
 
 NUMERIC = "numeric"
 """Name of the only branch of a robot without closed-form inverse: the one of the nearest training rows."""
+
+AWAY = 0.1
+"""[rad or m] A solution farther from where it was to be near to may not be the one that was meant."""
 
 
 class CorrectedIK:
@@ -65,7 +61,7 @@ class CorrectedIK:
         self._starts = StoredStarts(model.calibrated or model.robot, model.starts)
         self._arm: IdentifiedArm | None = None
         if model.calibrated is not None and self._solver is not None:
-            self._arm = IdentifiedArm(model.robot, model.calibrated, self._solver, self._starts)
+            self._arm = IdentifiedArm(model.robot, model.calibrated, self._solver, self._starts, model.hybrid)
         dof = model.robot.dof
         bounds = model.starts.aminmax(dim=0) if len(model.starts) else (torch.zeros(dof), torch.zeros(dof))
         self._centre = (bounds[0] + bounds[1]).double() / 2
@@ -93,10 +89,10 @@ class CorrectedIK:
         """
         if branch is not None and branch not in self.branches:
             raise PoseError(f"there is no branch '{branch}'; {nearest_choice(branch, self.branches)}")
-        T, given = _as_poses(T_base_tool)
+        T, given = as_poses(T_base_tool)
         start = None if near is None else self._as_near(near, T.shape[:-2])
         if self._solver is None:
-            return self._numeric(T, start).like(given)
+            return self._given(self._numeric(T, start), T, given)
         index = self._default if branch is None else self.branches.index(branch)
         free = start is not None and branch is None
         few: Sequence[int] = [index] if self._arm is not None and not free else range(len(self.branches))
@@ -105,22 +101,29 @@ class CorrectedIK:
         found = some.on_branch(self._nearest(some, start) if start is not None and free else chosen)
         if self._arm is not None:
             found = self._recovered(T, given, found, start, any_branch=branch is None)
-        return found.like(given)
+            if start is not None and free:
+                found = self._continued(T, found, start)
+        return self._given(found, T, given)
 
     def all_branches(self, T_base_tool: PoseLike) -> Solution:
         """Solutions on every branch, as `(*batch, branches)`; one for a robot without closed-form inverse."""
-        T, given = _as_poses(T_base_tool)
+        T, given = as_poses(T_base_tool)
         if self._solver is not None:
             every = self._on_branches(T, given, None, range(len(self.branches)))
             if self._arm is not None:
                 each = T.unsqueeze(-3).expand(*every.status.shape, 4, 4)
                 every = self._recovered(each, given, every, None, any_branch=False)
-            return every.like(given)
-        return self._numeric(T, None).with_branch_axis().like(given)
+        else:
+            every = self._numeric(T, None).with_branch_axis()
+        return self._given(every, T.unsqueeze(-3).expand(*every.status.shape, 4, 4), given)
+
+    def _given(self, found: Solution, T: Tensor, given: Tensor) -> Solution:
+        """Solutions as they are handed out: like the poses, and with what residuals are computed from."""
+        return replace(found.like(given), wanted=T, model=self.model)
 
     def _as_near(self, near: JointLike, batch: tuple[int, ...]) -> Tensor:
         """Joint values for every pose, float64 on the CPU."""
-        values = _as_numbers(near, "near", "joint values of shape (*batch, joints)").to("cpu", torch.float64)
+        values = as_numbers(near, "near", "joint values of shape (*batch, joints)").to("cpu", torch.float64)
         self.model.robot.check_joint_count(values.shape[-1] if values.ndim else 0)
         if not torch.isfinite(values).all():
             raise PoseError(
@@ -145,7 +148,7 @@ class CorrectedIK:
         if self._arm is None:
             return self._finish(each, q, status, branch, beside)
         reached, status = self._arm.follow(each, q)
-        return self._finish_identified(reached, q, status, branch, beside)
+        return self._finish_identified(each, reached, q, status, branch, beside)
 
     def _recovered(
         self, T: Tensor, given: Tensor, found: Solution, near: Tensor | None, any_branch: bool
@@ -166,7 +169,25 @@ class CorrectedIK:
         q, status, branch = self._arm.recover(T_lost, branch, anywhere)
         beside = None if near is None else near.reshape(-1, q.shape[-1])[lost]
         nominal = torch.full_like(q, torch.nan)
-        return found.with_rows(lost, self._finish_identified(q, nominal, status, branch, beside))
+        return found.with_rows(lost, self._finish_identified(T_lost, q, nominal, status, branch, beside))
+
+    def _continued(self, T: Tensor, found: Solution, near: Tensor) -> Solution:
+        """Look from `near` itself where nothing was found close to it.
+
+        Near singular poses the nominal arm may lack the branch on which the identified one is.
+        """
+        assert self._arm is not None
+        q_near, q_found = near.reshape(-1, near.shape[-1]), found.q.reshape(-1, near.shape[-1])
+        off = (q_found - q_near).norm(dim=-1).nan_to_num(torch.inf)
+        away = (off > AWAY).nonzero()[:, 0]
+        T_away, start = T.reshape(-1, 4, 4)[away], q_near[away]
+        q, status = search(self._arm.calibrated, T_away, start[:, None], self.model.hybrid)
+        lies = self._arm.branch_of(q)
+        nominal, _ = search(self.model.robot, T_away, q[:, None])
+        other = self._finish_identified(T_away, q, nominal, status, lies, start)
+        good = (other.status != Status.UNREACHABLE) & (other.status != Status.OUTSIDE_JOINT_LIMITS)
+        kept = (good & ((other.q - start).norm(dim=-1) < off[away])).nonzero()[:, 0]
+        return found.with_rows(away[kept], other.select(kept))
 
     def _numeric(self, T: Tensor, near: Tensor | None) -> Solution:
         """Numeric inverse from `near`, or from the training rows whose poses are nearest."""
@@ -174,13 +195,13 @@ class CorrectedIK:
         dof = self.model.robot.dof
         nearest = self._starts.nearest(flat, ATTEMPTS if near is None else 0)
         starts = self.model.starts[nearest] if near is None else near.reshape(-1, 1, dof)
-        q, status = search(self._starts.robot, flat, starts)
+        q, status = search(self._starts.robot, flat, starts, self.model.hybrid)
         branch = torch.zeros(shape, dtype=torch.int64)
         if self.model.calibrated is None:
             return self._finish(T, q.reshape(*shape, dof), status.reshape(shape), branch, near)
         nominal, _ = search(self.model.robot, flat, q[:, None])
         q, nominal = (values.reshape(*shape, dof) for values in (q, nominal))
-        return self._finish_identified(q, nominal, status.reshape(shape), branch, near)
+        return self._finish_identified(T, q, nominal, status.reshape(shape), branch, near)
 
     def _finish(self, T: Tensor, q: Tensor, status: Tensor, branch: Tensor, near: Tensor | None) -> Solution:
         """Add the correction to nominal joint values, and everything that limits the trust in it."""
@@ -204,18 +225,35 @@ class CorrectedIK:
         return Solution(commanded, q + turned, correction, branch, self.branches, status, measure)
 
     def _finish_identified(
-        self, q: Tensor, q_nominal: Tensor, status: Tensor, branch: Tensor, near: Tensor | None
+        self, T: Tensor, q: Tensor, q_nominal: Tensor, status: Tensor, branch: Tensor, near: Tensor | None
     ) -> Solution:
         """Put joint values of the identified arm beside the nominal ones, on the same turns."""
         found = torch.isfinite(q).all(-1)
         status = self._without_limits(torch.where(found[..., None], q, 0.0), status)
         commanded, inside = self._turned(q, near)
+        measure = torch.full(status.shape, torch.nan, dtype=torch.float64)
+        if self.model.hybrid is not None:
+            commanded, inside = self._on_turn(T, commanded, inside)
+            share = self.model.hybrid.coverage.share(commanded)
+            measure = 2 - share
+            status[(status == Status.REACHED) & (share < 1)] = int(Status.OUTSIDE_DOMAIN)
         status[~inside & found] = int(Status.OUTSIDE_JOINT_LIMITS)
         q_nominal = torch.where(found[..., None], q_nominal, torch.nan)
         q_nominal = turn_near(self.model.robot, q_nominal, commanded, within_limits=False)
-        measure = torch.full(status.shape, torch.nan, dtype=torch.float64)
         correction = commanded - q_nominal
         return Solution(commanded, q_nominal, correction, branch, self.branches, status, measure)
+
+    def _on_turn(self, T: Tensor, q: Tensor, inside: Tensor) -> tuple[Tensor, Tensor]:
+        """Solve again on the turns to command where a correction is not the same on all turns."""
+        hybrid = self.model.hybrid
+        assert hybrid is not None
+        if all(features.periodic for features in hybrid.correction.features):
+            return q, inside
+        flat = q.reshape(-1, 1, q.shape[-1])
+        found, status = search(self._starts.robot, T.reshape(-1, 4, 4), flat, hybrid)
+        settled = torch.where((status == Status.UNREACHABLE)[:, None], flat[:, 0], found).reshape(q.shape)
+        turned, within = turn_into_limits(self.model.robot, settled)
+        return settled, within & (turned == settled).all(-1)
 
     def _turned(self, q: Tensor, near: Tensor | None) -> tuple[Tensor, Tensor]:
         """Joint values on the turn to command, and whether they are inside the limits."""
@@ -253,25 +291,3 @@ def load(folder: str | os.PathLike[str]) -> CorrectedIK:
         ModelError: the folder is no whole model; the message says what is wrong with which file.
     """
     return CorrectedIK(load_model(folder))
-
-
-def _as_numbers(values: PoseLike | JointLike, name: str, wanted: str) -> Tensor:
-    """A floating-point tensor; float32 stays, integers become float64."""
-    if isinstance(values, Tensor):
-        given = values
-    else:
-        try:
-            array = np.asarray(values)
-            given = torch.as_tensor(array if array.dtype == np.float32 else array.astype(np.float64))
-        except (TypeError, ValueError):
-            raise PoseError(f"{name} is no array of numbers; give {wanted}.") from None
-    if given.dtype not in (torch.float32, torch.float64):
-        raise PoseError(f"{name} holds {given.dtype}; give float64 or float32.")
-    return given
-
-
-def _as_poses(poses: PoseLike) -> tuple[Tensor, Tensor]:
-    """The poses as float64 on the CPU, and as they were given."""
-    given = _as_numbers(poses, "T_base_tool", "homogeneous transforms of shape (*batch, 4, 4)")
-    check_transforms(given, "T_base_tool", tolerance=1e-6 if given.dtype == torch.float64 else 1e-4)
-    return given.detach().to("cpu", torch.float64), given

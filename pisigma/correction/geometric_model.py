@@ -1,6 +1,7 @@
-"""A geometric calibration as a model that corrected inverse kinematics can be made from."""
+"""A geometric or hybrid calibration as a model that corrected inverse kinematics can be made from."""
 
 import platform
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 
@@ -8,9 +9,13 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.correction.accuracy import geometry_of
 from pisigma.correction.calibrated_model import CalibratedModel, Provenance
 from pisigma.correction.identified_arm import IdentifiedArm
+from pisigma.correction.row_poses import Frames
 from pisigma.correction.stored_starts import StoredStarts, spread_rows
+from pisigma.hybrid.result import HybridResult, unexplained_length
+from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.result import CalibrationResult
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.measurement.dataset import Measurements
@@ -60,6 +65,44 @@ def model_of_calibration(
             | {"python": platform.python_version()},
         ),
     )
+
+
+def model_of_hybrid(
+    name: str,
+    nominal: Robot,
+    result: HybridResult,
+    measurements: Measurements,
+    recipe: tuple[str, str] = ("", ""),
+) -> CalibratedModel:
+    """Make the model of a hybrid calibration; without a joint correction that of its geometric calibration.
+
+    For the arguments see `model_of_calibration`. The uncertainty is kept in float32, so that the model is the
+    same before it is written and after it is read.
+    """
+    known, learned = result.geometric, result.learned
+    model = model_of_calibration(name, nominal, known, measurements, recipe)
+    model = replace(model, unexplained=unexplained_length(known))
+    if learned is None:
+        kept = _kept(result.uncertainty, known.robot, model.bases, model.tools)
+        return replace(model, uncertainty=kept)
+    found = learned.geometry
+    bases, tools = dict(found.bases), dict(found.tools)
+    return replace(
+        model,
+        kind="hybrid_calibration",
+        hybrid=result.arm(),
+        hybrid_bases=bases,
+        hybrid_tools=tools,
+        uncertainty=_kept(result.uncertainty, found.robot, bases, tools),
+    )
+
+
+def _kept(
+    uncertainty: PositionUncertainty, robot: Robot, bases: Frames, tools: Frames
+) -> PositionUncertainty:
+    """An uncertainty at the geometry of a model, with a root that float32 holds."""
+    geometry = geometry_of(robot, bases, tools)
+    return replace(uncertainty, geometry=geometry, root=uncertainty.root.float().double())
 
 
 def _branches(nominal: Robot, calibrated: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:

@@ -1,15 +1,18 @@
 """Inverse kinematics of an identified geometry, which has no closed form of its own."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
+from pisigma.correction.hybrid_motion import hybrid_motion
 from pisigma.correction.stored_starts import StoredStarts
+from pisigma.hybrid.arms import HybridArm
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.numeric import solve_numeric
+from pisigma.kinematics.numeric import NumericSolution, solve_numeric
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
 from pisigma.se3 import wrap_to_pi
@@ -20,6 +23,14 @@ PULL = 0.02
 ATTEMPTS = 4
 """Stored starts that are tried for a pose, nearest first."""
 
+HYBRID_TOLERANCE = 1e-12
+"""[m and rad] Residuals of a hybrid arm; blending two arms costs a few more roundings than one."""
+
+CHEAP_ITERATIONS, EXACT_ITERATIONS = 10, 25
+
+NEARLY = 0.01
+"""Share of the reach, and angle [rad]: a pose that the geometric arm misses by less the hybrid one may take."""
+
 
 def within_reach(robot: Robot, T: Float64[Tensor, "*batch 4 4"]) -> Bool[Tensor, "*batch"]:
     """Whether poses T_base_tool are not farther away than the robot is long, whatever its joints do."""
@@ -29,9 +40,18 @@ def within_reach(robot: Robot, T: Float64[Tensor, "*batch 4 4"]) -> Bool[Tensor,
 
 
 def search(
-    robot: Robot, T: Float64[Tensor, "poses 4 4"], starts: Float64[Tensor, "poses _starts dof"]
+    robot: Robot,
+    T: Float64[Tensor, "poses 4 4"],
+    starts: Float64[Tensor, "poses _starts dof"],
+    hybrid: HybridArm | None = None,
 ) -> tuple[Float64[Tensor, "poses dof"], Int64[Tensor, " poses"]]:
     """Solve for poses from one start after the other, until one leads there.
+
+    Args:
+        robot: the arm, or the geometric part of a hybrid one.
+        T: wanted poses.
+        starts: joint values to begin with [rad or m].
+        hybrid: the hybrid arm that is to take the poses, where it is one.
 
     Returns:
         Joint values [rad or m], NaN where the status is UNREACHABLE; poses beyond the reach are not tried.
@@ -43,10 +63,35 @@ def search(
         usable = torch.isfinite(starts[:, attempt]).all(-1)
         left = (near & usable & (status == Status.UNREACHABLE)).nonzero()[:, 0]
         if len(left):
-            found = solve_numeric(robot, T[left], starts[left, attempt])
+            found = _solve(robot, T[left], starts[left, attempt], hybrid)
             good = found.status != Status.NOT_CONVERGED
             q[left[good]], status[left[good]] = found.q[good], found.status[good]
     return q, status
+
+
+def _solve(robot: Robot, T: Tensor, start: Tensor, hybrid: HybridArm | None) -> NumericSolution:
+    """Solve for the arm, and from there for the hybrid one, which may reach a little farther.
+
+    First with a Jacobian that is cheap; what it does not solve, near singular poses, with the exact one.
+    """
+    found = solve_numeric(robot, T, start)
+    if hybrid is None:
+        return found
+    close = (found.position_residual < NEARLY * robot.reach) & (found.rotation_residual < NEARLY)
+    q, status = found.q.clone(), torch.full_like(found.status, int(Status.NOT_CONVERGED))
+    for exact, rounds in ((False, CHEAP_ITERATIONS), (True, EXACT_ITERATIONS)):
+        rows = (close & (status == Status.NOT_CONVERGED)).nonzero()[:, 0]
+        motion = partial(hybrid_motion, hybrid, exact=exact)
+        better = solve_numeric(
+            hybrid.hybrid,
+            T[rows],
+            q[rows],
+            tolerance=HYBRID_TOLERANCE,
+            max_iterations=rounds,
+            motion=motion,
+        )
+        q[rows], status[rows] = better.q, better.status
+    return replace(found, q=q, status=status)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,12 +103,14 @@ class IdentifiedArm:
         calibrated: the arm as identified.
         solver: closed form of the nominal arm.
         starts: joint values of calibration rows, with the poses of the identified arm there.
+        hybrid: the arm with its joint correction, which takes the poses instead, where there is one.
     """
 
     nominal: Robot
     calibrated: Robot
     solver: AbstractClosedForm
     starts: StoredStarts
+    hybrid: HybridArm | None = None
 
     def follow(
         self, T: Float64[Tensor, "*batch 4 4"], q: Float64[Tensor, "*batch dof"]
@@ -73,7 +120,9 @@ class IdentifiedArm:
         Returns:
             Joint values [rad or m] on the turns of q, and a status.
         """
-        found, status = search(self.calibrated, T.reshape(-1, 4, 4), q.reshape(-1, 1, q.shape[-1]))
+        found, status = search(
+            self.calibrated, T.reshape(-1, 4, 4), q.reshape(-1, 1, q.shape[-1]), self.hybrid
+        )
         return self.turned_like(found.reshape(q.shape), q), status.reshape(q.shape[:-1])
 
     def recover(
@@ -108,7 +157,7 @@ class IdentifiedArm:
         first = drawn[torch.arange(len(chosen)), wanted][:, None]
         others = torch.cat([drawn, self.starts.q[index]], 1)
         others = torch.where(anywhere[chosen, None, None], others, torch.nan)
-        found, reached = search(self.calibrated, T_near, torch.cat([first, others], 1))
+        found, reached = search(self.calibrated, T_near, torch.cat([first, others], 1), self.hybrid)
         lies = self.branch_of(found)
         lost = (lies != wanted) & ~anywhere[chosen]
         found[lost], reached[lost] = torch.nan, int(Status.UNREACHABLE)

@@ -12,7 +12,8 @@ from pisigma.errors import ModelError
 from pisigma.robot.robot_file import RobotDocument
 from pisigma.yaml_file import Section, parse_yaml
 
-FORMAT = 1
+FORMAT = 2
+"""Newest format; folders without anything of a hybrid calibration are written in format 1, which had none."""
 DESCRIPTION = "model.yaml"
 
 _CHECKSUM = re.compile(r"(.*^)sha256: ([0-9a-f]{64})\n", re.DOTALL | re.MULTILINE)
@@ -29,6 +30,80 @@ class GroupSection(Section):
     inputs: Annotated[tuple[str, ...], Field(min_length=1)]
     orders: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
     reference: tuple[_Vector, _Vector, _Vector]
+
+
+class SeriesSection(Section):
+    """See `pisigma.network.features.FourierSeries`."""
+
+    name: Literal["series"]
+    harmonics: Annotated[int, Field(ge=1, le=100_000)]
+
+
+class GravitySection(Section):
+    """See `pisigma.network.features.GravityTorques`."""
+
+    name: Literal["gravity"]
+    gravity: _Vector
+
+
+class ConditionSection(Section):
+    """See `pisigma.network.features.ConditionFeatures`."""
+
+    name: Literal["conditions"]
+    names: Annotated[tuple[Literal["payload_kg", "temperature_c"], ...], Field(min_length=1)]
+    mean: tuple[float, ...]
+    spread: tuple[float, ...]
+    gravity: _Vector
+
+
+class SharedSection(Section):
+    """See `pisigma.network.features.SharedFeatures`."""
+
+    name: Literal["joints", "sin_cos", "pose"]
+
+
+_Features = Annotated[
+    SeriesSection | GravitySection | ConditionSection | SharedSection, Field(discriminator="name")
+]
+
+
+class LearnedSection(Section):
+    """The joint correction of a hybrid calibration and the geometry that goes with it.
+
+    Attributes:
+        features: of the unit of order 1.
+        orders: number of factors of every product unit.
+        fade_rad: angle beyond the measured joint values over which the correction fades.
+        bases: per frame, of the hybrid's geometry.
+        tools: per target.
+    """
+
+    features: tuple[_Features, ...]
+    orders: tuple[Annotated[int, Field(ge=2, le=100)], ...]
+    fade_rad: Annotated[float, Field(gt=0)]
+    bases: dict[str, _Frame]
+    tools: dict[str, _Frame]
+
+
+class UncertaintySection(Section):
+    """What the root of the covariance, which stands in the weights file, belongs to.
+
+    Attributes:
+        sockets: names of the fixed points of the calibration.
+        anchors: the same of the ends of distances.
+        free: which parameters have a row in the root; the others' rows are 0. Behind them come all weights.
+        turns: whose turn it is, for every stretch of weights of product units that stands behind the others: see
+            `pisigma.hybrid.held_products.HeldProducts`.
+        widening: see `pisigma.hybrid.uncertainty.PositionUncertainty`.
+        unexplained_m: see `pisigma.correction.calibrated_model.CalibratedModel`.
+    """
+
+    sockets: tuple[str, ...]
+    anchors: tuple[str, ...]
+    free: tuple[Annotated[int, Field(ge=0)], ...]
+    turns: tuple[Annotated[int, Field(ge=0)], ...]
+    widening: Annotated[float, Field(gt=0)]
+    unexplained_m: Annotated[float, Field(ge=0)]
 
 
 class ProvenanceSection(Section):
@@ -50,7 +125,7 @@ class ModelDocument(Section):
 
     model_config = ConfigDict(protected_namespaces=())
 
-    format: Literal[1]
+    format: Literal[1, 2]
     name: str
     kind: str
     branches: tuple[str, ...]
@@ -60,13 +135,16 @@ class ModelDocument(Section):
     bases: dict[str, _Frame]
     tools: dict[str, _Frame]
     network: tuple[GroupSection, ...]
+    learned: LearnedSection | None = None
+    uncertainty: UncertaintySection | None = None
     provenance: ProvenanceSection
     metrics: dict[str, Any]
 
 
 def write_document(document: dict[str, Any], path: Path) -> None:
     """Write the document, and as its last line the checksum of all before it."""
-    text = yaml.safe_dump({"format": FORMAT, **document}, sort_keys=False, allow_unicode=True)
+    stated = FORMAT if {"learned", "uncertainty"} & set(document) else 1
+    text = yaml.safe_dump({"format": stated, **document}, sort_keys=False, allow_unicode=True)
     path.write_text(f"{text}sha256: {_digest(text)}\n", encoding="utf-8", newline="\n")
 
 

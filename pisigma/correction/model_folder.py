@@ -15,6 +15,14 @@ from torch import Tensor
 
 from pisigma.correction.calibrated_model import CalibratedModel, Provenance
 from pisigma.correction.domain import Domain
+from pisigma.correction.hybrid_folder import (
+    DTYPES,
+    Shape,
+    hybrid_sections,
+    hybrid_shapes,
+    hybrid_tensors,
+    with_hybrid,
+)
 from pisigma.correction.model_document import DESCRIPTION, ModelDocument, read_document, write_document
 from pisigma.errors import ModelError, PisigmaError, nearest_choice
 from pisigma.kinematics.closed_form import closed_form_solver
@@ -51,6 +59,7 @@ def save_model(model: CalibratedModel, folder: Path) -> None:
         "bases": {name: frame.tolist() for name, frame in model.bases.items()},
         "tools": {name: frame.tolist() for name, frame in model.tools.items()},
         "network": groups,
+        **hybrid_sections(model),
         "provenance": asdict(model.provenance),
         "metrics": model.metrics,
     }
@@ -85,7 +94,7 @@ def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:
 
 
 def _tensors(model: CalibratedModel) -> dict[str, Tensor]:
-    tensors = {"starts": model.starts}
+    tensors = {"starts": model.starts, **hybrid_tensors(model)}
     for prefix, module in (("network", model.network), ("domain", model.domain)):
         if module is not None:
             tensors |= {f"{prefix}.{key}": value for key, value in module.state_dict().items()}
@@ -128,7 +137,7 @@ def _build_model(document: ModelDocument, tensors: dict[str, Tensor]) -> Calibra
     _check_branches(robot, document.branches)
     network = _empty_network(document, robot)
     samples = "domain.samples" in tensors
-    expected: dict[str, tuple[int | None, ...]] = {"starts": (None, robot.dof)}
+    expected: dict[str, Shape] = {"starts": (None, robot.dof), **hybrid_shapes(document, robot)}
     if network is not None:
         expected |= {_PREFIX + key: tuple(value.shape) for key, value in network.state_dict().items()}
         inputs = sum(len(group.inputs.names) for group in network.groups)
@@ -139,7 +148,11 @@ def _build_model(document: ModelDocument, tensors: dict[str, Tensor]) -> Calibra
             {k.removeprefix(_PREFIX): v for k, v in tensors.items() if k.startswith(_PREFIX)}
         )
         network.requires_grad_(False)
-    return CalibratedModel(
+    bases, tools = (
+        {name: np.array(frame) for name, frame in frames.items()}
+        for frames in (document.bases, document.tools)
+    )
+    model = CalibratedModel(
         name=document.name,
         kind=document.kind,
         robot=robot,
@@ -148,11 +161,12 @@ def _build_model(document: ModelDocument, tensors: dict[str, Tensor]) -> Calibra
         branches=document.branches,
         starts=tensors["starts"],
         calibrated=_calibrated_robot(document, robot),
-        bases={name: np.array(frame) for name, frame in document.bases.items()},
-        tools={name: np.array(frame) for name, frame in document.tools.items()},
+        bases=bases,
+        tools=tools,
         provenance=Provenance(**document.provenance.model_dump()),
         metrics=document.metrics,
     )
+    return with_hybrid(model, document, tensors)
 
 
 def _calibrated_robot(document: ModelDocument, robot: Robot) -> Robot | None:
@@ -191,7 +205,7 @@ def _empty_network(document: ModelDocument, robot: Robot) -> CorrectionNetwork |
     return CorrectionNetwork(robot.dof, groups, networks) if groups else None
 
 
-def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, tuple[int | None, ...]]) -> None:
+def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, Shape]) -> None:
     """Refuse tensors that are not exactly the expected ones; None in a shape is any length."""
     for name in sorted(set(tensors) ^ set(expected)):
         raise ValueError(f"the tensor '{name}' is {'unknown' if name in tensors else 'missing'}")
@@ -203,5 +217,7 @@ def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, tuple[int | N
         if not fits:
             wanted = str(tuple("any" if length is None else length for length in shape)).replace("'", "")
             raise ValueError(f"the tensor '{name}' of shape {wanted} was wanted, got {tuple(value.shape)}")
-        if value.dtype != torch.float64:
-            raise ValueError(f"the tensor '{name}' in float64 was wanted, got {value.dtype}")
+        dtype = DTYPES.get(name, torch.float64)
+        if value.dtype != dtype:
+            kind = str(dtype).removeprefix("torch.")
+            raise ValueError(f"the tensor '{name}' in {kind} was wanted, got {value.dtype}")

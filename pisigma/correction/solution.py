@@ -1,10 +1,17 @@
 """What corrected inverse kinematics gives back."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
-from jaxtyping import Float, Int64
+import torch
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
+
+from pisigma.correction.accuracy import position_accuracy
+from pisigma.correction.calibrated_model import CalibratedModel
+from pisigma.kinematics.status import Status
+from pisigma.se3 import pose_error
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +29,11 @@ class Solution:
             limits, singular, outside domain, reached. Limits are those of the corrected values, which are
             commanded.
         domain_measure: distance to the training rows over their spacing; above 1 the correction is
-            extrapolated, whatever the status says. NaN where there is no network or no solution.
+            extrapolated, whatever the status says. For a hybrid 1 where all joint values were measured, rising
+            to 2 where only the geometric calibration holds. NaN where there is no network or no solution.
+        wanted: the poses T_base_tool that were asked for, float64 on the CPU.
+        model: whose solution it is. Residuals and accuracy are computed when they are first read, in float64 on
+            the CPU.
     """
 
     q: Float[Tensor, "*batch dof"]
@@ -32,6 +43,44 @@ class Solution:
     branches: tuple[str, ...]
     status: Int64[Tensor, "*batch"]
     domain_measure: Float[Tensor, "*batch"]
+    wanted: Float64[Tensor, "*batch 4 4"] | None = None
+    model: CalibratedModel | None = None
+
+    @property
+    def position_residual(self) -> Float64[Tensor, "*batch"]:
+        """Distance of the tool from the wanted position [m], as far as the model knows; NaN without solution."""
+        length: Tensor = torch.linalg.vector_norm(self._residual[..., :3], dim=-1)
+        return length
+
+    @property
+    def rotation_residual(self) -> Float64[Tensor, "*batch"]:
+        """Angle of the tool to the wanted orientation [rad], as far as the model knows; NaN without solution."""
+        angle: Tensor = torch.linalg.vector_norm(self._residual[..., 3:], dim=-1)
+        return angle
+
+    @cached_property
+    def accuracy(self) -> Float64[Tensor, "*batch"]:
+        """Predicted standard deviation of the tool's position [m]; NaN where the model does not know it."""
+        if self.model is None:
+            return torch.full(self.status.shape, torch.nan, dtype=torch.float64)
+        return position_accuracy(self.model, self.q)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What every status means and what to do about it, all batch axes in a row."""
+        return tuple(Status(status).sentence for status in self.status.flatten().tolist())
+
+    @cached_property
+    def _residual(self) -> Float64[Tensor, "*batch 6"]:
+        """Translation [m] and rotation vector [rad] from where the tool goes to where it was to go."""
+        found = torch.full((self.status.numel(), 6), torch.nan, dtype=torch.float64)
+        q = self.q.detach().to("cpu", torch.float64).reshape(len(found), self.q.shape[-1])
+        rows = torch.isfinite(q).all(-1).nonzero()[:, 0]
+        if self.model is not None and self.wanted is not None and len(rows):
+            T = self.model.forward(q[rows])
+            error = pose_error(self.wanted.reshape(-1, 4, 4)[rows], torch.nan_to_num(T))
+            found[rows] = torch.where(torch.isfinite(T).flatten(1).all(-1)[:, None], error, torch.nan)
+        return found.reshape(*self.status.shape, 6)
 
     def select(self, index: int | Tensor | slice) -> "Solution":
         """The solutions at an index of the first batch axis."""
@@ -58,22 +107,23 @@ class Solution:
             flat = values.reshape(-1, *values.shape[batch:])
             return flat.index_copy(0, index, others).reshape(values.shape)
 
-        return Solution(
+        return replace(
+            self,
             q=put(self.q, rows.q),
             q_nominal=put(self.q_nominal, rows.q_nominal),
             correction=put(self.correction, rows.correction),
             branch=put(self.branch, rows.branch),
-            branches=self.branches,
             status=put(self.status, rows.status),
             domain_measure=put(self.domain_measure, rows.domain_measure),
         )
 
     def like(self, poses: Tensor) -> "Solution":
         """The same in the dtype and on the device of the poses."""
-        return self._map(
+        other = self._map(
             lambda values: values.to(poses),
             lambda values: values.to(poses) if values.is_floating_point() else values.to(poses.device),
         )
+        return replace(other, wanted=self.wanted)
 
     def _map(self, vector: Callable[[Tensor], Tensor], single: Callable[[Tensor], Tensor]) -> "Solution":
         """Apply one function to what has an axis of joints and another to what has none."""
@@ -85,4 +135,10 @@ class Solution:
             branches=self.branches,
             status=single(self.status),
             domain_measure=single(self.domain_measure),
+            wanted=None if self.wanted is None else _as_matrices(vector(self.wanted.flatten(-2))),
+            model=self.model,
         )
+
+
+def _as_matrices(values: Float64[Tensor, "*batch 16"]) -> Float64[Tensor, "*batch 4 4"]:
+    return values.reshape(*values.shape[:-1], 4, 4)

@@ -1,4 +1,4 @@
-"""The card of a geometric calibration: the parameters, what the data do not tell, and how good it is."""
+"""The card of a calibration: the parameters, what the data do not tell, and how good it is."""
 
 import re
 from collections.abc import Mapping
@@ -13,16 +13,21 @@ from pisigma.evaluation.calibration_figures import (
     draw_residuals,
 )
 from pisigma.evaluation.calibration_report import PARAMETERS_CSV, write_parameters
-from pisigma.evaluation.geometric_validation import GeometricValidation
+from pisigma.evaluation.calibration_validation import CalibrationValidation
+from pisigma.evaluation.hybrid_card import compared, hybrid_parts, write_hybrid_figures
 from pisigma.evaluation.markdown import CARD, markdown_table, use_text
 from pisigma.evaluation.tables import figure_text, pose_table
+from pisigma.evaluation.trained_calibrations import Result, geometric_result
+from pisigma.hybrid.result import HybridResult
 from pisigma.identification.result import CalibrationResult
+from pisigma.measurement.dataset import Measurements
 
 
 def write_calibration_card(
     model: CalibratedModel,
-    result: CalibrationResult,
-    validation: GeometricValidation | None,
+    found: Result,
+    measurements: Measurements,
+    validation: CalibrationValidation | None,
     report: Mapping[str, Any],
     texts: Mapping[str, str],
     folder: Path,
@@ -31,23 +36,28 @@ def write_calibration_card(
 
     Args:
         model: the model of the folder.
-        result: the calibration.
-        validation: errors of held-out rows for the figure, or None.
+        found: the calibration.
+        measurements: its rows.
+        validation: errors of held-out rows for the figures, or None.
         report: from `report_calibration`.
         texts: "description", "command" and "not_validated".
         folder: where to write.
     """
+    result = geometric_result(found)
     write_parameters(result, folder / PARAMETERS_CSV)
-    held_out = (
-        {} if validation is None else {"nominal": validation.nominal, "geometric": validation.geometric}
-    )
+    held_out = {} if validation is None else validation.models
     lengths = {name: errors.position.numpy() for name, errors in held_out.items()}
-    draw_residuals(result.residuals, lengths, folder / RESIDUALS_PNG)
+    under = _UNDER if isinstance(found, HybridResult) else ""
+    draw_residuals(result.residuals, lengths, folder / RESIDUALS_PNG, under)
     draw_correlations((result.pairwise.lengths, result.pairwise.angles), folder / CORRELATION_PNG)
+    if isinstance(found, HybridResult):
+        write_hybrid_figures(found, measurements, validation, report, folder)
     (folder / CARD).write_text(_text(model, result, report, texts), encoding="utf-8")
 
 
 PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")
+
+_UNDER = " under the geometric calibration"
 
 _SHORT_REMARKS = (
     (r"^.* is identified, the single values are not", "in a sum, see below"),
@@ -83,6 +93,34 @@ def not_identified_lines(report: Mapping[str, Any]) -> list[str]:
     return [f"{line.rstrip('.')}." for line in lines] or ["Nothing: every parameter is identified."]
 
 
+def held_out_lines(found: Mapping[str, Any]) -> list[str]:
+    """What else a cross-validation says, in sentences: of sockets and frames that were held out whole."""
+    lines = []
+    if "sockets_held_out" in found:
+        lines.append(
+            f"{found['sockets_held_out']} sockets were held out whole; an error there is how far a row puts the ball "
+            "from where the socket's rows put it on average."
+        )
+    if "socket_distance" in found:
+        distance = found["socket_distance"]
+        *others, (last, best) = compared(distance).items()
+        beside = "; ".join(
+            f"{name} {figure_text(sizes['mean_mm'])} and {figure_text(sizes['max_mm'])} mm"
+            for name, sizes in others
+        )
+        by = f" by the {last} calibration" if last != "geometric" else ""
+        lines.append(
+            f"The known distance of held-out sockets ({distance['count']} of them) is met to "
+            f"{figure_text(best['mean_mm'])} mm on average, {figure_text(best['max_mm'])} mm at worst{by} ({beside})."
+        )
+    if "frames_fitted" in found:
+        lines.append(
+            f"{found['frames_fitted']} frames were held out whole; where the base stands in them, and nothing else, "
+            "was fitted to the held-out rows."
+        )
+    return lines
+
+
 def _text(
     model: CalibratedModel, result: CalibrationResult, report: Mapping[str, Any], texts: Mapping[str, str]
 ) -> str:
@@ -95,9 +133,14 @@ def _text(
         *_held_out_parts(report),
     ]
     if "position" in result.residuals:
-        parts.append(f"![residuals of the calibration rows, and errors of held-out rows]({RESIDUALS_PNG})")
+        under = _UNDER if "hybrid" in report else ""
+        parts.append(
+            f"![residuals of the calibration rows{under}, and errors of held-out rows]({RESIDUALS_PNG})"
+        )
+    parts += hybrid_parts(report)
     parts += [
         "## Parameters",
+        *_whose_parameters(report),
         "DH rows `RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; base and tool "
         "`Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`. A standard error is what the noise that was "
         "found makes of the estimate; a parameter without one was left at its nominal value. "
@@ -121,6 +164,16 @@ def _text(
     return "\n\n".join(parts) + "\n"
 
 
+def _whose_parameters(report: Mapping[str, Any]) -> list[str]:
+    """What the table of parameters does not show of a hybrid."""
+    if report.get("hybrid", {}).get("learned") is None:
+        return []
+    return [
+        "Of the geometric calibration, which holds where no joint values were measured. The geometry that goes with "
+        "the joint correction is in `model.yaml`; it differs, because it need not make up for what the correction does."
+    ]
+
+
 def _held_out_parts(report: Mapping[str, Any]) -> list[str]:
     """Headings, sentences and tables of errors on rows that were not calibrated with."""
     nominal = "nominal is the robot as drawn, with base and tool fitted to those other rows"
@@ -133,18 +186,29 @@ def _held_out_parts(report: Mapping[str, Any]) -> list[str]:
             if found["folds"] > 1
             else f"Judged on {found['rows']} rows by a calibration on the others"
         )
-        models = {name: found[name] for name in ("nominal", "geometric")}
-        parts += ["## Held-out pose errors", f"{how}; {nominal}.", pose_table(models)]
+        models = compared(found)
+        parts += ["## Held-out pose errors", f"{how}; {nominal}.", pose_table(models), *held_out_lines(found)]
     if "test" in report:
         found = report["test"]
-        models = {name: found[name] for name in ("nominal", "geometric")}
+        models = compared(found)
         how = f"The {found['rows']} rows that the file marks as test, with which nothing was calibrated"
         parts += ["## Pose errors of the test set", f"{how}; {nominal}.", pose_table(models)]
     if "held_out" in report:
-        figures = {name: value for name, value in report["held_out"].items() if name != "rows"}
-        how = f"{report['held_out']['rows']} other simulated rows."
-        parts += ["## Held-out pose errors", how, pose_table({"geometric": figures})]
+        found = report["held_out"]
+        models = compared(found) or {"geometric": {name: found[name] for name in found if name != "rows"}}
+        how = f"{found['rows']} other simulated rows{_repeats_text(found)}."
+        parts += ["## Held-out pose errors", how, pose_table(models)]
     return parts
+
+
+def _repeats_text(found: Mapping[str, Any]) -> str:
+    if found.get("folds", 1) == 1:
+        return ""
+    means = ", ".join(f"{name} {figure_text(mean)} mm" for name, mean in found["mean_rms_mm"].items())
+    return (
+        f" of {found['folds']} simulations that differ in all that is random (mean of their RMS position errors: "
+        f"{means})"
+    )
 
 
 def _quality_text(result: CalibrationResult, report: Mapping[str, Any]) -> str:

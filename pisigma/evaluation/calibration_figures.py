@@ -1,4 +1,4 @@
-"""Figures of a geometric calibration: residuals, held-out errors, correlations."""
+"""Figures of a calibration: residuals, held-out errors, correlations."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -23,6 +23,7 @@ def draw_residuals(
     residuals: Mapping[str, Float64[np.ndarray, "rows 3"]],
     held_out: Mapping[str, Float64[np.ndarray, " held"]],
     path: Path,
+    under: str = "",
 ) -> None:
     """Draw the residuals per coordinate over the rows, and how the held-out errors are spread.
 
@@ -31,19 +32,20 @@ def draw_residuals(
             was measured.
         held_out: by model, lengths of the held-out position errors [m]; may be empty.
         path: the PNG to write.
+        under: which calibration the residuals are of, for the title.
     """
     shown = [name for name in _UNITS if name in residuals]
     count = len(shown) + bool(held_out)
     figure = Figure(figsize=(7.6, 3.3 * max(count, 1)), layout="constrained")
     panels = figure.subplots(max(count, 1), 1, squeeze=False)[:, 0]
     for axes, name in zip(panels, shown, strict=False):
-        _draw_over_rows(axes, name, residuals[name])
+        _draw_over_rows(axes, name, residuals[name], under)
     if held_out:
         _draw_shares(panels[-1], held_out)
     save_figure(figure, path)
 
 
-def _draw_over_rows(axes: Axes, name: str, residuals: np.ndarray) -> None:
+def _draw_over_rows(axes: Axes, name: str, residuals: np.ndarray, under: str) -> None:
     unit, factor = _UNITS[name]
     size = 5 if len(residuals) <= 200 else 3 if len(residuals) <= 1000 else 2
     for column, (label, mark) in enumerate((("x", "o"), ("y", "s"), ("z", "^"))):
@@ -51,7 +53,7 @@ def _draw_over_rows(axes: Axes, name: str, residuals: np.ndarray) -> None:
         axes.plot(np.arange(1, len(values) + 1), values, mark, markersize=size, label=label, alpha=0.6)
     axes.axhline(0.0, color="black", linewidth=0.8)
     axes.set(xlabel="row", ylabel=f"residual [{unit}]")
-    axes.set_title(f"measured minus predicted {name}, calibration rows", loc="left", fontsize=10)
+    axes.set_title(f"measured minus predicted {name}, calibration rows{under}", loc="left", fontsize=10)
     axes.grid(alpha=0.3)
     axes.legend(ncols=3, loc="lower right", bbox_to_anchor=(1, 1), frameon=False, markerscale=2)
 
@@ -70,7 +72,7 @@ def _draw_shares(axes: Axes, held_out: Mapping[str, np.ndarray]) -> None:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(alpha=0.3)
-    axes.legend(loc="center right", bbox_to_anchor=(1, 0.2), framealpha=1.0)
+    axes.legend(loc="upper left", framealpha=1.0)
 
 
 def draw_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:

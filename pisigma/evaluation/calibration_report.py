@@ -1,4 +1,4 @@
-"""What a geometric calibration gave, as figures for tables, cards and `--json`."""
+"""What a calibration gave, as figures for tables, cards and `--json`."""
 
 import csv
 import math
@@ -6,7 +6,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from pisigma.evaluation.geometric_validation import GeometricValidation
+from pisigma.evaluation.calibration_validation import CalibrationValidation
+from pisigma.evaluation.hybrid_report import report_hybrid
+from pisigma.hybrid.result import HybridResult
 from pisigma.identification.result import CalibrationResult
 
 PARAMETERS_CSV = "parameters.csv"
@@ -16,17 +18,18 @@ _FIGURES = ("nominal", "estimated", "change", "standard_error")
 
 
 def report_calibration(
-    result: CalibrationResult,
-    validation: GeometricValidation | None = None,
-    test: GeometricValidation | None = None,
+    found: CalibrationResult | HybridResult,
+    validation: CalibrationValidation | None = None,
+    test: CalibrationValidation | None = None,
 ) -> dict[str, Any]:
     """Everything that is said of a calibration, in millimetres and degrees; what is not known is None.
 
     Args:
-        result: the calibration.
+        found: the calibration; of a hybrid, what it learned beyond the geometric one is under "hybrid".
         validation: of rows held out in turn.
         test: of rows that the file marks as test.
     """
+    result = found.geometric if isinstance(found, HybridResult) else found
     report: dict[str, Any] = {
         "status": result.status.value,
         "iterations": result.iterations,
@@ -50,6 +53,8 @@ def report_calibration(
         "warnings": list(result.warnings),
         "rmse_mm": [value * 1e3 for value in result.rms_path],
     }
+    if isinstance(found, HybridResult):
+        report["hybrid"] = report_hybrid(found)
     if validation is not None:
         report["cross_validation"] = validation.in_file_units()
     if test is not None:

@@ -2,16 +2,15 @@
 
 from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.correction.calibrated_model import CalibratedModel
-from pisigma.errors import MeasurementError, nearest_choice
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.correction.row_poses import nominal_poses_of_rows, poses_of_rows
+from pisigma.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
-from pisigma.se3 import invert, rotation_vector, transform_from_xyzrpy
+from pisigma.se3 import rotation_vector
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,58 +109,7 @@ def compare_on(model: CalibratedModel, measurements: Measurements) -> Comparison
         MeasurementError: no positions were measured, or in a frame or of a target that the model does not know.
     """
     nominal, corrected = (
-        PoseErrors.between(measurements, seen_from_frames(model, measurements, T))
-        for T in (forward_kinematics(model.robot, measurements.q), model.forward(measurements.q))
+        PoseErrors.between(measurements, poses(model, measurements))
+        for poses in (nominal_poses_of_rows, poses_of_rows)
     )
     return Comparison.of(nominal, corrected)
-
-
-def seen_from_frames(
-    model: CalibratedModel, measurements: Measurements, T: Float64[Tensor, "rows 4 4"]
-) -> Float64[Tensor, "rows 4 4"]:
-    """Poses T_base_tool of a model as poses of the rows' targets in the rows' frames.
-
-    Raises:
-        MeasurementError: the model does not know a frame or target of the rows.
-    """
-    before = _relative(model.bases, measurements.frame, "frame", measurements)
-    behind = _relative(model.tools, measurements.target, "target", measurements)
-    if before is not None:
-        own = transform_from_xyzrpy(torch.tensor(model.robot.base.tolist(), dtype=torch.float64))
-        T = before @ invert(own) @ T
-    if behind is not None:
-        own = transform_from_xyzrpy(torch.tensor(model.robot.tool.tolist(), dtype=torch.float64))
-        T = T @ invert(own) @ behind
-    return T
-
-
-def _relative(
-    known: dict[str, Float64[np.ndarray, " 6"]],
-    names: tuple[str, ...],
-    what: str,
-    measurements: Measurements,
-) -> Float64[Tensor, "rows 4 4"] | None:
-    """The frame or tool of every row; None where the model and the rows have one, whatever its name.
-
-    A model that was fitted to rows without names takes rows of any one name, and one that was fitted to a
-    single name takes rows without.
-    """
-    if not set(known) - {""}:
-        other = next((row for row, name in enumerate(names) if name != names[0]), None)
-        if other is not None:
-            raise MeasurementError(
-                f"{measurements.place(other)}: {what} '{names[other]}' stands there, but "
-                f"{measurements.place(0)} has '{names[0]}', and the model knows one {what} only; give a file for each."
-            )
-        return None
-    if len(known) == 1 and not any(names):
-        return None
-    for row, name in enumerate(names):
-        if name not in known:
-            raise MeasurementError(
-                f"{measurements.place(row)}: the model was not fitted to {what} '{name}'; "
-                f"{nearest_choice(name, known)}"
-            )
-    order = list(known)
-    frames = transform_from_xyzrpy(torch.from_numpy(np.stack([known[name] for name in order])))
-    return frames[torch.tensor([order.index(name) for name in names], dtype=torch.int64)]

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from pisigma.errors import IdentificationError, nearest_choice
+from pisigma.hybrid.common_frames import with_frames_of
 from pisigma.hybrid.coverage import JointCoverage
 from pisigma.hybrid.extrapolation import fade_angle
 from pisigma.hybrid.product_search import best_products
@@ -14,10 +15,12 @@ from pisigma.hybrid.search import Additive, Search, described
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.problem import CalibrationProblem, view_of
+from pisigma.identification.noise import view_of
+from pisigma.identification.problem import CalibrationProblem
 from pisigma.identification.result_assembly import SolvedCalibration
 from pisigma.identification.starting import chosen_rows
 from pisigma.identification.user_coordinates import identified_geometry
+from pisigma.measurement.conditions import told_conditions
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.network.features import (
@@ -103,7 +106,7 @@ class HybridCalibrator:
             return HybridResult(geometric, None, known, trials, verdict)
         progress("solving for everything")
         refined = refinement(solved, additive, orders, self.geometric.loss)
-        geometry = identified_geometry(solved.setup, refined.point)
+        geometry = with_frames_of(solved, refined, identified_geometry(solved.setup, refined.point))
         progress("looking beyond the measured joint values")
         fade = fade_angle(refined.rows, refined.design, refined.posterior, refined.sums)
         learned = LearnedPart(
@@ -149,7 +152,7 @@ class HybridCalibrator:
             (here.point - problem.nominal)[problem.active],
             groups_of_equal_joints(problem.q),
         )
-        series, others = self._features(problem, rows.configurations)
+        series, others = self._features(solved, rows.configurations)
         largest = [*others, *series[-1:]]
         search = Search(rows, view.noise, view.widening, largest, progress)
         additive = search.best_additive(series, others)
@@ -157,7 +160,7 @@ class HybridCalibrator:
         return search, additive, orders
 
     def _features(
-        self, problem: CalibrationProblem, configurations: int
+        self, solved: SolvedCalibration, configurations: int
     ) -> tuple[list[FourierSeries], list[AbstractFeatures]]:
         """Series of ever more harmonics, not many more than there are joint values; and the other features."""
         robot = self.geometric.robot
@@ -170,9 +173,9 @@ class HybridCalibrator:
             elif name == "gravity":
                 others.append(GravityTorques(robot, self.gravity))
             elif name == "conditions":
-                if problem.conditions is not None:
-                    mean, spread = problem.conditions.mean(0).tolist(), problem.conditions.std(0).tolist()
-                    names = problem.condition_names
+                values, names = solved.problem.conditions, told_conditions(solved.setup.measurements)
+                if values is not None:
+                    mean, spread = values.mean(0).tolist(), values.std(0).tolist()
                     others.append(ConditionFeatures(robot, names, mean, spread, self.gravity))
             else:
                 others.append(SharedFeatures(robot, name))

@@ -14,10 +14,11 @@ from pisigma.identification.extension import told_besides
 from pisigma.identification.information import Information, information
 from pisigma.identification.least_squares import Solution, levenberg_marquardt
 from pisigma.identification.loss import AbstractLoss, HampelLoss
+from pisigma.identification.noise import view_of
 from pisigma.identification.pairwise import find_pairwise_redundancy
 from pisigma.identification.parameters import ParameterSpace, Prior
 from pisigma.identification.plausibility import refuse_implausible
-from pisigma.identification.problem import CalibrationProblem, view_of
+from pisigma.identification.problem import CalibrationProblem
 from pisigma.identification.redundancy import Redundancy, find_redundancy
 from pisigma.identification.result import CalibrationResult
 from pisigma.identification.result_assembly import Findings, SolvedCalibration

@@ -4,7 +4,8 @@ import torch
 from torch import Tensor
 
 from pisigma.identification.least_squares import Linearisation
-from pisigma.identification.problem import CalibrationProblem, view_of
+from pisigma.identification.noise import view_of
+from pisigma.identification.problem import CalibrationProblem
 
 FAR_OFF = 10.0
 """Times the other frames' residuals."""

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.identification.least_squares import Linearisation
 from pisigma.identification.loss import AbstractLoss
 from pisigma.identification.sensors import AbstractSensor
 
@@ -94,6 +95,12 @@ class SensorView:
     def widened(self, precision: Float64[Tensor, " active"], group: Tensor) -> Float64[Tensor, " active"]:
         """1 / variance of parameters by the prior, as far as it was widened."""
         return precision / precision.new_tensor(self.widening).square()[group]
+
+
+def view_of(linearisation: Linearisation[Tensor]) -> SensorView:
+    """The sensors' part of a linearisation that a `CalibrationProblem` made."""
+    assert isinstance(linearisation.detail, SensorView)
+    return linearisation.detail
 
 
 def values_used(view: SensorView, covariance: Float64[Tensor, "active active"]) -> tuple[float, ...]:

@@ -25,6 +25,9 @@ USUAL_LENGTH = 1e-3
 USUAL_ANGLE = 1e-3
 """[rad]"""
 
+PriorSizes = Literal["stated", "widened", "estimated"]
+"""Whether the prior's sizes stand, may only grow, or are estimated."""
+
 
 @dataclass(frozen=True)
 class Prior:

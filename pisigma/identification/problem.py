@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Literal
 
 import torch
 from jaxtyping import Float64, Int64
@@ -26,11 +25,11 @@ from pisigma.identification.noise import (
     prior_widening,
     renumbered,
     values_used,
+    view_of,
 )
-from pisigma.identification.parameters import EVERYWHERE, ParameterSpace
+from pisigma.identification.parameters import EVERYWHERE, ParameterSpace, PriorSizes
 from pisigma.identification.sensors import AbstractSensor, OwnUnknowns
 
-PriorSizes = Literal["stated", "widened", "estimated"]
 CERTAIN_LOSS = SquaredLoss()
 
 
@@ -50,9 +49,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         active: indices of the free parameters.
         pose: number of every row's pose (joint values, frame, target), None where no pose is repeated.
         pairs: so many pairs of rows, the first ones, are measured together.
-        conditions: what else was different from row to row (see `pisigma.measurement.conditions`), for joint
-            corrections that depend on it; None where nothing was stated.
-        condition_names: of their columns.
+        conditions: payload, temperature (`measurement.conditions`) for corrections that depend on them.
         prior_sizes: "stated": the prior as it is; "widened": wider where the errors are larger than it says;
             "estimated": wider or narrower.
         memory: the last motion; shared with problems that differ in their free parameters or prior only.
@@ -70,7 +67,6 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     pose: Int64[Tensor, " rows"] | None = None
     pairs: int = 0
     conditions: Float64[Tensor, "rows _conditions"] | None = None
-    condition_names: tuple[str, ...] = ()
     prior_sizes: PriorSizes = "widened"
     memory: MotionMemory = field(default_factory=MotionMemory, repr=False)
 
@@ -119,7 +115,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             memory=MotionMemory(),
         )
 
-    @property
+    @cached_property
     def state(self) -> Float64[Tensor, "rows _state"]:
         """Joint values of the rows, and behind them their conditions."""
         return self.q if self.conditions is None else torch.cat([self.q, self.conditions], 1)
@@ -302,9 +298,3 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         sums.descent.addmv_(A, (residual * root).flatten())
         sums.residual[:, rows] = residual
         sums.distance[rows] = distance
-
-
-def view_of(linearisation: Linearisation[Tensor]) -> SensorView:
-    """The sensors' part of a linearisation that a `CalibrationProblem` made."""
-    assert isinstance(linearisation.detail, SensorView)
-    return linearisation.detail

@@ -11,9 +11,9 @@ from pisigma.identification.covariance import covariance_of
 from pisigma.identification.information import Information
 from pisigma.identification.least_squares import Linearisation, Solution
 from pisigma.identification.mixed_frames import frames_mixed_up
-from pisigma.identification.noise import values_used
+from pisigma.identification.noise import values_used, view_of
 from pisigma.identification.observability import observability_of
-from pisigma.identification.problem import CalibrationProblem, view_of
+from pisigma.identification.problem import CalibrationProblem
 from pisigma.identification.redundancy import Redundancy
 from pisigma.identification.result import CalibrationResult, Outlier, ParameterEstimate, SensorNoise
 from pisigma.identification.setup import CalibrationSetup

@@ -12,8 +12,8 @@ from torch import Tensor
 from pisigma.errors import IdentificationError
 from pisigma.identification.loss import AbstractLoss
 from pisigma.identification.noise import renumbered
-from pisigma.identification.parameters import ParameterSpace, Prior
-from pisigma.identification.problem import CalibrationProblem, PriorSizes
+from pisigma.identification.parameters import ParameterSpace, Prior, PriorSizes
+from pisigma.identification.problem import CalibrationProblem
 from pisigma.identification.sensor_building import (
     PairOfSockets,
     build_sensors,
@@ -23,7 +23,7 @@ from pisigma.identification.sensor_building import (
 )
 from pisigma.identification.starting import Start, find_start
 from pisigma.identification.sufficiency import check_poses
-from pisigma.measurement.conditions import conditions_of, told_conditions
+from pisigma.measurement.conditions import conditions_of, told_conditions, with_conditions
 from pisigma.measurement.dataset import Kind, Measurements
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert, rotation_from_rpy, transform_from_xyzrpy
@@ -135,6 +135,8 @@ def build_setup(
     start = start.to(device)
     known = build_socket_distances(measurements, options.socket_distances, options.socket_sigma)
     sensors = build_sensors(measurements, anchors.bases, anchors.tools, frame, target)
+    told = told_conditions(measurements)
+    carried = with_conditions(measurements, tuple(name for name in told if name == "payload_kg"))
     problem = CalibrationProblem(
         space=space,
         q=measurements.q,
@@ -145,10 +147,9 @@ def build_setup(
         nominal=start,
         precision=torch.from_numpy(space.precision(prior)).to(device),
         active=torch.zeros(0, dtype=torch.int64, device=device),
-        pose=repeated_poses(measurements.q, frame, target),
+        pose=repeated_poses(carried, frame, target),
         pairs=len(names_of(measurements.pair)),
-        conditions=conditions_of(measurements, told) if (told := told_conditions(measurements)) else None,
-        condition_names=told,
+        conditions=conditions_of(measurements, told) if told else None,
         prior_sizes=options.prior_sizes,
     )
     return CalibrationSetup(
@@ -187,7 +188,7 @@ def _frame_of(
 
 
 def repeated_poses(q: Tensor, frame: Tensor, target: Tensor) -> Tensor | None:
-    """Number every row's pose (joint values to 1e-9, frame, target); None where none is repeated."""
+    """Number every row's pose (joint values and payload to 1e-9, frame, target); None where none is repeated."""
     keys = torch.stack([*(q * 1e9).round().long().unbind(1), frame, target])
     mixed = torch.zeros_like(frame)
     for key in keys:  # integers wrap around, so equal rows mix equally

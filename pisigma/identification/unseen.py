@@ -6,7 +6,8 @@ import torch
 from torch import Tensor
 
 from pisigma.identification.least_squares import Linearisation
-from pisigma.identification.problem import CalibrationProblem, view_of
+from pisigma.identification.noise import view_of
+from pisigma.identification.problem import CalibrationProblem
 
 SHOWN = 0.25
 """Parameters with at least this share of a direction are named."""

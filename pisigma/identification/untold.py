@@ -68,8 +68,8 @@ def _frames(setup: CalibrationSetup) -> list[str]:
     return found
 
 
-def _adrift(setup: CalibrationSetup) -> list[str]:
-    """Frames in which nothing that was measured stands at a known place."""
+def frames_adrift(setup: CalibrationSetup) -> list[str]:
+    """Frames in which nothing that was measured stands at a known place: whatever is there may move as a whole."""
     data = setup.measurements
     if data.socket is None and data.distance is None:
         return []
@@ -77,8 +77,14 @@ def _adrift(setup: CalibrationSetup) -> list[str]:
     if data.anchor_place is not None:
         held |= torch.isfinite(data.anchor_place).all(-1)
     known = {frame for frame, told in zip(data.frame, held.tolist(), strict=True) if told}
-    adrift = [frame for frame in setup.problem.space.frames if frame not in known]
-    if not adrift or not data.kinds & {"socket", "distance"}:
+    if not data.kinds & {"socket", "distance"}:
+        return []
+    return [frame for frame in setup.problem.space.frames if frame not in known]
+
+
+def _adrift(setup: CalibrationSetup) -> list[str]:
+    adrift = frames_adrift(setup)
+    if not adrift:
         return []
     names = " and ".join(f"'{frame}'" for frame in adrift)
     where = f"frame{'s' if len(adrift) > 1 else ''} {names}" if any(adrift) else "the frame"

@@ -1,6 +1,8 @@
 """Numeric inverse kinematics from a given start, for any robot: damped Newton, batched."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -22,6 +24,9 @@ from pisigma.se3 import check_transforms, pose_error
 SINGULAR_TOLERANCE = 1e-5
 """A solution is SINGULAR where `singularity_measure` is smaller (in float32: than 3e-3). Iteration comes
 within some 1e-6 rad of a singular solution, as residuals there grow with the square of the joint error."""
+
+Motion = Callable[[Tensor], tuple[Tensor, Tensor]]
+"""Pose T_base_tool and joint Jacobian of an arm at joint values, as `joint_jacobian` gives them."""
 
 _FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 0.1, 1e-6, 1e12
 
@@ -83,6 +88,7 @@ def solve_numeric(
     *,
     tolerance: float | None = None,
     max_iterations: int = 100,
+    motion: Motion | None = None,
 ) -> NumericSolution:
     """Joint values near a start that take the tool to the poses.
 
@@ -98,6 +104,8 @@ def solve_numeric(
         start: joint values to begin with [rad or m]; batch dimensions broadcast with those of T.
         tolerance: residuals to come below [m and rad]; None: 1e-13 in float64, 1e-5 in shorter types.
         max_iterations: when to give up.
+        motion: where the tool of an arm with joint corrections is and how it moves; its Jacobian need not be
+            exact. None: that of the robot.
 
     Returns:
         The solution nearest in the sense of the iteration. Where no solution was found the status is
@@ -113,12 +121,13 @@ def solve_numeric(
     batch = np.broadcast_shapes(T.shape[:-2], start.shape[:-1])
     T_flat = T.detach().expand(*batch, 4, 4).reshape(-1, 4, 4)
     with torch.no_grad():
-        state = _begin(robot, T_flat, start.detach().expand(*batch, robot.dof).reshape(-1, robot.dof))
+        moving: Motion = motion or partial(joint_jacobian, robot)
+        state = _begin(moving, T_flat, start.detach().expand(*batch, robot.dof).reshape(-1, robot.dof))
         active = (~state.converged(tolerance)).nonzero()[:, 0]
         for _ in range(max_iterations):
             if active.numel() == 0:
                 break
-            _iterate(robot, T_flat, state, active)
+            _iterate(robot, moving, T_flat, state, active)
             stalled = state.damping[active] > _MOST_DAMPING
             active = active[~(state.converged(tolerance)[active] | stalled)]
         return _finish(robot, state, tolerance, batch)
@@ -143,8 +152,8 @@ def _check_start(robot: Robot, T: Tensor, start: Tensor) -> None:
         )
 
 
-def _begin(robot: Robot, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]) -> _Iterate:
-    T_now, J = joint_jacobian(robot, q)
+def _begin(motion: Motion, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]) -> _Iterate:
+    T_now, J = motion(q)
     damping = torch.full_like(q[:, 0], _FIRST_DAMPING)
     return _Iterate(
         q.clone(), pose_error(T, T_now), J.clone(), damping, torch.ones_like(damping, dtype=torch.int64)
@@ -152,12 +161,16 @@ def _begin(robot: Robot, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses 
 
 
 def _iterate(
-    robot: Robot, T: Float[Tensor, "poses 4 4"], state: _Iterate, active: Int64[Tensor, " active"]
+    robot: Robot,
+    motion: Motion,
+    T: Float[Tensor, "poses 4 4"],
+    state: _Iterate,
+    active: Int64[Tensor, " active"],
 ) -> None:
     """Try one step for the active poses and keep those that bring the tool nearer."""
     old = _scaled(robot, state.error[active])
     trial = state.q[active] + damped_step(robot, state.J[active], old, state.damping[active])
-    T_trial, J = joint_jacobian(robot, trial)
+    T_trial, J = motion(trial)
     error = pose_error(T[active], T_trial)
     better = _scaled(robot, error).square().sum(-1) < old.square().sum(-1)
     state.iterations[active] += 1

@@ -41,8 +41,8 @@ _SENTENCES = {
         "another branch or pose."
     ),
     Status.OUTSIDE_DOMAIN: (
-        "The joint values lie outside the region that the measurements covered, so the correction is "
-        "extrapolated; measure there too, or do not rely on it."
+        "The joint values lie outside the region that the measurements covered, so the correction there is a "
+        "guess or left out; measure there too, or do not rely on it."
     ),
     Status.UNREACHABLE: (
         "No joint values reach the pose on this branch; bring the pose into the workspace or choose another "

@@ -1,9 +1,12 @@
-"""Rows that belong together: equal joint values, and the two rows of a pair."""
+"""Rows that belong together: equal joint values, the two rows of a pair, and those of one placement."""
+
+from collections.abc import Sequence
 
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 
 
@@ -34,10 +37,54 @@ def groups_to_keep_whole(measurements: Measurements) -> Int64[Tensor, " rows"]:
         For every row the number of its group, from 0.
     """
     group = groups_of_equal_joints(measurements.q)
-    if measurements.pair is None:
-        return group
+    return group if measurements.pair is None else _joined(group, measurements.pair)
+
+
+def placements(measurements: Measurements) -> tuple[str, ...]:
+    """Name the placement of every row: where the thing that was touched or the sensor stood.
+
+    Sockets "plate/0" and "plate/1" are of the placement "plate", a socket without "/" is one by itself. Where
+    there are no sockets, every frame is a placement.
+
+    Returns:
+        Per row a name; "" in rows without a socket where others have one.
+
+    Raises:
+        MeasurementError: there are not two placements.
+    """
+    names = measurements.frame
+    if measurements.socket is not None:
+        names = tuple(name.rpartition("/")[0] or name for name in measurements.socket)
+    found = list(dict.fromkeys(name for name in names if name))
+    if len(found) < 2:
+        what = f"'{found[0]}' is the only one" if found else "neither sockets nor frames have names"
+        raise MeasurementError(
+            f"{measurements.source}: two placements or more were wanted, but {what}; name sockets by placement, "
+            "such as low/0 and low/1, or frames, or split by joints, time or space."
+        )
+    return names
+
+
+def placement_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
+    """Number the placements in the order of their first row; -1 in rows that belong to none.
+
+    Placements that share joint values or a pair of rows are one group.
+
+    Raises:
+        MeasurementError: there are not two placements.
+    """
+    names = placements(measurements)
+    group = _joined(groups_to_keep_whole(measurements), names)
+    named = torch.tensor([bool(name) for name in names], device=group.device)
+    placed = torch.isin(group, group[named])
+    group[placed] = _numbered(group[placed])
+    return torch.where(placed, group, -1)
+
+
+def _joined(group: Int64[Tensor, " rows"], names: Sequence[str]) -> Int64[Tensor, " rows"]:
+    """Join the groups of rows that have the same name."""
     numbers = group.tolist()
-    leader = list(range(max(numbers) + 1))
+    leader = list(range(max(numbers, default=0) + 1))
 
     def lead(number: int) -> int:
         while leader[number] != number:
@@ -46,7 +93,7 @@ def groups_to_keep_whole(measurements: Measurements) -> Int64[Tensor, " rows"]:
         return number
 
     first: dict[str, int] = {}
-    for row, name in enumerate(measurements.pair):
+    for row, name in enumerate(names):
         if name:
             leader[lead(numbers[row])] = lead(numbers[first.setdefault(name, row)])
     return _numbered(torch.tensor([lead(number) for number in numbers], device=group.device))

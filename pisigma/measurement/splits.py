@@ -1,7 +1,7 @@
 """Parting measurements into training and test; rows of equal joint values, and of a pair, stay together."""
 
 import heapq
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float64, Int64
@@ -10,49 +10,51 @@ from torch import Tensor
 from pisigma.errors import MeasurementError, nearest_choice
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints as groups_of_equal_joints
-from pisigma.measurement.groups import groups_to_keep_whole
+from pisigma.measurement.groups import groups_to_keep_whole, placement_groups
 
-SplitBy = Literal["joints", "time", "space"]
-"""By joints: at random; by time: blocks of the file's order; by space: blocks of the measured positions."""
+SplitBy = Literal["joints", "time", "space", "placement"]
+"""By joints: at random; by time: blocks of the file's order; by space: blocks of the measured positions; by
+placement: all sockets of a placement together, or all rows of a frame."""
 
 TrainTest = tuple[Int64[Tensor, " _train"], Int64[Tensor, " _test"]]
 """Rows to train on and rows to test on, each in the order of the measurements."""
 
 
 def k_folds(
-    measurements: Measurements, folds: int, seed: int | torch.Generator, by: SplitBy = "joints"
+    measurements: Measurements, folds: int | None, seed: int | torch.Generator, by: SplitBy = "joints"
 ) -> tuple[TrainTest, ...]:
     """Part the measurements into folds, each of which is the test once.
 
     Args:
         measurements: what to part.
-        folds: how many, 2 or more.
-        seed: decides which rows come together by joints; unused by time and by space.
+        folds: how many, 2 or more; None for as many as there are groups to keep whole.
+        seed: decides which groups come together by joints and by placement; unused by time and by space.
         by: "joints": groups of equal joints, shuffled and dealt such that folds are as equal as the groups
             allow; "time": contiguous blocks of the rows' order, a group counting where its first row stands;
-            "space": blocks from cutting the measured positions again and again across their widest axis.
+            "space": blocks from cutting the measured positions again and again across their widest axis;
+            "placement": dealt like joints, but whole placements (see `placements`); rows of none are in no test.
 
     Returns:
         Per fold the rows to train on and the rows to test on.
 
     Raises:
-        MeasurementError: there are fewer different joint vectors than folds, or positions that are needed
-            are not there.
+        MeasurementError: there are fewer groups than folds, or positions or names that are needed are not there.
     """
-    group = groups_to_keep_whole(measurements).cpu()
-    sizes = torch.bincount(group)
+    group, sizes = _groups(measurements, by)
+    folds = len(sizes) if folds is None else folds
     if folds < 2 or folds > len(sizes):
+        more = "placements" if by == "placement" else "poses"
         raise MeasurementError(
-            f"{measurements.source}: {folds} folds were wanted from {len(sizes)} different joint vectors; "
-            f"ask for 2 to {len(sizes)} folds or measure more poses."
+            f"{measurements.source}: {folds} folds were wanted from {len(sizes)} {_kind(by)}; "
+            f"ask for 2 to {len(sizes)} folds or measure more {more}."
         )
     fold = torch.zeros(len(sizes), dtype=torch.int64)
-    if _checked(by) == "joints":
+    if by in ("joints", "placement"):
         _deal(fold, sizes, _shuffled(len(sizes), seed), folds)
     else:
         positions = _group_positions(measurements, group, len(sizes)) if by == "space" else None
         _cut_into_folds(fold, sizes, positions, torch.arange(len(sizes)), 0, folds)
-    return tuple(_train_test(measurements, fold[group] == number) for number in range(folds))
+    return tuple(_train_test(measurements, (fold[group] == number) & (group >= 0)) for number in range(folds))
 
 
 def holdout(
@@ -62,43 +64,48 @@ def holdout(
 
     Args:
         measurements: what to part.
-        share: of the rows for the test, between 0 and 1; met as closely as groups of equal joints allow.
-        seed: decides which rows by joints; unused by time and by space.
+        share: of the rows for the test, between 0 and 1; met as closely as the groups allow.
+        seed: decides which rows by joints and by placement; unused by time and by space.
         by: "joints": groups of equal joints at random; "time": the last rows; "space": the far end of the
-            widest axis of the measured positions.
+            widest axis of the measured positions; "placement": whole placements at random.
 
     Raises:
-        MeasurementError: the share is not between 0 and 1, all rows have equal joints, or positions that are
+        MeasurementError: the share is not between 0 and 1, there is one group only, or positions or names that are
             needed are not there.
     """
     if not 0 < share < 1:
         raise MeasurementError(
             f"{measurements.source}: a test share between 0 and 1 was wanted, got {share:g}."
         )
-    group = groups_to_keep_whole(measurements).cpu()
-    sizes = torch.bincount(group)
+    group, sizes = _groups(measurements, by)
     if len(sizes) < 2:
         raise MeasurementError(
-            f"{measurements.source}: {len(sizes)} different joint vectors cannot be parted into training and "
-            "test; measure more poses."
+            f"{measurements.source}: {len(sizes)} {_kind(by)} cannot be parted into training and test; measure "
+            "more poses."
         )
     order = torch.arange(len(sizes))
-    if _checked(by) == "joints":
+    if by in ("joints", "placement"):
         order = _shuffled(len(sizes), seed)
     elif by == "space":
         order = _along_widest_axis(_group_positions(measurements, group, len(sizes)), order)
     cut = _cut(sizes[order], 1 - share, 1, 1)
     is_test = torch.zeros(len(sizes), dtype=torch.bool)
     is_test[order[cut:]] = True
-    return _train_test(measurements, is_test[group])
+    return _train_test(measurements, is_test[group] & (group >= 0))
 
 
-def _checked(by: str) -> str:
-    if by not in ("joints", "time", "space"):
-        raise MeasurementError(
-            f"split by '{by}' is unknown; {nearest_choice(by, ('joints', 'time', 'space'))}"
-        )
-    return by
+def _groups(
+    measurements: Measurements, by: SplitBy
+) -> tuple[Int64[Tensor, " rows"], Int64[Tensor, " groups"]]:
+    """The number of every row's group, -1 for rows that are in no test, and how many rows each has."""
+    if by not in get_args(SplitBy):
+        raise MeasurementError(f"split by '{by}' is unknown; {nearest_choice(by, get_args(SplitBy))}")
+    group = (placement_groups if by == "placement" else groups_to_keep_whole)(measurements).cpu()
+    return group, torch.bincount(group[group >= 0])
+
+
+def _kind(by: SplitBy) -> str:
+    return "placements" if by == "placement" else "different joint vectors"
 
 
 def _shuffled(count: int, seed: int | torch.Generator) -> Int64[Tensor, " count"]:

@@ -1,7 +1,7 @@
 """Functions of the joint values that a joint's correction is a weighted sum of: one interface, named choices."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -9,15 +9,12 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from pisigma.errors import nearest_choice
 from pisigma.kinematics.forward import Geometry, forward_kinematics, iterate_rows
 from pisigma.network.inputs import Inputs
 from pisigma.robot.description import Robot
 
 BAND_STARTS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256)
 """First harmonic of every band: about two bands an octave."""
-UNIT = 1e-12
-"""A direction whose length is this near to 1 is one of length 1."""
 
 
 class AbstractFeatures(ABC):
@@ -46,7 +43,7 @@ class AbstractFeatures(ABC):
         """
 
     def describe(self) -> dict[str, Any]:
-        """The name and what else `features_from` needs to make the same features again."""
+        """The name and what else `features_from` of `feature_description` needs to make the same features again."""
         return {"name": self.name}
 
     @property
@@ -108,7 +105,7 @@ class GravityTorques(AbstractFeatures):
     columns, a mass in the origin p_k of the row's frame and first moments along its axes u [1/m, scaled by
     `ARM` as a usual distance]::
 
-        z_j · ((p_k - p_j) × g) / reach        z_j · (u_k × g) · ARM / reach
+        z_j · ((p_k - p_j) × g) / reach        z_j · (u_k × g) · ARM
 
     with g the direction of gravity; a weight is then compliance times mass. On a prismatic joint, the force
     `z_j · g`. Taken on the nominal geometry.
@@ -133,11 +130,12 @@ class GravityTorques(AbstractFeatures):
         norm = float(np.linalg.norm(gravity))
         if not norm > 0 or not np.isfinite(norm):
             raise ValueError(f"gravity needs a direction, got {gravity}.")
-        unit = abs(norm - 1) < UNIT  # kept as it is, so that features made again are the same to the last bit
+        unit = (
+            abs(norm - 1) < 1e-12
+        )  # kept as it is, so that features made again are the same to the last bit
         self.gravity = tuple(float(x if unit else x / norm) for x in gravity)
         self._robot = robot
-        beyond = np.arange(robot.dof)[None] >= np.arange(robot.dof)[:, None]
-        self.used = torch.from_numpy(np.repeat(beyond, 4, axis=1))
+        self.used = torch.ones(robot.dof, robot.dof, dtype=torch.bool).triu().repeat_interleave(4, 1)
         self.group = torch.zeros_like(self.used, dtype=torch.int64)
 
     def describe(self) -> dict[str, Any]:
@@ -147,48 +145,32 @@ class GravityTorques(AbstractFeatures):
     def columns(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof columns"]:
         """Torques of unit masses and moments over the reach; 0 for masses before the joint."""
         q = q[..., : self._robot.dof]
-        frames = self._frames(q.reshape(-1, self._robot.dof))
-        g = q.new_tensor(self.gravity)
-        joints = []
-        for j, joint in enumerate(self._robot.joints):
-            z, p = frames[j][0] * joint.direction, frames[j][1]
-            cells = []
-            for k in range(self._robot.dof):
-                axes, origin = frames[k][2], frames[k][3]
-                if k < j:
-                    cells += [torch.zeros_like(p[0])] * 4
-                elif joint.type == "prismatic":
-                    force = z[0] * g[0] + z[1] * g[1] + z[2] * g[2]
-                    cells += [force, *[torch.zeros_like(force)] * 3]
-                else:
-                    cells.append(_torque(z, origin - p, g) / self._robot.reach)
-                    cells += [_torque(z, u, g) * self.ARM for u in axes]
-            joints.append(torch.stack(cells, -1))
-        return torch.stack(joints, -2).reshape(*q.shape, 4 * self._robot.dof)
+        z, p, carried = self._frames(q.reshape(-1, self._robot.dof))
+        g, z = q.new_tensor(self.gravity), z * q.new_tensor(self._robot.directions)[:, None, None]
+        lever = torch.linalg.cross(g[None, :, None].expand_as(z), z, dim=1)  # z · (a × g) = a · (g × z)
+        cells = torch.stack([lever[:, c, None, None] * carried[:, :, c] for c in range(3)]).sum(0)
+        origin = cells[:, :, :1] - (lever * p).sum(1)[:, None, None]
+        cells = torch.cat([origin / self._robot.reach, cells[:, :, 1:] * self.ARM], 2)
+        turning = torch.tensor(self._robot.revolute, device=q.device)[:, None, None, None]
+        force = (z * g[:, None]).sum(1)[:, None, None] * q.new_tensor([1.0, 0.0, 0.0, 0.0])[:, None]
+        cells = torch.where(turning, cells, force) * self.used.to(q).view(*cells.shape[:3], 1)
+        return cells.flatten(1, 2).movedim(-1, 0).reshape(*q.shape, 4 * self._robot.dof)
 
-    def _frames(self, q: Float[Tensor, "poses dof"]) -> list[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Per joint its axis and origin, then the axes and the origin of its row's frame, all `(3, poses)`."""
+    def _frames(self, q: Float[Tensor, "poses dof"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Per joint its axis and origin, and the origin and the axes of its row's frame; the pose index is last."""
         geometry = Geometry(self._robot.dh.tolist(), [0.0] * 6, [0.0] * 6)
-        one = torch.ones_like(q[:, 0])
 
         def vector(values: tuple[float | Tensor, ...]) -> Tensor:
-            return torch.stack([value * one for value in values])
+            return torch.stack([value * torch.ones_like(q[:, 0]) for value in values])
 
         found = []
         columns = q.t().contiguous().unbind(0)
         for row, step in zip(self._robot.rows, iterate_rows(self._robot, geometry, columns), strict=True):
             if row.type != "fixed":
-                axes = torch.stack([vector(axis) for axis in step.after[:3]])
-                z, p = vector(step.before[2]), vector(step.before[3])
-                found.append((z, p, axes, vector(step.after[3])))
-        return found
-
-
-def _torque(z: Tensor, arm: Tensor, g: Tensor) -> Tensor:
-    """`z · (arm × g)`, the pose index last."""
-    x = arm[1] * g[2] - arm[2] * g[1]
-    y = arm[2] * g[0] - arm[0] * g[2]
-    return z[0] * x + z[1] * y + z[2] * (arm[0] * g[1] - arm[1] * g[0])
+                carried = torch.stack([vector(part) for part in (step.after[3], *step.after[:3])])
+                found.append((vector(step.before[2]), vector(step.before[3]), carried))
+        z, p, carried = (torch.stack(part) for part in zip(*found, strict=True))
+        return z, p, carried
 
 
 class SharedFeatures(AbstractFeatures):
@@ -244,7 +226,6 @@ class ConditionFeatures(AbstractFeatures):
     """
 
     name = "conditions"
-    periodic = True
 
     def __init__(
         self,
@@ -275,6 +256,11 @@ class ConditionFeatures(AbstractFeatures):
         self.group = torch.tensor(group).expand(self.used.shape)
         self.group_names = self.names
 
+    def describe(self) -> dict[str, Any]:
+        """See `AbstractFeatures.describe`."""
+        values = {"mean": list(self.mean), "spread": list(self.spread), "gravity": list(self.gravity)}
+        return {"name": self.name, "names": list(self.names), **values}
+
     def columns(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof columns"]:
         """The products; 0 under the usual conditions, and for conditions that are NaN or not there."""
         joints, found = q[..., : self._robot.dof], q[..., self._robot.dof :]
@@ -295,10 +281,10 @@ class ConditionFeatures(AbstractFeatures):
 
 def scaled_joints(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
     """Joint values, 0 in the middle of the limits and ±1 at them; without limits over pi or the reach."""
-    middle = robot.limits.mean(1)
-    half = np.diff(robot.limits)[:, 0] / 2
-    half = np.where(np.isfinite(half), half, np.where(robot.revolute, np.pi, robot.reach))
-    middle = np.where(np.isfinite(middle), middle, 0.0)
+    limited = np.isfinite(robot.limits).all(1)
+    bounds = np.where(limited[:, None], robot.limits, 0.0)
+    middle, half = bounds.mean(1), (bounds[:, 1] - bounds[:, 0]) / 2
+    half = np.where(limited, half, np.where(robot.revolute, np.pi, robot.reach))
     return (q - q.new_tensor(middle)) / q.new_tensor(half)
 
 
@@ -312,30 +298,3 @@ def unit_inputs(robot: Robot, q: Float[Tensor, "*batch state"]) -> Float[Tensor,
     if len(sliding):
         parts.append(scaled_joints(robot, q).index_select(-1, sliding))
     return torch.cat(parts, -1)
-
-
-def features_from(robot: Robot, description: Mapping[str, Any]) -> AbstractFeatures:
-    """Features from what their `describe` gave.
-
-    Args:
-        robot: the nominal robot.
-        description: "name", and "harmonics" of a series or the direction "gravity" of gravity.
-
-    Raises:
-        ValueError: there are no features of that name, or what they need is missing, too much or wrong.
-    """
-    name = description.get("name")
-    names = (FourierSeries.name, GravityTorques.name, *SharedFeatures.CHOICES)
-    if name not in names:
-        raise ValueError(f"there are no features '{name}'; {nearest_choice(str(name), names)}")
-    needed = {FourierSeries.name: {"harmonics"}, GravityTorques.name: {"gravity"}}.get(name, set())
-    if wrong := needed ^ (set(description) - {"name"}):
-        raise ValueError(
-            f"the features '{name}' need {sorted(needed) or 'a name only'}; see {sorted(wrong)}."
-        )
-    if name == FourierSeries.name:
-        return FourierSeries(robot, description["harmonics"])
-    if name == GravityTorques.name:
-        x, y, z = description["gravity"]
-        return GravityTorques(robot, (x, y, z))
-    return SharedFeatures(robot, name)

@@ -186,9 +186,20 @@ def test_unknown_branch_is_refused(name):
         CorrectedIK(hand_made_model(name))(poses(name), branch="elbow_positve")
 
 
+def bent_ur10() -> Robot:
+    """A UR10 with a twist that is off, so that it has no closed-form inverse."""
+    robot = Robot.load("ur10")
+    dh = robot.dh.copy()
+    dh[1, 3] += 1e-3
+    bent = robot.with_geometry(dh=dh)
+    assert closed_form_solver(bent) is None
+    return bent
+
+
 def test_robot_without_closed_form_has_one_branch():
-    ik = CorrectedIK(hand_made_model("ur10"))
-    T = poses("ur10", 2, 3)
+    robot = bent_ur10()
+    ik = CorrectedIK(hand_made_model("ur10", robot=robot))
+    T = forward_kinematics(robot, joints_around("ur10", 2, 3, seed=3, spread=0.15))
     assert ik.branches == (NUMERIC,)
     every = ik.all_branches(T)
     assert every.q.shape == (2, 3, 1, 6)
@@ -367,7 +378,7 @@ def test_inputs_see_joints_on_the_turn_of_the_training_rows():
 
 def test_numeric_inverse_tries_more_than_one_start():
     """The nearest start of a pose may lead nowhere; then others are tried."""
-    ik = CorrectedIK(hand_made_model("ur10"))
+    ik = CorrectedIK(hand_made_model("ur10", robot=bent_ur10()))
     q = joints_around("ur10", 700, seed=9, spread=0.6)
     solution = ik(forward_kinematics(ik.model.robot, q))
     reached = solution.status != Status.UNREACHABLE
@@ -391,4 +402,6 @@ def test_models_that_do_not_fit_their_robot_are_refused():
     with pytest.raises(ModelError, match="no branch 'elbow_left'"):
         CorrectedIK(replace(hand_made_model("kiro3"), branches=("elbow_left",)))
     with pytest.raises(ModelError, match="no joint values to start from"):
-        CorrectedIK(replace(hand_made_model("ur10"), starts=torch.zeros(0, 6, dtype=torch.float64)))
+        CorrectedIK(
+            replace(hand_made_model("ur10", robot=bent_ur10()), starts=torch.zeros(0, 6, dtype=torch.float64))
+        )

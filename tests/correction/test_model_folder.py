@@ -164,8 +164,8 @@ def test_weights_of_another_model_are_noticed(folder, tmp_path):
 
 def test_a_newer_format_asks_for_an_upgrade(folder):
     path = folder / "model.yaml"
-    path.write_text(path.read_text().replace("format: 1\n", "format: 2\n", 1))
-    assert "model.yaml: format 2 is newer than this pisigma reads (1); upgrade pisigma." in refused(folder)
+    path.write_text(path.read_text().replace("format: 1\n", "format: 3\n", 1))
+    assert "model.yaml: format 3 is newer than this pisigma reads (2); upgrade pisigma." in refused(folder)
 
 
 def _set(key: str, value):

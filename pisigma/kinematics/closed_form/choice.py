@@ -3,6 +3,7 @@
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
 from pisigma.kinematics.closed_form.scara import Scara
 from pisigma.kinematics.closed_form.spherical_wrist import SphericalWristArm
+from pisigma.kinematics.closed_form.three_parallel import ThreeParallelArm
 from pisigma.robot.description import Robot
 
 
@@ -13,4 +14,4 @@ def closed_form_solver(robot: Robot) -> AbstractClosedForm | None:
     Signs of twists, offsets, directions, base, tool, fixed rows before the first and behind the last joint do
     not matter, nor do twist and beta of the last row.
     """
-    return Scara.of(robot) or SphericalWristArm.of(robot)
+    return Scara.of(robot) or SphericalWristArm.of(robot) or ThreeParallelArm.of(robot)

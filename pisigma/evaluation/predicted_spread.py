@@ -1,0 +1,93 @@
+"""Predicted standard deviations of positions beside the errors that were made."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.hybrid.result import HybridResult
+from pisigma.measurement.dataset import Measurements
+
+WITHIN = 1.96
+"""95 % of a normal value lie within so many standard deviations."""
+
+
+@dataclass(frozen=True, eq=False)
+class PredictedSpread:
+    """How far measured positions are from predicted ones, and how far they were expected to be.
+
+    Attributes:
+        error: measured minus predicted along the axes of the row's frame [m]; NaN where a row has no position
+            or was not judged.
+        sigma: predicted standard deviation of it, with the noise of the measurement [m]; NaN likewise.
+    """
+
+    error: Float64[Tensor, "rows 3"]
+    sigma: Float64[Tensor, "rows 3"]
+
+    @staticmethod
+    def none(rows: int) -> "PredictedSpread":
+        """Of rows that are not judged yet."""
+        nothing = torch.full((rows, 3), torch.nan, dtype=torch.float64)
+        return PredictedSpread(nothing, nothing.clone())
+
+    @property
+    def values(self) -> int:
+        """Number of coordinates with an error and a prediction of it."""
+        return int(self._judged.sum())
+
+    @property
+    def coverage(self) -> float:
+        """Share of coordinates whose error is within 1.96 standard deviations; 0.95 is wanted."""
+        inside = self.error.abs() <= WITHIN * self.sigma
+        return float(inside[self._judged].double().mean())
+
+    def in_file_units(self) -> dict[str, float]:
+        """Coverage, and root mean square of the predicted deviation of a position [mm]; nothing without rows."""
+        if not self.values:
+            return {}
+        rows = self._judged.all(-1)
+        sigma = float(self.sigma[rows].square().sum(-1).mean().sqrt()) * 1e3
+        return {"coverage": self.coverage, "predicted_rms_mm": sigma}
+
+    @property
+    def _judged(self) -> Tensor:
+        return torch.isfinite(self.error) & torch.isfinite(self.sigma)
+
+
+def predicted_spread(result: HybridResult, measurements: Measurements) -> PredictedSpread:
+    """Errors of measured positions under a hybrid calibration, and what it predicts of them.
+
+    The noise of the measurement is what the calibration found, or, where its rows stated theirs, what these rows
+    state times the factor that was found; rows that then state none are exact.
+
+    Raises:
+        IdentificationError: a row has a target that was not calibrated.
+    """
+    found = PredictedSpread.none(measurements.rows)
+    if measurements.position is None:
+        return found
+    frames = result.uncertainty.space.frames
+    errors = result.errors_of(measurements)["position"]
+    rows = torch.isfinite(measurements.position).all(-1)
+    rows &= torch.tensor([name in frames for name in measurements.frame], dtype=torch.bool)
+    chosen = rows.nonzero()[:, 0]
+    if not len(chosen):
+        return found
+    judged = measurements.select(chosen)
+    noise = _noise(result, judged)
+    found.error[chosen] = errors[chosen].detach().cpu()
+    found.sigma[chosen] = (result.deviation(judged).square() + noise.square()[:, None]).sqrt()
+    return found
+
+
+def _noise(result: HybridResult, measurements: Measurements) -> Float64[Tensor, " rows"]:
+    """Standard deviation of a measured coordinate of every row [m]."""
+    first = next(noise for noise in result.geometric.noise if noise.sensor == "position")
+    sigma = first.sigma if result.learned is None else result.learned.noise["position"]
+    none = torch.zeros(measurements.rows, dtype=torch.float64)
+    if first.unit != "given":
+        return none + sigma
+    stated = measurements.sigma_position
+    return none if stated is None else sigma * torch.nan_to_num(stated)

@@ -1,0 +1,149 @@
+"""Closed form of six-joint arms whose axes 2, 3 and 4 are parallel: the usual collaborative robots."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from pisigma.kinematics.closed_form.canonical import canonical_rows
+from pisigma.kinematics.closed_form.interface import AbstractClosedForm
+from pisigma.kinematics.closed_form.tolerance import rounding, singular_tolerance
+from pisigma.kinematics.closed_form.two_link import TwoLink, solve_two_link
+from pisigma.robot.description import Robot
+
+_RIGHT = math.pi / 2
+_TWISTS = (_RIGHT, 0.0, 0.0, _RIGHT, -_RIGHT)
+_MARGIN = 1e-9
+"""Share of the arm by which the elbow stays short of stretched or folded where joint 6 is free to choose."""
+
+
+@dataclass(frozen=True, eq=False)
+class ThreeParallelArm(AbstractClosedForm):
+    """Arm with twists 90, 0, 0, 90, -90 deg (each up to 180 deg) whose axes 5 and 6 meet: UR, RB and the like.
+
+    Axis 2 is a normal of the plane in which joints 2 to 4 move. The height over it of the point where axes 5
+    and 6 meet gives joint 1, its direction in the wanted frame gives joints 5 and 6; what is left are two
+    links in the plane (Hawkins 2013, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms",
+    here for any a_1 to a_4, d_1 to d_6, a_6, offsets, directions, base and tool).
+
+    Branches are named `shoulder/elbow/wrist`:
+
+    - `front` or `back`: the point where axes 5 and 6 meet lies ahead of or behind axis 1, as seen in the plane
+      of the arm.
+    - `elbow_up` or `elbow_down`: the elbow lies on the side of the line from axis 2 to axis 4 where the first
+      axis points, or on the other, for an axis 4 that lies outwards from axis 2.
+    - `no_flip` or `flip`: `t_5`, counted about the canonical axis, is positive or negative.
+
+    SINGULAR: the elbow is stretched or folded (two branches meet), the point where axes 5 and 6 meet lies in
+    the plane of axis 1 that is parallel to axis 2 (front and back meet; on axis 1 itself joint 1 is not
+    determined and given as 0 on the front branches), or the wrist is straight (axes 4 and 6 are parallel).
+    There joint 6 is given as 0 where the elbow reaches so, else as what brings the elbow just within reach.
+    Near, but not at, such a place the exact values are given.
+    """
+
+    @classmethod
+    def of(cls, robot: Robot) -> "ThreeParallelArm | None":
+        """The solver, or None where the rows are no such arm or a link has no length."""
+        rows = canonical_rows(robot, ("revolute",) * 6, _TWISTS)
+        if rows is None or rows.a[4] or not rows.a[1] or not rows.a[2]:
+            return None
+        return cls(robot, rows)
+
+    @property
+    def branches(self) -> tuple[str, ...]:
+        """`front/elbow_up/no_flip`, `front/elbow_up/flip`, `front/elbow_down/no_flip` and so on, 8 in all."""
+        return tuple(
+            f"{shoulder}/elbow_{elbow}/{wrist}"
+            for shoulder in ("front", "back")
+            for elbow in ("up", "down")
+            for wrist in ("no_flip", "flip")
+        )
+
+    @property
+    def _scale(self) -> float:
+        """How long the arm is [m]: what lengths are compared with."""
+        a, d = self.rows.a, self.rows.d
+        return abs(a[0]) + abs(a[1]) + abs(a[2]) + math.hypot(a[3], d[4]) + abs(d[1] + d[2] + d[3])
+
+    def _solve_canonical(
+        self, T: Float[Tensor, "*batch 4 4"]
+    ) -> tuple[Float[Tensor, "*batch 8 6"], Bool[Tensor, "*batch 8"], Bool[Tensor, "*batch 8"]]:
+        shoulder, elbow, wrist = (
+            T.new_tensor([1.0, -1.0]).reshape(shape) for shape in ((2, 1, 1), (1, 2, 1), (1, 1, 2))
+        )
+        each = T[..., None, None, None, :, :]
+        t_1, ahead, beside = self._solve_first(each[..., :3, 3], shoulder)
+        t_5, t_6, straight = self._solve_wrist(each[..., :3, :3], t_1, wrist)
+        x, y = ahead - self.rows.a[0], each[..., 2, 3] - self.rows.d[0]
+        shape = torch.broadcast_shapes(x.shape, elbow.shape, t_6.shape)
+        t_1, ahead, x, y, t_5, t_6 = (values.expand(shape) for values in (t_1, ahead, x, y, t_5, t_6))
+        upwards = (-shoulder * elbow * math.copysign(1.0, self.rows.a[1])).expand(shape)
+        arm, t_234 = self._solve_plane(each[..., :3, :3], t_1, t_6, x, y, upwards)
+        free = (straight <= rounding(T.dtype)).expand(shape) & ~arm.reached
+        if free.any():
+            t_6 = torch.where(free, self._turned_wrist(t_234, t_5, t_6, x, y), t_6)
+            arm, t_234 = self._solve_plane(each[..., :3, :3], t_1, t_6, x, y, upwards)
+        t_3 = arm.elbow - (math.pi if self.rows.a[2] < 0 else 0.0)
+        variables = torch.stack([t_1, arm.first, t_3, t_234 - arm.first - t_3, t_5, t_6], -1)
+        tolerance = singular_tolerance(T.dtype)
+        singular = arm.singular | (ahead.abs() < tolerance * self._scale) | (straight < tolerance)
+        return variables.flatten(-4, -2), (arm.reached & beside).flatten(-3), singular.flatten(-3)
+
+    def _solve_first(self, p: Tensor, shoulder: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Joint 1 from `s_1 x - c_1 y = d_2 + d_3 + d_4`; `c_1 x + s_1 y`; and whether there is such a joint."""
+        side = sum(self.rows.d[1:4])
+        x, y = p[..., 0], p[..., 1]
+        square = x * x + y * y - side * side
+        beside = square >= -rounding(p.dtype) * self._scale**2
+        ahead = shoulder * square.clamp(min=0).sqrt()
+        on_axis = torch.hypot(x, y) <= rounding(p.dtype) * self._scale
+        azimuth = torch.where(on_axis, self.rows.variable_at_zero(0), torch.atan2(y, x))
+        t_1 = azimuth + torch.atan2(torch.full_like(ahead, side), ahead)
+        return torch.where((shoulder < 0) & on_axis, azimuth + math.pi, t_1), ahead, beside
+
+    def _solve_wrist(self, R: Tensor, t_1: Tensor, wrist: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Joints 5 and 6, and the size of `s_5`: axis 2 in the wanted frame is `(s_5 c_6, -s_5 s_6, c_5)`."""
+        axis = torch.sin(t_1)[..., None] * R[..., 0, :] - torch.cos(t_1)[..., None] * R[..., 1, :]
+        x, y, z = axis.unbind(-1)
+        sine = torch.hypot(x, y)
+        t_6 = torch.where(
+            sine <= rounding(R.dtype), self.rows.variable_at_zero(5), torch.atan2(-wrist * y, wrist * x)
+        )
+        return wrist * torch.atan2(sine, z), t_6, sine
+
+    def _solve_plane(
+        self, R: Tensor, t_1: Tensor, t_6: Tensor, x: Tensor, y: Tensor, upwards: Tensor
+    ) -> tuple[TwoLink, Tensor]:
+        """The two links that carry axis 4, and `t_2 + t_3 + t_4`, from axis 5 `(s_234, -c_234)` in the plane."""
+        axis = -torch.sin(t_6)[..., None] * R[..., :, 0] - torch.cos(t_6)[..., None] * R[..., :, 1]
+        sine = torch.cos(t_1) * axis[..., 0] + torch.sin(t_1) * axis[..., 1]
+        t_234 = torch.atan2(sine, -axis[..., 2])
+        cos, sin = torch.cos(t_234), torch.sin(t_234)
+        along, across = self.rows.a[3], -self.rows.d[4]
+        arm = solve_two_link(
+            x - (cos * along - sin * across),
+            y - (sin * along + cos * across),
+            self.rows.a[1],
+            abs(self.rows.a[2]),
+            upwards,
+            self.rows.variable_at_zero(1),
+        )
+        return arm, t_234
+
+    def _turned_wrist(self, t_234: Tensor, t_5: Tensor, t_6: Tensor, x: Tensor, y: Tensor) -> Tensor:
+        """Joint 6 of a straight wrist that brings axis 4 just within the elbow's reach, on the side it was."""
+        along, across = self.rows.a[3], -self.rows.d[4]
+        hand, far = math.hypot(along, across), torch.hypot(x, y)
+        if hand == 0.0:
+            return t_6
+        a, b = abs(self.rows.a[1]), abs(self.rows.a[2])
+        turn = t_234 + math.atan2(across, along) - torch.atan2(y, x)
+        square = far * far + hand * hand - 2 * far * hand * torch.cos(turn)
+        nearest, farthest = abs(a - b) + _MARGIN * (a + b), (a + b) * (1 - _MARGIN)
+        wanted = square.clamp(nearest**2, farthest**2)
+        safe = torch.where(far > 0, far, torch.ones_like(far))
+        cosine = ((far * far + hand * hand - wanted) / (2 * safe * hand)).clamp(-1, 1)
+        change = torch.copysign(torch.acos(cosine), torch.sin(turn)) - turn
+        return t_6 - torch.sign(torch.cos(t_5)) * change

@@ -1,0 +1,121 @@
+"""Hybrid calibrations of simulated arms, for tests."""
+
+import functools
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from testing.models import no_type_checker
+
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.hybrid.result import HybridResult
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot import Robot
+from pisigma.se3 import invert, transform_from_xyzrpy
+from pisigma.simulation import TrueRobot
+from pisigma.simulation.geometric_random import RandomGeometricDeviation
+from pisigma.simulation.joint_compliance import JointCompliance, LinkMass
+from pisigma.simulation.transmission import Harmonic, TransmissionHarmonics
+
+NOISE = 3e-5
+"""[m] Of a measured coordinate."""
+
+
+@dataclass(frozen=True, eq=False)
+class HybridArmUnderTest:
+    """A simulated robot, what was measured on it, and its hybrid calibration."""
+
+    true: TrueRobot
+    measurements: Measurements
+    result: HybridResult
+
+
+def true_robot(robot: Robot, payload: float = 3.0) -> TrueRobot:
+    """A robot with errors of geometry, gears and, in its second and third joint, compliance.
+
+    Args:
+        robot: as drawn.
+        payload: mass at the tool [kg].
+    """
+    names = [joint.name for joint in robot.joints]
+    turning = [joint.name for joint in robot.joints if joint.type == "revolute"]
+    sines = [
+        Harmonic(joint=name, amplitude_deg=0.03, harmonic=1 + i % 4, phase_deg=40.0 * i)
+        for i, name in enumerate(turning)
+    ]
+    sums = [
+        Harmonic(joint=name, amplitude_deg=0.03, joints={turning[1]: 1, name: 1}, phase_deg=25.0)
+        for name in turning
+        if name != turning[1]
+    ]
+    compliance = JointCompliance(
+        kind="joint_compliance",
+        compliance_rad_per_Nm={name: 2e-6 for name in names[1:3] if name in turning},
+        links={names[2]: LinkMass(mass_kg=8, centre_mm=(-100, 0, 50))},
+        payload=LinkMass(mass_kg=payload),
+    )
+    geometry = RandomGeometricDeviation(
+        kind="geometric_random", distribution="normal", seed=3, length_mm=0.3, angle_deg=0.03
+    )
+    return TrueRobot(
+        robot, (geometry, TransmissionHarmonics(kind="transmission", terms=(*sines, *sums)), compliance)
+    )
+
+
+def joints_in(robot: Robot, rows: int, seed: int, share: float = 1.0) -> torch.Tensor:
+    """Joint values [rad or m], uniform over a share of the limits around their middle, at most one turn."""
+    limits = np.clip(robot.limits, -np.pi, np.pi)
+    middle, half = limits.mean(1), np.diff(limits)[:, 0] / 2 * share
+    return torch.from_numpy(
+        np.random.default_rng(seed).uniform(middle - half, middle + half, (rows, robot.dof))
+    )
+
+
+@functools.cache
+def hybrid_of(
+    name: str,
+    rows: int = 200,
+    share: float = 1.0,
+    orders: tuple[tuple[int, ...], ...] = (),
+    frames: bool = False,
+    features: tuple[str, ...] = ("gravity", "series"),
+    payloads: tuple[float, ...] = (),
+) -> HybridArmUnderTest:
+    """Calibrate a simulated robot from measured positions.
+
+    Args:
+        name: of the catalogue.
+        rows: measured positions.
+        share: of the joint ranges that is measured.
+        orders: of product units that are tried.
+        frames: measure in two frames and with two targets, else in one.
+        features: that are tried.
+        payloads: masses [kg] that the rows carry in turn, as they state; the usual one and not stated where none.
+    """
+    true = true_robot(Robot.load(name))
+    q = joints_in(true.nominal, rows, seed=0, share=share)
+    T, names = true.forward(q), {}
+    if payloads:
+        every = torch.stack([true_robot(true.nominal, payload).forward(q) for payload in payloads])
+        number = torch.arange(rows) % len(payloads)
+        T, names = every[number, torch.arange(rows)], {"payload": torch.tensor(payloads).double()[number]}
+    if frames:
+        T_frame = transform_from_xyzrpy(torch.tensor([[0.0] * 6, [0.5, -0.3, 0.2, 0.4, -0.2, 1.0]]).double())
+        T_target = transform_from_xyzrpy(
+            torch.tensor([[0.0] * 6, [0.05, 0.1, -0.04, 0.0, 0.0, 0.0]]).double()
+        )
+        number = torch.arange(rows)
+        T = invert(T_frame)[number % 2] @ T @ T_target[number // 2 % 2]
+        names |= {
+            "frame": tuple(("wall", "floor")[k] for k in (number % 2).tolist()),
+            "target": tuple(("A", "B")[k] for k in (number // 2 % 2).tolist()),
+        }
+    rng = np.random.default_rng(1)
+    position = T[:, :3, 3] + NOISE * torch.from_numpy(rng.normal(size=(rows, 3)))
+    measurements = Measurements(q=q, position=position, **names)
+    with no_type_checker():
+        calibrator = HybridCalibrator(
+            GeometricCalibrator(true.nominal), features=features, harmonics=(4, 8), orders=orders
+        )
+        return HybridArmUnderTest(true, measurements, calibrator.fit(measurements))

@@ -1,0 +1,127 @@
+"""Linearised rows of simulated arms, for tests of the hybrid's parts."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pisigma.hybrid.design import Design, sum_up
+from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence
+from pisigma.hybrid.rows import Rows
+from pisigma.hybrid.sensor_values import sensor_values
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.loss import SquaredLoss
+from pisigma.identification.noise import view_of
+from pisigma.identification.setup import CalibrationSetup
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import groups_of_equal_joints
+from pisigma.network.features import AbstractFeatures
+from pisigma.robot import Robot
+from pisigma.se3 import invert, rotation_from_vector, transform_from_xyzrpy
+
+FRAMES = torch.tensor(
+    [[0.3, -0.2, 0.1, 0.4, -0.2, 0.3], [0.5, -0.3, 0.2, 0.4, -0.2, 1.0]], dtype=torch.float64
+)
+TARGETS = torch.tensor(
+    [[0.02, -0.03, 0.1, 0.2, 0.1, -0.2], [0.05, 0.1, -0.04, 0.3, -0.1, 0.2]], dtype=torch.float64
+)
+"""x, y, z [m], roll, pitch, yaw [rad] of two frames in the base and of two targets on the tool."""
+
+
+def drawn_joints(robot: Robot, rows: int, seed: int, widest: float = np.pi) -> Tensor:
+    """Joint values [rad or m], uniform over the limits, turning joints at most so far from 0."""
+    most = np.where(robot.revolute, widest, np.inf)[:, None]
+    low, high = np.clip(robot.limits, -most, most).T
+    return torch.from_numpy(np.random.default_rng(seed).uniform(low, high, (rows, robot.dof)))
+
+
+def tracker_data(
+    true: Robot,
+    q: Tensor,
+    delta: Tensor | float = 0.0,
+    noise: float = 0.0,
+    turn_noise: float | None = None,
+    several: bool = False,
+    seed: int = 0,
+) -> Measurements:
+    """What a tracker sees of a robot whose joints are off by `delta`.
+
+    Args:
+        true: the robot.
+        q: commanded joint values.
+        delta: joint errors.
+        noise: of a coordinate [m].
+        turn_noise: of an angle [rad]; positions only where None.
+        several: measure in two frames and with two targets by turns, else in one.
+        seed: of the noise.
+    """
+    rng = np.random.default_rng(seed)
+    number = torch.arange(len(q)) * int(several)
+    T = invert(transform_from_xyzrpy(FRAMES))[number % 2] @ forward_kinematics(true, q + delta)
+    T = T @ transform_from_xyzrpy(TARGETS)[number // 2 % 2]
+    position = T[:, :3, 3] + noise * torch.from_numpy(rng.normal(size=(len(q), 3)))
+    rotation = None
+    if turn_noise is not None:
+        turn = rotation_from_vector(turn_noise * torch.from_numpy(rng.normal(size=(len(q), 3))))
+        rotation = turn @ T[:, :3, :3]
+    return Measurements(
+        q=q,
+        position=position,
+        rotation=rotation,
+        frame=tuple(("wall", "floor")[k] for k in (number % 2).tolist()),
+        target=tuple(("A", "B")[k] for k in (number // 2 % 2).tolist()),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class LinearisedArm:
+    """The rows of a geometric calibration, seen from its solution."""
+
+    setup: CalibrationSetup
+    rows: Rows
+    noise: tuple[float, ...]
+    widening: tuple[float, ...]
+
+    def fitted(self, features: Sequence[AbstractFeatures], iterations: int = 40) -> "Fitted":
+        """Geometry and a unit of order 1, prior sizes and noise by the evidence."""
+        design = Design(self.rows.problem, tuple(features))
+        sums = sum_up(design, self.rows.values, self.rows.start(design))
+        return Fitted(
+            design, sums, maximise_evidence(sums, design.prior(self.widening), self.noise, iterations)
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """A design with its normal equations and its posterior."""
+
+    design: Design
+    sums: Sums
+    posterior: Posterior
+
+
+def linearised(robot: Robot, measurements: Measurements, **options: object) -> LinearisedArm:
+    """Calibrate the geometry by least squares, all rows alike, and linearise there."""
+    solved = GeometricCalibrator(robot, loss=SquaredLoss(), **options).solve(measurements)  # type: ignore[arg-type]
+    here, problem = solved.solution.linearisation, solved.problem
+    view = view_of(here)
+    rows = Rows(
+        problem,
+        sensor_values(problem, here.point),
+        (here.point - problem.nominal)[problem.active],
+        groups_of_equal_joints(problem.q),
+    )
+    return LinearisedArm(solved.setup, rows, view.noise, view.widening)
+
+
+def with_directions(robot: Robot, directions: Sequence[int]) -> Robot:
+    """The same robot whose joints count the other way where the direction is -1."""
+    rows = list(robot.rows)
+    for place, direction in zip(robot.joint_rows, directions, strict=True):
+        row = rows[place]
+        low, high = sorted((direction * row.lower, direction * row.upper))
+        rows[place] = replace(row, direction=direction, lower=low, upper=high)
+    return replace(robot, rows=tuple(rows))
