@@ -45,13 +45,9 @@ class Design:
 
     def columns(self, values: SensorValues, rows: slice) -> Float64[Tensor, "seen components unknowns"]:
         """Derivative of a sensor's values by all unknowns, not weighted."""
-        joints = values.joints[rows]
+        state = self.problem.state
         blocks = [values.geometry[rows]]
-        state = self.problem.state[values.row[rows]]
-        for chosen in self.features:
-            block = (joints[..., None] * chosen.columns(state)[:, None]).flatten(2)
-            used = chosen.used.flatten()
-            blocks.append(block if bool(used.all()) else block[..., used])
+        blocks += [values.feature_columns(chosen, state, rows) for chosen in self.features]
         return torch.cat(blocks, -1)
 
     def prior(self, widening: Sequence[float]) -> GaussianPrior:

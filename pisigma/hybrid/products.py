@@ -196,9 +196,8 @@ class ProductFit:
     def _columns(self, features: AbstractFeatures, sensor: int) -> Float64[Tensor, "values weights"]:
         """Weighted columns of one more choice of features."""
         values = self.values[sensor]
-        joints = values.joints * values.root[:, None, None]
-        columns = features.columns(self.design.problem.state[values.row])
-        return (joints[..., None] * columns[:, None]).flatten(2).flatten(0, 1)
+        columns = values.feature_columns(features, self.design.problem.state, slice(None))
+        return (columns * values.root[:, None, None]).flatten(0, 1)
 
     def _solve_root(self, right: Tensor) -> Tensor:
         solved: Tensor = torch.linalg.solve_triangular(self._root, right, upper=False)

@@ -10,6 +10,7 @@ from torch import Tensor
 from pisigma.identification.noise import renumbered
 from pisigma.identification.parameters import ParameterSpace
 from pisigma.identification.problem import CalibrationProblem
+from pisigma.network.features import AbstractFeatures
 
 Shift = Callable[[Tensor], Tensor]
 """Joint corrections [rad or m] as a function of joint values and, behind them, conditions."""
@@ -28,6 +29,8 @@ class SensorValues:
         root: 1 / standard deviation where the rows give their own, else 1.
         given: whether the rows give their own.
         certain: whether the values are known rather than measured.
+        other_row: of distances between the targets of two rows, the number of the other one; else None.
+        other_joints: derivative by the joint values of that row.
     """
 
     name: str
@@ -38,6 +41,24 @@ class SensorValues:
     root: Float64[Tensor, " seen"]
     given: bool
     certain: bool
+    other_row: Int64[Tensor, " seen"] | None = None
+    other_joints: Float64[Tensor, "seen components dof"] | None = None
+
+    def feature_columns(
+        self, chosen: AbstractFeatures, state: Float64[Tensor, "rows state"], rows: slice
+    ) -> Float64[Tensor, "seen components weights"]:
+        """Derivative of the predicted values by the weights of the used columns of some features.
+
+        Args:
+            chosen: the features.
+            state: joint values and conditions of all rows of the problem.
+            rows: which of the seen rows.
+        """
+        used = chosen.used.flatten()
+        block = _spread(self.joints[rows], chosen.columns(state[self.row[rows]]))
+        if self.other_row is not None and self.other_joints is not None:
+            block = block + _spread(self.other_joints[rows], chosen.columns(state[self.other_row[rows]]))
+        return block if bool(used.all()) else block[..., used]
 
     @property
     def components(self) -> int:
@@ -53,6 +74,8 @@ class SensorValues:
             joints=self.joints[chosen],
             residual=self.residual[chosen],
             root=self.root[chosen],
+            other_row=None if self.other_row is None else self.other_row[chosen],
+            other_joints=None if self.other_joints is None else self.other_joints[chosen],
         )
 
     def weighted(self, weight: Float64[Tensor, " seen"]) -> "SensorValues":
@@ -67,7 +90,7 @@ class SensorValues:
         more than they do. Rows of a pose that see something else of it, such as touches along another axis or
         distances from another anchor, have other derivatives and stay apart.
         """
-        if not len(self.row):
+        if not len(self.row) or self.other_row is not None:
             return self
         key = renumbered(pose[self.row] * len(self.row) + self._sights())
         poses = int(key.max()) + 1
@@ -100,6 +123,13 @@ class SensorValues:
         return renumbered((seen / seen.abs().max().clamp(min=1e-300) * 1e6).round().to(torch.int64))
 
 
+def _spread(
+    joints: Float64[Tensor, "seen components dof"], columns: Float64[Tensor, "seen dof columns"]
+) -> Float64[Tensor, "seen components _weights"]:
+    """Derivative by joint values times columns, side by side for all joints."""
+    return (joints[..., None] * columns[:, None]).flatten(2)
+
+
 def sensor_values(
     problem: CalibrationProblem, point: Float64[Tensor, " parameters"], shift: Shift | None = None
 ) -> tuple[SensorValues, ...]:
@@ -122,21 +152,25 @@ def sensor_values(
             seen = sensor.seen[rows].nonzero()[:, 0]
             J = moved.derivative(sensor, motion, own, rows, index)[..., seen].permute(2, 1, 0)
             r = sensor.residual(motion, own, rows)[:, seen].t()
-            found.append((seen + rows.start, J, r))
+            other = sensor.partner_derivative(motion)[len(problem.active) :][..., seen].permute(2, 1, 0)
+            found.append((seen + rows.start, J, r, other))
     values = []
     for sensor, found in zip(problem.sensors, parts, strict=True):
-        row, J, r = (torch.cat(column) for column in zip(*found, strict=True))
+        row, J, r, other = (torch.cat(column) for column in zip(*found, strict=True))
+        joints, paired = J[..., len(problem.active) :] * direction, sensor.paired
         root = torch.ones_like(r[:, 0]) if sensor.sigma is None else 1 / sensor.sigma[row]
         values.append(
             SensorValues(
                 name=sensor.name,
                 row=row,
                 geometry=J[..., : len(problem.active)].contiguous(),
-                joints=J[..., len(problem.active) :] * direction,
+                joints=joints - other * direction if paired else joints,
                 residual=r.contiguous(),
                 root=root,
                 given=sensor.sigma is not None,
                 certain=sensor.certain,
+                other_row=row + 1 if paired else None,
+                other_joints=other * direction if paired else None,
             )
         )
     return tuple(values)

@@ -81,6 +81,7 @@ class PairSensor(AbstractSensor):
     unit = "m"
     components = 1
     turning = False
+    paired = True
     measured: Float64[Tensor, " rows"]
     seen: Bool[Tensor, " rows"]
     sigma: Float64[Tensor, " rows"] | None
@@ -104,6 +105,13 @@ class PairSensor(AbstractSensor):
         apart = self._apart(motion.position)
         direction = apart / apart.norm(dim=0).clamp(min=SHORTEST)
         return along(direction, self._apart(motion.derivative[:, :3]))
+
+    def partner_derivative(self, motion: ToolMotion) -> Float[Tensor, "parameters components poses"]:
+        """Minus the shift of the next row's tool along the line."""
+        apart = self._apart(motion.position)
+        direction = apart / apart.norm(dim=0).clamp(min=SHORTEST)
+        shift = motion.derivative[:, :3]
+        return -along(direction, torch.cat([shift[..., 1:], shift[..., :1]], -1))
 
     def _apart(self, values: Tensor) -> Tensor:
         """Of every row minus that of the next; it is used in the first rows of pairs only."""

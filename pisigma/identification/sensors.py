@@ -52,6 +52,7 @@ class AbstractSensor(ABC):
         turning: whether it needs the tool's rotation.
         certain: whether its values are known rather than measured: their standard deviation is as given, and none
             of them counts as wrong.
+        paired: whether a value belongs to a row and the next one together.
         seen: whether a row has a value.
         sigma: standard deviation of a value where the rows give it, else None: it is estimated.
     """
@@ -61,6 +62,7 @@ class AbstractSensor(ABC):
     components: ClassVar[int]
     turning: ClassVar[bool]
     certain: ClassVar[bool] = False
+    paired: ClassVar[bool] = False
     seen: Bool[Tensor, " rows"]
     sigma: Float64[Tensor, " rows"] | None
 
@@ -79,6 +81,12 @@ class AbstractSensor(ABC):
         self, motion: ToolMotion, own: OwnUnknowns, rows: slice
     ) -> Float[Tensor, "parameters components poses"]:
         """Derivative of the predicted value by every parameter that moves the tool."""
+
+    def partner_derivative(self, motion: ToolMotion) -> Float[Tensor, "parameters components poses"]:
+        """The part of the derivative that comes from the next row's tool, where values are paired; else 0."""
+        return motion.derivative.new_zeros(1, self.components, 1).expand(
+            motion.derivative.shape[0], -1, motion.derivative.shape[2]
+        )
 
     def own_derivatives(self, motion: ToolMotion, own: OwnUnknowns, rows: slice) -> tuple[OwnDerivative, ...]:
         """Derivatives by the sensor's own unknowns; none where it has none."""

@@ -1,11 +1,6 @@
 """Running a training with Lightning: checkpoints, resuming, quiet on stdout."""
 
-import logging
-import signal
-import threading
-import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,13 +17,7 @@ from pisigma.training.fit_sections import FitSection
 from pisigma.training.levenberg_marquardt import Patterns
 from pisigma.training.lightning_module import PatternData, PiSigmaTraining
 from pisigma.training.progress import EnergyProgress
-
-_HARMLESS = (
-    "does not have many workers",
-    "will run with no optimizer",
-    "isinstance.treespec",
-    "Trainer already configured",
-)
+from pisigma.training.trainer import train
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,21 +77,7 @@ def fit_networks(
         else:
             prepare_checkpoints(checkpoints)
         callbacks.append(CheckpointWriter(checkpoints, fit.epochs))
-    with _one_thread(), _quiet(), _keyboard_interrupts():
-        trainer = lightning.Trainer(
-            max_epochs=fit.epochs,
-            accelerator="cpu",
-            devices=1,
-            logger=False,
-            callbacks=callbacks,
-            enable_checkpointing=False,
-            enable_progress_bar=False,
-            enable_model_summary=False,
-            use_distributed_sampler=False,
-        )
-        trainer.fit(module, datamodule=PatternData(patterns), ckpt_path=checkpoint)
-        if trainer.interrupted:
-            raise KeyboardInterrupt
+    train(module, PatternData(patterns), fit.epochs, callbacks, checkpoint)
     module.write_networks()
     return TrainingHistory(tuple(module.labels), module.history, start)
 
@@ -115,46 +90,3 @@ def _check_finite(patterns: Sequence[Patterns], labels: Sequence[Sequence[str]])
                 raise TrainingError(
                     f"pattern {row} (counted from 0) of {', '.join(names)} is not finite; leave that row out."
                 )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Compute on one thread: on a hundred patterns, a second one costs more than it does."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Keep Lightning's hints and warnings about what we do on purpose to ourselves."""
-    loggers = [logging.getLogger(name) for name in ("lightning.pytorch", "lightning.fabric")]
-    levels = [logger.level for logger in loggers]
-    for logger in loggers:
-        logger.setLevel(logging.ERROR)
-    try:
-        with warnings.catch_warnings():
-            for harmless in _HARMLESS:
-                warnings.filterwarnings("ignore", f".*{harmless}.*")
-            yield
-    finally:
-        for logger, level in zip(loggers, levels, strict=True):
-            logger.setLevel(level)
-
-
-@contextmanager
-def _keyboard_interrupts() -> Iterator[None]:
-    """Let Ctrl-C arrive as `KeyboardInterrupt`: Lightning exits with status 1 and ignores all later ones."""
-    handler = signal.getsignal(signal.SIGINT)
-    try:
-        yield
-    except SystemExit as problem:
-        if isinstance(problem.__context__, KeyboardInterrupt):
-            raise KeyboardInterrupt from None
-        raise
-    finally:
-        if threading.current_thread() is threading.main_thread() and handler is not None:
-            signal.signal(signal.SIGINT, handler)

@@ -1,0 +1,278 @@
+"""The hybrid calibrator on simulated and measured robots: better where it can be, the geometric one elsewhere."""
+
+import functools
+import itertools
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.rb5_with_all_errors import NOISE, SimulatedTracker, simulated_tracker
+from testing.sensors import socket_data, true_robot
+
+from pisigma.errors import IdentificationError
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.hybrid.result import HybridResult
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.result import CalibrationResult
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.dataset import Measurements
+from pisigma.network.features import GravityTorques
+from pisigma.robot import Robot
+
+QUICK = {"harmonics": (8, 24), "orders": ()}
+
+
+def rms(result: HybridResult | CalibrationResult, measurements: Measurements) -> float:
+    """Of the errors' lengths [m]."""
+    return float(result.errors_of(measurements)["position"].square().sum(1).mean().sqrt())
+
+
+def calibrator(robot: Robot, **options: object) -> HybridCalibrator:
+    return HybridCalibrator(GeometricCalibrator(robot), **{**QUICK, **options})  # type: ignore[arg-type]
+
+
+@functools.cache
+def fitted(
+    seed: int = 0, rows: int = 150, geometry_only: bool = False
+) -> tuple[SimulatedTracker, HybridResult]:
+    simulated = simulated_tracker(seed, rows, geometry_only)
+    return simulated, calibrator(simulated.robot).fit(simulated.train)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_all_errors_of_a_simulated_robot_are_learned_from_150_positions(seed: int) -> None:
+    simulated, result = fitted(seed)
+    assert rms(result.geometric, simulated.test) > 0.2e-3
+    assert rms(result, simulated.test) < 0.07e-3
+    assert result.learned is not None
+    assert 0.5 * NOISE < result.learned.noise["position"] < 1.5 * NOISE
+    assert 0 < result.learned.effective < result.learned.unknowns
+    assert result.learned.rounds >= 2
+    assert "A joint correction was kept (gravity" in result.verdict
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_95_percent_intervals_cover_about_as_many_new_poses(seed: int) -> None:
+    simulated, result = fitted(seed)
+    errors = result.errors_of(simulated.test)["position"]
+    inside = errors.abs() < 1.96 * result.deviation(simulated.test)
+    assert 0.90 < float(inside.double().mean()) < 0.99
+    geometric_only, plain = fitted(seed, geometry_only=True)
+    errors = plain.errors_of(geometric_only.test)["position"]
+    inside = errors.abs() < 1.96 * plain.deviation(geometric_only.test)
+    assert 0.90 < float(inside.double().mean()) < 0.995
+
+
+def test_errors_of_geometry_alone_leave_the_geometric_calibration_as_it_is() -> None:
+    simulated, result = fitted(geometry_only=True)
+    assert result.learned is None
+    assert result.arm() is None
+    assert "geometric calibration stands" in result.verdict
+    alone = GeometricCalibrator(simulated.robot).fit(simulated.train)
+    assert_close(result.geometric.robot.dh, alone.robot.dh, atol=1e-12)
+    assert_close(
+        result.errors_of(simulated.test)["position"], alone.errors_of(simulated.test)["position"], atol=1e-12
+    )
+    assert next(trial.kept for trial in result.trials)
+    assert not any(trial.kept for trial in result.trials[1:])
+
+
+def test_a_kept_correction_is_in_the_table_of_what_was_tried() -> None:
+    _, result = fitted()
+    assert [trial.name for trial in result.trials[:2]] == ["geometry", "gravity"]
+    kept = [trial for trial in result.trials if trial.kept]
+    assert kept[0].left_out == 1.0
+    assert kept[-1].left_out < 0.5
+    assert all(b.log_evidence > a.log_evidence for a, b in itertools.pairwise(kept))
+    assert all(b.unknowns > kept[0].unknowns for b in result.trials[1:])
+
+
+def test_the_arm_and_the_predicted_poses_are_those_of_the_fit() -> None:
+    simulated, result = fitted()
+    arm, learned = result.arm(), result.learned
+    assert arm is not None
+    assert learned is not None
+    T = result.predicted_poses(simulated.test)
+    assert_close(arm.forward(simulated.test.q), T, atol=1e-12)
+    q = simulated.train.q
+    assert_close(learned.coverage.share(q), torch.ones(len(q)))
+    expected = forward_kinematics(learned.geometry.robot, q + learned.correction(q))
+    assert_close(result.predicted_poses(simulated.train), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", [0, 4])
+def test_30_positions_are_not_made_worse(seed: int) -> None:
+    simulated, result = fitted(seed, rows=30)
+    assert rms(result, simulated.test) < 1.02 * rms(result.geometric, simulated.test)
+
+
+def test_two_fits_are_equal_and_progress_is_told() -> None:
+    simulated, first = fitted(rows=30)
+    told: list[str] = []
+    second = calibrator(simulated.robot).fit(simulated.train, told.append)
+    assert bool((first.predicted_poses(simulated.test) == second.predicted_poses(simulated.test)).all())
+    assert bool((first.deviation(simulated.test) == second.deviation(simulated.test)).all())
+    assert told[0] == "gravity"
+    assert any(what.startswith("gravity + series 8") for what in told)
+    assert "solving for everything" in told
+
+
+def test_product_units_are_kept_where_joints_act_on_each_other() -> None:
+    """Errors of one joint that depend on the product of what two others do."""
+    robot = Robot.load("rb5")
+    simulated = simulated_tracker(3, 300, geometry_only=True)
+    q = torch.cat([simulated.train.q, simulated.test.q])
+    delta = torch.zeros_like(q)
+    delta[:, 1] = 4e-4 * q[:, 2].sin() * q[:, 3].cos()
+    delta[:, 2] = 3e-4 * (q[:, 1] + 0.5).cos() * q[:, 4].sin()
+    p = simulated.pose(q + delta)[:, :3, 3]
+    noise = NOISE * torch.randn(300, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    train, test = (
+        Measurements(q=q[:300], position=p[:300] + noise),
+        Measurements(q=q[300:], position=p[300:].contiguous()),
+    )
+    result = calibrator(robot, harmonics=(4,), orders=((2,), (2, 2))).fit(train)
+    assert result.learned is not None
+    assert result.learned.correction.orders in ((2,), (2, 2))
+    assert "product units" in result.verdict
+    assert rms(result, test) < 0.3 * rms(result.geometric, test)
+    errors, deviation = result.errors_of(test)["position"], result.deviation(test)
+    assert 0.85 < float((errors.abs() < 1.96 * deviation).double().mean()) < 0.995
+    names = [trial.name for trial in result.trials]
+    assert any("products (2,)" in name for name in names)
+
+
+def test_product_units_are_not_kept_where_there_is_nothing_for_them() -> None:
+    simulated = simulated_tracker(0)
+    result = calibrator(simulated.robot, harmonics=(8,), orders=((2,), (2, 2))).fit(simulated.train)
+    assert result.learned is not None
+    assert result.learned.correction.orders == ()
+    tried = [trial for trial in result.trials if "products" in trial.name]
+    assert [trial.kept for trial in tried] == [False]
+
+
+def test_repeats_of_a_few_poses_do_not_fool_it() -> None:
+    """24 poses measured 30 times: what is wrong at a pose is wrong in all of its repeats."""
+    simulated = simulated_tracker(2, 24, geometry_only=True)
+    generator = torch.Generator().manual_seed(4)
+    assert simulated.train.position is not None
+    systematic = simulated.train.position + 2e-4 * torch.randn(
+        24, 3, generator=generator, dtype=torch.float64
+    )
+    q, position = simulated.train.q.repeat(30, 1), systematic.repeat(30, 1)
+    position = position + 1e-5 * torch.randn(720, 3, generator=generator, dtype=torch.float64)
+    result = calibrator(simulated.robot).fit(Measurements(q=q, position=position))
+    assert rms(result, simulated.test) <= 1.02 * rms(result.geometric, simulated.test)
+
+
+def test_wrong_rows_do_not_count() -> None:
+    simulated, good = fitted()
+    generator = torch.Generator().manual_seed(0)
+    assert simulated.train.position is not None
+    position = simulated.train.position.clone()
+    bad = torch.randperm(150, generator=generator)[:8]
+    way = torch.randn(8, 3, generator=generator, dtype=torch.float64)
+    position[bad] += 3e-3 * way / way.norm(dim=1, keepdim=True)
+    result = calibrator(simulated.robot).fit(replace(simulated.train, position=position))
+    assert rms(result, simulated.test) < 0.07e-3
+    assert rms(result, simulated.test) < 1.5 * rms(good, simulated.test)
+    assert result.learned is not None
+    assert result.learned.noise["position"] < 2 * NOISE
+
+
+def test_choosing_on_a_part_of_the_rows_fits_to_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("pisigma.hybrid.calibrator.SEARCHED_ROWS", 90)
+    simulated, whole = fitted()
+    result = calibrator(simulated.robot).fit(simulated.train)
+    assert rms(result, simulated.test) < 1.1 * rms(whole, simulated.test)
+
+
+@pytest.mark.parametrize("features", [("sin_cos",), ("joints", "series"), ("pose",), ()])
+def test_other_features_can_be_chosen(features: tuple[str, ...]) -> None:
+    simulated, _ = fitted()
+    result = calibrator(simulated.robot, features=features, harmonics=(4,)).fit(simulated.train)
+    assert rms(result, simulated.test) < 1.02 * rms(result.geometric, simulated.test)
+    assert (result.learned is None) == (features in ((), ("pose",)))
+    tried = [trial.name for trial in result.trials[1:]]
+    wanted = {"sin_cos": "sin_cos", "joints": "joints", "pose": "pose"}
+    assert all(any(name.startswith(wanted[f]) for name in tried) for f in features if f in wanted)
+
+
+def test_series_have_not_many_more_harmonics_than_there_are_joint_values() -> None:
+    """Unless none would be left."""
+    simulated, _ = fitted(rows=30)
+    told: list[str] = []
+    calibrator(simulated.robot, features=("series",), harmonics=(2, 61)).fit(simulated.train, told.append)
+    assert [what for what in told if what.startswith("series")] == ["series 2"]
+
+
+def test_gravity_may_point_elsewhere() -> None:
+    simulated, _ = fitted()
+    made = calibrator(simulated.robot, gravity=(0.0, 3.0, 0.0), features=("gravity",)).fit(simulated.train)
+    assert made.learned is not None
+    (gravity,) = made.learned.correction.features
+    assert isinstance(gravity, GravityTorques)
+    assert gravity.gravity == (0.0, 1.0, 0.0)
+    right = calibrator(simulated.robot, features=("gravity",)).fit(simulated.train)
+    assert rms(right, simulated.test) < 0.8 * rms(made, simulated.test)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"features": ("serie",)}, "'serie' is no choice; did you mean 'series'"),
+        ({"harmonics": ()}, "whole numbers of at least 1 were wanted"),
+        ({"harmonics": (0, 8)}, "whole numbers of at least 1 were wanted"),
+        ({"orders": ((2,), (1, 2))}, "a product unit has two factors or more"),
+        ({"orders": ((),)}, "a product unit has two factors or more"),
+    ],
+)
+def test_choices_that_do_not_exist_are_refused(options: dict[str, object], sentence: str) -> None:
+    with pytest.raises(IdentificationError) as refused:
+        calibrator(Robot.load("rb5"), **options)
+    assert sentence.lower() in str(refused.value).lower()
+
+
+def test_harmonics_do_not_matter_without_a_series() -> None:
+    assert calibrator(Robot.load("rb5"), features=("gravity",), harmonics=()).harmonics == ()
+
+
+def test_touches_alone_are_enough() -> None:
+    """Along all three axes at every pose, in one jig frame."""
+    simulated = simulated_tracker(0)
+    q = simulated.train.q
+    generator = torch.Generator().manual_seed(0)
+    noise = NOISE * torch.randn(len(q), 3, generator=generator, dtype=torch.float64)
+    p = simulated.true.forward(q)[:, :3, 3]
+    data = Measurements(
+        q=q.repeat_interleave(3, 0),
+        touch=(p + noise).flatten(),
+        touch_axis=("x", "y", "z") * len(q),
+        frame=("jig",) * 3 * len(q),
+    )
+    geometric = GeometricCalibrator(simulated.robot, tool="position", frames={"jig": (0.0,) * 6})
+    result = HybridCalibrator(geometric, harmonics=(8,), orders=()).fit(data)
+    test = simulated.test.q
+    where = Measurements(q=test, frame=("jig",) * len(test))
+    true = simulated.true.forward(test)[:, :3, 3]
+    geometric_only = replace(result, learned=None)
+    before, after = (
+        (one.predicted_poses(where)[:, :3, 3] - true).square().sum(1).mean().sqrt()
+        for one in (geometric_only, result)
+    )
+    assert float(before) > 0.15e-3
+    assert float(after) < 0.05e-3
+    assert result.learned is not None
+    assert set(result.learned.noise) == {"touch"}
+
+
+def test_sockets_alone_with_nothing_but_geometry_are_the_geometric_calibration() -> None:
+    known = {("plate/0", "plate/1"): 0.05}
+    nominal, data = true_robot().nominal, socket_data()
+    noise = torch.randn(data.q.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    data = replace(data, q=data.q + 3e-5 * noise)
+    geometric = GeometricCalibrator(nominal, socket_distances=known)
+    result = HybridCalibrator(geometric, harmonics=(8,), orders=()).fit(data)
+    assert result.learned is None
+    assert bool(torch.isfinite(result.deviation(data)).all())
