@@ -1,4 +1,4 @@
-"""`pisigma calibrate`: geometric calibration of measured data."""
+"""`pisigma calibrate`: geometric or hybrid calibration of measured data."""
 
 import inspect
 import shlex
@@ -7,26 +7,53 @@ import time
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
 
 if TYPE_CHECKING:
-    from pisigma.evaluation.geometric_validation import GeometricValidation, TrainTest
+    from pisigma.correction.calibrated_model import CalibratedModel
+    from pisigma.evaluation.trained_calibrations import Calibrator, Result
     from pisigma.identification.calibrator import GeometricCalibrator
     from pisigma.measurement.dataset import Measurements
+    from pisigma.measurement.splits import TrainTest
+    from pisigma.robot.description import Robot
+
+FOLDS = 5
+"""Of a cross-validation that is not by placement."""
+MODELS = ("geometric", "hybrid")
+"""What may be fitted."""
 
 
 def calibrate(
     robot: Annotated[str, typer.Argument(help="Catalogue name or robot file (YAML).")],
     data: Annotated[Path, typer.Argument(help="Measurements (CSV).")],
     out: Annotated[Path, typer.Option(help="Model folder to write.")],
-    folds: Annotated[int, typer.Option(min=0, help="Folds of the cross-validation; 0 for none.")] = 5,
+    model: Annotated[
+        str,
+        typer.Option(
+            help="hybrid: geometry and, where the data are for it, a joint correction; or geometric."
+        ),
+    ] = "hybrid",
+    folds: Annotated[
+        int | None,
+        typer.Option(
+            min=0, help="Folds of the cross-validation, 0 for none. [default: 5, or one per placement]"
+        ),
+    ] = None,
     hold_out: Annotated[
         float | None, typer.Option(help="Instead of folds, share of the rows held out once.")
     ] = None,
-    split: Annotated[str, typer.Option(help="How rows are parted: joints, time or space.")] = "joints",
-    seed: Annotated[int, typer.Option(help="Of the parting.")] = 0,
+    split: Annotated[
+        str, typer.Option(help="How rows are parted: joints, time, space or placement.")
+    ] = "joints",
+    seed: Annotated[int, typer.Option(help="Of the parting, and of drawing training rows.")] = 0,
+    train_rows: Annotated[
+        int | None,
+        typer.Option(
+            help="Calibrate, in the cross-validation too, with so many rows drawn at random. [default: all]"
+        ),
+    ] = None,
     free: Annotated[
         str, typer.Option(help="identifiable, joint_offsets, or names such as a_2,theta_3.")
     ] = "identifiable",
@@ -43,15 +70,19 @@ def calibrate(
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Identify a robot's geometry from measurements and write it as a model folder with card and figures."""
+    """Calibrate a robot from measurements and write it as a model folder with card and figures.
+
+    Geometry, base and tool, and with them a correction of the joints where it predicts left-out rows better.
+    """
     started = time.perf_counter()
     from pisigma.cli.output import print_json
-    from pisigma.correction.geometric_model import model_of_calibration
+    from pisigma.cli.progress import progress_of
     from pisigma.correction.model_folder import save_model
     from pisigma.correction.staging import check_replaceable, staged_folder
     from pisigma.evaluation.calibration_card import write_calibration_card
     from pisigma.evaluation.calibration_report import report_calibration
-    from pisigma.evaluation.geometric_validation import judge
+    from pisigma.evaluation.calibration_validation import judge, validate
+    from pisigma.evaluation.trained_calibrations import fit
     from pisigma.measurement.dataset import Measurements
     from pisigma.robot.description import Robot
     from pisigma.training.geometric_recipe import calibration_section, known_socket_distances
@@ -60,29 +91,32 @@ def calibrate(
     check_replaceable(out)
     nominal = Robot.load(robot)
     measurements, test = part_sets(Measurements.read_csv(data, nominal))
-    calibrator = replace(
+    geometric = replace(
         calibration_section(free, prior_mm, prior_mrad, robust).calibrator(nominal),
         socket_distances=known_socket_distances(socket_distance, measurements.socket or ()),
     )
+    calibrator = _calibrator(model, geometric)
     parts = _parts(measurements, folds, hold_out, seed, split)
-    result = calibrator.fit(measurements)
-    validation = _validate(calibrator, measurements, parts)
-    kept_aside = None if test is None else judge(calibrator, result, measurements, test)
-    report = {"rows": measurements.rows, **report_calibration(result, validation, kept_aside)}
-    model = replace(model_of_calibration(out.resolve().name, nominal, result, measurements), metrics=report)
-    options = {"folds": folds, "hold-out": hold_out, "split": split, "seed": seed, "free": free}
-    options |= {"prior-mm": prior_mm, "prior-mrad": prior_mrad, "robust": robust}
-    options |= {"socket-distance": socket_distance}
+    rows, parts = _drawn(measurements, parts, train_rows, seed)
+    with progress_of("calibration") as tell:
+        result = fit(calibrator, rows, tell)
+    with progress_of("cross-validation") as tell:
+        validation = validate(calibrator, measurements, parts, tell) if parts else None
+    kept_aside = None if test is None else judge(calibrator, result, rows, test)
+    report = {"rows": rows.rows, **report_calibration(result, validation, kept_aside)}
+    found = replace(_model(out.resolve().name, nominal, result, rows), metrics=report)
+    options = {"model": model, "folds": folds, "hold-out": hold_out, "split": split, "seed": seed}
+    options |= {"train-rows": train_rows, "free": free, "prior-mm": prior_mm, "prior-mrad": prior_mrad}
+    options |= {"robust": robust, "socket-distance": socket_distance}
     texts = {
-        "description": f"Geometric calibration of robot {nominal.name} ({nominal.maker}): DH and Hayati "
-        "parameters, base and tool by least squares.",
+        "description": _description(model, nominal),
         "command": _command_line(robot, data, out, options),
         "not_validated": "Judged on rows of the same measurement only, not on other days, payloads or "
         "temperatures.",
     }
     with staged_folder(out) as scratch:
-        save_model(model, scratch)
-        write_calibration_card(model, result, validation or kept_aside, report, texts, scratch)
+        save_model(found, scratch)
+        write_calibration_card(found, result, rows, validation or kept_aside, report, texts, scratch)
     finished = {"model": str(out), "seconds": round(time.perf_counter() - started, 3), **report}
     if as_json:
         print_json(finished)
@@ -93,20 +127,41 @@ def calibrate(
 def print_calibration(result: dict[str, Any]) -> None:
     """Print what a calibration gave, for people."""
     from pisigma.cli.output import WIDTH_WITHOUT_TERMINAL, print_table
-    from pisigma.evaluation.calibration_card import PARAMETER_COLUMNS, not_identified_lines, parameter_table
+    from pisigma.evaluation.calibration_card import (
+        PARAMETER_COLUMNS,
+        held_out_lines,
+        not_identified_lines,
+        parameter_table,
+    )
+    from pisigma.evaluation.hybrid_card import compared, curve_rows
+    from pisigma.evaluation.hybrid_report import TRIAL_COLUMNS, coverage_line, learned_lines, trial_rows
     from pisigma.evaluation.tables import pose_rows
 
     print_table("parameters", PARAMETER_COLUMNS, parameter_table(result))
     typer.echo("What the data do not tell:")
     for line in not_identified_lines(result):
         typer.echo(textwrap.fill(f"- {line}", WIDTH_WITHOUT_TERMINAL, subsequent_indent="  "))
+    if "hybrid" in result:
+        print_table("what was tried beyond the geometry", TRIAL_COLUMNS, trial_rows(result["hybrid"]))
+        for line in learned_lines(result["hybrid"]):
+            typer.echo(textwrap.fill(line, WIDTH_WITHOUT_TERMINAL))
     for key, title in (
+        ("held_out", "pose errors of {rows} other simulated rows"),
         ("cross_validation", "pose errors of {rows} held-out rows ({folds} folds)"),
         ("test", "pose errors of the {rows} rows of the set 'test', which were kept aside"),
     ):
         if key in result:
-            models = {name: result[key][name] for name in ("nominal", "geometric")}
-            print_table(title.format(**result[key]), *pose_rows(models))
+            models = compared(result[key])
+            if models:
+                print_table(title.format(**result[key]), *pose_rows(models))
+            lines = held_out_lines(result[key])
+            lines += [coverage_line(result[key])] if "coverage" in result[key] else []
+            for line in lines:
+                typer.echo(textwrap.fill(line, WIDTH_WITHOUT_TERMINAL))
+    if "learning_curve" in result:
+        print_table(
+            "errors of held-out rows by number of training rows", *curve_rows(result["learning_curve"])
+        )
     outliers = result["outliers"]
     worst = f"; the worst is {outliers[0]['place']}" if outliers else ""
     typer.echo(f"Rank {result['rank']}, {result['iterations']} iterations, {len(outliers)} outliers{worst}.")
@@ -129,33 +184,58 @@ def _command_line(robot: str, data: Path, out: Path, options: dict[str, Any]) ->
 
 
 def _parts(
-    measurements: "Measurements", folds: int, hold_out: float | None, seed: int, split: str
+    measurements: "Measurements", folds: int | None, hold_out: float | None, seed: int, split: str
 ) -> "Sequence[TrainTest]":
     from pisigma.errors import MeasurementError, nearest_choice
-    from pisigma.measurement.splits import holdout, k_folds
+    from pisigma.measurement.splits import SplitBy, holdout, k_folds
 
-    if split not in ("joints", "time", "space"):
-        raise MeasurementError(
-            f"--split '{split}' is unknown; {nearest_choice(split, ('joints', 'time', 'space'))}"
-        )
+    choices: tuple[str, ...] = get_args(SplitBy)
+    if split not in choices:
+        raise MeasurementError(f"--split '{split}' is unknown; {nearest_choice(split, choices)}")
     if hold_out is not None:
         return [holdout(measurements, hold_out, seed, split)]  # type: ignore[arg-type]
-    return k_folds(measurements, folds, seed, split) if folds else []  # type: ignore[arg-type]
+    if folds is None and split != "placement":
+        folds = FOLDS
+    return [] if folds == 0 else k_folds(measurements, folds, seed, split)  # type: ignore[arg-type]
 
 
-def _validate(
-    calibrator: "GeometricCalibrator", measurements: "Measurements", parts: "Sequence[TrainTest]"
-) -> "GeometricValidation | None":
-    from rich.console import Console
+def _drawn(
+    measurements: "Measurements", parts: "Sequence[TrainTest]", rows: int | None, seed: int
+) -> "tuple[Measurements, Sequence[TrainTest]]":
+    """The rows to calibrate with, all or some of them, and parts with as many training rows."""
+    from pisigma.measurement.drawing import draw_rows, with_fewer
 
-    from pisigma.evaluation.geometric_validation import validate_geometric
+    if rows is None:
+        return measurements, parts
+    parts = with_fewer(measurements, parts, rows, seed)
+    return measurements.select(draw_rows(measurements, rows, seed)), parts
 
-    if not parts:
-        return None
-    with Console(stderr=True).status("cross-validation") as status:
-        return validate_geometric(
-            calibrator,
-            measurements,
-            parts,
-            lambda done, folds: status.update(f"cross-validation: fold {done + 1} of {folds}"),
+
+def _calibrator(model: str, geometric: "GeometricCalibrator") -> "Calibrator":
+    from pisigma.errors import IdentificationError, nearest_choice
+    from pisigma.hybrid.calibrator import HybridCalibrator
+
+    if model not in MODELS:
+        raise IdentificationError(f"--model '{model}' is unknown; {nearest_choice(model, MODELS)}")
+    return HybridCalibrator(geometric) if model == "hybrid" else geometric
+
+
+def _model(name: str, nominal: "Robot", result: "Result", rows: "Measurements") -> "CalibratedModel":
+    from pisigma.correction.geometric_model import model_of_calibration, model_of_hybrid
+    from pisigma.hybrid.result import HybridResult
+
+    if isinstance(result, HybridResult):
+        return model_of_hybrid(name, nominal, result, rows)
+    return model_of_calibration(name, nominal, result, rows)
+
+
+def _description(model: str, nominal: "Robot") -> str:
+    if model == "geometric":
+        return (
+            f"Geometric calibration of robot {nominal.name} ({nominal.maker}): DH and Hayati parameters, base and tool "
+            "by least squares."
         )
+    return (
+        f"Hybrid calibration of robot {nominal.name} ({nominal.maker}): DH and Hayati parameters, base and tool, and "
+        "with them, where the data are for it, a Pi-Sigma network that corrects the joint values."
+    )

@@ -29,6 +29,7 @@ def train(
     """Train the model of a recipe and write it as a model folder with card and figures."""
     started = time.perf_counter()
     from pisigma.training.geometric_recipe import GeometricRecipe
+    from pisigma.training.hybrid_recipe import HybridRecipe
     from pisigma.training.jig_recipe import JigRecipe
     from pisigma.training.recipe_kinds import read_any_recipe
 
@@ -41,6 +42,10 @@ def train(
         from pisigma.cli.train_geometric import train_geometric
 
         return train_geometric(stated, recipe, data, out, resume, as_json)
+    if isinstance(stated, HybridRecipe):
+        from pisigma.cli.train_hybrid import train_hybrid
+
+        return train_hybrid(stated, recipe, data, out, resume, as_json)
     from pisigma.cli.output import print_json
     from pisigma.correction.model_folder import save_model
     from pisigma.correction.staging import check_replaceable, staged_folder

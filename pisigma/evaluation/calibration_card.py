@@ -47,7 +47,7 @@ def write_calibration_card(
     write_parameters(result, folder / PARAMETERS_CSV)
     held_out = {} if validation is None else validation.models
     lengths = {name: errors.position.numpy() for name, errors in held_out.items()}
-    under = _UNDER if isinstance(found, HybridResult) else ""
+    under = ", geometric" if isinstance(found, HybridResult) else ""
     draw_residuals(result.residuals, lengths, folder / RESIDUALS_PNG, under)
     draw_correlations((result.pairwise.lengths, result.pairwise.angles), folder / CORRELATION_PNG)
     if isinstance(found, HybridResult):
@@ -56,8 +56,6 @@ def write_calibration_card(
 
 
 PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")
-
-_UNDER = " under the geometric calibration"
 
 _SHORT_REMARKS = (
     (r"^.* is identified, the single values are not", "in a sum, see below"),
@@ -133,7 +131,7 @@ def _text(
         *_held_out_parts(report),
     ]
     if "position" in result.residuals:
-        under = _UNDER if "hybrid" in report else ""
+        under = " under the geometric calibration" if "hybrid" in report else ""
         parts.append(
             f"![residuals of the calibration rows{under}, and errors of held-out rows]({RESIDUALS_PNG})"
         )

@@ -72,7 +72,7 @@ def _draw_shares(axes: Axes, held_out: Mapping[str, np.ndarray]) -> None:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper left", framealpha=1.0)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=9, frameon=False)
 
 
 def draw_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:

@@ -58,14 +58,14 @@ def inverse_checks(recipe: "Recipe", robot: Robot) -> Iterator[Check]:
     if recipe.data.kind == "simulated":
         yield ("data", "errors"), partial(TrueRobot, robot, recipe.data.errors)
         for part, section in (("training", recipe.data.training), ("held_out", recipe.data.held_out)):
-            yield from _where_checks(("data", part), section, robot)
+            yield from where_checks(("data", part), section, robot)
 
 
 def geometric_checks(recipe: "GeometricRecipe", robot: Robot) -> Iterator[Check]:
     """What to try with a recipe of the geometric calibrator."""
     yield ("errors",), partial(TrueRobot, robot, recipe.errors)
-    yield from _where_checks(("measurements",), recipe.measurements, robot)
-    yield from _where_checks(("held_out",), recipe.held_out, robot)
+    yield from where_checks(("measurements",), recipe.measurements, robot)
+    yield from where_checks(("held_out",), recipe.held_out, robot)
     yield ("held_out", "frame"), partial(_check_frames, recipe.measurements.frame, recipe.held_out.frame)
     calibrator = recipe.calibration.calibrator(robot)
     space = ParameterSpace(robot, (recipe.measurements.frame,), ("",))
@@ -95,7 +95,14 @@ def _network_checks(recipe: "Recipe", robot: Robot) -> Iterator[Check]:
         yield ("fit", "learning_rate"), partial(recipe.fit.rates, corrected)
 
 
-def _where_checks(place: Place, section: SimulatedMeasurements, robot: Robot) -> Iterator[Check]:
+def where_checks(place: Place, section: SimulatedMeasurements, robot: Robot) -> Iterator[Check]:
+    """What to try with a section that says where to measure.
+
+    Args:
+        place: the keys that lead to it.
+        section: it.
+        robot: the nominal robot.
+    """
     if isinstance(section.poses, JointsRandom):
         yield (*place, "poses"), partial(section.poses.joints, robot)
     elif section.branch is not None:

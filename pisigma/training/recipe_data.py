@@ -6,9 +6,12 @@ import torch
 
 from pisigma.errors import MeasurementError, RecipeError
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joining import join
+from pisigma.measurement.splits import TrainTest
 from pisigma.robot.description import Robot
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.training.geometric_recipe import GeometricRecipe
+from pisigma.training.hybrid_recipe import HybridRecipe, repeated
 from pisigma.training.jig_recipe import JigRecipe
 from pisigma.training.recipe import Recipe, SimulatedData
 
@@ -36,7 +39,7 @@ def part_sets(measurements: Measurements) -> tuple[Measurements, Measurements | 
     return measurements.select(~test), measurements.select(test)
 
 
-def load_measurements(recipe: Recipe, data: Path | None) -> Measurements:
+def load_measurements(recipe: Recipe | HybridRecipe, data: Path | None) -> Measurements:
     """Give the rows of a recipe: the simulated training rows, or all of a file; see `part_sets`.
 
     Raises:
@@ -53,7 +56,7 @@ def load_measurements(recipe: Recipe, data: Path | None) -> Measurements:
     return Measurements.read_csv(data, robot)
 
 
-def simulate_training(recipe: Recipe | GeometricRecipe | JigRecipe) -> Measurements:
+def simulate_training(recipe: Recipe | GeometricRecipe | HybridRecipe | JigRecipe) -> Measurements:
     """Measure the training rows of a recipe on its true robot; with jigs, the touches of the first seed.
 
     Raises:
@@ -65,7 +68,7 @@ def simulate_training(recipe: Recipe | GeometricRecipe | JigRecipe) -> Measureme
     return section.measure(_true_robot(recipe))
 
 
-def simulate_held_out(recipe: Recipe | GeometricRecipe | JigRecipe) -> Measurements:
+def simulate_held_out(recipe: Recipe | GeometricRecipe | HybridRecipe | JigRecipe) -> Measurements:
     """Measure the held-out rows of a recipe on its true robot.
 
     Raises:
@@ -77,7 +80,28 @@ def simulate_held_out(recipe: Recipe | GeometricRecipe | JigRecipe) -> Measureme
     return section.measure(_true_robot(recipe))
 
 
-def simulated_data(recipe: Recipe) -> SimulatedData:
+def simulate_repeats(recipe: HybridRecipe) -> tuple[Measurements, tuple[TrainTest, ...]]:
+    """Measure training and held-out rows of every repeat of a simulation.
+
+    Returns:
+        All rows together, and per repeat which of them are its training and its held-out rows.
+
+    Raises:
+        RecipeError: the recipe is for measured data.
+    """
+    robot, rows, parts, start = Robot.load(recipe.robot), [], [], 0
+    for repeat in range(recipe.repeats):
+        data = repeated(simulated_data(recipe), repeat)
+        true = TrueRobot(robot, data.errors)
+        train, test = data.training.measure(true), data.held_out.measure(true)
+        middle, end = start + train.rows, start + train.rows + test.rows
+        parts.append((torch.arange(start, middle), torch.arange(middle, end)))
+        rows += [train, test]
+        start = end
+    return join(rows), tuple(parts)
+
+
+def simulated_data(recipe: Recipe | HybridRecipe) -> SimulatedData:
     """The section of a recipe that simulates its data.
 
     Raises:
@@ -88,6 +112,6 @@ def simulated_data(recipe: Recipe) -> SimulatedData:
     return recipe.data
 
 
-def _true_robot(recipe: Recipe | GeometricRecipe) -> TrueRobot:
+def _true_robot(recipe: Recipe | GeometricRecipe | HybridRecipe) -> TrueRobot:
     errors = recipe.errors if isinstance(recipe, GeometricRecipe) else simulated_data(recipe).errors
     return TrueRobot(Robot.load(recipe.robot), errors)

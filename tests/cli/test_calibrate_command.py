@@ -43,7 +43,7 @@ def data(poses, tmp_path_factory):
 def calibrated(run, data, tmp_path_factory):
     """The folder of a calibration and what it printed."""
     folder = tmp_path_factory.mktemp("calibrated") / "arm"
-    result = run("calibrate", "kiro4", data, "--out", folder, "--folds", 3, "--json")
+    result = run("calibrate", "kiro4", data, "--out", folder, "--model", "geometric", "--folds", 3, "--json")
     assert result.exit_code == 0, result.output
     assert result.stdout.count("\n") == 1
     return folder, json.loads(result.stdout)
@@ -84,7 +84,8 @@ def test_the_card_says_everything(calibrated):
     card = (folder / "README.md").read_text()
     assert card.startswith("# arm\n\nGeometric calibration of robot kiro4 (")
     assert (
-        "Made by `pisigma calibrate kiro4 poses.csv --out arm --folds 3`, on 60 rows of `poses.csv`." in card
+        "Made by `pisigma calibrate kiro4 poses.csv --out arm --model geometric --folds 3`, on 60 rows of `poses.csv`."
+        in card
     )
     assert "3-fold cross-validation: each of 60 rows" in card
     assert f"{printed['cross_validation']['geometric']['rms_mm']:.4f}" in card
@@ -98,7 +99,9 @@ def test_the_card_says_everything(calibrated):
 
 
 def test_what_is_printed_for_people_fits_in_120_columns(run, data, tmp_path):
-    text = run("calibrate", "kiro4", data, "--out", tmp_path / "arm", "--folds", 2).stdout
+    text = run(
+        "calibrate", "kiro4", data, "--out", tmp_path / "arm", "--model", "geometric", "--folds", 2
+    ).stdout
     lines = text.splitlines()[:-1]  # the last one holds a path
     assert max(map(len, lines)) <= 120
     for part in ("theta_6", "in a sum, see below", "is identified, the single values are not.", "Rank 30, "):
@@ -108,7 +111,19 @@ def test_what_is_printed_for_people_fits_in_120_columns(run, data, tmp_path):
 
 @pytest.mark.parametrize("split", ["joints", "time", "space"])
 def test_a_share_is_held_out_instead(run, data, tmp_path, split):
-    arguments = ("calibrate", "kiro4", data, "--out", tmp_path / "arm", "--hold-out", 0.25, "--split", split)
+    arguments = (
+        "calibrate",
+        "kiro4",
+        data,
+        "--out",
+        tmp_path / "arm",
+        "--model",
+        "geometric",
+        "--hold-out",
+        0.25,
+        "--split",
+        split,
+    )
     validation = json.loads(run(*arguments, "--json").stdout)["cross_validation"]
     assert (validation["folds"], validation["rows"]) == (1, 15)
     assert "Judged on 15 rows by a calibration on the others" in (tmp_path / "arm" / "README.md").read_text()
@@ -116,7 +131,18 @@ def test_a_share_is_held_out_instead(run, data, tmp_path, split):
 
 def test_no_folds_no_cross_validation(run, data, tmp_path):
     printed = json.loads(
-        run("calibrate", "kiro4", data, "--out", tmp_path / "arm", "--folds", 0, "--json").stdout
+        run(
+            "calibrate",
+            "kiro4",
+            data,
+            "--out",
+            tmp_path / "arm",
+            "--model",
+            "geometric",
+            "--folds",
+            0,
+            "--json",
+        ).stdout
     )
     assert "cross_validation" not in printed
     assert "Held-out" not in (tmp_path / "arm" / "README.md").read_text()
@@ -129,7 +155,18 @@ def test_rows_of_the_test_set_are_kept_aside(run, refuses, poses, calibrated, tm
     position[::3] += 1.0  # a metre: nobody who looks at these rows overlooks it
     path = write(tmp_path / "sets.csv", replace(rows, position=position), sets)
     printed = json.loads(
-        run("calibrate", "kiro4", path, "--out", tmp_path / "arm", "--folds", 2, "--json").stdout
+        run(
+            "calibrate",
+            "kiro4",
+            path,
+            "--out",
+            tmp_path / "arm",
+            "--model",
+            "geometric",
+            "--folds",
+            2,
+            "--json",
+        ).stdout
     )
     assert (printed["rows"], printed["test"]["rows"], printed["cross_validation"]["rows"]) == (40, 20, 40)
     assert set(printed["test"]["geometric"]) == POSE
@@ -171,7 +208,9 @@ def targets(poses):
 
 def test_several_targets_and_frames(run, refuses, targets, tmp_path):
     path = write(tmp_path / "targets.csv", targets)
-    printed = json.loads(run("calibrate", "kiro4", path, "--out", tmp_path / "arm", "--json").stdout)
+    printed = json.loads(
+        run("calibrate", "kiro4", path, "--out", tmp_path / "arm", "--model", "geometric", "--json").stdout
+    )
     assert printed["cross_validation"]["geometric"]["rms_mm"] < 0.1
     model = load_model(tmp_path / "arm")
     assert (set(model.bases), set(model.tools)) == ({"left", "right"}, {"A", "B", "C"})
@@ -202,7 +241,10 @@ def test_inverse_calibration_wants_one_frame_and_target(refuses, repository, tar
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (("--split", "tim"), "--split 'tim' is unknown; did you mean 'time'? Valid: joints, space, time."),
+        (
+            ("--split", "tim"),
+            "--split 'tim' is unknown; did you mean 'time'? Valid: joints, placement, space, time.",
+        ),
         (("--folds", "1"), "1 folds were wanted"),
         (("--hold-out", "2"), "between 0 and 1 was wanted, got 2."),
         (("--free", "a_9"), "a_9"),
@@ -211,7 +253,9 @@ def test_inverse_calibration_wants_one_frame_and_target(refuses, repository, tar
     ],
 )
 def test_options_at_fault(refuses, data, tmp_path, arguments, complaint):
-    assert complaint in refuses("calibrate", "kiro4", data, "--out", tmp_path / "arm", *arguments)
+    assert complaint in refuses(
+        "calibrate", "kiro4", data, "--out", tmp_path / "arm", "--model", "geometric", *arguments
+    )
     assert not (tmp_path / "arm").exists()
 
 

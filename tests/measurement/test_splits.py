@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pisigma.errors import MeasurementError
-from pisigma.measurement import Measurements, groups_of_equal_joints, holdout, k_folds
+from pisigma.measurement import Measurements, groups_of_equal_joints, holdout, k_folds, placements
 
 WAYS = ("joints", "time", "space")
 
@@ -152,3 +152,57 @@ def test_refuses_space_without_positions_to_compare():
         holdout(Measurements(q=q, position=position), 0.5, 0, by="space")
     with pytest.raises(MeasurementError, match="2 frames cannot be compared"):
         k_folds(Measurements(q=q, position=position, frame=("a", "a", "b", "b")), 2, 0, by="space")
+
+
+def in_sockets(names: list[str], **more: object) -> Measurements:
+    """A row per socket's name, each with joints of its own."""
+    q = torch.arange(2.0 * len(names), dtype=torch.float64).view(-1, 2)
+    return Measurements(q=q, socket=tuple(names), **more)  # type: ignore[arg-type]
+
+
+def test_placements_are_what_stands_before_the_last_slash():
+    data = in_sockets(["a/b/0", "a/b/1", "a/c/0", "lone", "lone"], frame=("one", "two", "one", "two", "two"))
+    assert placements(data) == ("a/b", "a/b", "a/c", "lone", "lone")
+    touches = Measurements(
+        q=torch.arange(6, dtype=torch.float64).view(3, 2),
+        frame=("left", "right", "left"),
+        touch_axis=("x", "x", "y"),
+        touch=torch.zeros(3, dtype=torch.float64),
+    )
+    assert placements(touches) == ("left", "right", "left")
+
+
+def test_by_placement_one_fold_holds_one_placement():
+    names = ["low/0", "low/1", "high/0", "low/0", "high/1", "far/0", "far/0"]
+    parts = k_folds(in_sockets(names), None, seed=0, by="placement")
+    tests = sorted(test.tolist() for _, test in parts)
+    assert tests == [[0, 1, 3], [2, 4], [5, 6]]
+    assert all(sorted(train.tolist() + test.tolist()) == list(range(7)) for train, test in parts)
+    two = k_folds(in_sockets(names), 2, seed=0, by="placement")
+    assert sorted(len(test) for _, test in two) == [3, 4]
+    _, test = holdout(in_sockets(names), 0.3, seed=1, by="placement")
+    assert test.tolist() in tests
+
+
+def test_placements_that_share_joints_stay_together():
+    data = in_sockets(["low/0", "high/0", "far/0"])
+    q = data.q.clone()
+    q[1] = q[0]
+    shared = Measurements(q=q, socket=data.socket)
+    assert sorted(test.tolist() for _, test in k_folds(shared, None, 0, "placement")) == [[0, 1], [2]]
+
+
+@pytest.mark.parametrize(
+    ("names", "complaint"),
+    [(["low/0", "low/1"], "'low' is the only one"), (["", ""], "neither sockets nor frames have names")],
+)
+def test_refuses_to_split_by_placements_that_are_not_there(names: list[str], complaint: str):
+    position = torch.zeros(2, 3, dtype=torch.float64)
+    data = in_sockets(names) if names[0] else Measurements(q=in_sockets(["a", "b"]).q, position=position)
+    with pytest.raises(MeasurementError, match=complaint):
+        k_folds(data, None, seed=0, by="placement")
+
+
+def test_refuses_more_folds_than_placements():
+    with pytest.raises(MeasurementError, match="3 folds were wanted from 2 placements; ask for 2 to 2 folds"):
+        k_folds(in_sockets(["a/0", "b/0", "b/1"]), 3, seed=0, by="placement")

@@ -116,7 +116,7 @@ def test_touches_on_no_jig_are_refused(recipe):
     ("old", "new", "message"),
     [
         ("name: jig_2\n", "name: jig_1\n", r"placement 'jig_1' stands twice"),
-        ("seeds: 10", "seeds: 0", r"line \d+"),
+        ("seeds: 50", "seeds: 0", r"line \d+"),
         ("paper_parameters:", "papers_parameters:", r"did you mean 'paper_parameters'"),
     ],
 )

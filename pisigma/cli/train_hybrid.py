@@ -1,0 +1,117 @@
+"""`pisigma train` with a recipe of the hybrid calibrator."""
+
+import shlex
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pisigma.measurement.dataset import Measurements
+    from pisigma.measurement.splits import TrainTest
+    from pisigma.training.hybrid_recipe import HybridRecipe
+
+    Given = tuple[Measurements, Measurements, Measurements | None, tuple[TrainTest, ...]]
+
+
+def train_hybrid(
+    stated: "HybridRecipe", recipe: Path, data: Path | None, out: Path | None, resume: bool, as_json: bool
+) -> None:
+    """Calibrate the robot of a recipe, judge it on held-out rows and write the model folder.
+
+    Args:
+        stated: the recipe.
+        recipe: its file.
+        data: measured data, where the recipe asks for it.
+        out: model folder to write; None: runs/NAME.
+        resume: not for this kind of recipe.
+        as_json: print one JSON object.
+
+    Raises:
+        RecipeError: the recipe does not fit, or options were given that it has no use for.
+    """
+    started = time.perf_counter()
+    from pisigma.cli.calibrate import print_calibration
+    from pisigma.cli.output import print_json
+    from pisigma.cli.progress import progress_of
+    from pisigma.correction.geometric_model import model_of_hybrid
+    from pisigma.correction.model_folder import save_model
+    from pisigma.correction.staging import check_replaceable, staged_folder
+    from pisigma.errors import RecipeError
+    from pisigma.evaluation.calibration_card import write_calibration_card
+    from pisigma.evaluation.calibration_validation import judge, validate
+    from pisigma.robot.description import Robot
+    from pisigma.training.recipe import recipe_hash
+
+    if resume:
+        raise RecipeError(f"{recipe}: a recipe of kind {stated.kind} has no use for --resume; leave it out.")
+    folder = out or Path("runs") / stated.name
+    check_replaceable(folder)
+    calibrator = stated.calibrator()
+    rows, everything, test, parts = _rows(stated, data)
+    fitting = time.perf_counter()
+    with progress_of("calibration") as tell:
+        result = calibrator.fit(rows, tell)
+    fitting = time.perf_counter() - fitting
+    with progress_of("held-out rows") as tell:
+        validation = validate(calibrator, everything, parts, tell)
+    kept_aside = None if test is None else judge(calibrator, result, rows, test)
+    report = {"rows": rows.rows, "fit_seconds": round(fitting, 3)}
+    report |= _report(stated, result, (validation, kept_aside), everything, parts)
+    model = model_of_hybrid(
+        stated.name, Robot.load(stated.robot), result, rows, (stated.name, recipe_hash(recipe))
+    )
+    command = shlex.join(["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])])
+    texts = {"description": stated.description, "command": command, "not_validated": stated.not_validated}
+    with staged_folder(folder) as scratch:
+        save_model(replace(model, metrics=report), scratch)
+        write_calibration_card(model, result, rows, validation, report, texts, scratch)
+    finished = {"model": str(folder), "seconds": round(time.perf_counter() - started, 3), **report}
+    if as_json:
+        print_json(finished)
+    else:
+        print_calibration(finished)
+
+
+def _rows(recipe: "HybridRecipe", data: Path | None) -> "Given":
+    """Rows to calibrate with, all rows to judge on, those of the set `test`, and how the rows are parted."""
+    from pisigma.measurement.splits import k_folds
+    from pisigma.training.recipe import MeasuredData
+    from pisigma.training.recipe_data import load_measurements, part_sets, simulate_repeats
+
+    rows, test = part_sets(load_measurements(recipe, data))
+    if isinstance(recipe.data, MeasuredData):
+        return rows, rows, test, k_folds(rows, recipe.data.folds, recipe.data.seed)
+    everything, parts = simulate_repeats(recipe)
+    return rows, everything, None, parts
+
+
+def _report(
+    recipe: "HybridRecipe",
+    result: Any,
+    judged: tuple[Any, Any],
+    everything: "Measurements",
+    parts: "tuple[TrainTest, ...]",
+) -> dict[str, Any]:
+    """Figures of the calibration, of held-out rows and of the learning curve."""
+    from pisigma.cli.progress import progress_of
+    from pisigma.evaluation.calibration_report import report_calibration
+    from pisigma.evaluation.learning_curve import learning_curve
+    from pisigma.training.recipe import MeasuredData
+
+    validation, test = judged
+    if isinstance(recipe.data, MeasuredData):
+        report = report_calibration(result, validation, test)
+    else:
+        report = {
+            **report_calibration(result),
+            "held_out": validation.in_file_units() | validation.means(parts),
+        }
+    if recipe.learning_curve is not None:
+        stated = recipe.learning_curve
+        with progress_of("learning curve") as tell:
+            points = learning_curve(
+                recipe.calibrator(), everything, parts, stated.rows, stated.seed, tell, validation
+            )
+        report["learning_curve"] = [point.in_file_units() for point in points]
+    return report

@@ -1,0 +1,269 @@
+"""`pisigma calibrate` with the hybrid, its default, and `train` with recipes of it."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.hybrid import hybrid_of
+from testing.models import no_type_checker
+from testing.simulated_arm import simulate
+
+import pisigma
+from pisigma.correction.model_folder import load_model
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.measurement.dataset import Measurements
+
+POSITION = {"rms_mm", "mean_mm", "p95_mm", "max_mm"}
+FIGURES = {"joint_corrections.png", "predicted_spread.png", "residuals.png", "correlation.png"}
+TRIAL = {"name", "unknowns", "log_evidence", "left_out", "seconds", "kept"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def few_choices():
+    """Try few features, so that a calibration takes a second."""
+    whole = HybridCalibrator.__init__
+    few = {"features": ("gravity", "series"), "harmonics": (4, 8), "orders": ()}
+
+    def with_few(self, geometric, **options):
+        whole(self, geometric, **(few | options))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(HybridCalibrator, "__init__", with_few)
+        yield
+
+
+def write(path, measurements, split=None):
+    with no_type_checker():
+        replace(measurements, split=split).write_csv(path, revolute=[True] * measurements.dof)
+    return path
+
+
+@pytest.fixture(scope="module")
+def rows():
+    with no_type_checker():
+        return hybrid_of("rb5", 200).measurements
+
+
+@pytest.fixture(scope="module")
+def data(rows, tmp_path_factory):
+    return write(tmp_path_factory.mktemp("data") / "rows.csv", rows)
+
+
+@pytest.fixture(scope="module")
+def calibrated(run, data, tmp_path_factory):
+    """The folder of a calibration and what it printed."""
+    folder = tmp_path_factory.mktemp("calibrated") / "arm"
+    result = run("calibrate", "rb5", data, "--out", folder, "--folds", 3, "--json")
+    assert result.exit_code == 0, result.output
+    assert result.stdout.count("\n") == 1
+    return folder, json.loads(result.stdout)
+
+
+def test_json_has_the_agreed_shape(calibrated):
+    _, printed = calibrated
+    validation = printed["cross_validation"]
+    assert (validation["folds"], validation["rows"]) == (3, 200)
+    assert set(validation["nominal"]) == set(validation["geometric"]) == set(validation["hybrid"]) == POSITION
+    assert validation["hybrid"]["rms_mm"] < 0.6 * validation["geometric"]["rms_mm"]
+    assert 0.88 <= validation["coverage"] <= 1.0
+    hybrid = printed["hybrid"]
+    assert hybrid["verdict"].startswith("A joint correction was kept (gravity + series")
+    assert all(set(trial) == TRIAL for trial in hybrid["trials"])
+    assert hybrid["trials"][0]["name"] == "geometry"
+    assert hybrid["learned"]["orders"] == []
+    assert [row["name"] for row in printed["parameters"]][:2] == ["theta_1", "d_1"]
+
+
+def test_the_card_and_the_figures_are_there(calibrated):
+    folder, printed = calibrated
+    assert {entry.name for entry in folder.glob("*.png")} == FIGURES
+    card = (folder / "README.md").read_text()
+    assert card.startswith("# arm\n\nHybrid calibration of robot rb5 (")
+    assert "Made by `pisigma calibrate rb5 rows.csv --out arm --folds 3`, on 200 rows" in card
+    assert "| error | unit | nominal | geometric | hybrid |" in card
+    assert printed["hybrid"]["verdict"] in card
+    for trial in printed["hybrid"]["trials"]:
+        assert f"| {trial['name']} | {trial['unknowns']} |" in card
+    for name in FIGURES:
+        assert f"]({name})" in card
+    assert "The geometry that goes with the joint correction is in `model.yaml`" in card
+
+
+def test_the_folder_loads_and_predicts_what_was_measured(run, calibrated, rows, data):
+    folder, printed = calibrated
+    model = load_model(folder)
+    assert model.kind == "hybrid_calibration"
+    assert model.metrics["hybrid"]["verdict"] == printed["hybrid"]["verdict"]
+    with no_type_checker():
+        ik = pisigma.load(folder)
+        error = (ik.model.forward(rows.q)[:, :3, 3] - rows.position).norm(dim=-1)
+    assert float(error.square().mean().sqrt()) < 1e-3 * printed["cross_validation"]["geometric"]["rms_mm"]
+
+
+def test_what_is_printed_for_people(run, data, tmp_path):
+    result = run("calibrate", "rb5", data, "--out", tmp_path / "arm", "--folds", 2)
+    assert result.exit_code == 0, result.output
+    lines = result.stdout.splitlines()[:-1]  # the last one holds a path
+    assert max(map(len, lines)) <= 120
+    text = result.stdout
+    for part in (
+        "what was tried beyond the geometry",
+        "log evidence",
+        "gravity + series 8",
+        "A joint correction",
+    ):
+        assert part in text
+    head = next(line for line in lines if "geometric" in line and "hybrid" in line)
+    assert head.split() == ["error", "unit", "nominal", "geometric", "hybrid"]
+    assert "% of the held-out coordinates are within the 95 % intervals" in text
+
+
+def test_fewer_training_rows(run, refuses, data, tmp_path):
+    command = ("calibrate", "rb5", data, "--out", tmp_path / "arm", "--folds", 3)
+    few, many = (
+        json.loads(
+            run(*command[:4], tmp_path / str(count), *command[5:], "--train-rows", count, "--json").stdout
+        )
+        for count in (50, 130)
+    )
+    assert (few["rows"], many["rows"]) == (50, 130)
+    assert few["cross_validation"]["rows"] == many["cross_validation"]["rows"] == 200
+    errors = [found["cross_validation"]["hybrid"]["rms_mm"] for found in (few, many)]
+    assert errors[1] < errors[0] < 1.05 * few["cross_validation"]["geometric"]["rms_mm"]
+    assert "--train-rows 50" in (tmp_path / "50" / "README.md").read_text()
+    assert "on 50 rows of" in (tmp_path / "50" / "README.md").read_text()
+    for count, wanted in (("150", "there are 133 to draw"), ("0", "ask for 1 to 13")):
+        assert wanted in refuses(*command, "--train-rows", count)
+    assert not (tmp_path / "arm").exists()
+
+
+def test_the_geometric_model_is_there_still(run, refuses, data, calibrated, tmp_path):
+    command = ("calibrate", "rb5", data, "--out", tmp_path / "arm", "--folds", 3, "--json", "--model")
+    printed = json.loads(run(*command, "geometric").stdout)
+    assert "hybrid" not in printed
+    assert set(printed["cross_validation"]) == {"folds", "rows", "nominal", "geometric"}
+    ours, theirs = (found["cross_validation"]["geometric"]["rms_mm"] for found in (printed, calibrated[1]))
+    assert_close(ours, theirs, rtol=1e-9)
+    assert load_model(tmp_path / "arm").kind == "geometric_calibration"
+    assert not (tmp_path / "arm" / "joint_corrections.png").exists()
+    sentence = refuses("calibrate", "rb5", data, "--out", tmp_path / "other", "--model", "hybird")
+    assert "--model 'hybird' is unknown; did you mean 'hybrid'?" in sentence
+
+
+def test_nothing_to_learn_is_said_and_the_geometry_stands(run, tmp_path):
+    with no_type_checker():
+        rows = simulate("kiro4", rows=60, noise=5e-5).measurements
+    path = write(tmp_path / "rows.csv", rows)
+    result = run("calibrate", "kiro4", path, "--out", tmp_path / "arm", "--folds", 2, "--json")
+    printed = json.loads(result.stdout)
+    assert printed["hybrid"]["learned"] is None
+    assert printed["hybrid"]["verdict"].startswith("Nothing beyond the geometry was found")
+    found = printed["cross_validation"]
+    assert found["hybrid"] == found["geometric"]
+    assert not (tmp_path / "arm" / "joint_corrections.png").exists()
+    assert "Nothing beyond the geometry was found" in (tmp_path / "arm" / "README.md").read_text()
+
+
+def test_rows_of_the_test_set_are_judged_with_all_three(run, rows, tmp_path):
+    path = write(
+        tmp_path / "sets.csv", rows, tuple("test" if k % 4 == 0 else "train" for k in range(rows.rows))
+    )
+    command = ("calibrate", "rb5", path, "--out", tmp_path / "arm", "--folds", 0, "--json")
+    printed = json.loads(run(*command).stdout)
+    assert "cross_validation" not in printed
+    test = printed["test"]
+    assert (printed["rows"], test["rows"]) == (150, 50)
+    assert test["hybrid"]["rms_mm"] < 0.6 * test["geometric"]["rms_mm"]
+    assert 0.8 <= test["coverage"] <= 1.0
+    judged = json.loads(run("evaluate", tmp_path / "arm", path, "--json").stdout)
+    assert_close(judged["corrected"]["rms_mm"], test["hybrid"]["rms_mm"], rtol=1e-6)
+
+
+def test_balls_in_sockets_of_a_real_panda(run, shared_data, tmp_path):
+    panda = shared_data / "panda_sockets" / "panda_3.csv"
+    command = ("calibrate", "panda", panda, "--out", tmp_path / "arm", "--split", "placement", "--folds", 2)
+    result = run(*command, "--socket-distance", "*/0,*/1,50", "--json")
+    assert result.exit_code == 0, result.output
+    figures = json.loads(result.stdout)["cross_validation"]
+    assert (figures["folds"], figures["rows"], figures["sockets_held_out"]) == (2, 387, 12)
+    assert figures["hybrid"]["rms_mm"] < 0.9 * figures["geometric"]["rms_mm"]
+    assert figures["socket_distance"]["hybrid"]["mean_mm"] < 0.1
+    card = (tmp_path / "arm" / "README.md").read_text()
+    assert "is met to 0.0" in card
+    assert "by the hybrid calibration (nominal 0." in card
+
+
+def test_a_real_ur5(run, shared_data, tmp_path):
+    command = ("calibrate", "ur5", shared_data / "ur5" / "grid.csv", "--out", tmp_path / "arm")
+    result = run(*command, "--hold-out", 0.3, "--train-rows", 200, "--json")
+    assert result.exit_code == 0, result.output
+    figures = json.loads(result.stdout)["cross_validation"]
+    assert figures["rows"] == 300
+    assert figures["hybrid"]["rms_mm"] < 0.95 * figures["geometric"]["rms_mm"] < 0.12
+    assert 0.9 <= figures["coverage"] <= 0.99
+
+
+@pytest.fixture(scope="module")
+def trained_hybrid(run, repository, tmp_path_factory):
+    """The folder of a small RB5 recipe and what it printed."""
+    folder = tmp_path_factory.mktemp("hybrid")
+    text = (repository / "training" / "rb5_hybrid.yaml").read_text()
+    for old, new in (
+        ("count: 5000", "count: 200"),
+        ("repeats: 5", "repeats: 2"),
+        ("[30, 50, 75, 100]", "[100, 60]"),
+    ):
+        assert old in text
+        text = text.replace(old, new)
+    (folder / "small.yaml").write_text(text + "hybrid: {harmonics: [4, 8], orders: []}\n")
+    result = run("train", folder / "small.yaml", "--out", folder / "model", "--json")
+    assert result.exit_code == 0, result.output
+    return folder, json.loads(result.stdout)
+
+
+def test_a_simulated_recipe_is_judged_on_true_positions_of_every_repeat(trained_hybrid):
+    folder, printed = trained_hybrid
+    held_out = printed["held_out"]
+    assert (held_out["folds"], held_out["rows"]) == (2, 400)
+    for name in ("nominal", "geometric", "hybrid"):
+        own = held_out["rms_mm_of_parts"][name]
+        assert len(own) == 2
+        assert_close(held_out["mean_rms_mm"][name], sum(own) / 2, rtol=1e-9)
+    assert held_out["mean_rms_mm"]["hybrid"] < 0.07 < 0.2 < held_out["mean_rms_mm"]["geometric"]
+    assert 0.9 <= held_out["coverage"] <= 1.0
+    assert printed["seconds"] > printed["fit_seconds"] > 0
+    assert [point["rows"] for point in printed["learning_curve"]] == [60, 100, 150]
+    assert all(point["held_out"] == 400 for point in printed["learning_curve"])
+    card = (folder / "model" / "README.md").read_text()
+    assert "400 other simulated rows of 2 simulations that differ in all that is random" in card
+    assert "## How many rows it takes" in card
+    assert (folder / "model" / "learning_curve.png").exists()
+    assert load_model(folder / "model").provenance.recipe == "rb5_hybrid"
+
+
+def test_simulated_rows_of_a_hybrid_recipe(run, refuses, trained_hybrid, tmp_path):
+    recipe = trained_hybrid[0] / "small.yaml"
+    for option, count in (((), 150), (("--held-out",), 200)):
+        command = ("simulate", recipe, "--out", tmp_path / "rows.csv", "--json", *option)
+        assert json.loads(run(*command).stdout)["rows"] == count
+    read = Measurements.read_csv(tmp_path / "rows.csv", pisigma.Robot.load("rb5"))
+    assert read.kinds == {"position"}
+    assert bool(torch.isfinite(read.q).all())
+    sentence = refuses("train", recipe, "--out", tmp_path / "model", "--resume")
+    assert "has no use for --resume; leave it out." in sentence
+
+
+def test_a_measured_recipe_is_cross_validated(run, repository, data, tmp_path):
+    text = (repository / "training" / "ur5_hybrid.yaml").read_text().replace("robot: ur5", "robot: rb5")
+    text = text.replace("folds: 5", "folds: 2").replace("[30, 50, 100, 300]", "[60]")
+    (tmp_path / "measured.yaml").write_text(text + "hybrid: {harmonics: [8], orders: []}\n")
+    result = run("train", tmp_path / "measured.yaml", "--data", data, "--out", tmp_path / "model")
+    assert result.exit_code == 0, result.output
+    assert "pose errors of 200 held-out rows (2 folds)" in result.stdout
+    assert "errors of held-out rows by number of training rows" in result.stdout
+    assert max(map(len, result.stdout.splitlines()[:-1])) <= 120
+    card = (tmp_path / "model" / "README.md").read_text()
+    assert "2-fold cross-validation: each of 200 rows" in card
+    assert "--data rows.csv" in card
