@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.hybrid.common_frames import with_frames_of
 from pisigma.hybrid.coverage import JointCoverage
+from pisigma.hybrid.evidence import told_share
 from pisigma.hybrid.extrapolation import fade_angle
 from pisigma.hybrid.product_search import best_products
 from pisigma.hybrid.refinement import Refinement, refine, with_held_factors
 from pisigma.hybrid.result import HybridResult, LearnedPart
 from pisigma.hybrid.rows import Rows
-from pisigma.hybrid.search import Additive, Search, described
+from pisigma.hybrid.search import MOST_TOLD, Additive, Search, described
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
@@ -100,12 +101,15 @@ class HybridCalibrator:
         trials = tuple(search.trials)
         if not features and not orders:
             verdict = "Nothing beyond the geometry was found in the data: the geometric calibration stands."
-            drawn = identified_geometry(solved.setup, solved.solution.linearisation.point)
-            first = search.geometry
-            known = position_uncertainty(search.rows, first.design, first.posterior, first.sums, drawn)
-            return HybridResult(geometric, None, known, trials, verdict)
+            return _geometric_alone(solved, search, verdict)
         progress("solving for everything")
         refined = refinement(solved, additive, orders, self.geometric.loss)
+        if told_share(refined.sums, refined.posterior) > MOST_TOLD:
+            verdict = (
+                "A joint correction would take up nearly all that the few rows tell, so the geometric calibration "
+                "stands; measure more poses."
+            )
+            return _geometric_alone(solved, search, verdict)
         geometry = with_frames_of(solved, refined, identified_geometry(solved.setup, refined.point))
         progress("looking beyond the measured joint values")
         fade = fade_angle(refined.rows, refined.design, refined.posterior, refined.sums)
@@ -180,6 +184,14 @@ class HybridCalibrator:
             else:
                 others.append(SharedFeatures(robot, name))
         return series, others
+
+
+def _geometric_alone(solved: SolvedCalibration, search: Search, verdict: str) -> HybridResult:
+    """The geometric calibration, with the uncertainty of its positions."""
+    geometry = identified_geometry(solved.setup, solved.solution.linearisation.point)
+    first = search.geometry
+    known = position_uncertainty(search.rows, first.design, first.posterior, first.sums, geometry)
+    return HybridResult(solved.result(), None, known, tuple(search.trials), verdict)
 
 
 def searched_rows(problem: CalibrationProblem) -> CalibrationProblem:

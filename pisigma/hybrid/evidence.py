@@ -119,6 +119,13 @@ class Posterior:
     iterations: int
 
 
+def told_share(sums: Sums, found: Posterior) -> float:
+    """Share of the values that the unknowns use up; near 1 nothing is left that tells noise from error."""
+    held = found.prior.precision * found.covariance.diagonal()
+    values = sum(count for count, exact in zip(sums.count, sums.exact, strict=True) if not exact)
+    return float((1 - held).sum()) / max(values, 1.0)
+
+
 def solve_posterior(sums: Sums, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
     """Solve `(Σ_s N_s / noise_s² + precision) x = Σ_s b_s / noise_s²` by Cholesky with column scaling.
 

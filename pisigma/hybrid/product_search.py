@@ -16,7 +16,9 @@ FOLDS = 4
 """Parts of the training rows on which product units are judged."""
 MOST_CONFIGURATIONS = 600
 """They are judged on so many configurations at most."""
-BETTER = 0.99
+LEAST_CONFIGURATIONS = 40
+"""They are not looked for among fewer."""
+BETTER = 0.98
 """Held-out RMS must fall below this share for product units to be kept."""
 
 
@@ -54,7 +56,7 @@ def best_products(
     Returns:
         The unit of order 1 and the orders; no orders where product units do not help.
     """
-    if not choices:
+    if not choices or search.rows.configurations < LEAST_CONFIGURATIONS:
         return additive, ()
     last = next(trial.left_out for trial in reversed(search.trials) if trial.kept)
     folds = _folds(search, additive)

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from pisigma.hybrid.design import Design, sum_up
-from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence
+from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence, told_share
 from pisigma.hybrid.left_out import left_out
 from pisigma.hybrid.rows import Rows
 from pisigma.network.features import AbstractFeatures, FourierSeries
@@ -14,6 +14,8 @@ LEVEL = 1.03
 """Features that the evidence is for are kept unless the left-out RMS rises above so many times what it was."""
 CLEARLY = 5.0
 """The log evidence has to rise by so much (a Bayes factor of 150: very strong, Kass and Raftery 1995)."""
+MOST_TOLD = 0.75
+"""Unknowns may use up so much of the values, or the noise cannot be told from them."""
 ROUGHLY = 0.1
 """While features are chosen, a log evidence that rises by less has settled."""
 FAILURES = 3
@@ -170,7 +172,7 @@ class Search:
         found = self.additive(features, best)
         own = self.left_out_rms(found.design, found.posterior)
         gain = found.posterior.log_evidence - best.posterior.log_evidence
-        better = gain > CLEARLY and own < rms * LEVEL
+        better = gain > CLEARLY and own < rms * LEVEL and told_share(found.sums, found.posterior) < MOST_TOLD
         self.note(found.name, found.design, found.posterior, own, began, better)
         return (found, own, True) if better else (best, rms, False)
 

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.hybrid.design import Design
-from pisigma.hybrid.evidence import Posterior, Sums
+from pisigma.hybrid.evidence import Posterior, Sums, told_share
 from pisigma.hybrid.left_out import LeftOut, folds_left_out, left_out
 from pisigma.hybrid.rows import Rows
 from pisigma.hybrid.sensor_values import joint_columns
@@ -154,9 +154,7 @@ def degrees_of_freedom_factor(posterior: Posterior, sums: Sums) -> float:
     Features, prior sizes and noise are chosen on the same rows, which makes the posterior a little too sure; new rows
     err by about so much more (as in generalised cross-validation, Craven and Wahba 1979).
     """
-    held = posterior.prior.precision * posterior.covariance.diagonal()
-    values = sum(count for count, exact in zip(sums.count, sums.exact, strict=True) if not exact)
-    return values / max(values - float((1 - held).sum()), 0.2 * values)
+    return 1 / max(1 - told_share(sums, posterior), 0.2)
 
 
 def position_uncertainty(
