@@ -23,6 +23,7 @@ LAYERS = (
     "se3",
     "robot",
     "kinematics",
+    "compiled",
     "measurement",
     "simulation",
     "identification",
@@ -106,6 +107,14 @@ def test_import_is_light_and_has_no_side_effects(tmp_path):
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("path", sorted((PACKAGE / "compiled").glob("*.py")), ids=name_of)
+def test_the_compiled_route_imports_no_torch(path):
+    light = {"errors", "kinematics.status", "compiled"}
+    own = {module.removeprefix("pisigma.") for module in imported(path) if module.startswith("pisigma.")}
+    assert not {module for module in own if not module.startswith(tuple(light))}
+    assert not {module.split(".")[0] for module in imported(path)} & {"torch", "scipy", "jaxtyping"}
 
 
 def test_loading_a_model_needs_neither_lightning_nor_matplotlib():

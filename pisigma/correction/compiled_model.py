@@ -146,8 +146,8 @@ def _correction(model: CalibratedModel) -> Correction:
         "masses": np.zeros((0, dof, 4)),
         "scaled": np.zeros((0, dof)),
         "units": np.zeros((0, inputs)),
-        "weight": np.zeros((0, 0, inputs)),
-        "bias": np.zeros((0, 0)),
+        "weight": np.zeros((0, inputs, dof)),
+        "bias": np.zeros((0, dof)),
         "orders": np.zeros(0, dtype=np.int64),
     }
     if hybrid is not None:
@@ -155,8 +155,8 @@ def _correction(model: CalibratedModel) -> Correction:
         for features, weight in zip(own.features, own.linear, strict=True):
             _add_features(model, robot, features, weight.detach().numpy(), found)
         fixed = own.fixed.numpy()
-        found["weight"] = own.weight.detach().numpy() * fixed[..., None]
-        found["bias"] = own.bias.detach().numpy() * fixed
+        found["weight"] = (own.weight.detach().numpy() * fixed[..., None]).transpose(1, 2, 0).copy()
+        found["bias"] = (own.bias.detach().numpy() * fixed).T.copy()
         found["orders"] = np.array(own.orders, dtype=np.int64)
     half = 1 / (one - zero)
     turning = np.array(robot.revolute)

@@ -3,6 +3,7 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -77,7 +78,7 @@ class ThreeParallelArm(AbstractClosedForm):
         t_1, ahead, beside = self._solve_first(each[..., :3, 3], shoulder)
         t_5, t_6, straight = self._solve_wrist(each[..., :3, :3], t_1, wrist)
         x, y = ahead - self.rows.a[0], each[..., 2, 3] - self.rows.d[0]
-        shape = torch.broadcast_shapes(x.shape, elbow.shape, t_6.shape)
+        shape = np.broadcast_shapes(x.shape, elbow.shape, t_6.shape)
         t_1, ahead, x, y, t_5, t_6 = (values.expand(shape) for values in (t_1, ahead, x, y, t_5, t_6))
         upwards = (-shoulder * elbow * math.copysign(1.0, self.rows.a[1])).expand(shape)
         arm, t_234 = self._solve_plane(each[..., :3, :3], t_1, t_6, x, y, upwards)

@@ -1,0 +1,137 @@
+"""Corrected inverse kinematics: poses a second and microseconds a call, as ratios to scipy and to the torch route.
+
+Run `OMP_NUM_THREADS=1 python benchmarks/inverse_speed.py` (scipy comes with `pip install -e ".[bench]"`). The arm has
+errors of 0.5 mm and 1 mrad in every row, base and tool, and a correction of a Fourier series, gravity torques and
+product units; every joint value counts as measured. scipy solves the same poses of the geometric part alone, from the
+joint values themselves with 0.05 rad added. Poses are those of uniformly drawn joint values; they are checked before
+solving and the residual is computed after it in every route.
+"""
+
+import argparse
+import math
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.optimize import least_squares
+
+from pisigma.correction.calibrated_model import CalibratedModel
+from pisigma.correction.compiled_model import compile_model, save_compiled
+from pisigma.correction.corrected_ik import CorrectedIK
+from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.coverage import JointCoverage
+from pisigma.kinematics.status import Status
+from pisigma.network.features import FourierSeries, GravityTorques
+from pisigma.network.joint_correction import JointCorrection
+from pisigma.robot import Robot
+
+ERRORS = np.array([1e-3, 5e-4, 5e-4, 1e-3, 1e-3])
+BASE, TOOL = np.array([0.4, -0.7, 0.3, 2.0, 0.5, -1.0]), np.array([0.06, -0.04, 0.13, 0.4, -0.3, 0.8])
+COLD = """
+import time
+start = time.perf_counter()
+import numpy as np
+from pisigma.compiled.solver import CompiledIK
+CompiledIK.load({file!r}).solve(np.load({pose!r}))
+print(time.perf_counter() - start)
+"""
+
+
+def draw_joints(robot: Robot, rows: int, rng: np.random.Generator) -> torch.Tensor:
+    """Joint values [rad or m] over the limits, at most a turn."""
+    limits = np.clip(robot.limits, -math.pi, math.pi)
+    return torch.from_numpy(rng.uniform(limits[:, 0], limits[:, 1], (rows, robot.dof)))
+
+
+def make_model(name: str, harmonics: int, rng: np.random.Generator) -> CalibratedModel:
+    """A calibrated arm with a correction of about 1 mrad."""
+    robot = Robot.load(name).with_geometry(base=BASE, tool=TOOL)
+    geometric = robot.with_geometry(dh=robot.dh + ERRORS * rng.normal(size=robot.dh.shape))
+    features = [FourierSeries(robot, harmonics), GravityTorques(robot)]
+    correction = JointCorrection(robot, features, (2, 2))
+    with torch.no_grad():
+        for weight, chosen in zip(correction.linear, features, strict=True):
+            weight.copy_(5e-4 / math.sqrt(chosen.count) * torch.from_numpy(rng.normal(size=weight.shape)))
+        correction.weight.copy_(0.01 * torch.from_numpy(rng.normal(size=correction.weight.shape)))
+    starts = draw_joints(robot, 400, rng)
+    arm = HybridArm(geometric, geometric, correction.requires_grad_(False), JointCoverage.of(robot, starts))
+    return CalibratedModel(name, "benchmark", robot, None, None, (), starts, calibrated=geometric, hybrid=arm)
+
+
+def time_scipy(kernels: object, T: np.ndarray, q: np.ndarray) -> float:
+    """Seconds a pose by least squares on the geometric arm."""
+    from pisigma.compiled.arrays import GEOMETRIC
+
+    def residual(joints: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        return (kernels.forward(joints[None], GEOMETRIC)[0][0, :3] - wanted[:3]).ravel()  # type: ignore[attr-defined]
+
+    start = time.perf_counter()
+    for wanted, joints in zip(T, q, strict=True):
+        least_squares(residual, joints + 0.05, args=(wanted,), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    return (time.perf_counter() - start) / len(T)
+
+
+def main() -> None:
+    """Print the figures of one robot."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("robot", nargs="?", default="ur10")
+    parser.add_argument("--poses", type=int, default=100_000)
+    parser.add_argument("--harmonics", type=int, default=24)
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    rng = np.random.default_rng(0)
+    model = make_model(options.robot, options.harmonics, rng)
+    kernels = compile_model(model)
+    q = draw_joints(model.robot, options.poses, rng).numpy()
+    T = kernels.forward(q)[0]
+    kernels.solve_batch(T[:100])
+    rates = {}
+    for label, near, threads in (
+        ("default branch", None, 1),
+        ("default branch", None, 2),
+        ("near", q + 0.02, 2),
+    ):
+        start, used = time.perf_counter(), time.process_time()
+        found = kernels.solve_batch(T, near=near, threads=threads)
+        seconds, used = time.perf_counter() - start, time.process_time() - used
+        reached = found.status != Status.UNREACHABLE
+        rates[label, threads] = len(T) / seconds
+        print(
+            f"{label}, {threads} threads: {len(T) / seconds:,.0f} poses/s, {used / len(T) * 1e6:.1f} us of processor a "
+            f"pose, reached {100 * reached.mean():.2f} %, residual at most {np.nanmax(found.position_residual):.1e} m"
+        )
+    calls = []
+    for pose in T[:20_000]:
+        start = time.perf_counter()
+        kernels.solve(pose)
+        calls.append(time.perf_counter() - start)
+    median, high = np.percentile(calls, [50, 99]) * 1e6
+    print(f"one call: median {median:.1f} us, 99 % {high:.1f} us")
+    few = min(200, len(T))
+    scipy = time_scipy(kernels, T[:few], q[:few])
+    print(f"scipy: {scipy * 1e6:,.0f} us a pose, {scipy * 1e6 / median:,.0f} times a compiled call")
+    solver = CorrectedIK(model)
+    start = time.perf_counter()
+    solver(T[:2000])
+    rate = 2000 / (time.perf_counter() - start)
+    print(
+        f"torch route: {rate:,.0f} poses/s; compiled batch {rates['default branch', 2] / rate:,.0f} times that"
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        file, pose = str(Path(folder) / "compiled.npz"), str(Path(folder) / "T.npy")
+        save_compiled(model, file)
+        np.save(pose, T[0])
+        script = COLD.format(file=file, pose=pose)
+        done = [
+            subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+            for _ in "123"
+        ]
+        print(f"new process, import to first solution: {min(float(run.stdout) for run in done):.2f} s")
+
+
+if __name__ == "__main__":
+    main()

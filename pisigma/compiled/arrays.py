@@ -1,0 +1,154 @@
+"""What the compiled kernels know of a calibrated arm, as plain arrays."""
+
+from typing import Any, NamedTuple
+
+NOMINAL, GEOMETRIC, HYBRID, DRAWN = 0, 1, 2, 3
+"""Which arm: as modelled, with the identified geometry, with the geometry that goes with the correction, and as
+drawn without base, on which gravity acts."""
+BLENDED = 4
+"""The hybrid arm where joints were measured, going over into the geometric one beyond."""
+
+FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
+"""What moves in a row."""
+
+NO_CLOSED_FORM, SCARA, SPHERICAL_WRIST, THREE_PARALLEL = 0, 1, 2, 3
+"""Which closed form the nominal arm has."""
+
+
+class Arms(NamedTuple):
+    """The rows of the four arms, which have the same joints.
+
+    Attributes:
+        kind: per row FIXED, REVOLUTE or PRISMATIC.
+        rows: `(4, rows, 9)`: theta [rad], d, a [m], cosine and sine of alpha, of beta and of theta.
+        ends: `(4, 2, 3, 4)`: transforms of base and tool without their last rows.
+        reach: of every arm [m].
+        direction: per joint +1 or -1, how the controller counts.
+        revolute: per joint 1 where it turns, else 0.
+        limits: `(dof, 2)` [rad or m].
+        hybrid: 1 where there is a hybrid arm, else 0.
+    """
+
+    kind: Any
+    rows: Any
+    ends: Any
+    reach: Any
+    direction: Any
+    revolute: Any
+    limits: Any
+    hybrid: int
+
+
+class Correction(NamedTuple):
+    """The joint correction Δ(q); see `pisigma.network.joint_correction.JointCorrection`.
+
+    Attributes:
+        rate: per joint, angle per joint value.
+        series: `(harmonics, 2, dof)`: weights of sines and cosines of a joint's own angle.
+        gravity: direction in which things fall.
+        masses: `(dof, dof, 4)`: weights of joint and moved row, over the reach (mass), and times the arm (first
+            moments); empty without gravity.
+        scaled: `(dof, dof)`: weights of scaled joint values; empty without them.
+        middle: of every joint's values [rad or m].
+        half: of every joint's travel [rad or m].
+        units: `(dof, inputs)`: weights of the sines and cosines of all joints; empty without them.
+        weight: `(factors, inputs, dof)` of the product units.
+        bias: `(factors, dof)` of the product units.
+        orders: number of factors of every product unit.
+        periodic: 1 where the correction is the same on all turns, else 0.
+    """
+
+    rate: Any
+    series: Any
+    gravity: Any
+    masses: Any
+    scaled: Any
+    middle: Any
+    half: Any
+    units: Any
+    weight: Any
+    bias: Any
+    orders: Any
+    periodic: int
+
+
+class Coverage(NamedTuple):
+    """Measured joint values; see `pisigma.hybrid.coverage.JointCoverage`.
+
+    Attributes:
+        joint: of every stretch.
+        middle: of every stretch [rad].
+        half: half its length [rad].
+        rate: per joint, angle per joint value.
+        fade: angle over which a correction fades [rad].
+    """
+
+    joint: Any
+    middle: Any
+    half: Any
+    rate: Any
+    fade: float
+
+
+class ClosedForm(NamedTuple):
+    """The nominal arm with canonical twists; see `pisigma.kinematics.closed_form`.
+
+    Attributes:
+        kind: NO_CLOSED_FORM, SCARA, SPHERICAL_WRIST or THREE_PARALLEL.
+        branches: how many it has; 1 without closed form.
+        default: index of the branch that is taken where none is asked for.
+        first: `(3, 4)`: frame of poses in the frame before the first joint.
+        last: `(3, 4)`: frame of the last joint in that of the tool.
+        sign: per joint, `variable = sign · (direction · q + offset)`.
+        direction: per joint.
+        offset: per joint.
+        theta: of every joint's row, with sign [rad].
+        d: of every joint's row, with sign [m].
+        a: of every joint's row [m].
+    """
+
+    kind: int
+    branches: int
+    default: int
+    first: Any
+    last: Any
+    sign: Any
+    direction: Any
+    offset: Any
+    theta: Any
+    d: Any
+    a: Any
+
+
+class Starts(NamedTuple):
+    """Joint values to start from.
+
+    Attributes:
+        q: `(starts, dof)` [rad or m].
+        points: `(starts, 12)`: positions [m], and rotations times half a reach over sqrt(2).
+        lever: half a reach over sqrt(2) [m].
+    """
+
+    q: Any
+    points: Any
+    lever: float
+
+
+class Description(NamedTuple):
+    """All of a calibrated arm."""
+
+    arms: Arms
+    correction: Correction
+    coverage: Coverage
+    closed_form: ClosedForm
+    starts: Starts
+
+
+PARTS: dict[str, Any] = {
+    "arms": Arms,
+    "correction": Correction,
+    "coverage": Coverage,
+    "closed_form": ClosedForm,
+    "starts": Starts,
+}
+"""The parts of a description by name."""

@@ -1,0 +1,174 @@
+"""Damped least-squares steps and the distance from a singularity, on plain numbers."""
+
+import math
+from typing import Any, no_type_check
+
+from numba import njit
+
+Array = Any
+Record = Any
+
+_FLOOR = 4 * 2.220446049250313e-16
+_SWEEPS = 30
+
+
+@njit(error_model="numpy")
+@no_type_check
+def scaled_square(reach: float, error: Array) -> float:
+    """Squared pose error with translation in characteristic lengths."""
+    scale = 1 / (reach * reach)
+    position = error[0] * error[0] + error[1] * error[1] + error[2] * error[2]
+    return scale * position + error[3] * error[3] + error[4] * error[4] + error[5] * error[5]
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _normal(arms: Record, reach: float, J: Array, memory: Record) -> tuple[int, float]:
+    """Write the dimensionless Jacobian A and the smaller of `A A^T` and `A^T A`; give its size and trace."""
+    A, S, dof = memory.scaled, memory.square, arms.dof
+    for j in range(dof):
+        length = 1.0 if arms.revolute[j] else reach
+        for i in range(3):
+            A[i, j] = J[i, j] * length / reach
+            A[i + 3, j] = J[i + 3, j] * length
+    size = min(6, dof)
+    trace = 0.0
+    for i in range(size):
+        for k in range(i + 1):
+            total = 0.0
+            if dof < 6:
+                for m in range(6):
+                    total += A[m, i] * A[m, k]
+            else:
+                for m in range(dof):
+                    total += A[i, m] * A[k, m]
+            S[i, k] = total
+        trace += S[i, i]
+    return size, trace
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _factor(S: Array, size: int) -> float:
+    """Cholesky factor in place, the inverse of the diagonal on it; the determinant, 0 where it breaks down."""
+    determinant = 1.0
+    for j in range(size):
+        pivot = S[j, j]
+        for k in range(j):
+            pivot -= S[j, k] * S[j, k]
+        if not pivot > 0.0:
+            return 0.0
+        determinant *= pivot
+        inverse = 1 / math.sqrt(pivot)
+        S[j, j] = inverse
+        for i in range(j + 1, size):
+            total = S[i, j]
+            for k in range(j):
+                total -= S[i, k] * S[j, k]
+            S[i, j] = total * inverse
+    return determinant
+
+
+@njit(error_model="numpy")
+@no_type_check
+def damped_step(arms: Record, reach: float, J: Array, error: Array, damping: float, memory: Record) -> bool:
+    """Write the step [rad or m] of `(J^T J + λ) dq = J^T e` into `memory.step`: see `kinematics.numeric`.
+
+    Args:
+        arms: the arms.
+        reach: characteristic length [m].
+        J: Jacobian.
+        error: pose error.
+        damping: factor of the squared error in λ; rounding sets a floor under it.
+        memory: to work in.
+
+    Returns:
+        Whether there is such a step.
+    """
+    size, trace = _normal(arms, reach, J, memory)
+    A, S, x, dof = memory.scaled, memory.square, memory.right, arms.dof
+    weight = damping * scaled_square(reach, error) + _FLOOR * trace
+    for i in range(size):
+        S[i, i] += weight
+    if _factor(S, size) == 0.0:
+        return False
+    for i in range(size):
+        if dof < 6:
+            x[i] = A[3, i] * error[3] + A[4, i] * error[4] + A[5, i] * error[5]
+            x[i] += (A[0, i] * error[0] + A[1, i] * error[1] + A[2, i] * error[2]) / reach
+        else:
+            x[i] = error[i] / reach if i < 3 else error[i]
+    for i in range(size):
+        total = x[i]
+        for k in range(i):
+            total -= S[i, k] * x[k]
+        x[i] = total * S[i, i]
+    for i in range(size - 1, -1, -1):
+        total = x[i]
+        for k in range(i + 1, size):
+            total -= S[k, i] * x[k]
+        x[i] = total * S[i, i]
+    for j in range(dof):
+        total = x[j] if dof < 6 else 0.0
+        if dof >= 6:
+            for i in range(6):
+                total += A[i, j] * x[i]
+        memory.step[j] = total if arms.revolute[j] else total * reach
+    return True
+
+
+@njit(error_model="numpy")
+@no_type_check
+def is_singular(arms: Record, reach: float, J: Array, tolerance: float, memory: Record) -> bool:
+    """Whether the smallest singular value of the dimensionless Jacobian is below a tolerance.
+
+    The determinant of the normal equations over the largest that the other values can have is a lower bound, which
+    settles it but near singularities.
+    """
+    size, trace = _normal(arms, reach, J, memory)
+    determinant = _factor(memory.square, size)
+    others = (trace / (size - 1)) ** (size - 1) if size > 1 else 1.0
+    if determinant > 2 * tolerance * tolerance * others:
+        return False
+    return _smallest_singular_value(memory.scaled, size, arms.dof) < tolerance
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _smallest_singular_value(A: Array, size: int, dof: int) -> float:
+    """One-sided Jacobi rotations of A's columns, or of its rows where they are fewer; A is overwritten."""
+    by_column = dof == size
+    length = 6 if by_column else dof
+    for _ in range(_SWEEPS):
+        largest = 0.0
+        for i in range(size - 1):
+            for k in range(i + 1, size):
+                a, b, c = 0.0, 0.0, 0.0
+                for m in range(length):
+                    u = A[m, i] if by_column else A[i, m]
+                    v = A[m, k] if by_column else A[k, m]
+                    a += u * u
+                    b += v * v
+                    c += u * v
+                if abs(c) <= 1e-15 * math.sqrt(a * b) or c == 0.0:
+                    continue
+                largest = max(largest, abs(c) / math.sqrt(a * b))
+                zeta = (b - a) / (2 * c)
+                tangent = math.copysign(1.0, zeta) / (abs(zeta) + math.sqrt(1 + zeta * zeta))
+                cos = 1 / math.sqrt(1 + tangent * tangent)
+                sin = cos * tangent
+                for m in range(length):
+                    if by_column:
+                        A[m, i], A[m, k] = cos * A[m, i] - sin * A[m, k], sin * A[m, i] + cos * A[m, k]
+                    else:
+                        A[i, m], A[k, m] = cos * A[i, m] - sin * A[k, m], sin * A[i, m] + cos * A[k, m]
+        if largest < 1e-14:
+            break
+    least = math.inf
+    for i in range(size):
+        total = 0.0
+        for m in range(length):
+            value = A[m, i] if by_column else A[i, m]
+            total += value * value
+        least = min(least, total)
+    return math.sqrt(least)
