@@ -23,8 +23,6 @@ from pisigma.training.checkpoints import discard_checkpoints, find_checkpoint, p
 from pisigma.training.trainer import train
 from pisigma.training.whitened_unknowns import WhitenedUnknowns
 
-MANY_ROWS = 100_000
-"""From so many rows on mini-batches are worth while."""
 STEPS = 300
 """Without a number of epochs there are at least so many steps, and `FEWEST_EPOCHS`."""
 FEWEST_EPOCHS = 8
