@@ -11,7 +11,7 @@ from torch import Tensor
 from pisigma.network.features import turning_rate
 from pisigma.robot.description import Robot
 
-LARGEST_GAP = math.radians(30)
+LARGEST_GAP = math.radians(60)
 """Joint values between two measured ones that are not farther apart than this count as measured."""
 FADE = math.radians(15)
 """Over so much beyond the measured joint values a correction fades to nothing, unless the data say otherwise."""

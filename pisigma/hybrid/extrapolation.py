@@ -16,7 +16,7 @@ TAIL = 0.2
 """Share of the configurations at either end of a joint's range that is left out."""
 FADES = tuple(math.radians(angle) for angle in (1, 5, 10, 15, 20, 30, 45))
 """Angles [rad] that are tried."""
-DENSE = 100
+DENSE = 200
 """From so many configurations on, joint values beyond the measured ones are rare, and no way into them is safe far."""
 DENSE_FADE = math.radians(10)
 """Longest angle then."""

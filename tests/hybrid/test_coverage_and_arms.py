@@ -43,11 +43,11 @@ def beyond(coverage: JointCoverage, *angles: float) -> Tensor:
 
 
 def test_a_gap_wider_than_allowed_was_not_measured_and_a_narrower_one_was() -> None:
-    found = coverage_of(line((-60, 0), (29, 90), (125, 150)))
+    found = coverage_of(line((-90, -60), (-1, 30), (95, 150)))
     assert int((found.joint == 0).sum()) == 2
-    assert_close(beyond(found, -60, -30, 15, 90, 125, 140), torch.zeros(6), atol=1e-9)
-    expected = torch.tensor([10.0, 50.0, 30.0, 10.0, 15.0, 5.0]).double()
-    assert_close(beyond(found, -70, -160, 270, 100, 110, 155), expected, atol=1e-9)
+    assert_close(beyond(found, -90, -30, 15, 30, 95, 140), torch.zeros(6), atol=1e-9)
+    expected = torch.tensor([10.0, 50.0, 20.0, 10.0, 15.0, 5.0]).double()
+    assert_close(beyond(found, -100, -160, 250, 40, 80, 155), expected, atol=1e-9)
 
 
 def test_a_stretch_may_reach_over_the_full_turn() -> None:

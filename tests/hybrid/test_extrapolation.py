@@ -51,7 +51,7 @@ def test_gravity_holds_as_far_as_the_outermost_rows_tell(seed: int) -> None:
     fitted = arm.fitted((GravityTorques(robot),))
     fade = fade_angle(arm.rows, fitted.design, fitted.posterior, fitted.sums)
     assert fade in FADES
-    assert fade == DENSE_FADE
+    assert fade >= math.radians(20)
 
 
 @pytest.mark.parametrize("seed", range(2))
