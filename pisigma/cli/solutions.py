@@ -3,15 +3,13 @@
 import csv
 import io
 import math
-import os
-import tempfile
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from pisigma.correction.solution import Solution
-from pisigma.errors import OutputError
+from pisigma.export.output_file import write_whole
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
 
@@ -82,7 +80,7 @@ def write_joints(solution: Solution, robot: Robot, path: Path) -> None:
     for status, branch, both in zip(_statuses(solution), solution.branch.tolist(), joints, strict=True):
         cells = ["" if math.isnan(v) else repr(v) for part in both for v in _in_file_units(part, robot)]
         writer.writerow([status.name.lower(), solution.branches[branch], *cells])
-    _put(path, text.getvalue())
+    write_whole(path, text.getvalue())
 
 
 def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str | None:
@@ -123,19 +121,3 @@ def _in_file_units(values: Sequence[float], robot: Robot) -> list[float]:
 
 def _or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
-
-
-def _put(path: Path, text: str) -> None:
-    """Write a file beside `path` and move it there in one step."""
-    scratch = None
-    try:
-        handle, scratch = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
-        with os.fdopen(handle, "w", newline="", encoding="utf-8") as file:
-            file.write(text)
-        os.chmod(scratch, 0o644)
-        os.replace(scratch, path)
-    except OSError as problem:
-        raise OutputError(f"{path}: cannot be written ({problem.strerror}); choose another --out.") from None
-    finally:
-        if scratch:
-            Path(scratch).unlink(missing_ok=True)
