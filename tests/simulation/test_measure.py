@@ -171,7 +171,7 @@ def test_joint_values_have_no_branch():
             RecipeError,
             "no branch 'elbow_posive'; did you mean 'elbow_positive'",
         ),
-        ("ur10", {"name": "elbow_positive"}, RecipeError, "'ur10' has no closed form .* state near_deg"),
+        ("panda", {"name": "elbow_positive"}, RecipeError, "'panda' has no closed form .* state near_deg"),
         ("kiro3", {"near_deg": {"tehta_1": 1}}, RecipeError, "no joint 'tehta_1'; did you mean 'theta_1'"),
     ],
 )
