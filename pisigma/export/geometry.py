@@ -15,13 +15,18 @@ def calibrated_geometry(model: CalibratedModel) -> Robot:
     )
 
 
+def corrects_joints(model: CalibratedModel) -> bool:
+    """Whether a model has a learned joint correction, which files of geometry cannot hold."""
+    return model.network is not None or model.hybrid is not None
+
+
 def remarks(model: CalibratedModel) -> tuple[str, ...]:
     """Sentences for the head of a file that holds the geometry of a model and nothing else."""
     drawn = "as drawn, with the identified base and tool" if model.calibrated is None else "as identified"
     said = [
         f"Geometry {drawn}, of model {model.name} (robot {model.robot.name}), by pisigma {__version__}.",
     ]
-    if model.network is not None:
+    if corrects_joints(model):
         said.append(
             "The learned joint correction of the model is not in this file: a program that reads it gets the "
             "geometry only, without the accuracy that the correction adds."
@@ -39,7 +44,7 @@ def remarks(model: CalibratedModel) -> tuple[str, ...]:
 def offset_remarks(model: CalibratedModel) -> tuple[str, ...]:
     """The same for a file that holds joint offsets and nothing else."""
     title = f"Joint offsets of model {model.name} (robot {model.robot.name}), by pisigma {__version__}."
-    if model.network is None:
+    if not corrects_joints(model):
         return (title,)
     return (
         title,

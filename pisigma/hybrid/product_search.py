@@ -72,11 +72,11 @@ def best_products(
         other
         for other in search.fitted
         if 0 < other.harmonics < additive.harmonics
-        and len(other.design.features) == len(additive.design.features)
+        and {c.name for c in other.design.features} == {c.name for c in additive.design.features}
     ]
     for other in sorted(fewer, key=lambda one: -one.harmonics):
-        square, better = _judged(search, other, _folds(search, other), best, least, (last, first))
-        if square > least:
+        square, better = _judged(search, other, _folds(search, other), best, least / BETTER**2, (last, first))
+        if not better:
             break
         additive, least = other, square
     return additive, best
