@@ -9,7 +9,8 @@ import torch
 from testing.closeness import assert_close
 from testing.models import HOMES, hand_made_model, joints_around, with_limits
 
-from pisigma.correction.corrected_ik import NUMERIC, CorrectedIK
+from pisigma.correction.corrected_ik import CorrectedIK
+from pisigma.correction.torch_ik import NUMERIC
 from pisigma.errors import ModelError, PoseError
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.forward import forward_kinematics
