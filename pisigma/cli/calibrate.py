@@ -26,7 +26,7 @@ MODELS = ("geometric", "hybrid")
 
 
 def calibrate(
-    robot: Annotated[str, typer.Argument(help="Catalogue name or robot file (YAML).")],
+    robot: Annotated[str, typer.Argument(help="Catalogue name or robot file (YAML or URDF).")],
     data: Annotated[Path, typer.Argument(help="Measurements (CSV).")],
     out: Annotated[Path, typer.Option(help="Model folder to write.")],
     model: Annotated[
@@ -68,6 +68,12 @@ def calibrate(
             help="Known distance of two sockets as A,B,MM; */0,*/1,50 means that of every placement."
         ),
     ] = None,
+    base: Annotated[
+        str | None, typer.Option(help="Of a URDF file: link that is the base. [default: its root]")
+    ] = None,
+    tip: Annotated[
+        str | None, typer.Option(help="Of a URDF file: link that is the tool. [default: its only leaf]")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Calibrate a robot from measurements and write it as a model folder with card and figures.
@@ -89,7 +95,7 @@ def calibrate(
     from pisigma.training.recipe_data import part_sets
 
     check_replaceable(out)
-    nominal = Robot.load(robot)
+    nominal = Robot.load(robot, base, tip)
     measurements, test = part_sets(Measurements.read_csv(data, nominal))
     geometric = replace(
         calibration_section(free, prior_mm, prior_mrad, robust).calibrator(nominal),
@@ -107,7 +113,7 @@ def calibrate(
     found = replace(_model(out.resolve().name, nominal, result, rows), metrics=report)
     options = {"model": model, "folds": folds, "hold-out": hold_out, "split": split, "seed": seed}
     options |= {"train-rows": train_rows, "free": free, "prior-mm": prior_mm, "prior-mrad": prior_mrad}
-    options |= {"robust": robust, "socket-distance": socket_distance}
+    options |= {"robust": robust, "socket-distance": socket_distance, "base": base, "tip": tip}
     texts = {
         "description": _description(model, nominal),
         "command": _command_line(robot, data, out, options),
