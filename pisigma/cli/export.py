@@ -8,19 +8,35 @@ import typer
 if TYPE_CHECKING:
     from pisigma.correction.calibrated_model import CalibratedModel
 
-_SUFFIXES = {"urdf": (".urdf",), "dh": (".csv", ".yaml", ".yml"), "offsets": (".csv", ".yaml", ".yml")}
-_CONTENTS = {"urdf": "a URDF", "dh": "a DH table", "offsets": "a table of joint offsets"}
+_SUFFIXES = {
+    "urdf": (".urdf",),
+    "dh": (".csv", ".yaml", ".yml"),
+    "offsets": (".csv", ".yaml", ".yml"),
+    "targets": (".csv", ".script", ".src", ".mod", ".ls"),
+}
+_CONTENTS = {
+    "urdf": "a URDF",
+    "dh": "a DH table",
+    "offsets": "a table of joint offsets",
+    "targets": "a table or program of targets",
+}
 
 
 def export(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
-    out: Annotated[Path, typer.Option(help="File to write: .urdf, or .csv or .yaml for dh and offsets.")],
+    out: Annotated[
+        Path,
+        typer.Option(
+            help="File to write: .urdf; .csv or .yaml for dh and offsets; for targets .csv, .script (URScript), "
+            ".src (KUKA), .mod (ABB) or .ls (FANUC)."
+        ),
+    ],
     form: Annotated[
         str,
         typer.Option(
             "--format",
             help="urdf: calibrated geometry; dh: its DH + Hayati table with base and tool; offsets: the best "
-            "joint offsets alone, with the accuracy that this gives up.",
+            "joint offsets alone, with the accuracy that this gives up; targets: corrected targets for --poses.",
         ),
     ],
     like: Annotated[
@@ -32,9 +48,36 @@ def export(
     tip: Annotated[
         str | None, typer.Option(help="With --like: link that is the tool, as it was given then.")
     ] = None,
+    poses: Annotated[
+        Path | None,
+        typer.Option(
+            help="With targets: CSV file of poses, x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg or qx,qy,qz,qw."
+        ),
+    ] = None,
+    kind: Annotated[
+        str | None,
+        typer.Option(
+            "--targets",
+            help="What a program of targets tells the controller: joints (default), or cartesian, for a controller "
+            "that computes with the robot as drawn. A .csv file holds both.",
+        ),
+    ] = None,
+    branch: Annotated[
+        str | None, typer.Option(help="With targets: branch to take instead of the trained one.")
+    ] = None,
+    config: Annotated[
+        str | None,
+        typer.Option(
+            help="With .ls and --targets cartesian: the arm's configuration, such as 'N U T, 0, 0, 0'."
+        ),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Write a model for other programs, whole or not at all."""
+    """Write a model for other programs, whole or not at all.
+
+    Exit status 2 when a pose of --poses has no target, being unreachable, singular or outside the joint limits: its
+    values are empty in a .csv file, and no program is written. Every program is slow and has to be tested.
+    """
     from pisigma.cli.output import print_json
     from pisigma.errors import OutputError, nearest_choice
 
@@ -44,10 +87,16 @@ def export(
         raise OutputError(f"--like goes with --format urdf, not with {form}; leave it out.")
     if tip is not None and like is None:
         raise OutputError("--tip names a link of the file that --like gives; give both or none.")
+    _check_target_options(form, poses, kind, branch, config)
     from pisigma.correction.model_folder import load_model
     from pisigma.export.output_file import check_output, write_whole
 
     check_output(out, _SUFFIXES[form], _CONTENTS[form])
+    if poses is not None:
+        from pisigma.cli.export_targets import export_targets
+
+        export_targets(model, out, poses, kind, branch, config, as_json)
+        return
     loaded, as_csv = load_model(model), out.suffix.lower() == ".csv"
     text, result = _urdf(loaded, like, tip) if form == "urdf" else _table(loaded, form, as_csv)
     write_whole(out, text)
@@ -59,6 +108,18 @@ def export(
     typer.echo(
         f"{_CONTENTS[form].capitalize().replace('urdf', 'URDF').replace('dh', 'DH')} written to {out}."
     )
+
+
+def _check_target_options(form: str, poses: Path | None, *options: str | None) -> None:
+    """Refuse options of targets without targets, and targets without poses."""
+    from pisigma.errors import OutputError
+
+    if form == "targets" and poses is None:
+        raise OutputError("--format targets needs the poses to make them for; give them with --poses.")
+    names = ("--poses", "--targets", "--branch", "--config")
+    for name, value in zip(names, (poses, *options), strict=True):
+        if form != "targets" and value is not None:
+            raise OutputError(f"{name} goes with --format targets, not with {form}; leave it out.")
 
 
 def _urdf(model: "CalibratedModel", like: Path | None, tip: str | None) -> tuple[str, dict[str, Any]]:

@@ -31,6 +31,12 @@ def remarks(model: CalibratedModel) -> tuple[str, ...]:
             "The learned joint correction of the model is not in this file: a program that reads it gets the "
             "geometry only, without the accuracy that the correction adds."
         )
+    return (*said, *frame_remarks(model))
+
+
+def frame_remarks(model: CalibratedModel) -> tuple[str, ...]:
+    """Sentences on whose base and tool leave pisigma where the model knows several."""
+    said = []
     for what, names in (("frame", list(model.bases)), ("target", list(model.tools))):
         if len(names) > 1:
             part = "base" if what == "frame" else "tool"

@@ -1,0 +1,1 @@
+"""Corrected targets as a table and as programs for robot controllers."""

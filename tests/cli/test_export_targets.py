@@ -1,0 +1,233 @@
+"""`pisigma export --format targets`: poses in, a table or a program out."""
+
+import csv
+import json
+
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.models import joints_around
+from testing.program_readers import READERS
+
+from pisigma.correction.model_folder import load_model
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.robot import Robot
+from pisigma.se3 import xyzrpy_from_transform
+
+COLUMNS = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
+FAR = (9000.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def poses_of(name: str, q: torch.Tensor) -> list[tuple[float, ...]]:
+    values = xyzrpy_from_transform(forward_kinematics(Robot.load(name), q))
+    return [tuple(row) for row in torch.cat([values[:, :3] * 1e3, torch.rad2deg(values[:, 3:])], -1).tolist()]
+
+
+def good_poses(name: str, rows: int = 3) -> list[tuple[float, ...]]:
+    return poses_of(name, joints_around(name, rows, seed=6, spread=0.1))
+
+
+@pytest.fixture
+def poses(tmp_path):
+    """Write a file of poses; line 2 is a comment, so the first pose stands in line 3."""
+
+    def write(rows):
+        path = tmp_path / "poses.csv"
+        lines = [",".join(COLUMNS), "# by hand", *(",".join(map(repr, row)) for row in rows)]
+        path.write_text("\n".join(lines) + "\n")
+        return path
+
+    return write
+
+
+def export(run, model, poses, out, *options):
+    return run("export", model, "--format", "targets", "--poses", poses, "--out", out, *options)
+
+
+def test_a_table(run, models, poses, tmp_path):
+    path, out = poses(good_poses("ur10")), tmp_path / "targets.csv"
+    result = export(run, models / "ur10", path, out)
+    assert (result.exit_code, result.stderr) == (0, "")
+    assert result.stdout == f"Targets for 3 poses written to {out}: 3 reached.\n"
+    rows = list(csv.DictReader(line for line in out.read_text().splitlines() if not line.startswith("#")))
+    assert [row["line"] for row in rows] == ["3", "4", "5"]
+    degrees = [[float(row[f"q{i}_deg"]) for i in range(1, 7)] for row in rows]
+    q = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    reached = load_model(models / "ur10").forward(q)
+    wanted = forward_kinematics(Robot.load("ur10"), joints_around("ur10", 3, seed=6, spread=0.1))
+    assert_close(reached, wanted, atol=1e-9)
+    told = json.loads(export(run, models / "ur10", path, out, "--json").stdout)
+    assert told == {
+        "file": str(out),
+        "format": "targets",
+        "targets": "both",
+        "robot": "ur10",
+        "rows": 3,
+        "statuses": {"reached": 3},
+        "remarks": [],
+    }
+
+
+@pytest.mark.parametrize("suffix", READERS)
+@pytest.mark.parametrize("kind", [None, "joints", "cartesian"])
+def test_a_program(run, models, poses, tmp_path, suffix, kind):
+    path, out, table = poses(good_poses("ur10")), tmp_path / f"cell{suffix}", tmp_path / "targets.csv"
+    assert export(run, models / "ur10", path, table).exit_code == 0
+    options = [] if kind is None else ["--targets", kind]
+    options += ["--config", "N U T, 0, 0, 0"] if (kind, suffix) == ("cartesian", ".ls") else []
+    result = export(run, models / "ur10", path, out, *options, "--json")
+    assert result.exit_code == 0
+    told = json.loads(result.stdout)
+    assert (told["targets"], told["rows"]) == (kind or "joints", 3)
+    assert "".join(f"pisigma: {remark}\n" for remark in told["remarks"]) == result.stderr
+    assert any("J3 counts from the horizontal" in remark for remark in told["remarks"]) == (suffix == ".ls")
+    program = READERS[suffix](out.read_bytes().decode("ascii"))
+    assert [remark for remark in program.remarks if remark.startswith("line ")] == [
+        "line 3",
+        "line 4",
+        "line 5",
+    ]
+    rows = list(csv.DictReader(line for line in table.read_text().splitlines() if not line.startswith("#")))
+    if kind == "cartesian":
+        factor = 1e3 if suffix == ".script" else 1.0
+        found = [[factor * value for value in pose[:3]] for pose in program.poses]
+        assert_close(found, [[float(row[name]) for name in COLUMNS[:3]] for row in rows], atol=1.1e-6)
+    else:
+        q = torch.tensor(program.joints, dtype=torch.float64)
+        found = torch.rad2deg(q) if suffix == ".script" else q
+        assert_close(found, [[float(row[f"q{i}_deg"]) for i in range(1, 7)] for row in rows], atol=1.1e-6)
+
+
+def test_a_table_of_a_robot_with_a_sliding_joint(run, models, poses, tmp_path):
+    out = tmp_path / "targets.csv"
+    assert export(run, models / "kiro3", poses(good_poses("kiro3")), out).exit_code == 0
+    assert "line,status,branch,q1_deg,q2_deg,q3_mm,q4_deg,x_mm," in out.read_text()
+
+
+def test_a_branch_that_is_asked_for(run, models, poses, tmp_path):
+    path, out = poses(good_poses("kiro4", 1)), tmp_path / "targets.csv"
+    every = json.loads(
+        run("ik", models / "kiro4", "--pose", *good_poses("kiro4", 1)[0], "--all-branches", "--json").stdout
+    )
+    found = next(s for s in every["solutions"][1:] if s["status"] in ("reached", "outside_domain"))
+    assert export(run, models / "kiro4", path, out, "--branch", found["branch"]).exit_code == 0
+    (row,) = csv.DictReader(line for line in out.read_text().splitlines() if not line.startswith("#"))
+    assert row["branch"] == found["branch"]
+    assert_close([float(row[f"q{i}_deg"]) for i in range(1, 7)], found["q_deg"], atol=1e-6)
+
+
+def test_a_pose_that_cannot_be_reached(run, refuses, models, poses, tmp_path):
+    good = good_poses("ur10", 2)
+    path, table, program = poses([good[0], FAR, good[1]]), tmp_path / "t.csv", tmp_path / "t.src"
+    result = export(run, models / "ur10", path, table)
+    assert result.exit_code == 2
+    assert "2 reached, 1 unreachable" in result.stdout
+    assert result.stderr.startswith(f"pisigma: {path}, line 4: unreachable. No joint values reach the pose")
+    rows = list(csv.DictReader(line for line in table.read_text().splitlines() if not line.startswith("#")))
+    assert [row["status"] for row in rows] == ["reached", "unreachable", "reached"]
+    assert {rows[1][name] for name in ("q1_deg", "q6_deg", "x_mm", "yaw_deg", "sigma_mm")} == {""}
+    program.write_text("old")
+    sentence = refuses(
+        "export", models / "ur10", "--format", "targets", "--poses", path, "--out", program, "--json"
+    )
+    assert sentence.startswith(f"{path}, line 4: unreachable.")
+    assert sentence.endswith("No program is written while a pose has no target.")
+    assert program.read_text() == "old"
+
+
+def test_a_singular_pose(run, models, poses, tmp_path):
+    q = torch.tensor([[0.3, 0.0, -0.1, 0.0]], dtype=torch.float64)
+    out = tmp_path / "targets.csv"
+    result = export(run, models / "kiro3", poses(poses_of("kiro3", q)), out)
+    assert result.exit_code == 2
+    assert "line 3: singular." in result.stderr
+    assert "\n3,singular,elbow_positive,,,,,,,,,,,\n" in out.read_text()
+
+
+def test_a_pose_outside_the_domain(run, models, poses, tmp_path):
+    far = joints_around("ur10", 1, seed=6, spread=0.1) + torch.tensor([1.5, 0, 0, 0, 0, 0])
+    path = poses([*good_poses("ur10", 1), *poses_of("ur10", far)])
+    for suffix in (".csv", *READERS):
+        out = tmp_path / f"cell{suffix}"
+        result = export(run, models / "ur10", path, out)
+        assert result.exit_code == 0
+        assert "1 reached, 1 outside_domain" in result.stdout
+        assert result.stderr.startswith(
+            "pisigma: 1 of 2 poses, line 4: outside_domain. The joint values lie outside"
+        )
+        text = out.read_text()
+        assert ("4,outside_domain," if suffix == ".csv" else "line 4 OUTSIDE DOMAIN") in text
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (("--out", "cell.csv"), "--format targets needs the poses to make them for"),
+        (
+            ("--out", "cell.txt", "--poses", "poses.csv"),
+            "cell.txt: a table or program of targets goes into a .csv",
+        ),
+        (("--out", "cell.src", "--poses", "none.csv"), "none.csv: cannot be read"),
+        (("--out", "poses.csv", "--poses", "poses.csv"), "poses.csv: is the file of poses itself"),
+        (
+            ("--out", "9 bad-name.ls", "--poses", "poses.csv"),
+            "9 bad-name.ls: the program is called as its file",
+        ),
+        (
+            ("--out", "cell.src", "--poses", "poses.csv", "--targets", "joint"),
+            "--targets 'joint' is unknown; did you mean 'joints'?",
+        ),
+        (
+            ("--out", "cell.csv", "--poses", "poses.csv", "--targets", "joints"),
+            "--targets goes with a program; a .csv file holds all targets.",
+        ),
+        (
+            ("--out", "cell.ls", "--poses", "poses.csv", "--targets", "cartesian"),
+            "cell.ls: FANUC's Cartesian targets need the arm's configuration",
+        ),
+        (
+            (
+                "--out",
+                "cell.mod",
+                "--poses",
+                "poses.csv",
+                "--targets",
+                "cartesian",
+                "--config",
+                "N U T, 0, 0, 0",
+            ),
+            "--config goes with a .ls file and --targets cartesian",
+        ),
+        (
+            ("--out", "cell.mod", "--poses", "poses.csv", "--branch", "up"),
+            "there is no branch 'up'",
+        ),
+    ],
+)
+def test_what_is_refused(refuses, models, poses, tmp_path, monkeypatch, options, complaint):
+    monkeypatch.chdir(tmp_path)
+    poses(good_poses("ur10"))
+    sentence = refuses("export", models / "ur10", "--format", "targets", *options)
+    assert sentence.startswith(complaint)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["poses.csv"]
+
+
+@pytest.mark.parametrize("option", ["--poses", "--targets", "--branch", "--config"])
+def test_options_of_targets_go_with_targets(refuses, models, tmp_path, option):
+    out = tmp_path / "robot.urdf"
+    sentence = refuses("export", models / "ur10", "--format", "urdf", "--out", out, option, "x")
+    assert sentence == f"{option} goes with --format targets, not with urdf; leave it out."
+
+
+def test_a_sliding_joint_has_no_program(refuses, models, poses, tmp_path):
+    path = poses(good_poses("kiro3"))
+    sentence = refuses(
+        "export", models / "kiro3", "--format", "targets", "--poses", path, "--out", tmp_path / "cell.script"
+    )
+    assert "URScript programs are written for robots with six joints that turn" in sentence
+    assert not (tmp_path / "cell.script").exists()
+
+
+def test_the_command_tells_its_formats(run):
+    text = run("export", "--help").stdout
+    assert all(word in text for word in ("targets", "--poses", "--config", "URScript", "FANUC", "cartesian"))
