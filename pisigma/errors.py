@@ -1,7 +1,8 @@
 """Every exception that pisigma raises on purpose.
 
 A message says what was wanted, what came, where, and what to do about it. The command line turns any
-`PisigmaError` into one line on stderr and exit status 2; everything else is a defect of ours.
+`PisigmaError` into one line on stderr and exit status 2, an `AcceptanceError` into status 3; everything else is a
+defect of ours.
 """
 
 import difflib
@@ -46,6 +47,10 @@ class IdentificationError(PisigmaError, ValueError):
 
 class OutputError(PisigmaError, ValueError):
     """An output cannot be written where it was asked for."""
+
+
+class AcceptanceError(PisigmaError, ValueError):
+    """A model does not meet the limits that were set for it."""
 
 
 class TrainingError(PisigmaError, RuntimeError):

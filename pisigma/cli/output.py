@@ -7,9 +7,12 @@ from typing import Any
 
 import typer
 
-from pisigma.errors import PisigmaError
+from pisigma.errors import AcceptanceError, PisigmaError
 
 WIDTH_WITHOUT_TERMINAL = 120
+
+NOT_ACCEPTED = 3
+"""Exit status of a model that does not meet its limits."""
 
 _INTERRUPTED = 130
 
@@ -41,12 +44,17 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
 
 
 def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
-    """Make a command end with one line on stderr and exit status 2 where the user's input is at fault."""
+    """Make a command end with one line on stderr and a status that says whose fault it is.
+
+    2 where the user's input is at fault, 3 where a model does not meet the limits that were set.
+    """
 
     @functools.wraps(command)
     def told(*args: Any, **kwargs: Any) -> None:
         try:
             command(*args, **kwargs)
+        except AcceptanceError as problem:
+            fail(str(problem), NOT_ACCEPTED)
         except PisigmaError as problem:
             fail(str(problem))
         except KeyboardInterrupt:
@@ -56,10 +64,10 @@ def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
     return told
 
 
-def fail(sentence: str) -> None:
-    """Say what is wrong in one line on stderr and end with exit status 2."""
+def fail(sentence: str, status: int = 2) -> None:
+    """Say what is wrong in one line on stderr and end with an exit status."""
     typer.echo(f"pisigma: {' '.join(sentence.split())}", err=True)
-    raise typer.Exit(2) from None
+    raise typer.Exit(status) from None
 
 
 def _is_number(cell: str) -> bool:

@@ -117,8 +117,7 @@ class CalibratedModel:
         """Pose T_base_tool that the robot takes when commanded to q [rad or m], as far as the model knows.
 
         With an identified geometry it is its forward kinematics, with the joint correction of a hybrid. Else
-        it is the pose whose corrected joint values are q: `q_nominal = q - Δ(FK(q_nominal), q_nominal)`, solved
-        by iteration.
+        it is the pose whose corrected joint values are q, see `nominal_joints`.
 
         Returns:
             The poses; NaN where the iteration does not settle because the correction is steeper than the
@@ -128,12 +127,22 @@ class CalibratedModel:
             return hybrid_poses(self.hybrid, q)
         if self.calibrated is not None:
             return forward_kinematics(self.calibrated, q)
+        q_nominal = self.nominal_joints(q)
+        settled = torch.isfinite(q_nominal).all(-1, keepdim=True)
+        T = forward_kinematics(self.robot, torch.where(settled, q_nominal, q))
+        return torch.where(settled[..., None], T, torch.nan)
+
+    def nominal_joints(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
+        """Joint values `q_nominal = q - Δ(FK(q_nominal), q_nominal)` [rad or m] that `network` corrects to q.
+
+        Returns:
+            NaN where the iteration does not settle; q itself without a network.
+        """
         q_nominal, moved = q, torch.zeros_like(q)
         for _ in range(FORWARD_ITERATIONS if self.network is not None else 0):
             following = q - self.correction(forward_kinematics(self.robot, q_nominal), q_nominal)
             moved, q_nominal = (following - q_nominal).abs(), following
             if bool((moved <= FORWARD_TOLERANCE).all()):
                 break
-        settled = (moved <= 1e-9).all(-1)
-        T = forward_kinematics(self.robot, torch.where(settled[..., None], q_nominal, q))
-        return torch.where(settled[..., None, None], T, torch.nan)
+        settled = (moved <= 1e-9).all(-1, keepdim=True)
+        return torch.where(settled, q_nominal, torch.nan)

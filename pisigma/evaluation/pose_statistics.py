@@ -14,6 +14,65 @@ from pisigma.se3 import rotation_vector
 
 
 @dataclass(frozen=True, eq=False)
+class ErrorVectors:
+    """How measured rows are off from where a model expects them, measured minus expected.
+
+    Attributes:
+        position: along the axes of the row's frame [m]; NaN where no position was measured or predicted.
+        rotation: rotation vector of `R_measured R_expected^T` about these axes [rad]; NaN likewise; None where no row
+            has an orientation.
+    """
+
+    position: Float64[Tensor, "rows 3"]
+    rotation: Float64[Tensor, "rows 3"] | None
+
+    @staticmethod
+    def between(measurements: Measurements, expected: Float64[Tensor, "rows 4 4"]) -> "ErrorVectors":
+        """Errors of measurements against expected poses T_base_tool.
+
+        Raises:
+            MeasurementError: no position was measured.
+        """
+        if measurements.position is None:
+            raise MeasurementError(f"{measurements.source}: {_no_positions(measurements)}")
+        position = measurements.position - expected[:, :3, 3]
+        if measurements.rotation is None:
+            return ErrorVectors(position, None)
+        there = torch.isfinite(measurements.rotation).all(-1).all(-1) & torch.isfinite(expected).all(-1).all(
+            -1
+        )
+        eye = torch.eye(3, dtype=position.dtype)
+        R = torch.where(there[:, None, None], measurements.rotation @ expected[:, :3, :3].mT, eye)
+        return ErrorVectors(position, torch.where(there[:, None], rotation_vector(R), torch.nan))
+
+    @property
+    def sizes(self) -> "PoseErrors":
+        """Lengths and angles of the errors."""
+        return PoseErrors(
+            self.position.norm(dim=-1), None if self.rotation is None else self.rotation.norm(dim=-1)
+        )
+
+    def only(self, rows: Bool[Tensor, " rows"]) -> "ErrorVectors":
+        """The errors of some rows; NaN in all others."""
+        chosen = rows[:, None]
+        position = torch.where(chosen, self.position, torch.nan)
+        return ErrorVectors(
+            position, None if self.rotation is None else torch.where(chosen, self.rotation, torch.nan)
+        )
+
+    def axes_in_file_units(self) -> dict[str, dict[str, float]]:
+        """Per axis of the frame the figures of `axis_statistics` in mm and, where measured, in deg."""
+        found = {}
+        for index, axis in enumerate("xyz"):
+            along = axis_statistics(self.position[:, index])
+            found[axis] = {f"{name}_mm": value * 1e3 for name, value in along.items()}
+            if self.rotation is not None and torch.isfinite(self.rotation).any():
+                about = axis_statistics(torch.rad2deg(self.rotation[:, index]))
+                found[axis] |= {f"{name}_deg": value for name, value in about.items()}
+        return found
+
+
+@dataclass(frozen=True, eq=False)
 class PoseErrors:
     """How far measured rows are from where a model expects them.
 
@@ -29,22 +88,8 @@ class PoseErrors:
 
     @staticmethod
     def between(measurements: Measurements, expected: Float64[Tensor, "rows 4 4"]) -> "PoseErrors":
-        """Errors of measurements against expected poses T_base_tool.
-
-        Raises:
-            MeasurementError: no position was measured.
-        """
-        if measurements.position is None:
-            raise MeasurementError(f"{measurements.source}: no positions were measured; give x, y and z.")
-        position = (measurements.position - expected[:, :3, 3]).norm(dim=-1)
-        if measurements.rotation is None:
-            return PoseErrors(position, None)
-        there = torch.isfinite(measurements.rotation).all(-1).all(-1) & torch.isfinite(expected).all(-1).all(
-            -1
-        )
-        eye = torch.eye(3, dtype=position.dtype)
-        R = torch.where(there[:, None, None], measurements.rotation @ expected[:, :3, :3].mT, eye)
-        return PoseErrors(position, torch.where(there, rotation_vector(R).norm(dim=-1), torch.nan))
+        """Errors of measurements against expected poses; see `ErrorVectors.between`."""
+        return ErrorVectors.between(measurements, expected).sizes
 
     def only(self, rows: Bool[Tensor, " rows"]) -> "PoseErrors":
         """The errors of some rows; NaN in all others."""
@@ -75,6 +120,24 @@ def error_statistics(errors: Float64[Tensor, " rows"]) -> dict[str, float]:
         "p95": float(torch.quantile(present, 0.95)),
         "max": float(present.max()),
     }
+
+
+def axis_statistics(errors: Float64[Tensor, " rows"]) -> dict[str, float]:
+    """Mean of signed errors, which is their bias, and RMS, 95 % quantile and maximum of their sizes; without NaN."""
+    sizes = error_statistics(errors.abs())
+    return {**sizes, "mean": float(errors[torch.isfinite(errors)].mean())}
+
+
+def _no_positions(measurements: Measurements) -> str:
+    """What is missing in rows without positions."""
+    kinds = measurements.kinds - {"rotation"}
+    if not kinds:
+        return "no positions were measured; give x, y and z."
+    return (
+        f"no positions were measured, but {' and '.join(sorted(kinds))} values; a model does not keep where sockets, "
+        "anchors and jigs stand, so these rows cannot be judged by themselves; give x, y and z, or hold rows out "
+        "with `pisigma calibrate --hold-out`."
+    )
 
 
 @dataclass(frozen=True, eq=False)

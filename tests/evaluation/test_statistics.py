@@ -10,7 +10,14 @@ from testing.models import hand_made_model, joints_around
 
 from pisigma.errors import MeasurementError
 from pisigma.evaluation.joint_statistics import JointStatistics
-from pisigma.evaluation.pose_statistics import Comparison, PoseErrors, compare_on, error_statistics
+from pisigma.evaluation.pose_statistics import (
+    Comparison,
+    ErrorVectors,
+    PoseErrors,
+    axis_statistics,
+    compare_on,
+    error_statistics,
+)
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.se3 import rotation_from_vector, transform
@@ -97,3 +104,37 @@ def test_comparison_is_on_the_same_rows():
     assert torch.equal(found.nominal.position.isnan(), corrected.position.isnan())
     assert_close(found.in_file_units()["nominal"]["mean_mm"], 2500.0)
     assert_close(found.in_file_units()["corrected"]["mean_mm"], 500.0)
+
+
+def test_error_vectors_are_measured_minus_expected_along_the_axes(generator):
+    q = joints_around("kiro4", 6)
+    T = forward_kinematics(hand_made_model("kiro4").robot, q)
+    shift = torch.randn(6, 3, generator=generator, dtype=torch.float64)
+    turn = torch.randn(6, 3, generator=generator, dtype=torch.float64)
+    moved = transform(rotation_from_vector(turn) @ T[:, :3, :3], T[:, :3, 3] + shift)
+    errors = ErrorVectors.between(measured(moved, q), T)
+    assert_close(errors.position, shift, atol=1e-12)
+    assert_close(errors.rotation, turn, atol=1e-9)
+    figures = errors.axes_in_file_units()
+    for index, axis in enumerate("xyz"):
+        along, about = 1e3 * shift[:, index].numpy(), np.rad2deg(turn[:, index].numpy())
+        for values, unit in ((along, "mm"), (about, "deg")):
+            assert_close(figures[axis][f"mean_{unit}"], values.mean(), atol=1e-6)
+            assert_close(figures[axis][f"rms_{unit}"], np.sqrt((values**2).mean()), rtol=1e-8)
+            assert_close(figures[axis][f"p95_{unit}"], np.quantile(np.abs(values), 0.95), rtol=1e-8)
+            assert_close(figures[axis][f"max_{unit}"], np.abs(values).max(), rtol=1e-8)
+    some = errors.only(torch.tensor([True, False] * 3))
+    assert torch.equal(some.sizes.position.isnan(), torch.tensor([False, True] * 3))
+    assert torch.equal(some.sizes.rotation.isnan(), torch.tensor([False, True] * 3))
+
+
+def test_a_bias_shows_in_the_mean_along_an_axis():
+    found = axis_statistics(torch.tensor([-3.0, math.nan, 1.0, -1.0], dtype=torch.float64))
+    assert found == pytest.approx({"rms": math.sqrt(11 / 3), "mean": -1.0, "p95": 2.8, "max": 3.0}, rel=1e-15)
+
+
+def test_rows_without_positions_are_told_what_is_missing():
+    q = joints_around("kiro4", 2)
+    T = forward_kinematics(hand_made_model("kiro4").robot, q)
+    with pytest.raises(MeasurementError, match="but socket values; a model does not keep where sockets"):
+        PoseErrors.between(Measurements(q=q, socket=("a", "b")), T)

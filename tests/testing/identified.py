@@ -1,0 +1,76 @@
+"""Models with an identified geometry, and with a joint correction, made by hand."""
+
+import numpy as np
+import torch
+from testing.models import hand_made_model, joints_around
+
+from pisigma.correction.calibrated_model import CalibratedModel
+from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.coverage import JointCoverage
+from pisigma.network.features import AbstractFeatures
+from pisigma.network.joint_correction import JointCorrection
+from pisigma.robot import Robot
+
+ROWS, SPREAD = 60, 0.5
+"""Joint values that count as measured, and how far [rad] they spread to either side."""
+
+
+def off_by(robot: Robot, length: float = 3e-4, angle: float = 2e-3, seed: int = 0) -> Robot:
+    """The robot with all lengths [m] and angles [rad] of its rows off by about so much."""
+    off = np.random.default_rng(seed).normal(size=robot.dh.shape)
+    return robot.with_geometry(robot.dh + off * [angle, length, length, angle, angle])
+
+
+def geometric_model(name: str, robot: Robot | None = None) -> CalibratedModel:
+    """A robot of `testing.models.HOMES` whose geometry is off."""
+    robot = robot or Robot.load(name)
+    return CalibratedModel(
+        name=f"geometric_{name}",
+        kind="geometric_calibration",
+        robot=robot,
+        network=None,
+        domain=None,
+        branches=hand_made_model(name).branches,
+        starts=joints_around(name, ROWS, spread=SPREAD),
+        calibrated=off_by(robot),
+        bases={"": robot.base.copy()},
+        tools={"": robot.tool.copy()},
+    )
+
+
+def hybrid_model(
+    name: str,
+    features: list[AbstractFeatures],
+    *,
+    orders: tuple[int, ...] = (),
+    size: float = 1e-3,
+    robot: Robot | None = None,
+) -> CalibratedModel:
+    """The same with a joint correction of random weights of some size [rad or m], over the columns of a joint."""
+    model = geometric_model(name, robot)
+    correction = JointCorrection(model.robot, features, orders)
+    generator = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for chosen, weight in zip(correction.features, correction.linear, strict=True):
+            drawn = torch.randn(weight.shape, generator=generator, dtype=torch.float64)
+            weight.copy_(size / chosen.count**0.5 * drawn * chosen.used)
+        for part in (correction.weight, correction.bias):
+            part.copy_(size**0.5 * torch.randn(part.shape, generator=generator, dtype=torch.float64))
+    correction.requires_grad_(False)
+    assert model.calibrated is not None
+    arm = HybridArm(
+        model.calibrated,
+        off_by(model.calibrated, 1e-5, 1e-5, seed=1),
+        correction,
+        JointCoverage.of(model.robot, model.starts),
+    )
+    return CalibratedModel(
+        **{
+            **vars(model),
+            "name": f"hybrid_{name}",
+            "kind": "hybrid_calibration",
+            "hybrid": arm,
+            "hybrid_bases": model.bases,
+            "hybrid_tools": model.tools,
+        }
+    )
