@@ -1,7 +1,8 @@
 """`pisigma ik`: corrected joint values for poses."""
 
+from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -25,43 +26,72 @@ def ik(
     all_branches: Annotated[
         bool, typer.Option("--all-branches", help="Print the solutions on all branches of --pose.")
     ] = False,
+    accuracy: Annotated[
+        bool,
+        typer.Option(
+            "--accuracy", help="With --poses: predict the tool's standard deviation too; slow with a hybrid."
+        ),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print the joint values that really reach a pose, or write those of a file of poses.
 
-    Exit status 2 when a pose is unreachable, singular or outside the joint limits; what was found is given
-    all the same.
+    Exit status 2 when a pose is unreachable, singular or outside the joint limits, or a row of the file is no
+    pose; what was found is given all the same. A file may be of any length.
     """
     _check_options(pose, poses, out, branch, all_branches)
+    if accuracy and poses is None:
+        raise typer.BadParameter("it goes with --poses", param_hint="'--accuracy'")
+    if poses is not None and out is not None:
+        _write_file(model, poses, out, branch, accuracy, as_json)
+    elif pose is not None:
+        _print_pose(model, pose, branch, all_branches, as_json)
+
+
+def _print_pose(model: Path, pose: Pose, branch: str | None, all_branches: bool, as_json: bool) -> None:
+    """Print the solutions of one pose."""
     from pisigma.cli.output import fail, print_json
-    from pisigma.cli.solutions import count_statuses, failure, print_solutions, solution_records, write_joints
+    from pisigma.cli.solutions import failure, print_solutions, solution_records
     from pisigma.correction.corrected_ik import load
+    from pisigma.correction.solution import Solution
 
     solver = load(model)
-    robot = solver.model.robot
-    T, places = _wanted(pose, poses)
+    T, places = _transform(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
     if all_branches:
         solution = solver.all_branches(T).select(0)
         places = [f"{places[0]}, branch {name}" for name in solver.branches]
     else:
         solution = solver(T, branch=branch)
-    if out is not None:
-        write_joints(solution, robot, out)
-        result: dict[str, Any] = {
-            "file": str(out),
-            "rows": len(places),
-            "statuses": count_statuses(solution),
-        }
-    else:
-        result = {"solutions": solution_records(solution, robot)}
+    assert isinstance(solution, Solution)  # of a tensor
     if as_json:
-        print_json(result)
-    elif out is not None:
-        found = ", ".join(f"{count} {status}" for status, count in result["statuses"].items())
-        typer.echo(f"{len(places)} rows written to {out}: {found}.")
+        print_json({"solutions": solution_records(solution, solver.model.robot)})
     else:
-        print_solutions(solution, robot)
+        print_solutions(solution, solver.model.robot)
     if problem := failure(solution, places, any_will_do=all_branches):
+        fail(problem)
+
+
+def _write_file(
+    model: Path, poses: Path, out: Path, branch: str | None, accuracy: bool, as_json: bool
+) -> None:
+    """Write the joint values of a file of poses, of any length."""
+    from pisigma.cli.joint_file import write_joint_file
+    from pisigma.cli.output import fail, print_json
+    from pisigma.cli.progress import progress_of
+    from pisigma.correction.corrected_ik import load
+
+    solver = load(model)
+    with progress_of(f"solving {poses}") as tell:
+        outcome = write_joint_file(solver, poses, out, branch, tell, accuracy)
+    statuses = dict(outcome.statuses.most_common())
+    if as_json:
+        failures = [asdict(row) for row in outcome.first_failed]
+        counts = {"rows": outcome.rows, "statuses": statuses, "failed": outcome.failed}
+        print_json({"file": str(out), **counts, "first_failures": failures})
+    else:
+        found = ", ".join(f"{count} {status}" for status, count in statuses.items())
+        typer.echo(f"{outcome.rows} rows written to {out}: {found}.")
+    if problem := outcome.problem(poses):
         fail(problem)
 
 
@@ -77,17 +107,11 @@ def _check_options(
         raise typer.BadParameter("it goes with --pose and without --branch", param_hint="'--all-branches'")
 
 
-def _wanted(pose: Pose | None, poses: Path | None) -> "tuple[Tensor, list[str]]":
-    """The wanted poses T_base_tool, and what to call each of them."""
+def _transform(pose: Pose) -> "Tensor":
+    """The wanted pose T_base_tool as a batch of one."""
     import torch
 
-    from pisigma.measurement.pose_csv import read_poses
     from pisigma.se3 import transform_from_xyzrpy
 
-    if pose is None:
-        assert poses is not None
-        wanted = read_poses(poses)
-        return wanted.T, [f"{poses}, line {line}" for line in wanted.line]
     values = torch.tensor(pose, dtype=torch.float64)
-    T = transform_from_xyzrpy(torch.cat([values[:3] / 1e3, torch.deg2rad(values[3:])]))
-    return T[None], [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
+    return transform_from_xyzrpy(torch.cat([values[:3] / 1e3, torch.deg2rad(values[3:])]))[None]

@@ -1,21 +1,18 @@
-"""Solutions of the corrected inverse kinematics as records, tables and files."""
+"""Solutions of the corrected inverse kinematics as records and tables."""
 
-import csv
-import io
 import math
-from collections import Counter
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from pisigma.correction.solution import Solution
-from pisigma.export.output_file import write_whole
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
 
 _QUANTITIES = ("q", "q_nominal", "correction")
-_FAILURES = (Status.UNREACHABLE, Status.OUTSIDE_JOINT_LIMITS, Status.SINGULAR)
 _LISTED = 10
+
+FAILURES = tuple(status for status in Status if status not in (Status.REACHED, Status.OUTSIDE_DOMAIN))
+"""What ends a command with exit status 2."""
 
 
 def solution_records(solution: Solution, robot: Robot) -> list[dict[str, Any]]:
@@ -35,7 +32,7 @@ def solution_records(solution: Solution, robot: Robot) -> list[dict[str, Any]]:
             else:
                 record[name] = [
                     {"joint": joint.name, "value": value, "unit": unit}
-                    for joint, value, unit in zip(robot.joints, values, _units(robot), strict=True)
+                    for joint, value, unit in zip(robot.joints, values, file_units(robot), strict=True)
                 ]
         record["branch"] = solution.branches[int(solution.branch[row])]
         record["domain_measure"] = _or_none(measures[row])
@@ -51,36 +48,11 @@ def print_solutions(solution: Solution, robot: Robot) -> None:
         values = [_in_file_units(getattr(solution, name)[row].tolist(), robot) for name in _QUANTITIES]
         lines = [
             (joint.name, *(f"{value:.6f}" for value in figures), unit)
-            for joint, unit, *figures in zip(robot.joints, _units(robot), *values, strict=True)
+            for joint, unit, *figures in zip(robot.joints, file_units(robot), *values, strict=True)
         ]
         title = f"{status.name.lower()}, branch {solution.branches[int(solution.branch[row])]}"
         print_table(title, ("joint", "corrected", "nominal", "correction", "unit"), lines)
         print(status.sentence)
-
-
-def count_statuses(solution: Solution) -> dict[str, int]:
-    """How many solutions have which status, most frequent first."""
-    return dict(Counter(status.name.lower() for status in _statuses(solution)).most_common())
-
-
-def write_joints(solution: Solution, robot: Robot, path: Path) -> None:
-    """Write one row per pose, whole or not at all: status, branch, corrected and nominal joint values.
-
-    Raises:
-        OutputError: the file cannot be written there.
-    """
-    units = _units(robot)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    commanded = [f"q{i}_{unit}" for i, unit in enumerate(units, 1)]
-    writer.writerow(
-        ["status", "branch", *commanded, *(f"q{i}_nominal_{unit}" for i, unit in enumerate(units, 1))]
-    )
-    joints = zip(solution.q.tolist(), solution.q_nominal.tolist(), strict=True)
-    for status, branch, both in zip(_statuses(solution), solution.branch.tolist(), joints, strict=True):
-        cells = ["" if math.isnan(v) else repr(v) for part in both for v in _in_file_units(part, robot)]
-        writer.writerow([status.name.lower(), solution.branches[branch], *cells])
-    write_whole(path, text.getvalue())
 
 
 def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str | None:
@@ -92,7 +64,7 @@ def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str
         any_will_do: one that reaches is enough (all branches of one pose).
     """
     statuses = _statuses(solution)
-    failed = [row for row, status in enumerate(statuses) if status in _FAILURES]
+    failed = [row for row, status in enumerate(statuses) if status in FAILURES]
     if not failed or (any_will_do and len(failed) < len(statuses)):
         return None
     others = failed[1:]
@@ -109,7 +81,8 @@ def _statuses(solution: Solution) -> list[Status]:
     return [Status(status) for status in solution.status.tolist()]
 
 
-def _units(robot: Robot) -> list[str]:
+def file_units(robot: Robot) -> list[str]:
+    """Unit of every joint where values enter or leave."""
     return ["deg" if revolute else "mm" for revolute in robot.revolute]
 
 

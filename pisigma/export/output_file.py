@@ -2,7 +2,10 @@
 
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
 
 from pisigma.errors import OutputError
 
@@ -28,17 +31,33 @@ def check_output(path: Path, suffixes: tuple[str, ...], what: str) -> None:
         raise OutputError(f"{path}: the folder cannot be written to; choose another --out.")
 
 
-def write_whole(path: Path, text: str) -> None:
-    """Write the text beside `path` and move it there in one step; what was there is replaced.
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write the content beside `path` and move it there in one step; what was there is replaced.
 
     Raises:
         OutputError: it cannot be written there; nothing is left behind.
+    """
+    with writing_whole(path) as file:
+        if isinstance(content, bytes):
+            file.buffer.write(content)
+        else:
+            file.write(content)
+
+
+@contextmanager
+def writing_whole(path: Path) -> Iterator[TextIO]:
+    """A text file beside `path` to write to bit by bit, moved there at the end; what was there is replaced.
+
+    Nothing is left behind where the block ends with an exception, an interruption among them.
+
+    Raises:
+        OutputError: it cannot be written there.
     """
     scratch = None
     try:
         handle, scratch = tempfile.mkstemp(prefix=f".{path.name}.", suffix=".part", dir=path.parent)
         with os.fdopen(handle, "w", newline="\n", encoding="utf-8") as file:
-            file.write(text)
+            yield file
         os.chmod(scratch, 0o644)
         os.replace(scratch, path)
     except OSError as problem:

@@ -47,7 +47,7 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     if not content:
         raise MeasurementError(f"{source}: the file is empty; a header and at least one row were wanted.")
     header_line = content[0][0]
-    header, problem = _split(content[0][1])
+    header, problem = split_line(content[0][1])
     if problem:
         raise MeasurementError(
             f"{source}, line {header_line}: the header is no valid CSV ({problem}); check its quotes."
@@ -56,7 +56,7 @@ def read_table(path: str | os.PathLike[str]) -> Table:
         raise MeasurementError(
             f"{source}, line {header_line}: the file ends after its header; add one row per measurement."
         )
-    split = [_split(line) for _, line in content[1:]]
+    split = [split_line(line) for _, line in content[1:]]
     return Table(
         source=source,
         header=tuple(name.strip() for name in header),
@@ -83,7 +83,7 @@ def _read_text(path: str | os.PathLike[str], source: str) -> str:
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
-def _split(line: str) -> tuple[list[str], str]:
+def split_line(line: str) -> tuple[list[str], str]:
     """The fields of a line, and what is wrong with its quotes ("" where nothing is)."""
     if '"' not in line:
         return line.split(","), ""

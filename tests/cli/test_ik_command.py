@@ -84,7 +84,13 @@ def test_all_branches_of_a_pose(run, models):
     one = run(
         "ik", models / "kiro4", "--pose", *home_pose("kiro4"), "--branch", solutions[1]["branch"], "--json"
     )
-    assert json.loads(one.stdout)["solutions"] == [solutions[1]]
+    (single,) = json.loads(one.stdout)["solutions"]
+    assert single.keys() == solutions[1].keys()
+    for key, value in single.items():
+        if isinstance(value, str):
+            assert value == solutions[1][key]
+        else:
+            assert_close(value, solutions[1][key], atol=1e-12)  # batches of other sizes round otherwise
 
 
 @pytest.mark.parametrize("name", HOMES)
@@ -130,7 +136,8 @@ def test_poses_of_a_file(run, models, tmp_path):
     out = tmp_path / "joints.csv"
     result = run("ik", models / "kiro4", "--poses", tmp_path / "poses.csv", "--out", out, "--json")
     assert result.exit_code == 0
-    assert json.loads(result.stdout) == {"file": str(out), "rows": 5, "statuses": {"reached": 5}}
+    printed = {"file": str(out), "rows": 5, "statuses": {"reached": 5}, "failed": 0, "first_failures": []}
+    assert json.loads(result.stdout) == printed
     written = list(csv.DictReader(out.read_text().splitlines()))
     T = forward_kinematics(Robot.load("kiro4"), joints_around("kiro4", 5, seed=8, spread=0.1))
     expected = load(models / "kiro4")(T)
@@ -139,6 +146,11 @@ def test_poses_of_a_file(run, models, tmp_path):
     assert_close(commanded, torch.rad2deg(expected.q), atol=1e-8)
     assert_close(nominal, torch.rad2deg(expected.q_nominal), atol=1e-8)
     assert {row["status"] for row in written} == {"reached"}
+    assert [row["line"] for row in written] == ["2", "3", "4", "5", "6"]
+    assert max(float(row["position_residual_mm"]) for row in written) < 1e-6
+    assert max(float(row["rotation_residual_deg"]) for row in written) < 1e-6
+    assert all(float(row["domain_measure"]) >= 0 for row in written)
+    assert "accuracy_mm" not in written[0]
     assert sorted(entry.name for entry in tmp_path.iterdir()) == ["joints.csv", "poses.csv"]
 
 
@@ -157,6 +169,122 @@ def test_poses_that_fail_are_named_by_their_lines(run, models, tmp_path):
     assert list(csv.DictReader(out.read_text().splitlines()))[1]["q1_deg"] == ""
 
 
+BAD_ROWS = {
+    4: ("1,2,three,4,5,6", "column 'z_mm': 'three' is no finite number"),
+    5: ("1,2,,4,5,6", "column 'z_mm': '' is no finite number"),
+    8: ("nan,2,3,4,5,6", "column 'x_mm': 'nan' is no finite number"),
+    9: ("1,2,3", "6 fields were wanted, got 3"),
+    11: ('1,2,3,4,5,"6', "is no valid CSV"),
+    14: ("400000,100000,200000,0,0,0", "times the reach of robot"),
+}
+"""By line of the file: a row that is no pose, and why."""
+
+
+@pytest.fixture
+def one_row_at_fault(tmp_path):
+    """A file of poses of kiro4 in which the rows `BAD_ROWS` stand between good ones, and the good ones."""
+    good = [pose_of("kiro4", q) for q in joints_around("kiro4", 12, seed=8, spread=0.1)]
+    lines = [",".join(COLUMNS), *(",".join(map(repr, row)) for row in good)]
+    for line, (row, _) in BAD_ROWS.items():
+        lines.insert(line - 1, row)
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return path, good
+
+
+@pytest.mark.parametrize("rows_at_a_time", [1, 4, 1000])
+def test_rows_that_are_no_poses_do_not_stop_the_others(
+    run, models, tmp_path, monkeypatch, one_row_at_fault, rows_at_a_time
+):
+    path, good = one_row_at_fault
+    monkeypatch.setattr("pisigma.cli.joint_file.CHUNK_ROWS", rows_at_a_time)
+    out = tmp_path / "joints.csv"
+    result = run("ik", models / "kiro4", "--poses", path, "--out", out, "--json")
+    assert result.exit_code == 2
+    printed = json.loads(result.stdout)
+    assert printed["rows"] == len(good) + len(BAD_ROWS)
+    assert printed["statuses"] == {"reached": len(good), "bad_row": len(BAD_ROWS)}
+    assert [row["line"] for row in printed["first_failures"]] == list(BAD_ROWS)
+    for row, (_, reason) in zip(printed["first_failures"], BAD_ROWS.values(), strict=True):
+        assert row["status"] == "bad_row"
+        assert reason in row["reason"]
+        assert reason in result.stderr
+    assert result.stderr.startswith(f"pisigma: {path}, line 4: bad_row. column 'z_mm': 'three'")
+    written = list(csv.DictReader(out.read_text().splitlines()))
+    assert [int(row["line"]) for row in written] == list(range(2, 2 + len(good) + len(BAD_ROWS)))
+    solved = [row for row in written if row["status"] != "bad_row"]
+    expected = load(models / "kiro4")(
+        forward_kinematics(Robot.load("kiro4"), joints_around("kiro4", 12, seed=8, spread=0.1))
+    )
+    commanded = [[float(row[f"q{i}_deg"]) for i in range(1, 7)] for row in solved]
+    assert_close(commanded, torch.rad2deg(expected.q), atol=1e-7)
+    for line, row in enumerate(written, start=2):
+        empty = {key for key, value in row.items() if value == ""}
+        assert empty == (set(row) - {"line", "status"} if line in BAD_ROWS else set())
+
+
+def test_only_the_first_failures_are_told_one_by_one(run, models, tmp_path):
+    path, out = tmp_path / "poses.csv", tmp_path / "joints.csv"
+    path.write_text("\n".join([",".join(COLUMNS), *["x,0,0,0,0,0"] * 25]) + "\n")
+    result = run("ik", models / "kiro4", "--poses", path, "--out", out, "--json")
+    assert result.exit_code == 2
+    printed = json.loads(result.stdout)
+    assert (printed["failed"], len(printed["first_failures"])) == (25, 10)
+    assert result.stderr.endswith("; and 15 more.)\n")
+    assert len(out.read_text().splitlines()) == 26
+
+
+def test_metres_are_not_refused(run, models, tmp_path):
+    q = joints_around("kiro4", 3, seed=8, spread=0.1)
+    poses = torch.tensor([pose_of("kiro4", row) for row in q])
+    lines = [[*(row[:3] / 1e3).tolist(), *row[3:].tolist()] for row in poses]
+    header = ",".join(COLUMNS).replace("_mm", "_m")
+    path, out = tmp_path / "poses.csv", tmp_path / "joints.csv"
+    path.write_text("\n".join([header, *(",".join(map(repr, row)) for row in lines)]))
+    assert run("ik", models / "kiro4", "--poses", path, "--out", out).exit_code == 0
+    thousandfold = [[*row[:3].tolist(), *row[3:].tolist()] for row in poses]
+    path.write_text("\n".join([header, *(",".join(map(repr, row)) for row in thousandfold)]))
+    result = run("ik", models / "kiro4", "--poses", path, "--out", out)
+    assert result.exit_code == 2
+    assert "millimetres in a _m column?" in result.stderr
+
+
+def test_an_interruption_leaves_nothing(run, models, tmp_path, monkeypatch):
+    write_poses(tmp_path / "poses.csv", [home_pose("kiro3")] * 5)
+    out, chunks = tmp_path / "joints.csv", []
+    monkeypatch.setattr("pisigma.cli.joint_file.CHUNK_ROWS", 2)
+
+    def interrupted(solver, T, branch):
+        chunks.append(len(T))
+        if len(chunks) == 2:
+            assert len(list(tmp_path.iterdir())) == 2  # the poses, and what was written so far
+            raise KeyboardInterrupt
+        return solver(T, branch=branch)
+
+    monkeypatch.setattr("pisigma.cli.joint_file._solve", interrupted)
+    result = run("ik", models / "kiro3", "--poses", tmp_path / "poses.csv", "--out", out)
+    assert result.exit_code == 130
+    assert chunks == [2, 2]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["poses.csv"]
+
+
+def test_the_file_of_poses_is_not_overwritten(refuses, models, tmp_path):
+    write_poses(tmp_path / "poses.csv", [home_pose("kiro3")])
+    before = (tmp_path / "poses.csv").read_text()
+    same = tmp_path / "poses.csv"
+    assert "is the file of poses itself" in refuses("ik", models / "kiro3", "--poses", same, "--out", same)
+    assert same.read_text() == before
+
+
+def test_accuracy_where_asked_for(run, models, tmp_path):
+    write_poses(tmp_path / "poses.csv", [home_pose("kiro3")])
+    out = tmp_path / "joints.csv"
+    run("ik", models / "kiro3", "--poses", tmp_path / "poses.csv", "--out", out, "--accuracy")
+    (row,) = csv.DictReader(out.read_text().splitlines())
+    assert row["accuracy_mm"] == ""  # a model of joint errors knows none
+    assert row["status"] == "reached"
+
+
 @pytest.mark.parametrize(
     "options",
     [
@@ -167,6 +295,7 @@ def test_poses_that_fail_are_named_by_their_lines(run, models, tmp_path):
         ["--poses", "poses.csv"],
         ["--pose", 1, 2, 3, 4, 5, 6, "--out", "joints.csv"],
         ["--poses", "poses.csv", "--out", "joints.csv", "--all-branches"],
+        ["--pose", 1, 2, 3, 4, 5, 6, "--accuracy"],
         ["--pose", 1, 2, 3, 4, 5, 6, "--all-branches", "--branch", "flip"],
         ["--pose", 1, 2, 3, 4, 5, 6, "--colour", "red"],
     ],

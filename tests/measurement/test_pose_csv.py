@@ -5,7 +5,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.errors import MeasurementError
-from pisigma.measurement.pose_csv import read_poses
+from pisigma.measurement.pose_csv import read_pose_chunks, read_poses
 from pisigma.se3 import transform_from_xyzrpy
 
 RPY = "x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg"
@@ -78,3 +78,61 @@ def test_files_that_cannot_be_read(tmp_path):
     (tmp_path / "poses.csv").write_bytes(b"\xff\xfe\x00x")
     with pytest.raises(MeasurementError, match="not UTF-8"):
         read_poses(tmp_path / "poses.csv")
+
+
+HALF = 0.5**0.5
+ROWS = [
+    "0.1,0.2,0.3,0,0,0,1",
+    "",
+    f"0.4,0.5,0.6,0,0,{HALF},{HALF}",
+    "0.1,0.2,0.3,0,0,0,2",
+    "# a remark",
+    "0.1,0.2,0.3,0,0,0",
+    "0.7,0.8,0.9,1,0,0,0",
+    "0.1,two,0.3,0,0,0,1",
+    "0.2,0.3,0.4,0,1,0,0",
+]
+SOUND, BAD = (2, 4, 8, 10), (5, 7, 9)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 100])
+def test_chunks_hold_every_row_once_and_in_order(tmp_path, rows):
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join([QUATERNION, *ROWS]) + "\n")
+    chunks = list(read_pose_chunks(path, rows))
+    assert all(len(chunk.line) + len(chunk.bad) <= rows for chunk in chunks)
+    assert [line for chunk in chunks for line in chunk.line] == list(SOUND)
+    assert [bad.line for chunk in chunks for bad in chunk.bad] == list(BAD)
+    only_sound = read(tmp_path, QUATERNION, *(ROWS[line - 2] for line in SOUND))
+    assert_close(torch.cat([chunk.T for chunk in chunks]), only_sound.T, atol=0.0)
+    shares = [chunk.share for chunk in chunks]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1
+
+
+def test_chunks_say_what_is_wrong_with_a_row(tmp_path):
+    path = tmp_path / "poses.csv"
+    path.write_bytes("\n".join([QUATERNION, *ROWS, "0,0,0,0,0,0,ü", ""]).encode("latin-1"))
+    (chunk,) = read_pose_chunks(path)
+    reasons = [bad.reason for bad in chunk.bad]
+    assert "a quaternion of length 1 was wanted, got 2" in reasons[0]
+    assert "7 fields were wanted, got 6" in reasons[1]
+    assert "column 'y_m': 'two' is no finite number" in reasons[2]
+    assert "is not UTF-8 text" in reasons[3]
+    assert chunk.bad[3].line == 11
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_ends_of_lines_and_byte_order_marks(tmp_path, end):
+    path = tmp_path / "poses.csv"
+    path.write_bytes(("\ufeff" + end.join([QUATERNION, *ROWS[:3]])).encode())
+    (chunk,) = read_pose_chunks(path)
+    assert chunk.line == (2, 4)
+    assert not chunk.bad
+
+
+def test_a_long_cell_is_cut(tmp_path):
+    path = tmp_path / "poses.csv"
+    path.write_text(f"{QUATERNION}\n{'x' * 100_000},0,0,0,0,0,1\n")
+    (chunk,) = read_pose_chunks(path)
+    assert len(chunk.bad[0].reason) < 200

@@ -1,0 +1,207 @@
+"""Joint values of a file of poses: solved and written some rows at a time."""
+
+import csv
+import math
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pisigma.cli.solutions import FAILURES, file_units
+from pisigma.compiled.solution import CompiledSolution
+from pisigma.correction.corrected_ik import CorrectedIK
+from pisigma.correction.solution import Solution
+from pisigma.errors import OutputError
+from pisigma.export.output_file import writing_whole
+from pisigma.kinematics.status import Status
+from pisigma.measurement.dataset import LeftOut
+from pisigma.measurement.pose_csv import CHUNK_ROWS, PoseChunk, read_pose_chunks
+from pisigma.robot.description import Robot
+
+BAD_ROW = "bad_row"
+"""Status of a row that is no pose."""
+
+FAR = 50.0
+"""A position this many times the reach away is no pose of the robot; metres taken for millimetres are off by 1000."""
+
+LISTED = 10
+"""Rows that failed are told one by one, up to so many."""
+
+_MEASURES = ("position_residual_mm", "rotation_residual_deg", "domain_measure")
+_ACCURACY = "accuracy_mm"
+
+
+@dataclass(frozen=True)
+class FailedRow:
+    """A row without joint values that can be used as they are.
+
+    Attributes:
+        line: in the file of poses.
+        status: `bad_row`, or the name of a `Status` in lower case.
+        reason: what is wrong and what to do.
+    """
+
+    line: int
+    status: str
+    reason: str
+
+
+@dataclass
+class Outcome:
+    """What became of a file of poses.
+
+    Attributes:
+        rows: all of them.
+        statuses: how many have which status.
+        first_failed: the first `LISTED` rows that failed, in the order of the file.
+        failed: how many failed.
+    """
+
+    rows: int = 0
+    statuses: Counter[str] = field(default_factory=Counter)
+    first_failed: list[FailedRow] = field(default_factory=list)
+    failed: int = 0
+
+    def problem(self, source: Path) -> str | None:
+        """Say which rows failed and why; None where none did."""
+        if not self.failed:
+            return None
+        first, *others = self.first_failed
+        more = [
+            f"line {row.line} {row.status}" + (f" ({row.reason})" if row.status == BAD_ROW else "")
+            for row in others
+        ]
+        if self.failed > len(self.first_failed):
+            more.append(f"and {self.failed - len(self.first_failed)} more")
+        also = f" (Also: {'; '.join(more)}.)" if more else ""
+        return f"{source}, line {first.line}: {first.status}. {first.reason.rstrip('.')}.{also}"
+
+
+def write_joint_file(
+    solver: CorrectedIK,
+    poses: Path,
+    out: Path,
+    branch: str | None,
+    tell: Callable[[str], None],
+    accuracy: bool = False,
+) -> Outcome:
+    """Write one row per pose of a file, whole or not at all, however long the file is.
+
+    A row holds the line of the pose, status, branch, corrected and nominal joint values, the residuals of the
+    calibrated model, the domain measure and, where asked for, the predicted standard deviation of the tool's
+    position. What is not known is empty. A row that is no pose gets the status `bad_row` and does not stop the
+    others.
+
+    Args:
+        solver: the corrected inverse kinematics.
+        poses: the file of poses.
+        out: the file of joint values.
+        branch: to take instead of the trained one.
+        tell: gets what was done, such as "40,000 rows, 4%, 9,000 rows/s".
+        accuracy: whether to predict the standard deviations, which with a hybrid takes longer than all the rest.
+
+    Raises:
+        MeasurementError: the file of poses or its header cannot be used.
+        OutputError: the file cannot be written there.
+        PoseError: there is no such branch.
+    """
+    if out.is_dir():
+        raise OutputError(f"{out}: cannot be written (Is a directory); choose another --out.")
+    if out.exists() and poses.exists() and out.samefile(poses):
+        raise OutputError(f"{out}: is the file of poses itself; choose another --out.")
+    robot, outcome, begun = solver.model.robot, Outcome(), time.monotonic()
+    with writing_whole(out) as file:
+        writer = csv.writer(file, lineterminator="\n")
+        header = _header(robot, accuracy)
+        writer.writerow(header)
+        for chunk in read_pose_chunks(poses, CHUNK_ROWS):
+            chunk_rows = _solved_rows(solver, chunk, branch, accuracy, outcome)
+            writer.writerows(cells + [""] * (len(header) - len(cells)) for cells in chunk_rows)
+            rate = outcome.rows / max(time.monotonic() - begun, 1e-3)
+            share = "" if math.isnan(chunk.share) else f", {chunk.share:.0%}"
+            tell(f"{outcome.rows:,} rows{share}, {rate:,.0f} rows/s")
+    return outcome
+
+
+def _header(robot: Robot, accuracy: bool) -> list[str]:
+    units = file_units(robot)
+    joints = [f"q{i}_{unit}" for i, unit in enumerate(units, 1)]
+    nominal = [f"q{i}_nominal_{unit}" for i, unit in enumerate(units, 1)]
+    return ["line", "status", "branch", *joints, *nominal, *_MEASURES, *((_ACCURACY,) if accuracy else ())]
+
+
+def _solved_rows(
+    solver: CorrectedIK, chunk: PoseChunk, branch: str | None, accuracy: bool, outcome: Outcome
+) -> Iterator[list[str]]:
+    """The first cells of the rows to write for a chunk, in the order of the file; counts them in the outcome."""
+    robot = solver.model.robot
+    too_far = _too_far(chunk, robot)
+    near = [line for line, far in zip(chunk.line, too_far, strict=True) if not far]
+    bad = [*chunk.bad, *(LeftOut(line, far) for line, far in zip(chunk.line, too_far, strict=True) if far)]
+    rows: list[tuple[int, list[str]]] = []
+    failed: list[FailedRow] = []
+    if near:
+        kept = torch.tensor([not far for far in too_far])
+        solution = _solve(solver, chunk.T[kept], branch)
+        rows.extend(zip(near, _cells(solution, near, robot, accuracy), strict=True))
+        statuses = [Status(status) for status in solution.status.tolist()]
+        outcome.statuses.update(status.name.lower() for status in statuses)
+        failed.extend(
+            FailedRow(line, status.name.lower(), status.sentence)
+            for line, status in zip(near, statuses, strict=True)
+            if status in FAILURES
+        )
+    rows.extend((row.line, [str(row.line), BAD_ROW]) for row in bad)
+    failed.extend(FailedRow(row.line, BAD_ROW, row.reason) for row in bad)
+    if bad:
+        outcome.statuses[BAD_ROW] += len(bad)
+    outcome.rows += len(rows)
+    outcome.failed += len(failed)
+    failed.sort(key=lambda row: row.line)
+    outcome.first_failed.extend(failed[: LISTED - len(outcome.first_failed)])
+    return (cells for _, cells in sorted(rows, key=lambda row: row[0]))
+
+
+def _solve(solver: CorrectedIK, T: Tensor, branch: str | None) -> Solution | CompiledSolution:
+    """The one place where poses of a file meet the solver."""
+    return solver(T.numpy(), branch=branch)
+
+
+def _too_far(chunk: PoseChunk, robot: Robot) -> list[str]:
+    """For every pose why it cannot be one of the robot; "" where it can."""
+    distance = (chunk.T[:, :3, 3] - torch.from_numpy(robot.base[:3].copy())).norm(dim=-1)
+    reasons = [""] * len(chunk.line)
+    for row in (distance > FAR * robot.reach).nonzero()[:, 0].tolist() if robot.reach > 0 else []:
+        times = float(distance[row]) / robot.reach
+        reasons[row] = (
+            f"columns 'x' to 'z': the position is {float(distance[row]):.4g} m from the base, {times:.3g} times the "
+            f"reach of robot '{robot.name}'; check the unit (millimetres in a _m column?)"
+        )
+    return reasons
+
+
+def _cells(
+    solution: Solution | CompiledSolution, lines: Sequence[int], robot: Robot, accuracy: bool
+) -> Iterator[list[str]]:
+    """The cells of solved poses; empty where a value is not known."""
+    per_file_unit = np.array([180 / math.pi if revolute else 1e3 for revolute in robot.revolute])
+    joints = np.concatenate([np.asarray(q) * per_file_unit for q in (solution.q, solution.q_nominal)], -1)
+    measures = [
+        np.asarray(solution.position_residual) * 1e3,
+        np.rad2deg(np.asarray(solution.rotation_residual)),
+        np.asarray(solution.domain_measure),
+        *([np.asarray(solution.accuracy) * 1e3] if accuracy else []),
+    ]
+    exact = (["" if v != v else repr(v) for v in row] for row in joints.tolist())
+    short = (["" if v != v else f"{v:.6g}" for v in row] for row in np.stack(measures, -1).tolist())
+    names = {int(status): status.name.lower() for status in Status}
+    heads = zip(lines, solution.status.tolist(), solution.branch.tolist(), strict=True)
+    return (
+        [str(line), names[status], solution.branches[branch], *joint_cells, *measure_cells]
+        for (line, status, branch), joint_cells, measure_cells in zip(heads, exact, short, strict=True)
+    )

@@ -1,0 +1,73 @@
+"""`pisigma verify`: exit status, figures, one JSON object."""
+
+import json
+
+import pytest
+import torch
+from testing.models import hand_made_model, joints_around, no_type_checker
+
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.dataset import Measurements
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """Positions of the hand-made kiro3 with its correction, without it, and with a sign turned."""
+    folder = tmp_path_factory.mktemp("measured")
+    model = hand_made_model("kiro3")
+    q = joints_around("kiro3", 40, seed=5, spread=0.2)
+    with no_type_checker():
+        right, nominal = model.forward(q)[:, :3, 3], forward_kinematics(model.robot, q)[:, :3, 3]
+    turned = q * torch.tensor([1, -1, 1, 1])
+    for name, joints, position in (("good", q, right), ("nominal", q, nominal), ("sign", turned, right)):
+        revolute = list(model.robot.revolute)
+        Measurements(q=joints, position=position).write_csv(folder / f"{name}.csv", revolute=revolute)
+    return folder
+
+
+def test_measurements_that_are_explained_better(run, models, files):
+    result = run("verify", models / "kiro3", files / "good.csv", "--json")
+    assert result.exit_code == 0
+    assert result.stderr == ""
+    printed = json.loads(result.stdout)
+    assert printed["explained_better"] is True
+    assert printed["verdict"] == "better"
+    assert printed["mix_ups"] == []
+    assert [model["name"] for model in printed["models"]] == ["nominal", "corrected"]
+    assert printed["models"][1]["mean_mm"] < printed["models"][0]["mean_mm"]
+    assert printed["ratio"] < 0.1
+    shown = run("verify", models / "kiro3", files / "good.csv")
+    assert shown.exit_code == 0
+    assert shown.stdout.splitlines()[-1] == printed["sentence"]
+    for words in (
+        "position, RMS",
+        "position, 95 %",
+        "position, maximum",
+        "difference to nominal",
+        "better in",
+    ):
+        assert words in shown.stdout
+
+
+def test_the_nominal_robot_ends_with_status_3(run, models, files):
+    result = run("verify", models / "kiro3", files / "nominal.csv", "--json")
+    assert result.exit_code == 3
+    printed = json.loads(result.stdout)
+    assert printed["explained_better"] is False
+    assert printed["mix_ups"][0]["kinds"] == ["correction"]
+    assert result.stderr == f"pisigma: {printed['sentence']}\n"
+    assert "at least as well" in printed["sentence"]
+
+
+def test_a_mix_up_is_named(run, models, files):
+    result = run("verify", models / "kiro3", files / "sign.csv")
+    assert result.exit_code == 3
+    assert "the sign of q2 turned" in result.stdout
+    assert "something was mixed up" in result.stderr
+
+
+def test_things_at_fault(refuses, models, files, tmp_path):
+    assert "there is no such model folder" in refuses("verify", tmp_path / "nothing", files / "good.csv")
+    assert "cannot be read" in refuses("verify", models / "kiro3", tmp_path / "no.csv")
+    (tmp_path / "few.csv").write_text("q1_deg,x_mm,y_mm,z_mm\n1,2,3,4\n")
+    refuses("verify", models / "kiro3", tmp_path / "few.csv")
