@@ -186,12 +186,28 @@ def check_transforms(T: Tensor, name: str, tolerance: float = 1e-6) -> None:
         )
     if not T.is_floating_point():
         raise PoseError(f"{name} holds {T.dtype}; give float64 or float32, lengths in metres.")
+    for bad, what in transform_faults(T, tolerance):
+        if bad.any():
+            index = tuple(bad.nonzero()[0].tolist())
+            place = f" at index {index if len(index) > 1 else index[0]}" if index else ""
+            raise PoseError(f"{name}{place} {what}.")
+
+
+def transform_faults(
+    T: Float[Tensor, "*batch 4 4"], tolerance: float
+) -> tuple[tuple[Bool[Tensor, "*batch"], str], ...]:
+    """For everything that may be wrong with a rigid transform, which matrices are wrong in that way, and a word on it.
+
+    Args:
+        T: the matrices.
+        tolerance: see `check_transforms`.
+    """
     eye = torch.eye(4, dtype=T.dtype, device=T.device)
     finite = torch.isfinite(T).all(-1).all(-1)
     R = torch.where(finite[..., None, None], T, eye)[..., :3, :3]
     skewness = (R.mT @ R - eye[:3, :3]).abs().amax((-1, -2))
     last_row = (T[..., 3, :] - eye[3]).abs().amax(-1)
-    for bad, what in (
+    return (
         (~finite, "has entries that are not finite numbers; give 16 finite numbers"),
         (last_row > tolerance, "does not end with the row 0 0 0 1; give a homogeneous transform"),
         (
@@ -202,8 +218,4 @@ def check_transforms(T: Tensor, name: str, tolerance: float = 1e-6) -> None:
             torch.linalg.det(R) < 0,
             "has a left-handed rotation part (determinant -1); a reflection is no pose, check its axes",
         ),
-    ):
-        if bad.any():
-            index = tuple(bad.nonzero()[0].tolist())
-            place = f" at index {index if len(index) > 1 else index[0]}" if index else ""
-            raise PoseError(f"{name}{place} {what}.")
+    )

@@ -32,6 +32,13 @@ def ik(
             "--accuracy", help="With --poses: predict the tool's standard deviation too; slow with a hybrid."
         ),
     ] = False,
+    path: Annotated[
+        bool,
+        typer.Option(
+            "--path",
+            help="The rows of --poses are a path: stay on one branch as long as possible and say where that ends.",
+        ),
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print the joint values that really reach a pose, or write those of a file of poses.
@@ -40,10 +47,11 @@ def ik(
     pose; what was found is given all the same. A file may be of any length.
     """
     _check_options(pose, poses, out, branch, all_branches)
-    if accuracy and poses is None:
-        raise typer.BadParameter("it goes with --poses", param_hint="'--accuracy'")
+    for name, given in (("--accuracy", accuracy), ("--path", path)):
+        if given and poses is None:
+            raise typer.BadParameter("it goes with --poses", param_hint=f"'{name}'")
     if poses is not None and out is not None:
-        _write_file(model, poses, out, branch, accuracy, as_json)
+        _write_file(model, poses, out, branch, accuracy, path, as_json)
     elif pose is not None:
         _print_pose(model, pose, branch, all_branches, as_json)
 
@@ -72,7 +80,7 @@ def _print_pose(model: Path, pose: Pose, branch: str | None, all_branches: bool,
 
 
 def _write_file(
-    model: Path, poses: Path, out: Path, branch: str | None, accuracy: bool, as_json: bool
+    model: Path, poses: Path, out: Path, branch: str | None, accuracy: bool, path: bool, as_json: bool
 ) -> None:
     """Write the joint values of a file of poses, of any length."""
     from pisigma.cli.joint_file import write_joint_file
@@ -82,14 +90,21 @@ def _write_file(
 
     solver = load(model)
     with progress_of(f"solving {poses}") as tell:
-        outcome = write_joint_file(solver, poses, out, branch, tell, accuracy)
+        outcome = write_joint_file(solver, poses, out, branch, tell, accuracy, path)
     statuses = dict(outcome.statuses.most_common())
     if as_json:
         failures = [asdict(row) for row in outcome.first_failed]
         counts = {"rows": outcome.rows, "statuses": statuses, "failed": outcome.failed}
-        print_json({"file": str(out), **counts, "first_failures": failures})
+        switches = [
+            {"line": line, "kind": switch.kind, "sentence": switch.sentence}
+            for line, switch in outcome.switches
+        ]
+        told = {"switches": switches} if path else {}
+        print_json({"file": str(out), **counts, "first_failures": failures, **told})
     else:
         found = ", ".join(f"{count} {status}" for status, count in statuses.items())
+        for line, switch in outcome.switches:
+            typer.echo(f"{poses}, line {line}: {switch.sentence}")
         typer.echo(f"{outcome.rows} rows written to {out}: {found}.")
     if problem := outcome.problem(poses):
         fail(problem)

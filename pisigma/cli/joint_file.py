@@ -2,6 +2,7 @@
 
 import csv
 import math
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -15,6 +16,7 @@ from torch import Tensor
 from pisigma.cli.solutions import FAILURES, file_units
 from pisigma.compiled.solution import CompiledSolution
 from pisigma.correction.corrected_ik import CorrectedIK
+from pisigma.correction.path import PathSwitch
 from pisigma.correction.solution import Solution
 from pisigma.errors import OutputError
 from pisigma.export.output_file import writing_whole
@@ -60,12 +62,14 @@ class Outcome:
         statuses: how many have which status.
         first_failed: the first `LISTED` rows that failed, in the order of the file.
         failed: how many failed.
+        switches: of a path, the line of every place where the joints do not simply go on, and that place.
     """
 
     rows: int = 0
     statuses: Counter[str] = field(default_factory=Counter)
     first_failed: list[FailedRow] = field(default_factory=list)
     failed: int = 0
+    switches: list[tuple[int, PathSwitch]] = field(default_factory=list)
 
     def problem(self, source: Path) -> str | None:
         """Say which rows failed and why; None where none did."""
@@ -89,6 +93,7 @@ def write_joint_file(
     branch: str | None,
     tell: Callable[[str], None],
     accuracy: bool = False,
+    path: bool = False,
 ) -> Outcome:
     """Write one row per pose of a file, whole or not at all, however long the file is.
 
@@ -104,6 +109,7 @@ def write_joint_file(
         branch: to take instead of the trained one.
         tell: gets what was done, such as "40,000 rows, 4%, 9,000 rows/s".
         accuracy: whether to predict the standard deviations, which with a hybrid takes longer than all the rest.
+        path: whether the poses are a path, which is solved as a whole and in memory; see `CorrectedIK.path`.
 
     Raises:
         MeasurementError: the file of poses or its header cannot be used.
@@ -119,8 +125,8 @@ def write_joint_file(
         writer = csv.writer(file, lineterminator="\n")
         header = _header(robot, accuracy)
         writer.writerow(header)
-        for chunk in read_pose_chunks(poses, CHUNK_ROWS):
-            chunk_rows = _solved_rows(solver, chunk, branch, accuracy, outcome)
+        for chunk in read_pose_chunks(poses, sys.maxsize if path else CHUNK_ROWS):
+            chunk_rows = _solved_rows(solver, chunk, branch, accuracy, outcome, path)
             writer.writerows(cells + [""] * (len(header) - len(cells)) for cells in chunk_rows)
             rate = outcome.rows / max(time.monotonic() - begun, 1e-3)
             share = "" if math.isnan(chunk.share) else f", {chunk.share:.0%}"
@@ -136,7 +142,12 @@ def _header(robot: Robot, accuracy: bool) -> list[str]:
 
 
 def _solved_rows(
-    solver: CorrectedIK, chunk: PoseChunk, branch: str | None, accuracy: bool, outcome: Outcome
+    solver: CorrectedIK,
+    chunk: PoseChunk,
+    branch: str | None,
+    accuracy: bool,
+    outcome: Outcome,
+    path: bool,
 ) -> Iterator[list[str]]:
     """The first cells of the rows to write for a chunk, in the order of the file; counts them in the outcome."""
     robot = solver.model.robot
@@ -147,7 +158,8 @@ def _solved_rows(
     failed: list[FailedRow] = []
     if near:
         kept = torch.tensor([not far for far in too_far])
-        solution = _solve(solver, chunk.T[kept], branch)
+        solution, switches = _solve(solver, chunk.T[kept], branch, path)
+        outcome.switches.extend((near[switch.index], switch) for switch in switches)
         rows.extend(zip(near, _cells(solution, near, robot, accuracy), strict=True))
         statuses = [Status(status) for status in solution.status.tolist()]
         outcome.statuses.update(status.name.lower() for status in statuses)
@@ -167,9 +179,14 @@ def _solved_rows(
     return (cells for _, cells in sorted(rows, key=lambda row: row[0]))
 
 
-def _solve(solver: CorrectedIK, T: Tensor, branch: str | None) -> Solution | CompiledSolution:
+def _solve(
+    solver: CorrectedIK, T: Tensor, branch: str | None, path: bool
+) -> tuple[Solution | CompiledSolution, Sequence[PathSwitch]]:
     """The one place where poses of a file meet the solver."""
-    return solver(T.numpy(), branch=branch)
+    if path:
+        followed = solver.path(T.numpy(), branch=branch)
+        return followed.solution, followed.switches
+    return solver(T.numpy(), branch=branch), ()
 
 
 def _too_far(chunk: PoseChunk, robot: Robot) -> list[str]:

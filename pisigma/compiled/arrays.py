@@ -15,6 +15,10 @@ NO_CLOSED_FORM, SCARA, SPHERICAL_WRIST, THREE_PARALLEL = 0, 1, 2, 3
 """Which closed form the nominal arm has."""
 
 
+ANGLE, SINE, COSINE = 6, 7, 8
+"""What an input of a network is; 0 to 5 are coordinates of the pose, in the order of `network.inputs.POSE_INPUTS`."""
+
+
 class Arms(NamedTuple):
     """The rows of the four arms, which have the same joints.
 
@@ -90,13 +94,62 @@ class Coverage(NamedTuple):
     fade: float
 
 
+class Network(NamedTuple):
+    """What corrects nominal joint values; see `network.correction_network` and `correction.domain`.
+
+    Attributes:
+        used: 1 where there is such a network, else 0.
+        source: per input its kind: a coordinate of the pose, ANGLE, SINE or COSINE. Those of a group lie together.
+        factors: `(inputs, dof)`: the angle of an input is their sum over the joint values.
+        offset: of every input.
+        scale: of every input.
+        reference: `(groups, 3, 3)`: rotation from which roll, pitch and yaw are counted.
+        first: `(groups + 1,)`: index of a group's first input.
+        orders: `(groups, units)`: number of factors of every product unit, 0 where there is none.
+        group: per joint; -1 where the joint is not corrected.
+        weight: `(dof, factors, inputs)`.
+        bias: `(dof, factors)`.
+        output_offset: per joint [rad or m].
+        output_scale: per joint [rad or m].
+        centre: per joint the middle of training rows [rad or m], on whose turns the network knows joint values.
+        samples: number of training rows that make the domain; 0 where there is none.
+        column: index of the input that a coordinate of the domain is; inputs that are the same are one coordinate.
+        times: per coordinate the root of how often its input stands in the network.
+        coarse: how many coordinates, the first ones, tell nearly all of a distance.
+        rows: `(coordinates · samples,)`: scaled inputs of the training rows, one coordinate after the other.
+        radius: of the domain, in scaled inputs.
+    """
+
+    used: int
+    source: Any
+    factors: Any
+    offset: Any
+    scale: Any
+    reference: Any
+    first: Any
+    orders: Any
+    group: Any
+    weight: Any
+    bias: Any
+    output_offset: Any
+    output_scale: Any
+    centre: Any
+    samples: int
+    column: Any
+    times: Any
+    coarse: int
+    rows: Any
+    radius: float
+
+
 class ClosedForm(NamedTuple):
     """The nominal arm with canonical twists; see `pisigma.kinematics.closed_form`.
 
     Attributes:
         kind: NO_CLOSED_FORM, SCARA, SPHERICAL_WRIST or THREE_PARALLEL.
         branches: how many it has; 1 without closed form.
-        default: index of the branch that is taken where none is asked for.
+        order: indices of the branches in the order in which they are tried where none is asked for.
+        trained: how many of these, the first ones, training rows lie on.
         first: `(3, 4)`: frame of poses in the frame before the first joint.
         last: `(3, 4)`: frame of the last joint in that of the tool.
         sign: per joint, `variable = sign · (direction · q + offset)`.
@@ -109,7 +162,8 @@ class ClosedForm(NamedTuple):
 
     kind: int
     branches: int
-    default: int
+    order: Any
+    trained: int
     first: Any
     last: Any
     sign: Any
@@ -140,6 +194,7 @@ class Description(NamedTuple):
     arms: Arms
     correction: Correction
     coverage: Coverage
+    network: Network
     closed_form: ClosedForm
     starts: Starts
 
@@ -148,6 +203,7 @@ PARTS: dict[str, Any] = {
     "arms": Arms,
     "correction": Correction,
     "coverage": Coverage,
+    "network": Network,
     "closed_form": ClosedForm,
     "starts": Starts,
 }

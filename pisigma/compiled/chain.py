@@ -11,7 +11,7 @@ Array = Any
 Record = Any
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def walk(arms: Record, arm: int, q: Array, axes: Array, T: Array) -> None:
     """Tool pose, and axis and origin of every joint, in the base frame: see `kinematics.forward`.
@@ -65,7 +65,7 @@ def walk(arms: Record, arm: int, q: Array, axes: Array, T: Array) -> None:
     T[2, 3] += cp
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def jacobian(arms: Record, axes: Array, T: Array, J: Array) -> None:
     """Geometric Jacobian in the base frame at the tool's origin: see `kinematics.jacobian`.

@@ -22,21 +22,19 @@ _LIMIT = 1e-9
 
 @njit(error_model="numpy")
 @no_type_check
-def all_branches(arms: Record, form: Record, T: Array, only: int, P: Array, q: Array) -> int:
-    """Write joint values of every branch, NaN where it does not reach the pose.
+def all_branches(arms: Record, form: Record, T: Array, only: int, P: Array, q: Array) -> None:
+    """Write joint values of every branch, the first of them NaN where it does not reach the pose.
 
     Args:
         arms: the arms, for limits.
         form: the nominal arm with canonical twists.
         T: wanted T_base_tool.
-        only: the only branch that is wanted; -1 for all. Others are left NaN.
+        only: the only branch that is wanted; -1 for all. Of the others the first joint value is NaN.
         P: `(4, 4)`, overwritten.
         q: `(8, dof)`, written [rad or m]: in (-pi, pi], or a full turn from there within the limits.
-
-    Returns:
-        How many branches reach the pose.
     """
-    q[:] = math.nan
+    for branch in range(form.branches):
+        q[branch, 0] = math.nan
     _canonical_pose(form, T, P)
     if form.kind == SCARA:
         _scara(form, P, only, q)
@@ -44,16 +42,13 @@ def all_branches(arms: Record, form: Record, T: Array, only: int, P: Array, q: A
         _spherical_wrist(form, P, only, q)
     elif form.kind == THREE_PARALLEL:
         _three_parallel(form, P, only, q)
-    reached = 0
     for branch in range(form.branches):
         if math.isnan(q[branch, 0]):
             continue
-        reached += 1
         for j in range(arms.dof):
             value = form.direction[j] * (form.sign[j] * q[branch, j] - form.offset[j])
             q[branch, j] = wrap(value) if arms.revolute[j] else value
         turn_into_limits(arms, q[branch])
-    return reached
 
 
 @njit(error_model="numpy")

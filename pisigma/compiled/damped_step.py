@@ -12,7 +12,7 @@ _FLOOR = 4 * 2.220446049250313e-16
 _SWEEPS = 30
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def scaled_square(reach: float, error: Array) -> float:
     """Squared pose error with translation in characteristic lengths."""
@@ -21,7 +21,7 @@ def scaled_square(reach: float, error: Array) -> float:
     return scale * position + error[3] * error[3] + error[4] * error[4] + error[5] * error[5]
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _normal(arms: Record, reach: float, J: Array, memory: Record) -> tuple[int, float]:
     """Write the dimensionless Jacobian A and the smaller of `A A^T` and `A^T A`; give its size and trace."""
@@ -47,7 +47,7 @@ def _normal(arms: Record, reach: float, J: Array, memory: Record) -> tuple[int, 
     return size, trace
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _factor(S: Array, size: int) -> float:
     """Cholesky factor in place, the inverse of the diagonal on it; the determinant, 0 where it breaks down."""
@@ -69,7 +69,7 @@ def _factor(S: Array, size: int) -> float:
     return determinant
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def damped_step(arms: Record, reach: float, J: Array, error: Array, damping: float, memory: Record) -> bool:
     """Write the step [rad or m] of `(J^T J + λ) dq = J^T e` into `memory.step`: see `kinematics.numeric`.
@@ -117,7 +117,7 @@ def damped_step(arms: Record, reach: float, J: Array, error: Array, damping: flo
     return True
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def is_singular(arms: Record, reach: float, J: Array, tolerance: float, memory: Record) -> bool:
     """Whether the smallest singular value of the dimensionless Jacobian is below a tolerance.
@@ -133,7 +133,7 @@ def is_singular(arms: Record, reach: float, J: Array, tolerance: float, memory: 
     return _smallest_singular_value(memory.scaled, size, arms.dof) < tolerance
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _smallest_singular_value(A: Array, size: int, dof: int) -> float:
     """One-sided Jacobi rotations of A's columns, or of its rows where they are fewer; A is overwritten."""

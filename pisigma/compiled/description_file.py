@@ -1,5 +1,7 @@
 """A calibrated arm as one file of plain arrays, which is read without torch."""
 
+import json
+import math
 import os
 import zipfile
 import zlib
@@ -10,27 +12,50 @@ import numpy as np
 from pisigma.compiled.arrays import PARTS, Description
 from pisigma.errors import ModelError
 
-FORMAT = 1
-_NAMES = ("branches", "joints", "name")
+FORMAT = 3
+_NAMES = ("branches", "joints", "name", "belongs_to")
+_FIELDS = [(part, field) for part, kind in PARTS.items() for field in kind._fields]
 
 
 def write_description(
-    file: str | os.PathLike[str], description: Description, *, branches: Any, joints: Any, name: str
+    file: str | os.PathLike[str],
+    description: Description,
+    *,
+    branches: Any,
+    joints: Any,
+    name: str,
+    belongs_to: str = "",
 ) -> None:
-    """Write a description, and the names that go with it, as `.npz`."""
-    values = {
-        f"{part}.{field}": np.asarray(value)
-        for part in PARTS
-        for field, value in getattr(description, part)._asdict().items()
+    """Write a description, and the names that go with it, as `.npz`; see `CompiledIK` for these.
+
+    All numbers stand in two rows, because every array in the file costs a new process time to read.
+    """
+    shapes: dict[str, tuple[str, tuple[int, ...]]] = {}
+    rows: dict[str, list[Any]] = {"floats": [], "integers": []}
+    for part, field in _FIELDS:
+        value = np.asarray(getattr(getattr(description, part), field))
+        kind = "integers" if value.dtype.kind == "i" else "floats"
+        shapes[f"{part}.{field}"] = (kind, value.shape)
+        rows[kind].append(value.ravel())
+    stated = {
+        "branches": branches,
+        "joints": joints,
+        "name": name,
+        "belongs_to": belongs_to,
+        "shapes": shapes,
     }
-    values |= {"branches": np.array(branches), "joints": np.array(joints), "name": np.array(name)}
+    values = {
+        "header": np.array(json.dumps(stated)),
+        "floats": np.concatenate(rows["floats"]).astype(np.float64),
+        "integers": np.concatenate(rows["integers"]).astype(np.int64),
+    }
     with open(file, "wb") as stream:
-        stated = {"format": np.array(FORMAT), "checksum": np.array(_checksum(values))}
-        np.savez(stream, allow_pickle=False, **stated, **values)
+        checks = {"format": np.array(FORMAT), "checksum": np.array(_checksum(values))}
+        np.savez(stream, allow_pickle=False, **checks, **values)
 
 
 def read_description(file: str | os.PathLike[str]) -> tuple[Description, dict[str, Any]]:
-    """Read what `write_description` wrote: the description, and branches, joints and name by name.
+    """Read what `write_description` wrote: the description, and the names by what they are of.
 
     Raises:
         ModelError: the file is missing, truncated, foreign, changed or of another format.
@@ -50,20 +75,27 @@ def read_description(file: str | os.PathLike[str]) -> tuple[Description, dict[st
     if stated is None or stated.shape != () or int(stated) != FORMAT:
         raise ModelError(f"{file}: is no compiled model of format {FORMAT}; export the model again.")
     checksum = values.pop("checksum", None)
-    wanted = {f"{part}.{field}" for part, kind in PARTS.items() for field in kind._fields} | set(_NAMES)
-    if checksum is None or set(values) != wanted or int(checksum) != _checksum(values):
+    if (
+        checksum is None
+        or set(values) != {"header", "floats", "integers"}
+        or int(checksum) != _checksum(values)
+    ):
         raise ModelError(f"{file}: was changed or is no whole compiled model; export the model again.")
-    parts = {
-        part: kind(*(_plain(values[f"{part}.{field}"]) for field in kind._fields))
-        for part, kind in PARTS.items()
-    }
-    names = {name: values[name].tolist() for name in _NAMES}
-    return Description(**parts), names
+    header = json.loads(str(values["header"]))
+    return _description(header["shapes"], values), {name: header[name] for name in _NAMES}
 
 
-def _plain(value: Any) -> Any:
-    """A number as Python's, an array as it is."""
-    return value.item() if value.ndim == 0 else value
+def _description(shapes: dict[str, Any], values: dict[str, Any]) -> Description:
+    """Cut the two rows of numbers into fields; a single number becomes Python's."""
+    taken = {"floats": 0, "integers": 0}
+    parts: dict[str, dict[str, Any]] = {part: {} for part in PARTS}
+    for part, field in _FIELDS:
+        kind, shape = shapes[f"{part}.{field}"]
+        start = taken[kind]
+        taken[kind] = start + math.prod(shape)
+        numbers = values[kind][start : taken[kind]]
+        parts[part][field] = numbers.reshape(shape) if shape else numbers.item()
+    return Description(**{part: PARTS[part](**fields) for part, fields in parts.items()})
 
 
 def _checksum(values: dict[str, Any]) -> int:

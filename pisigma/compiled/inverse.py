@@ -5,31 +5,23 @@ from typing import Any, no_type_check
 
 from numba import njit
 
-from pisigma.compiled.arrays import BLENDED, GEOMETRIC, HYBRID, NO_CLOSED_FORM, NOMINAL
+from pisigma.compiled.arrays import NO_CLOSED_FORM, NOMINAL
 from pisigma.compiled.closed_form import all_branches, turn_into_limits, turn_near
-from pisigma.compiled.damped_step import is_singular
-from pisigma.compiled.motion import move
+from pisigma.compiled.codes import UNREACHABLE
+from pisigma.compiled.corrected import add_correction, choose_corrected, finish_corrected
+from pisigma.compiled.finishing import finish
 from pisigma.compiled.newton import ACCEPTED, TOLERANCE, newton, search
 from pisigma.compiled.recovery import branch_of, nearest_starts, recover, within_reach
-from pisigma.compiled.rotations import pose_error, wrap
-from pisigma.kinematics.status import Status
+from pisigma.compiled.rotations import wrap
+from pisigma.compiled.rows import copy, fill
 
 Array = Any
 Record = Any
 
-REACHED, SINGULAR, OUTSIDE_LIMITS = (
-    int(Status.REACHED),
-    int(Status.SINGULAR),
-    int(Status.OUTSIDE_JOINT_LIMITS),
-)
-OUTSIDE_DOMAIN, UNREACHABLE = int(Status.OUTSIDE_DOMAIN), int(Status.UNREACHABLE)
-SINGULAR_TOLERANCE = 1e-5
-"""A solution is SINGULAR where the smallest singular value is smaller: see `kinematics.numeric`."""
 _MARGIN = 1.0
 """[rad or m] Corrections are smaller, so that branches that are farther off need not be corrected to be compared."""
 AWAY = 0.1
 """[rad or m] A solution farther from where it was to be near to may not be the one that was meant."""
-_LIMIT = 1e-9
 
 
 @njit(error_model="numpy")
@@ -43,66 +35,130 @@ def solve_pose(description: Record, memory: Record, has_near: bool, branch: int,
         has_near: whether these count.
         branch: index of the branch wanted, or -1.
         found: `(2 · dof + 5,)`, written: commanded and nominal joint values [rad or m], distance [m] and angle [rad]
-            from the pose, share of the correction, status and branch.
+            from the pose, measure of the domain, status and branch.
     """
     form, chosen = description.closed_form, -1
-    wanted = form.default if branch < 0 else branch
-    memory.nominal[:] = math.nan
+    wanted = form.order[0] if branch < 0 else branch
+    fill(memory.nominal, math.nan)
+    if description.network.used:
+        _solve_by_network(description, memory, has_near, branch, wanted, found)
+        return
     if not within_reach(description, memory.pose):
         pass
     elif form.kind == NO_CLOSED_FORM:
-        chosen = _solve_without_branches(description, memory, has_near)
+        chosen = 0 if _solve_without_branches(description, memory, has_near) else -1
     else:
         free = has_near and branch < 0
-        all_branches(
-            description.arms, form, memory.pose, -1 if free else wanted, memory.wanted, memory.branches
-        )
-        chosen = _solve_branches(description, memory, free)
+        chosen = _solve_nearest(description, memory) if free else _solve_in_order(description, memory, branch)
         if chosen >= 0:
-            memory.nominal[:] = memory.branches[chosen]
+            copy(memory.branches[chosen], memory.nominal)
         else:
             chosen = recover(description, memory, wanted, branch < 0)
         if free:
             chosen = _continue(description, memory, chosen)
-    reached, status = _finish(description, memory, has_near, chosen >= 0, found)
-    dof = description.arms.dof
-    for j in range(dof):
-        found[j] = memory.solution[j] if reached else math.nan
-        found[dof + j] = memory.nominal[j] if reached else math.nan
-    found[2 * dof + 3], found[2 * dof + 4] = status, wanted if chosen < 0 else chosen
+    reached, status = finish(description, memory, has_near, chosen >= 0, found)
+    _write(description, memory, reached, status, wanted if chosen < 0 else chosen, found)
 
 
 @njit(error_model="numpy")
 @no_type_check
-def _solve_branches(description: Record, memory: Record, free: bool) -> int:
-    """Solve from the nominal joint values of the branches on; the best goes to `memory.solution`, its index is given.
+def _solve_by_network(
+    description: Record, memory: Record, has_near: bool, branch: int, wanted: int, found: Array
+) -> None:
+    """The same where a network corrects the nominal joint values."""
+    chosen, inside = choose_corrected(description, memory, has_near, branch, wanted)
+    numeric = description.closed_form.kind == NO_CLOSED_FORM and within_reach(description, memory.pose)
+    if numeric and _solve_without_branches(description, memory, has_near):
+        copy(memory.solution, memory.nominal)
+        chosen, inside = 0, add_correction(description, memory, has_near)
+    fill(found, math.nan)
+    status = UNREACHABLE
+    if chosen >= 0:
+        status = finish_corrected(description, memory, chosen, inside, found)
+    _write(description, memory, chosen >= 0, status, wanted if chosen < 0 else chosen, found)
 
-    Where any branch will do, the nearest of those that reach the pose inside the limits is best, else of the others.
+
+@njit(error_model="numpy")
+@no_type_check
+def _write(
+    description: Record, memory: Record, reached: bool, status: int, branch: int, found: Array
+) -> None:
+    """Write the joint values in memory, NaN where they do not reach the pose, the status and the branch."""
+    dof = description.arms.dof
+    for j in range(dof):
+        found[j] = memory.solution[j] if reached else math.nan
+        found[dof + j] = memory.nominal[j] if reached else math.nan
+    found[2 * dof + 3], found[2 * dof + 4] = status, branch
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _solve_in_order(description: Record, memory: Record, wanted: int) -> int:
+    """Solve on the wanted branch, or on the first that reaches the pose inside the limits; -1 if none reaches it.
+
+    Where one does that only outside its limits, it is the first of these. Joint values go to `memory.solution`.
     """
-    arms, others = description.arms, memory.others
-    others[:, :] = memory.branches
+    arms, form, outside = description.arms, description.closed_form, -1
+    first = form.order[0] if wanted < 0 else wanted
+    all_branches(arms, form, memory.pose, first, memory.wanted, memory.branches)
+    for place in range(form.branches if wanted < 0 else 1):
+        if place == 1:
+            all_branches(arms, form, memory.pose, -1, memory.wanted, memory.branches)
+        branch = form.order[place] if wanted < 0 else wanted
+        if math.isnan(memory.branches[branch, 0]) or not _follow(description, memory, branch):
+            continue
+        copy(memory.q, memory.trial)
+        if wanted >= 0 or turn_into_limits(arms, memory.trial):
+            copy(memory.q, memory.solution)
+            return branch
+        if outside < 0:
+            outside = branch
+            copy(memory.q, memory.kept)
+    if outside >= 0:
+        copy(memory.kept, memory.solution)
+    return outside
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _follow(description: Record, memory: Record, branch: int) -> bool:
+    """Solve from the nominal joint values of a branch on, for joint values `memory.q` on their turns."""
+    arms = description.arms
+    copy(memory.branches[branch], memory.q)
+    if not search(description, memory, memory.pose, memory.q):
+        return False
+    for j in range(arms.dof):
+        if arms.revolute[j]:
+            memory.q[j] = memory.branches[branch, j] + wrap(memory.q[j] - memory.branches[branch, j])
+    return True
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _solve_nearest(description: Record, memory: Record) -> int:
+    """Solve for joint values `memory.solution` near to `memory.near`; give their branch, or -1.
+
+    The nearest of the branches that reach the pose inside the limits is best, else of the others.
+    """
+    arms, form, others = description.arms, description.closed_form, memory.others
+    all_branches(arms, form, memory.pose, -1, memory.wanted, memory.branches)
+    for index in range(form.branches):
+        copy(memory.branches[index], others[index])
     best, best_rank, best_distance = -1, 2, math.inf
     while True:
-        branch, distance = _nearest(description, memory, free)
+        branch, distance = _nearest(description, memory)
         if branch < 0 or (best_rank == 0 and math.sqrt(distance) - _MARGIN > math.sqrt(best_distance)):
             break
         others[branch, 0] = math.nan
-        memory.q[:] = memory.branches[branch]
-        if not search(description, memory, memory.pose, memory.q):
+        if not _follow(description, memory, branch):
             continue
-        for j in range(arms.dof):
-            if arms.revolute[j]:
-                memory.q[j] = memory.branches[branch, j] + wrap(memory.q[j] - memory.branches[branch, j])
-        if not free:
-            memory.solution[:] = memory.q
-            return branch
-        memory.trial[:] = memory.q
+        copy(memory.q, memory.trial)
         rank = 0 if turn_into_limits(arms, memory.trial) else 1
         turn_near(arms, memory.trial, memory.near, True)
         distance = _distance(arms, memory.trial, memory.near)
         if rank < best_rank or (rank == best_rank and distance < best_distance):
             best, best_rank, best_distance = branch, rank, distance
-            memory.solution[:] = memory.q
+            copy(memory.q, memory.solution)
     return best
 
 
@@ -112,23 +168,23 @@ def _continue(description: Record, memory: Record, chosen: int) -> int:
     """Look from `memory.near` itself where nothing was found close to it; the branch, -1 where still nothing was."""
     arms, off = description.arms, math.inf
     if chosen >= 0:
-        memory.trial[:] = memory.solution
+        copy(memory.solution, memory.trial)
         turn_into_limits(arms, memory.trial)
         turn_near(arms, memory.trial, memory.near, True)
         off = math.sqrt(_distance(arms, memory.trial, memory.near))
     if off <= AWAY:
         return chosen
-    memory.q[:] = memory.near
+    copy(memory.near, memory.q)
     if not search(description, memory, memory.pose, memory.q):
         return chosen
-    memory.trial[:] = memory.q
+    copy(memory.q, memory.trial)
     inside = turn_into_limits(arms, memory.trial)
     turn_near(arms, memory.trial, memory.near, True)
     if not inside or not math.sqrt(_distance(arms, memory.trial, memory.near)) < off:
         return chosen
-    memory.solution[:] = memory.q
+    copy(memory.q, memory.solution)
     lies = branch_of(description, memory, memory.q)
-    memory.checked[:] = math.nan
+    fill(memory.checked, math.nan)
     _solve_nominal(description, memory)
     return lies
 
@@ -141,22 +197,20 @@ def _solve_nominal(description: Record, memory: Record) -> None:
     square = 0.0
     for i in range(6):
         square += memory.best[i] ** 2
-    memory.nominal[:] = math.nan
+    fill(memory.nominal, math.nan)
     if square < ACCEPTED * ACCEPTED:
-        memory.nominal[:] = memory.q
+        copy(memory.q, memory.nominal)
 
 
 @njit(error_model="numpy")
 @no_type_check
-def _nearest(description: Record, memory: Record, free: bool) -> tuple[int, float]:
+def _nearest(description: Record, memory: Record) -> tuple[int, float]:
     """Of the branches that are left the nearest one and its squared distance; -1 where none is left."""
     arms, nearest, least = description.arms, -1, math.inf
     for branch in range(description.closed_form.branches):
         if math.isnan(memory.others[branch, 0]):
             continue
-        if not free:
-            return branch, 0.0
-        memory.q[:] = memory.others[branch]
+        copy(memory.others[branch], memory.q)
         turn_near(arms, memory.q, memory.near, True)
         distance = _distance(arms, memory.q, memory.near)
         if distance < least:
@@ -175,73 +229,17 @@ def _distance(arms: Record, q: Array, near: Array) -> float:
 
 @njit(error_model="numpy")
 @no_type_check
-def _solve_without_branches(description: Record, memory: Record, has_near: bool) -> int:
-    """Numeric inverse from `near`, then from the starts whose poses are nearest; 0, or -1 if none leads there."""
+def _solve_without_branches(description: Record, memory: Record, has_near: bool) -> bool:
+    """Numeric inverse from `near`, then from the starts whose poses are nearest; whether one leads there."""
     count = nearest_starts(description, memory, memory.pose)
     for attempt in range(-1 if has_near else 0, count):
         if attempt < 0:
-            memory.q[:] = memory.near
+            copy(memory.near, memory.q)
         else:
-            memory.q[:] = description.starts.q[memory.nearest[attempt]]
+            copy(description.starts.q[memory.nearest[attempt]], memory.q)
         if search(description, memory, memory.pose, memory.q):
-            memory.solution[:] = memory.q
-            memory.checked[:] = math.nan
+            copy(memory.q, memory.solution)
+            fill(memory.checked, math.nan)
             _solve_nominal(description, memory)
-            return 0
-    return -1
-
-
-@njit(error_model="numpy")
-@no_type_check
-def _finish(
-    description: Record, memory: Record, has_near: bool, reached: bool, found: Array
-) -> tuple[bool, int]:
-    """Choose the turns, write what is left of the error there and the share; whether it is reached, and the status."""
-    arms, q, place = description.arms, memory.solution, 2 * description.arms.dof
-    inside = False
-    if reached:
-        inside, reached = _choose_turns(description, memory, has_near)
-    if not reached:
-        found[place], found[place + 1], found[place + 2] = math.nan, math.nan, math.nan
-        return False, UNREACHABLE
-    fresh, share = True, memory.share
-    for j in range(arms.dof):
-        fresh = fresh and memory.checked[j] == q[j]
-    if not fresh:
-        share = move(description, memory, BLENDED if arms.hybrid else GEOMETRIC, q)
-        pose_error(memory.pose, memory.T, memory.R, memory.error)
-    e = memory.error
-    found[place] = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
-    found[place + 1] = math.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
-    found[place + 2] = share if arms.hybrid else math.nan
-    turn_near(arms, memory.nominal, q, False)
-    if not inside:
-        return True, OUTSIDE_LIMITS
-    reach = arms.reach[HYBRID if arms.hybrid else GEOMETRIC]
-    if is_singular(arms, reach, memory.J, SINGULAR_TOLERANCE, memory):
-        return True, SINGULAR
-    return True, OUTSIDE_DOMAIN if share < 1.0 else REACHED
-
-
-@njit(error_model="numpy")
-@no_type_check
-def _choose_turns(description: Record, memory: Record, has_near: bool) -> tuple[bool, bool]:
-    """Bring joints into their limits and near to given values; whether they are inside, and still reach the pose."""
-    arms, q = description.arms, memory.solution
-    memory.q[:] = q
-    inside = turn_into_limits(arms, q)
-    if has_near:
-        turn_near(arms, q, memory.near, True)
-    turned = False
-    for j in range(arms.dof):
-        turned = turned or memory.q[j] != q[j]
-    if not turned or not arms.hybrid or description.correction.periodic:
-        return inside, True
-    memory.q[:] = q
-    if not search(description, memory, memory.pose, memory.q):
-        return inside, False
-    turn_near(arms, memory.q, q, False)
-    q[:] = memory.q
-    for j in range(arms.dof):
-        inside = inside and arms.limits[j, 0] - _LIMIT <= q[j] <= arms.limits[j, 1] + _LIMIT
-    return inside, True
+            return True
+    return False

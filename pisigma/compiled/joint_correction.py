@@ -11,7 +11,7 @@ Array = Any
 Record = Any
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def joint_correction(
     arms: Record, correction: Record, q: Array, turning: Array, phi: Array, delta: Array
@@ -51,28 +51,37 @@ def joint_correction(
     _add_products(correction, dof, phi, delta)
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _series(correction: Record, dof: int, turning: Array, delta: Array) -> None:
-    """Sines and cosines of multiples of every joint's angle, each multiple from the one before, four joints abreast."""
+    """Sums of sines and cosines of multiples of every joint's angle, four joints abreast.
+
+    Source: C. W. Clenshaw, A note on the summation of Chebyshev series, 1955: from the last multiple to the first,
+    `b_k = w_k + 2 cos(θ) b_k+1 - b_k+2`; the sum is `b_1 cos(θ) - b_2` of cosines and `b_1 sin(θ)` of sines.
+    """
     for j in range(0, dof, 4):
-        sin_0, sin_1, sin_2, sin_3 = turning[0, j], turning[0, j + 1], turning[0, j + 2], turning[0, j + 3]
-        cos_0, cos_1, cos_2, cos_3 = turning[1, j], turning[1, j + 1], turning[1, j + 2], turning[1, j + 3]
-        s_0, s_1, s_2, s_3, c_0, c_1, c_2, c_3 = sin_0, sin_1, sin_2, sin_3, cos_0, cos_1, cos_2, cos_3
-        d_0, d_1, d_2, d_3 = 0.0, 0.0, 0.0, 0.0
-        for k in range(correction.harmonics):
-            d_0 += correction.series[k, 0, j] * s_0 + correction.series[k, 1, j] * c_0
-            d_1 += correction.series[k, 0, j + 1] * s_1 + correction.series[k, 1, j + 1] * c_1
-            d_2 += correction.series[k, 0, j + 2] * s_2 + correction.series[k, 1, j + 2] * c_2
-            d_3 += correction.series[k, 0, j + 3] * s_3 + correction.series[k, 1, j + 3] * c_3
-            s_0, c_0 = s_0 * cos_0 + c_0 * sin_0, c_0 * cos_0 - s_0 * sin_0
-            s_1, c_1 = s_1 * cos_1 + c_1 * sin_1, c_1 * cos_1 - s_1 * sin_1
-            s_2, c_2 = s_2 * cos_2 + c_2 * sin_2, c_2 * cos_2 - s_2 * sin_2
-            s_3, c_3 = s_3 * cos_3 + c_3 * sin_3, c_3 * cos_3 - s_3 * sin_3
-        delta[j], delta[j + 1], delta[j + 2], delta[j + 3] = d_0, d_1, d_2, d_3
+        sine, cosine, total = turning[0, j : j + 4], turning[1, j : j + 4], delta[j : j + 4]
+        weights = correction.series[:, :, j : j + 4]
+        t_0, t_1, t_2, t_3 = 2 * cosine[0], 2 * cosine[1], 2 * cosine[2], 2 * cosine[3]
+        s_0, s_1, s_2, s_3, c_0, c_1, c_2, c_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        u_0, u_1, u_2, u_3, v_0, v_1, v_2, v_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(correction.harmonics - 1, -1, -1):
+            w = weights[k]
+            u_0, s_0 = s_0, t_0 * s_0 + (w[0, 0] - u_0)
+            u_1, s_1 = s_1, t_1 * s_1 + (w[0, 1] - u_1)
+            u_2, s_2 = s_2, t_2 * s_2 + (w[0, 2] - u_2)
+            u_3, s_3 = s_3, t_3 * s_3 + (w[0, 3] - u_3)
+            v_0, c_0 = c_0, t_0 * c_0 + (w[1, 0] - v_0)
+            v_1, c_1 = c_1, t_1 * c_1 + (w[1, 1] - v_1)
+            v_2, c_2 = c_2, t_2 * c_2 + (w[1, 2] - v_2)
+            v_3, c_3 = c_3, t_3 * c_3 + (w[1, 3] - v_3)
+        total[0] = sine[0] * s_0 + (cosine[0] * c_0 - v_0)
+        total[1] = sine[1] * s_1 + (cosine[1] * c_1 - v_1)
+        total[2] = sine[2] * s_2 + (cosine[2] * c_2 - v_2)
+        total[3] = sine[3] * s_3 + (cosine[3] * c_3 - v_3)
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def series_slope(correction: Record, dof: int, turning: Array, slope: Array) -> None:
     """Slope of the series of every joint by the joint's own value; the steepest part of a correction.
@@ -83,43 +92,55 @@ def series_slope(correction: Record, dof: int, turning: Array, slope: Array) -> 
         turning: sines and cosines, as `joint_correction` leaves them.
         slope: `(DOF,)`, written.
     """
-    for j in range(dof):
-        sine, cosine, total = turning[0, j], turning[1, j], 0.0
-        for k in range(correction.harmonics):
-            total += (k + 1) * (correction.series[k, 0, j] * cosine - correction.series[k, 1, j] * sine)
-            sine, cosine = (
-                sine * turning[1, j] + cosine * turning[0, j],
-                cosine * turning[1, j] - sine * turning[0, j],
-            )
-        slope[j] = correction.rate[j] * total
+    for j in range(0, dof, 4):
+        sine, cosine, total = turning[0, j : j + 4], turning[1, j : j + 4], slope[j : j + 4]
+        weights, rate = correction.series[:, :, j : j + 4], correction.rate[j : j + 4]
+        t_0, t_1, t_2, t_3 = 2 * cosine[0], 2 * cosine[1], 2 * cosine[2], 2 * cosine[3]
+        s_0, s_1, s_2, s_3, c_0, c_1, c_2, c_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        u_0, u_1, u_2, u_3, v_0, v_1, v_2, v_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(correction.harmonics - 1, -1, -1):
+            w, times = weights[k], k + 1.0
+            u_0, s_0 = s_0, t_0 * s_0 - (times * w[1, 0] + u_0)
+            u_1, s_1 = s_1, t_1 * s_1 - (times * w[1, 1] + u_1)
+            u_2, s_2 = s_2, t_2 * s_2 - (times * w[1, 2] + u_2)
+            u_3, s_3 = s_3, t_3 * s_3 - (times * w[1, 3] + u_3)
+            v_0, c_0 = c_0, t_0 * c_0 + (times * w[0, 0] - v_0)
+            v_1, c_1 = c_1, t_1 * c_1 + (times * w[0, 1] - v_1)
+            v_2, c_2 = c_2, t_2 * c_2 + (times * w[0, 2] - v_2)
+            v_3, c_3 = c_3, t_3 * c_3 + (times * w[0, 3] - v_3)
+        total[0] = rate[0] * (sine[0] * s_0 + (cosine[0] * c_0 - v_0))
+        total[1] = rate[1] * (sine[1] * s_1 + (cosine[1] * c_1 - v_1))
+        total[2] = rate[2] * (sine[2] * s_2 + (cosine[2] * c_2 - v_2))
+        total[3] = rate[3] * (sine[3] * s_3 + (cosine[3] * c_3 - v_3))
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _add_products(correction: Record, dof: int, phi: Array, delta: Array) -> None:
     """Products of sums of the inputs, four joints abreast."""
     for j in range(0, dof, 4):
-        factor = 0
+        total, factor = delta[j : j + 4], 0
+        weights, biases = correction.weight[:, :, j : j + 4], correction.bias[:, j : j + 4]
         for unit in range(correction.products):
             p_0, p_1, p_2, p_3 = 1.0, 1.0, 1.0, 1.0
             for _ in range(correction.orders[unit]):
-                t_0, t_1 = correction.bias[factor, j], correction.bias[factor, j + 1]
-                t_2, t_3 = correction.bias[factor, j + 2], correction.bias[factor, j + 3]
+                bias = biases[factor]
+                t_0, t_1, t_2, t_3 = bias[0], bias[1], bias[2], bias[3]
                 for i in range(correction.inputs):
-                    value = phi[i]
-                    t_0 += correction.weight[factor, i, j] * value
-                    t_1 += correction.weight[factor, i, j + 1] * value
-                    t_2 += correction.weight[factor, i, j + 2] * value
-                    t_3 += correction.weight[factor, i, j + 3] * value
+                    value, w = phi[i], weights[factor, i]
+                    t_0 += w[0] * value
+                    t_1 += w[1] * value
+                    t_2 += w[2] * value
+                    t_3 += w[3] * value
                 p_0, p_1, p_2, p_3 = p_0 * t_0, p_1 * t_1, p_2 * t_2, p_3 * t_3
                 factor += 1
-            delta[j] += p_0
-            delta[j + 1] += p_1
-            delta[j + 2] += p_2
-            delta[j + 3] += p_3
+            total[0] += p_0
+            total[1] += p_1
+            total[2] += p_2
+            total[3] += p_3
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def add_gravity(
     arms: Record, correction: Record, q: Array, turning: Array, frames: Array, delta: Array
@@ -159,7 +180,7 @@ def add_gravity(
             delta[j] += force * (zx * gx + zy * gy + zz * gz)
 
 
-@njit(error_model="numpy")
+@njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
 def _walk_drawn(arms: Record, correction: Record, q: Array, turning: Array, frames: Array) -> None:
     """Frames of the arm as drawn, in the frame of its first row."""

@@ -12,8 +12,12 @@ from pisigma.errors import ModelError
 
 DOF, ROWS, HARMONICS, FACTORS, UNITS, STRETCHES, STARTS = 8, 24, 128, 24, 12, 96, 512
 """The largest numbers of joints, rows, harmonics, factors and product units, stretches and starts."""
+BRANCHES = 8
+"""The largest number of branches of a closed form."""
 INPUTS = 2 * DOF
 """The largest number of inputs of product units."""
+GROUPS, SEEN, GROUP_INPUTS, SAMPLES, ENTRIES = 8, 512, 80, 2048, 2048 * 320
+"""The largest numbers of groups of a network, inputs of all and of one, rows of a domain, and entries of these."""
 
 _Field = tuple[str, Any, tuple[int, ...]]
 
@@ -53,7 +57,33 @@ _CORRECTION = _integers(
 _COVERAGE = _integers(stretches=(), joint=(STRETCHES,)) + _floats(
     middle=(STRETCHES,), half=(STRETCHES,), rate=(DOF,), fade=()
 )
-_CLOSED_FORM = _integers(kind=(), branches=(), default=()) + _floats(
+_NETWORK = _integers(
+    used=(),
+    inputs=(),
+    samples=(),
+    columns=(),
+    coarse=(),
+    column=(SEEN,),
+    source=(SEEN,),
+    first=(GROUPS + 1,),
+    products=(GROUPS,),
+    orders=(GROUPS, UNITS),
+    group=(DOF,),
+) + _floats(
+    factors=(SEEN, DOF),
+    offset=(SEEN,),
+    scale=(SEEN,),
+    reference=(GROUPS, 3, 3),
+    weight=(DOF, FACTORS, GROUP_INPUTS),
+    bias=(DOF, FACTORS),
+    output_offset=(DOF,),
+    output_scale=(DOF,),
+    centre=(DOF,),
+    times=(SEEN,),
+    rows=(ENTRIES,),
+    radius=(),
+)
+_CLOSED_FORM = _integers(kind=(), branches=(), trained=(), order=(BRANCHES,)) + _floats(
     first=(3, 4), last=(3, 4), sign=(DOF,), direction=(DOF,), offset=(DOF,), theta=(DOF,), d=(DOF,), a=(DOF,)
 )
 _STARTS = _integers(count=()) + _floats(q=(STARTS, DOF), points=(STARTS, 12), lever=())
@@ -63,6 +93,7 @@ DESCRIPTION = np.dtype(
         ("arms", np.dtype(_ARMS)),
         ("correction", np.dtype(_CORRECTION)),
         ("coverage", np.dtype(_COVERAGE)),
+        ("network", np.dtype(_NETWORK)),
         ("closed_form", np.dtype(_CLOSED_FORM)),
         ("starts", np.dtype(_STARTS)),
     ]
@@ -95,14 +126,18 @@ MEMORY = np.dtype(
         scaled=(6, DOF),  # dimensionless Jacobian, normal equations and their right side
         square=(6, 6),
         right=(6,),
-        branches=(8, DOF),  # closed-form joint values of all branches
-        others=(8, DOF),  # the same of other poses
+        branches=(BRANCHES, DOF),  # closed-form joint values of all branches
+        others=(BRANCHES, DOF),  # the same of other poses
         wanted=(4, 4),  # a pose in the frames of the closed form
         drawn=(4, 4),  # a pose moved towards a stored one
         q=(DOF,),  # joint values of a candidate
         start=(DOF,),  # joint values to start from
+        kept=(DOF,),  # joint values outside their limits, in case there are no others
         checked=(DOF,),  # joint values that T, J, error and share belong to, NaN where they belong to none
         share=(),  # of the correction
+        seen=(SEEN,),  # scaled inputs of a network
+        angles=(3,),  # roll, pitch and yaw
+        distance=(SAMPLES,),  # squared, of scaled inputs from the rows of a domain
     )
     + _integers(nearest=(4,))  # stored starts
 )
@@ -144,6 +179,15 @@ def pack(description: Description, name: str) -> np.ndarray:
         "has_units": len(correction.units) > 0,
     }.items():
         packed["correction"][count] = value
+    network = description.network
+    if network.samples > SAMPLES:
+        raise ModelError(
+            f"model '{name}': its domain has {network.samples} training rows, but the compiled kernels have room for "
+            f"{SAMPLES}; use pisigma.load."
+        )
+    packed["network"]["inputs"] = len(network.source)
+    packed["network"]["columns"] = len(network.column)
+    packed["network"]["products"][0, : len(network.orders)] = (network.orders > 0).sum(-1)
     packed["coverage"]["stretches"] = len(description.coverage.joint)
     packed["starts"]["count"] = len(description.starts.q)
     return packed

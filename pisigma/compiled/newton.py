@@ -10,6 +10,7 @@ from pisigma.compiled.damped_step import damped_step, scaled_square
 from pisigma.compiled.joint_correction import series_slope
 from pisigma.compiled.motion import correct, move
 from pisigma.compiled.rotations import pose_error
+from pisigma.compiled.rows import copy, copy_rows, fill
 
 Array = Any
 Record = Any
@@ -53,7 +54,7 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
     share = move(description, memory, arm, q)
     _steepen(description, memory, arm, share)
     pose_error(T, memory.T, memory.R, memory.best)
-    memory.J_best[:] = memory.J
+    copy_rows(memory.J, memory.J_best)
     old, damping = scaled_square(reach, memory.best), _FIRST_DAMPING
     for _ in range(_ITERATIONS):
         if _within(memory.best, tolerance, tolerance) or damping > _MOST_DAMPING:
@@ -69,9 +70,9 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
             new = scaled_square(reach, memory.error)
         if new < old:
             old = new
-            q[:] = memory.trial
-            memory.best[:] = memory.error
-            memory.J_best[:] = memory.J
+            copy(memory.trial, q)
+            copy(memory.error, memory.best)
+            copy_rows(memory.J, memory.J_best)
             damping = max(damping * 0.2, _LEAST_DAMPING)
         else:
             damping *= 8.0
@@ -99,12 +100,12 @@ def search(description: Record, memory: Record, T: Array, q: Array) -> bool:
     near already, a shorter way to the same place.
     """
     arms = description.arms
-    memory.checked[:] = math.nan
+    fill(memory.checked, math.nan)
     if arms.dof <= 6:
-        memory.start[:] = q
+        copy(q, memory.start)
         if _quick(description, memory, T, q):
             return True
-        q[:] = memory.start
+        copy(memory.start, q)
     newton(description, memory, GEOMETRIC, T, q, TOLERANCE)
     if not arms.hybrid:
         return _within(memory.best, ACCEPTED, ACCEPTED)
@@ -130,7 +131,7 @@ def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
         move(description, memory, GEOMETRIC, q)
         pose_error(T, memory.T, memory.R, memory.error)
         return _checked(memory, q, 1.0, TOLERANCE * 4)
-    memory.trial[:] = q
+    copy(q, memory.trial)
     before = 1.0
     for attempt in range(20):
         correct(description, memory, q)
@@ -158,7 +159,7 @@ def _checked(memory: Record, q: Array, share: float, tolerance: float) -> bool:
     """Whether the pose is reached; if so, keep that the pose, Jacobian and error in memory are those of q."""
     if not _within(memory.error, tolerance, tolerance):
         return False
-    memory.checked[:] = q
+    copy(q, memory.checked)
     memory.share = share
     return True
 

@@ -10,6 +10,7 @@ from pisigma.compiled.chain import walk
 from pisigma.compiled.closed_form import all_branches
 from pisigma.compiled.newton import search
 from pisigma.compiled.rotations import wrap
+from pisigma.compiled.rows import copy, fill
 
 Array = Any
 Record = Any
@@ -34,7 +35,7 @@ def nearest_starts(description: Record, memory: Record, T: Array) -> int:
     starts, near = description.starts, memory.nearest
     count = min(near.shape[0], starts.count)
     best = memory.right  # squared distances; nothing else works while starts are compared
-    best[:count] = math.inf
+    fill(best, math.inf)
     for s in range(starts.count):
         point, distance = starts.points[s], 0.0
         for i in range(3):
@@ -60,7 +61,7 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
         description: the calibrated arm.
         memory: to work in, with the pose; the joint values found are written into `memory.solution`.
         branch: index of the branch wanted.
-        any_branch: whether another will do where the nominal arm reaches the pose on none.
+        any_branch: whether another will do.
 
     Returns:
         Index of the branch on which they lie, -1 where nothing was found.
@@ -68,23 +69,22 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
     form, starts, arms, drawn = description.closed_form, description.starts, description.arms, memory.others
     if starts.count == 0:
         return -1
-    anywhere = any_branch and all_branches(arms, form, memory.pose, -1, memory.wanted, drawn) == 0
     count = nearest_starts(description, memory, memory.pose)
     _draw(description, memory.pose, memory.nearest[0], memory.drawn)
     all_branches(arms, form, memory.drawn, -1, memory.wanted, drawn)
-    for attempt in range(1 + form.branches + count if anywhere else 1):
+    for attempt in range(1 + form.branches + count if any_branch else 1):
         place = branch if attempt == 0 else attempt - 1
         if attempt > form.branches:
-            memory.q[:] = starts.q[memory.nearest[attempt - 1 - form.branches]]
+            copy(starts.q[memory.nearest[attempt - 1 - form.branches]], memory.q)
         elif math.isnan(drawn[place, 0]):
             continue
         else:
-            memory.q[:] = drawn[place]
+            copy(drawn[place], memory.q)
         if search(description, memory, memory.pose, memory.q):
-            memory.solution[:] = memory.q
+            copy(memory.q, memory.solution)
             lies = branch_of(description, memory, memory.q)
-            memory.checked[:] = math.nan
-            return lies if anywhere or lies == branch else -1
+            fill(memory.checked, math.nan)
+            return lies if any_branch or lies == branch else -1
     return -1
 
 

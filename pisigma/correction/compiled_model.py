@@ -2,6 +2,7 @@
 
 import math
 import os
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -27,8 +28,8 @@ from pisigma.compiled.arrays import (
     Starts,
 )
 from pisigma.compiled.description_file import write_description
-from pisigma.compiled.solver import CompiledIK
 from pisigma.correction.calibrated_model import CalibratedModel
+from pisigma.correction.compiled_network import describe_network
 from pisigma.correction.stored_starts import StoredStarts
 from pisigma.errors import ModelError
 from pisigma.hybrid.arms import HybridArm
@@ -48,46 +49,55 @@ from pisigma.network.features import (
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert, transform_from_xyzrpy
 
-FILE = "compiled.npz"
-"""Name of the file in a model folder."""
+if TYPE_CHECKING:
+    from pisigma.compiled.solver import CompiledIK
 
 _KINDS = {"fixed": FIXED, "revolute": REVOLUTE, "prismatic": PRISMATIC}
 _FORMS = {Scara: SCARA, SphericalWristArm: SPHERICAL_WRIST, ThreeParallelArm: THREE_PARALLEL}
 _NUMERIC = ("numeric",)
 
 
-def compile_model(model: CalibratedModel) -> CompiledIK:
+def compile_model(model: CalibratedModel) -> "CompiledIK":
     """The compiled inverse kinematics of a model.
 
     Raises:
         ModelError: the model corrects by something that has no compiled form; see `describe`.
     """
+    from pisigma.compiled.solver import CompiledIK
+
     description, branches = describe(model)
     return CompiledIK(description, branches, [joint.name for joint in model.robot.joints], model.name)
 
 
-def save_compiled(model: CalibratedModel, file: str | os.PathLike[str]) -> None:
+def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_to: str = "") -> None:
     """Write what `CompiledIK.load` reads.
+
+    Args:
+        model: the model.
+        file: to write.
+        belongs_to: `folder_hash` of the folder that says the same, kept in the file: one with another is stale.
 
     Raises:
         ModelError: see `describe`.
     """
     description, branches = describe(model)
     joints = [joint.name for joint in model.robot.joints]
-    write_description(file, description, branches=branches, joints=joints, name=model.name)
+    write_description(
+        file, description, branches=branches, joints=joints, name=model.name, belongs_to=belongs_to
+    )
 
 
 def describe(model: CalibratedModel) -> tuple[Description, tuple[str, ...]]:
     """A model as arrays, and the names of its branches.
 
     Raises:
-        ModelError: the model's network works on nominal joint values, its learned correction uses features without
+        ModelError: the model has a network and an identified geometry, its learned correction uses features without
             compiled form, or it has neither a closed-form inverse nor joint values to start from.
     """
-    if model.network is not None:
+    if model.network is not None and model.calibrated is not None:
         raise ModelError(
-            f"model '{model.name}': its network corrects nominal joint values, which has no compiled form; use "
-            "pisigma.load, or calibrate the geometry."
+            f"model '{model.name}': it has an identified geometry and a network that corrects nominal joint values, "
+            "which has no compiled form; leave one out."
         )
     solver = closed_form_solver(model.robot)
     if solver is None and not len(model.starts):
@@ -100,6 +110,7 @@ def describe(model: CalibratedModel) -> tuple[Description, tuple[str, ...]]:
         arms=_arms(model.robot, geometric, model.hybrid),
         correction=_correction(model),
         coverage=_coverage(geometric, model.hybrid),
+        network=describe_network(model),
         closed_form=_closed_form(model, solver),
         starts=_starts(geometric, model),
     )
@@ -212,12 +223,27 @@ def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> C
     dof, none = model.robot.dof, np.zeros((3, 4))
     if solver is None:
         zeros = np.zeros(dof)
-        return ClosedForm(NO_CLOSED_FORM, 1, 0, none, none, zeros, zeros, zeros, zeros, zeros, zeros)
+        return ClosedForm(
+            NO_CLOSED_FORM,
+            1,
+            np.zeros(1, dtype=np.int64),
+            1,
+            none,
+            none,
+            zeros,
+            zeros,
+            zeros,
+            zeros,
+            zeros,
+            zeros,
+        )
     rows, names = solver.rows, solver.branches
+    trained = [names.index(name) for name in model.branches] or list(range(len(names)))
     return ClosedForm(
         kind=_FORMS[type(solver)],
         branches=len(names),
-        default=names.index(model.branches[0]) if model.branches else 0,
+        order=np.array([*trained, *(index for index in range(len(names)) if index not in trained)]),
+        trained=len(trained),
         first=invert(rows.T_base_first)[:3].numpy(),
         last=invert(rows.T_last_tool)[:3].numpy(),
         sign=rows.sign.numpy(),

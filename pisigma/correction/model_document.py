@@ -14,8 +14,6 @@ from pisigma.yaml_file import Section, parse_yaml
 
 FORMAT = 2
 """Newest format; folders without anything of a hybrid calibration are written in format 1, which had none."""
-DESCRIPTION = "model.yaml"
-
 _CHECKSUM = re.compile(r"(.*^)sha256: ([0-9a-f]{64})\n", re.DOTALL | re.MULTILINE)
 
 _Vector = tuple[float, float, float]

@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 
@@ -14,7 +15,9 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from pisigma.correction.calibrated_model import CalibratedModel, Provenance
+from pisigma.correction.compiled_model import save_compiled
 from pisigma.correction.domain import Domain
+from pisigma.correction.folder_files import COMPILED, DESCRIPTION, WEIGHTS, folder_hash
 from pisigma.correction.hybrid_folder import (
     DTYPES,
     Shape,
@@ -23,7 +26,7 @@ from pisigma.correction.hybrid_folder import (
     hybrid_tensors,
     with_hybrid,
 )
-from pisigma.correction.model_document import DESCRIPTION, ModelDocument, read_document, write_document
+from pisigma.correction.model_document import ModelDocument, read_document, write_document
 from pisigma.errors import ModelError, PisigmaError, nearest_choice
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
@@ -32,13 +35,15 @@ from pisigma.network.pi_sigma import PiSigma
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import robot_to_yaml
 
-WEIGHTS = "model.safetensors"
-
 _PREFIX = "network."
 
 
 def save_model(model: CalibratedModel, folder: Path) -> None:
-    """Write `model.yaml` and `model.safetensors` into a folder, such as `staged_folder` gives."""
+    """Write the files of a model into a folder, such as `staged_folder` gives.
+
+    Next to `model.yaml` and `model.safetensors` it gets what the compiled kernels read, where they know the model's
+    kind of correction.
+    """
     weights = save_tensors(_tensors(model))
     groups = [
         {
@@ -65,6 +70,8 @@ def save_model(model: CalibratedModel, folder: Path) -> None:
     }
     (folder / WEIGHTS).write_bytes(weights)
     write_document(document, folder / DESCRIPTION)
+    with suppress(ModelError):
+        save_compiled(model, folder / COMPILED, folder_hash(folder) or "")
 
 
 def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:

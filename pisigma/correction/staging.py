@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from pisigma.correction.model_document import DESCRIPTION
+from pisigma.correction.folder_files import DESCRIPTION
 from pisigma.errors import OutputError
 
 

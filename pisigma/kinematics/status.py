@@ -6,8 +6,8 @@ import enum
 class Status(enum.IntEnum):
     """Outcome of inverse kinematics for one pose and one branch.
 
-    Joint values are NaN where, and only where, the status is UNREACHABLE. Where several apply, the gravest
-    counts, in the order REACHED, OUTSIDE_DOMAIN, SINGULAR, OUTSIDE_JOINT_LIMITS, then NOT_CONVERGED or
+    Joint values are NaN where, and only where, the status is UNREACHABLE or INVALID_POSE. Where several apply, the
+    gravest counts, in the order REACHED, OUTSIDE_DOMAIN, SINGULAR, OUTSIDE_JOINT_LIMITS, then NOT_CONVERGED or
     UNREACHABLE: a singular pose is never hidden, and the domain is seen in its measure too.
     """
 
@@ -17,6 +17,7 @@ class Status(enum.IntEnum):
     OUTSIDE_DOMAIN = 3
     UNREACHABLE = 4
     NOT_CONVERGED = 5
+    INVALID_POSE = 6
 
     @property
     def sentence(self) -> str:
@@ -26,7 +27,7 @@ class Status(enum.IntEnum):
     @property
     def reaches(self) -> bool:
         """Whether the joint values given with this status take the tool to the pose, limits aside."""
-        return self not in (Status.UNREACHABLE, Status.NOT_CONVERGED)
+        return self not in (Status.UNREACHABLE, Status.NOT_CONVERGED, Status.INVALID_POSE)
 
 
 _SENTENCES = {
@@ -51,5 +52,9 @@ _SENTENCES = {
     Status.NOT_CONVERGED: (
         "The search stopped before it reached the pose, and the joint values given do not reach it; start "
         "nearer, or check that the pose lies in the workspace."
+    ),
+    Status.INVALID_POSE: (
+        "The matrix is no pose (not finite, no rotation, or no last row 0 0 0 1), or the joint values to be near "
+        "to are not finite; correct it."
     ),
 }

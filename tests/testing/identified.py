@@ -16,8 +16,12 @@ ROWS, SPREAD = 60, 0.5
 
 
 def off_by(robot: Robot, length: float = 3e-4, angle: float = 2e-3, seed: int = 0) -> Robot:
-    """The robot with all lengths [m] and angles [rad] of its rows off by about so much."""
+    """The robot with all lengths [m] and angles [rad] of its rows off by about so much.
+
+    Axes of an arm of fewer than six joints stay parallel, or it could not take the poses of the nominal one.
+    """
     off = np.random.default_rng(seed).normal(size=robot.dh.shape)
+    off[:, 3:] *= robot.dof >= 6
     return robot.with_geometry(robot.dh + off * [angle, length, length, angle, angle])
 
 
