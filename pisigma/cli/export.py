@@ -13,12 +13,14 @@ _SUFFIXES = {
     "dh": (".csv", ".yaml", ".yml"),
     "offsets": (".csv", ".yaml", ".yml"),
     "targets": (".csv", ".script", ".src", ".mod", ".ls"),
+    "onnx": (".onnx",),
 }
 _CONTENTS = {
     "urdf": "a URDF",
     "dh": "a DH table",
     "offsets": "a table of joint offsets",
     "targets": "a table or program of targets",
+    "onnx": "an ONNX graph",
 }
 
 
@@ -28,7 +30,7 @@ def export(
         Path,
         typer.Option(
             help="File to write: .urdf; .csv or .yaml for dh and offsets; for targets .csv, .script (URScript), "
-            ".src (KUKA), .mod (ABB) or .ls (FANUC)."
+            ".src (KUKA), .mod (ABB) or .ls (FANUC); .onnx."
         ),
     ],
     form: Annotated[
@@ -36,7 +38,8 @@ def export(
         typer.Option(
             "--format",
             help="urdf: calibrated geometry; dh: its DH + Hayati table with base and tool; offsets: the best "
-            "joint offsets alone, with the accuracy that this gives up; targets: corrected targets for --poses.",
+            "joint offsets alone, with the accuracy that this gives up; targets: corrected targets for --poses; "
+            "onnx: the network alone.",
         ),
     ],
     like: Annotated[
@@ -98,16 +101,19 @@ def export(
         export_targets(model, out, poses, kind, branch, config, as_json)
         return
     loaded, as_csv = load_model(model), out.suffix.lower() == ".csv"
-    text, result = _urdf(loaded, like, tip) if form == "urdf" else _table(loaded, form, as_csv)
-    write_whole(out, text)
+    content: str | bytes
+    if form == "onnx":
+        content, result = _onnx(loaded, model)
+    else:
+        content, result = _urdf(loaded, like, tip) if form == "urdf" else _table(loaded, form, as_csv)
+    write_whole(out, content)
     if as_json:
         print_json({"file": str(out), "format": form, **result})
         return
     for remark in result["remarks"]:
         typer.echo(remark)
-    typer.echo(
-        f"{_CONTENTS[form].capitalize().replace('urdf', 'URDF').replace('dh', 'DH')} written to {out}."
-    )
+    what = _CONTENTS[form]
+    typer.echo(f"{what[0].upper()}{what[1:]} written to {out}.")
 
 
 def _check_target_options(form: str, poses: Path | None, *options: str | None) -> None:
@@ -136,6 +142,20 @@ def _urdf(model: "CalibratedModel", like: Path | None, tip: str | None) -> tuple
 
         text = robot_into_urdf(robot, model.robot, like, tip, told)
     return text, {"robot": robot.name, "joints": robot.dof, "remarks": list(told)}
+
+
+def _onnx(model: "CalibratedModel", folder: Path) -> tuple[bytes, dict[str, Any]]:
+    """The content of the file, and what to tell about it."""
+    import hashlib
+
+    from pisigma.export.onnx_model import export_onnx, onnx_remarks
+
+    content = export_onnx(model, hashlib.sha256((folder / "model.yaml").read_bytes()).hexdigest())
+    return content, {
+        "robot": model.robot.name,
+        "joints": model.robot.dof,
+        "remarks": list(onnx_remarks(model)),
+    }
 
 
 def _table(model: "CalibratedModel", form: str, as_csv: bool) -> tuple[str, dict[str, Any]]:

@@ -6,13 +6,16 @@ import typer
 
 from pisigma import __version__
 from pisigma.cli.calibrate import calibrate
+from pisigma.cli.distill import distill
 from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
 from pisigma.cli.ik import ik
 from pisigma.cli.output import tell_problems
+from pisigma.cli.report import report
 from pisigma.cli.robots import robots
 from pisigma.cli.simulate import simulate
 from pisigma.cli.train import train
+from pisigma.cli.verify import verify
 
 app = typer.Typer(
     name="pisigma",
@@ -22,7 +25,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (robots, simulate, calibrate, train, evaluate, ik, export):
+for command in (robots, simulate, calibrate, train, evaluate, report, ik, distill, export, verify):
     app.command()(tell_problems(command))
 
 
@@ -42,5 +45,5 @@ def _options(
 
 
 def run() -> None:
-    """Run the command line: exit status 0 done, 2 the user's input is at fault, 1 a defect of ours."""
+    """Run the command line: exit status 0 done, 2 the user's input is at fault, 3 limits not met, 1 our defect."""
     app()

@@ -24,8 +24,9 @@ class Inputs:
     """A named choice of inputs for one robot.
 
     A name is a coordinate of the pose (`x`, `y`, `z`, `roll`, `pitch`, `yaw`), a joint (`theta_1`: its
-    nominal value [rad or m]), or `sin(...)` and `cos(...)` of a sum of revolute joints (`sin(theta_1)`,
-    `cos(theta_2 + theta_3)`, `sin(theta_5 - theta_4)`).
+    nominal value [rad or m]), or `sin(...)` and `cos(...)` of a sum of revolute joints, each of which may have a
+    whole number before it (`sin(theta_1)`, `cos(theta_2 + theta_3)`, `sin(theta_5 - theta_4)`,
+    `cos(8*theta_1)`).
 
     Attributes:
         names: the inputs in order.
@@ -56,7 +57,7 @@ class Inputs:
                     f"the network input '{name}' is a coordinate of the pose and a joint of robot "
                     f"'{robot.name}'; rename the joint."
                 )
-            function, factors = chosen._combination(name)
+            function, factors = chosen.combination(name)
             meaning = (function if factors else name, tuple(factors))
             if meaning in meanings:
                 raise RecipeError(
@@ -86,13 +87,13 @@ class Inputs:
                 index = POSE_INPUTS.index(name)
                 columns.append(T[..., index, 3] if index < 3 else rpy[index - 3])
                 continue
-            function, factors = self._combination(name)
+            function, factors = self.combination(name)
             angle = q @ torch.tensor(factors, dtype=q.dtype, device=q.device)
             columns.append({"sin": torch.sin, "cos": torch.cos}[function](angle) if function else angle)
         return torch.stack(columns, -1)
 
-    def _combination(self, name: str) -> tuple[str, list[float]]:
-        """Function ("" for none) and the factor of every joint in its argument; none for a coordinate."""
+    def combination(self, name: str) -> tuple[str, list[float]]:
+        """What a name means: function ("" for none) and every joint's factor in its argument; none for a coordinate."""
         if name in POSE_INPUTS:
             return "", []
         factors = [0.0] * len(self.joint_names)
@@ -103,18 +104,19 @@ class Inputs:
         if not match:
             raise RecipeError(self._unknown(name))
         function, argument = match.groups()
-        for sign, term in self._terms(argument, name):
-            factors[self.joint_names.index(term)] += -1.0 if sign == "-" else 1.0
+        for factor, term in self._terms(argument, name):
+            factors[self.joint_names.index(term)] += factor
         return function, factors
 
-    def _terms(self, argument: str, name: str) -> list[tuple[str, str]]:
-        """Sign ("+", "-" or "") and joint of every term of a sum; nothing may be left over between them."""
+    def _terms(self, argument: str, name: str) -> list[tuple[float, str]]:
+        """Factor and joint of every term of a sum; nothing may be left over between them."""
         joints = "|".join(re.escape(joint) for joint in sorted(self.joint_names, key=len, reverse=True))
-        term = rf"\s*({{sign}})\s*({joints})\s*"
         rest = argument
-        terms: list[tuple[str, str]] = []
-        while match := re.match(term.format(sign="[+-]" if terms else "[+-]?"), rest):
-            terms.append((match[1], match[2]))
+        terms: list[tuple[float, str]] = []
+        while match := re.match(
+            rf"\s*({'[+-]' if terms else '[+-]?'})\s*(?:([1-9][0-9]{{0,3}})\s*\*\s*)?({joints})\s*", rest
+        ):
+            terms.append((float(match[1] + (match[2] or "1")), match[3]))
             rest = rest[match.end() :]
         if rest or not terms:
             raise RecipeError(self._unknown(name))

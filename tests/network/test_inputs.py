@@ -31,6 +31,7 @@ VALUES = {
     "sin(theta_5-theta_4)": math.sin(-2.4),
     "sin(-theta_1 + theta_6)": math.sin(0.8),
     "sin( theta_1+theta_1 )": math.sin(0.6),
+    "sin(3*theta_1 - 2 * theta_2)": math.sin(3.3),
 }
 
 
@@ -72,7 +73,10 @@ def test_angles_are_counted_from_the_reference(ur10):
         ("sin(theta_1 theta_2)", "unknown"),
         ("sin(theta_1 +)", "unknown"),
         ("sin(theta_1 ++ theta_2)", "unknown"),
-        ("sin(2*theta_1)", "unknown"),
+        ("sin(0*theta_1)", "unknown"),
+        ("sin(1.5*theta_1)", "unknown"),
+        ("sin(2 theta_1)", "unknown"),
+        ("sin(2*)", "unknown"),
         ("sin()", "unknown"),
         ("sin(+)", "unknown"),
         ("", "unknown"),

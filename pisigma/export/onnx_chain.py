@@ -1,0 +1,128 @@
+"""Forward kinematics of a nominal robot as ONNX nodes, and the torques of gravity on its joints."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from pisigma.export.onnx_graph import OnnxGraph
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.network.features import GravityTorques
+from pisigma.robot.description import Robot, Row
+from pisigma.se3 import transform_from_xyzrpy
+
+
+class _Step(NamedTuple):
+    """A row of the chain: what it is, and the frames `(batch, 4, 4)` before and after it."""
+
+    row: Row
+    before: str
+    after: str
+
+
+def add_pose(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str]:
+    """Position `(batch, 3)` of T_base_tool and the cells of its rotation `(batch, 9)`, row by row."""
+    (*_, last) = _add_chain(graph, robot, q, _matrix(robot.base))
+    cells = graph.reshape(graph.node("MatMul", last.after, _matrix(robot.tool)), [16])
+    return graph.columns(cells, [3, 7, 11]), graph.columns(cells, [0, 1, 2, 4, 5, 6, 8, 9, 10])
+
+
+def add_gravity(graph: OnnxGraph, features: GravityTorques, weight: np.ndarray, robot: Robot, q: str) -> str:
+    """Weighted torques of unit masses and moments, `(batch, dof)`; see `GravityTorques.columns`."""
+    node, dof, g = graph.node, robot.dof, np.array(features.gravity)
+    steps = [step for step in _add_chain(graph, robot, q, np.eye(4)) if step.row.type != "fixed"]
+    before = [graph.reshape(step.before, [16]) for step in steps]
+    after = [graph.reshape(step.after, [16]) for step in steps]
+    axes = node("Concat", *(graph.columns(cells, [2, 6, 10]) for cells in before), axis=1)
+    z = node("Mul", graph.reshape(axes, [dof, 3]), robot.directions[:, None])
+    places = node("Concat", *(graph.columns(cells, [3, 7, 11]) for cells in before), axis=1)
+    order = [3, 7, 11, 0, 4, 8, 1, 5, 9, 2, 6, 10]  # origin, then the three axes
+    carried = node("Concat", *(graph.columns(cells, order) for cells in after), axis=1)
+    across = np.array([[0, -g[2], g[1]], [g[2], 0, -g[0]], [-g[1], g[0], 0]])
+    lever = node("MatMul", z, across.T)
+    cells = node("MatMul", lever, node("Transpose", graph.reshape(carried, [4 * dof, 3]), perm=[0, 2, 1]))
+    own = graph.reshape(graph.total(node("Mul", lever, graph.reshape(places, [dof, 3])), 2), [dof, 1])
+    origin = np.tile([1.0, 0.0, 0.0, 0.0], dof)
+    scale = np.tile([1 / robot.reach, *[features.ARM] * 3], dof)
+    turns = np.array(robot.revolute, dtype=np.float64)
+    weight = weight * features.used.numpy()
+    torques = node("Mul", node("Sub", cells, node("Mul", own, origin)), scale * weight * turns[:, None])
+    force = node("Mul", graph.total(node("Mul", z, g), 2), (weight * origin).sum(1) * (1 - turns))
+    return node("Add", graph.total(torques, 2), force)
+
+
+def _add_chain(graph: OnnxGraph, robot: Robot, q: str, base: np.ndarray) -> Iterator[_Step]:
+    """Walk along the rows: `RotZ(q)` or `Trans(0, 0, q)` comes first, and what does not move behind it."""
+    frame, joint = _Frame(base, None), 0
+    for row, still in zip(robot.rows, _still(robot), strict=True):
+        before = frame
+        if row.type != "fixed":
+            value = graph.reshape(graph.node("Mul", graph.column(q, joint), float(row.direction)), [1, 1])
+            frame = frame.then_moving(graph, row, value)
+            joint += 1
+        frame = frame.then_still(graph, still)
+        yield _Step(row, before.name(graph, q), frame.name(graph, q))
+
+
+class _Frame(NamedTuple):
+    """A frame: one that does not move, or a value of the graph `(batch, 4, 4)`."""
+
+    constant: np.ndarray
+    value: str | None
+
+    def then_moving(self, graph: OnnxGraph, row: Row, value: str) -> "_Frame":
+        """The frame behind a joint of values `(batch, 1, 1)`."""
+        parts = _moving(row)
+        if self.value is None:
+            return _Frame(self.constant, _combined(graph, value, [self.constant @ part for part in parts]))
+        return _Frame(self.constant, graph.node("MatMul", self.value, _combined(graph, value, parts)))
+
+    def then_still(self, graph: OnnxGraph, still: np.ndarray) -> "_Frame":
+        """The frame behind what does not move."""
+        if self.value is None:
+            return _Frame(self.constant @ still, None)
+        return _Frame(self.constant, graph.node("MatMul", self.value, still))
+
+    def name(self, graph: OnnxGraph, q: str) -> str:
+        """The frame as `(batch, 4, 4)`; one that does not move is repeated for every row of q."""
+        if self.value is not None:
+            return self.value
+        ones = graph.node("Add", graph.node("Mul", graph.column(q, 0), 0.0), 1.0)
+        return graph.node("Mul", graph.reshape(ones, [1, 1]), self.constant)
+
+
+def _moving(row: Row) -> list[np.ndarray]:
+    """Matrices that `RotZ(q)` is the sum of, times 1, cos q and sin q, or `Trans(0, 0, q)`, times 1 and q."""
+    if row.type == "prismatic":
+        along = np.zeros((4, 4))
+        along[2, 3] = 1.0
+        return [np.eye(4), along]
+    crossed = np.zeros((4, 4))
+    crossed[1, 0], crossed[0, 1] = 1.0, -1.0
+    return [np.diag([0.0, 0.0, 1.0, 1.0]), np.diag([1.0, 1.0, 0.0, 0.0]), crossed]
+
+
+def _combined(graph: OnnxGraph, value: str, parts: Sequence[np.ndarray]) -> str:
+    """The sum of `_moving` at joint values `(batch, 1, 1)`, as `(batch, 4, 4)`."""
+    constant, *others = parts
+    factors = [value] if len(others) == 1 else [graph.node("Cos", value), graph.node("Sin", value)]
+    total = ""
+    for factor, part in zip(factors, others, strict=True):
+        term = graph.node("Mul", factor, part)
+        total = graph.node("Add", total, term) if total else term
+    return graph.node("Add", total, constant)
+
+
+def _still(robot: Robot) -> list[np.ndarray]:
+    """What every row does at joint value 0."""
+    found = []
+    for row, dh in zip(robot.rows, robot.dh, strict=True):
+        alone = Robot(robot.name, robot.maker, robot.source, (Row(row.name, "revolute"),), dh[None])
+        found.append(forward_kinematics(alone, torch.zeros(1, dtype=torch.float64)).numpy())
+    return found
+
+
+def _matrix(frame: np.ndarray) -> np.ndarray:
+    matrix: np.ndarray = transform_from_xyzrpy(torch.from_numpy(frame.copy())).numpy()
+    return matrix

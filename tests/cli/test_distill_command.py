@@ -1,0 +1,112 @@
+"""`pisigma distill`, and its model as an ONNX file."""
+
+import json
+
+import pytest
+from testing.identified import geometric_model
+from testing.models import hand_made_model
+
+import pisigma
+from pisigma.correction.model_folder import save_model
+from pisigma.export.onnx_model import INVERSE
+
+SMALL = ("--poses", 200, "--orders", "1,2")
+
+
+@pytest.fixture(scope="module")
+def parents(tmp_path_factory):
+    """A folder with a geometric model and one with a network only."""
+    folder = tmp_path_factory.mktemp("parents")
+    for name, model in (("geometric", geometric_model("kiro3")), ("network", hand_made_model("kiro3"))):
+        (folder / name).mkdir()
+        save_model(model, folder / name)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def distilled(run, parents):
+    """What the command printed, and the folder it wrote."""
+    out = parents / "small"
+    result = run("distill", parents / "geometric", "--out", out, *SMALL, "--seed", 3, "--json")
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout), out
+
+
+def test_the_model_can_be_used(run, distilled):
+    _, out = distilled
+    ik = pisigma.load(out)
+    assert (ik.model.kind, ik.model.name) == ("distilled", "small")
+    T = ik.model.forward(ik.model.starts[:1])[0]
+    x, y, z = (T[:3, 3] * 1e3).tolist()
+    yaw = float(T[1, 0].atan2(T[0, 0]).rad2deg())
+    flipped = 180.0 if float(T[2, 2]) < 0 else 0.0
+    done = run("ik", out, "--pose", x, y, z, yaw, 0, flipped, "--json")
+    assert done.exit_code == 0, done.output
+
+
+def test_the_report_says_what_was_lost(distilled):
+    report, out = distilled
+    held_out = report["held_out"]
+    assert held_out["full"]["max_mm"] < 1e-6
+    assert held_out["distilled"]["rms_mm"] < 0.1 * held_out["nominal"]["rms_mm"]
+    assert report["poses"]["held_out"] == 80
+    assert [size["orders"] for size in report["sizes"]] == [[1, 2]]
+    card = (out / "README.md").read_text()
+    assert "`pisigma distill geometric --out small --poses 200 --orders 1,2 --seed 3`" in card
+    assert report["parent"]["sha256"] in card
+    for sentence in report["gives_up"]:
+        assert sentence in card
+
+
+def test_without_json_there_are_tables(run, parents, tmp_path):
+    joints = tmp_path / "q.csv"
+    rows = geometric_model("kiro3").starts[:20].rad2deg()
+    rows[:, 2] *= 1e3 / rows.new_tensor(1.0).rad2deg()
+    lines = [",".join(map(repr, row)) for row in rows.tolist()]
+    joints.write_text("\n".join(["q1_deg,q2_deg,q3_mm,q4_deg", *lines]) + "\n")
+    out = tmp_path / "tables"
+    result = run("distill", parents / "geometric", "--out", out, "--joints", joints, *SMALL)
+    assert result.exit_code == 0, result.output
+    assert "tool under the full model, 80 held-out poses" in result.stdout
+    assert "--joints q.csv" in (out / "README.md").read_text()
+
+
+def test_it_can_be_exported(run, distilled, tmp_path):
+    onnx = pytest.importorskip("onnx")
+    file = tmp_path / "small.onnx"
+    result = run("export", distilled[1], "--format", "onnx", "--out", file, "--json")
+    assert result.exit_code == 0, result.output
+    about = {entry.key: entry.value for entry in onnx.load(file).metadata_props}
+    assert (about["model"], about["computes"], len(about["model_yaml_sha256"])) == ("small", INVERSE, 64)
+    assert [path.name for path in tmp_path.iterdir()] == ["small.onnx"]
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (("--orders", "1,x"), "--orders '1,x': whole numbers from 1 to 20"),
+        (("--orders", "0"), "--orders '0'"),
+        (("--harmonics", 4), "--harmonics goes with --orders"),
+        (("--orders", "1", "--harmonics", 0), "--harmonics 0"),
+        (("--seed", -1), "--seed -1"),
+        (("--poses", 5), "5 poses are too few"),
+        (("--region", 1, 0, 0, 1, 0, 1), "each minimum not above its maximum"),
+        (("--region", 0, "nan", 0, 1, 0, 1), "x_min x_max"),
+        (("--region", 4000, 4100, 0, 100, 0, 100, *SMALL), "takes only 0"),
+        (("--joints", "missing.csv"), "missing.csv: cannot be read"),
+    ],
+)
+def test_bad_options_are_told(refuses, parents, tmp_path, options, complaint):
+    out = tmp_path / "out"
+    assert complaint in refuses("distill", parents / "geometric", "--out", out, *options)
+    assert not out.exists()
+
+
+def test_a_model_of_a_network_only_is_refused(refuses, parents, tmp_path):
+    assert "nothing to distil" in refuses("distill", parents / "network", "--out", tmp_path / "out")
+
+
+def test_another_folder_is_not_touched(refuses, parents, tmp_path):
+    (tmp_path / "letter.txt").write_text("dear reader")
+    assert "is no model folder" in refuses("distill", parents / "geometric", "--out", tmp_path)
+    assert (tmp_path / "letter.txt").read_text() == "dear reader"
