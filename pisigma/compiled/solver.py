@@ -1,8 +1,9 @@
 """Corrected inverse kinematics for control loops: NumPy in, NumPy out, a few microseconds a pose."""
 
 import os
+import sys
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -41,6 +42,24 @@ _WRONG = {
     NEAR_NOT_FINITE: ("near{} holds joint values that are no finite numbers; give a number for every joint."),
 }
 
+_PATIENCE = 2.0
+"""[s] Kernels that are on disk are loaded in far less."""
+_COMPILING = (
+    "pisigma: compiling the inverse kinematics for this machine, once; that takes a minute or two ...\n"
+)
+
+
+def _kernels() -> Callable[..., int]:
+    """The kernels; where they have to be compiled first, somebody at a terminal is told why it takes so long."""
+    told = threading.Timer(_PATIENCE, sys.stderr.write, (_COMPILING,))
+    told.daemon = True
+    if sys.stderr.isatty():
+        told.start()
+    try:
+        return load_kernels()
+    finally:
+        told.cancel()
+
 
 class CompiledIK:
     """The corrected inverse kinematics of one arm, compiled. It may be called from several threads at a time.
@@ -74,7 +93,7 @@ class CompiledIK:
         self.name = name
         self.belongs_to = belongs_to
         self._none = np.zeros((0, len(self.joints)))
-        self._kernels = load_kernels()
+        self._kernels = _kernels()
         self._threads = threading.local()
 
     @staticmethod

@@ -55,6 +55,7 @@ class CorrectedIK:
         self.limits, self.revolute = model.robot.limits, np.array(model.robot.revolute)
         self.closed_form = self.branches != (NUMERIC,)
         self.model, self.torch = model, route
+        self._read: Callable[[], pisigma.correction.calibrated_model.CalibratedModel] = lambda: model
 
     @classmethod
     def _of_kernels(

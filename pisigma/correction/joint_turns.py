@@ -33,7 +33,7 @@ def unroll(
     rewinds: list[tuple[int, int]] = []
     for joint in np.flatnonzero(revolute):
         meant = 0.0 if near is None else float(near[joint])
-        rolled[:, joint], breaks = _within(rolled[:, joint], *limits[joint], meant)
+        rolled[:, joint], breaks = _within(rolled[:, joint], limits[joint, 0], limits[joint, 1], meant)
         rewinds += [(pose, int(joint)) for pose in breaks]
     return rolled, sorted(rewinds)
 

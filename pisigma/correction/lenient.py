@@ -32,10 +32,15 @@ def solve_what_can_be(
         fine = fine & finite.all(-1).to(fine.device).expand(fine.shape)
         beside = torch.where(finite, beside, 0.0)
     found = ik(T, near=beside, branch=branch)
-    nan = {
-        name: torch.where(fine[..., None], getattr(found, name), torch.nan)
-        for name in ("q", "q_nominal", "correction")
-    }
-    status = torch.where(fine, found.status, int(Status.INVALID_POSE))
-    measure = torch.where(fine, found.domain_measure, torch.nan)
-    return replace(found, status=status, domain_measure=measure, **nan)
+    q, nominal, correction = (
+        torch.where(fine[..., None], values, torch.nan)
+        for values in (found.q, found.q_nominal, found.correction)
+    )
+    return replace(
+        found,
+        q=q,
+        q_nominal=nominal,
+        correction=correction,
+        status=torch.where(fine, found.status, int(Status.INVALID_POSE)),
+        domain_measure=torch.where(fine, found.domain_measure, torch.nan),
+    )

@@ -83,7 +83,9 @@ def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:
     """
     path = Path(folder)
     if not path.is_dir():
-        raise ModelError(f"{path}: there is no such model folder; give a folder that `pisigma train` wrote.")
+        raise ModelError(
+            f"{path}: there is no such model folder; give a folder that `pisigma calibrate` or `pisigma train` wrote."
+        )
     for name in (DESCRIPTION, WEIGHTS):
         if not (path / name).is_file():
             raise ModelError(

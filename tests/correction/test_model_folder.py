@@ -4,6 +4,7 @@ import hashlib
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 import yaml
@@ -106,7 +107,7 @@ def test_windows_line_ends_do_not_count_as_edits(folder):
 
 def test_missing_folder_and_files(folder):
     with pytest.raises(
-        ModelError, match="there is no such model folder; give a folder that `pisigma train` wrote"
+        ModelError, match="there is no such model folder; give a folder that `pisigma calibrate` or"
     ):
         load_model(folder / "nothing")
     with pytest.raises(ModelError, match="there is no such model folder"):
