@@ -88,6 +88,7 @@ def calibrate(
     from pisigma.evaluation.calibration_card import write_calibration_card
     from pisigma.evaluation.calibration_report import report_calibration
     from pisigma.evaluation.calibration_validation import judge, validate
+    from pisigma.evaluation.held_out_rows import HELD_OUT_CSV, held_out_csv, held_out_section
     from pisigma.evaluation.trained_calibrations import fit
     from pisigma.measurement.dataset import Measurements
     from pisigma.robot.description import Robot
@@ -110,6 +111,9 @@ def calibrate(
         validation = validate(calibrator, measurements, parts, tell) if parts else None
     kept_aside = None if test is None else judge(calibrator, result, rows, test)
     report = {"rows": rows.rows, **report_calibration(result, validation, kept_aside)}
+    held_out = None if validation is None else held_out_csv(validation, measurements, nominal)
+    if held_out is not None:
+        report |= held_out_section(held_out, measurements)
     found = replace(_model(out.resolve().name, nominal, result, rows), metrics=report)
     options = {"model": model, "folds": folds, "hold-out": hold_out, "split": split, "seed": seed}
     options |= {"train-rows": train_rows, "free": free, "prior-mm": prior_mm, "prior-mrad": prior_mrad}
@@ -123,6 +127,8 @@ def calibrate(
     with staged_folder(out) as scratch:
         save_model(found, scratch)
         write_calibration_card(found, result, rows, validation or kept_aside, report, texts, scratch)
+        if held_out is not None:
+            (scratch / HELD_OUT_CSV).write_text(held_out, encoding="utf-8", newline="\n")
     finished = {"model": str(out), "seconds": round(time.perf_counter() - started, 3), **report}
     if as_json:
         print_json(finished)

@@ -14,6 +14,7 @@ from pisigma.evaluation.calibration_figures import (
 )
 from pisigma.evaluation.calibration_report import PARAMETERS_CSV, write_parameters
 from pisigma.evaluation.calibration_validation import CalibrationValidation
+from pisigma.evaluation.correlation_csv import CORRELATION_CSV, write_correlations
 from pisigma.evaluation.hybrid_card import compared, hybrid_parts, write_hybrid_figures
 from pisigma.evaluation.markdown import CARD, markdown_table, use_text
 from pisigma.evaluation.tables import figure_text, pose_table
@@ -49,7 +50,9 @@ def write_calibration_card(
     lengths = {name: errors.position.numpy() for name, errors in held_out.items()}
     under = ", geometric" if isinstance(found, HybridResult) else ""
     draw_residuals(result.residuals, lengths, folder / RESIDUALS_PNG, under)
-    draw_correlations((result.pairwise.lengths, result.pairwise.angles), folder / CORRELATION_PNG)
+    tables = (result.pairwise.lengths, result.pairwise.angles)
+    draw_correlations(tables, folder / CORRELATION_PNG)
+    write_correlations(tables, folder / CORRELATION_CSV)
     if isinstance(found, HybridResult):
         write_hybrid_figures(found, measurements, validation, report, folder)
     (folder / CARD).write_text(_text(model, result, report, texts), encoding="utf-8")

@@ -1,0 +1,1 @@
+"""One page by which an engineer accepts a calibration."""

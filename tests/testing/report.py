@@ -1,0 +1,73 @@
+"""Models and measurements that reports are made of in tests."""
+
+import functools
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from testing.hybrid import NOISE, HybridArmUnderTest, hybrid_of, joints_in
+from testing.models import no_type_checker
+
+from pisigma.correction.calibrated_model import CalibratedModel
+from pisigma.correction.geometric_model import model_of_calibration, model_of_hybrid
+from pisigma.correction.model_folder import save_model
+from pisigma.evaluation.calibration_report import report_calibration
+from pisigma.evaluation.calibration_validation import CalibrationValidation, judge
+from pisigma.evaluation.correlation_csv import CORRELATION_CSV, write_correlations
+from pisigma.evaluation.held_out_rows import HELD_OUT_CSV, held_out_csv, held_out_section
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.measurement.dataset import Measurements
+
+HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&\u2028$x_1$"
+"""A name that breaks pages which do not show it as text."""
+
+
+def measured(arm: HybridArmUnderTest, rows: int, seed: int) -> Measurements:
+    """Other rows of a simulated robot, with the noise of its calibration."""
+    q = joints_in(arm.true.nominal, rows, seed)
+    noise = NOISE * torch.from_numpy(np.random.default_rng(seed).normal(size=(rows, 3)))
+    return Measurements(q=q, position=arm.true.forward(q)[:, :3, 3] + noise)
+
+
+@functools.cache
+def hybrid_under_test(frames: bool = False) -> tuple[HybridArmUnderTest, CalibratedModel]:
+    """A simulated arm, and its model with all metrics, judged on other rows as a test set."""
+    arm = hybrid_of("rb5", 200, frames=frames)
+    with no_type_checker():
+        report = report_calibration(arm.result, None if frames else judged_on(arm, measured(arm, 60, 5)))
+        model = model_of_hybrid("arm", arm.true.nominal, arm.result, arm.measurements)
+    return arm, replace(model, metrics={"rows": 200, **report})
+
+
+def judged_on(arm: HybridArmUnderTest, rows: Measurements) -> CalibrationValidation:
+    """Judge the calibration of an arm on rows."""
+    calibrator = HybridCalibrator(GeometricCalibrator(arm.true.nominal))
+    return judge(calibrator, arm.result, arm.measurements, rows)
+
+
+@functools.cache
+def geometric_under_test() -> tuple[HybridArmUnderTest, CalibratedModel]:
+    """The same arm, its geometric calibration alone."""
+    arm = hybrid_of("rb5", 200)
+    with no_type_checker():
+        result = arm.result.geometric
+        model = model_of_calibration("plain", arm.true.nominal, result, arm.measurements)
+        return arm, replace(model, metrics={"rows": 200, **report_calibration(result)})
+
+
+def folder_with_held_out(arm: HybridArmUnderTest, model: CalibratedModel, folder: Path) -> CalibratedModel:
+    """A model folder that keeps errors of "held-out" rows: those of the calibration, a tenth larger."""
+    with no_type_checker():
+        found = judged_on(arm, arm.measurements)
+        for errors in found.models.values():
+            errors.position.mul_(1.1)
+        text = held_out_csv(found, arm.measurements, model.robot)
+        model = replace(model, metrics=model.metrics | held_out_section(text, arm.measurements))
+        folder.mkdir()
+        save_model(model, folder)
+        (folder / HELD_OUT_CSV).write_text(text, encoding="utf-8", newline="\n")
+        pairwise = arm.result.geometric.pairwise
+        write_correlations((pairwise.lengths, pairwise.angles), folder / CORRELATION_CSV)
+    return model
