@@ -1,0 +1,21 @@
+"""Formulas as MathML, made while the pages are built, so that they need neither network nor scripts to be read."""
+
+import html
+import re
+from typing import Any
+
+from latex2mathml.converter import convert
+
+_FORMULA = re.compile(r'<(span|div) class="arithmatex">(?:\\\((.+?)\\\)|\\\[(.+?)\\\])</\1>', re.DOTALL)
+
+
+def on_page_content(content: str, **_: Any) -> str:
+    """Put MathML in the place of every formula; mkdocs calls this for every page."""
+    return _FORMULA.sub(_mathml, content)
+
+
+def _mathml(match: re.Match[str]) -> str:
+    inline, block = match[2], match[3]
+    latex = html.unescape(inline or block).strip()
+    formula = convert(latex, display="inline" if inline else "block")
+    return formula if inline else f'<div class="formula">{formula}</div>'

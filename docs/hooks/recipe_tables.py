@@ -1,0 +1,142 @@
+"""Tables of all keys of recipes, from the models that check them.
+
+`python docs/hooks/recipe_tables.py` renews the page.
+"""
+
+import re
+import types
+import typing
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
+
+from pisigma.training.geometric_recipe import GeometricRecipe
+from pisigma.training.hybrid_recipe import HybridRecipe
+from pisigma.training.jig_recipe import JigRecipe
+from pisigma.training.recipe import Recipe
+
+PAGE = Path(__file__).parent.parent / "reference" / "recipes.md"
+BEGIN, END = "<!-- begin: keys -->", "<!-- end: keys -->"
+KINDS = (Recipe, GeometricRecipe, HybridRecipe, JigRecipe)
+
+_PLAIN = {
+    float: "number",
+    int: "whole number",
+    str: "text",
+    bool: "true or false",
+    type(None): "null",
+    Any: "anything",
+}
+
+
+def tables() -> str:
+    """All tables as Markdown, the kinds of recipes first and then what they are made of."""
+    return "\n".join(_table(section) for section in _sections())
+
+
+def page_with(text: str, new: str) -> str:
+    """A page with what stands between its marks replaced."""
+    head, _, rest = text.partition(BEGIN)
+    return f"{head}{BEGIN}\n\n{new}\n{END}{rest.partition(END)[2]}"
+
+
+def _sections() -> list[type[BaseModel]]:
+    """The kinds of recipes and every section that they lead to, each once."""
+    found: list[type[BaseModel]] = list(KINDS)
+    for section in found:
+        for field in section.model_fields.values():
+            found += [inner for inner in _inner(field.annotation) if inner not in found]
+    return found
+
+
+def _inner(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for argument in typing.get_args(annotation):
+        yield from _inner(argument)
+
+
+def _table(section: type[BaseModel]) -> str:
+    doc = _documentation(section)
+    lines = [f"### {_name(section)}", "", _cell(_summary(section)), ""]
+    lines += ["| key | value | default | meaning |", "|---|---|---|---|"]
+    for name, field in section.model_fields.items():
+        cells = (f"`{name}`", _type(field.annotation), _default(field), _cell(doc.get(name, "")))
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join([*lines, ""])
+
+
+def _name(section: type[BaseModel]) -> str:
+    """How a section is called on the page: by its `kind` or `method`, else by its class."""
+    for key in ("kind", "method"):
+        if key in section.model_fields:
+            (value,) = typing.get_args(section.model_fields[key].annotation)
+            return f"{key}: {value}"
+    words = re.sub(r"(Section|Figures)$", "", section.__name__)
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", words).lower()
+
+
+def _summary(section: type[BaseModel]) -> str:
+    text = (section.__doc__ or "").strip()
+    return re.split(r"\n\s*(?:Attributes|Source):", text)[0].replace("``", "`")
+
+
+def _documentation(section: type[BaseModel]) -> dict[str, str]:
+    """What the docstring says of every attribute."""
+    lines = (section.__doc__ or "").partition("Attributes:")[2].splitlines()
+    found: dict[str, str] = {}
+    last = ""
+    for line in lines:
+        if match := re.match(r"^ {8}(\w+): (.*)$", line):
+            last = match[1]
+            found[last] = match[2]
+        elif last and line.startswith(" " * 12):
+            found[last] += f" {line.strip()}"
+    return found
+
+
+def _type(annotation: Any) -> str:
+    origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
+    if annotation in _PLAIN:
+        return _PLAIN[annotation]
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        name = _name(annotation)
+        return f"[{name}](#{re.sub(r'[^a-z0-9_]+', '-', name.lower()).strip('-')})"
+    if origin is typing.Annotated:
+        return _type(arguments[0])
+    if origin is typing.Literal:
+        return " or ".join(f"`{value}`" for value in arguments)
+    if origin in (typing.Union, types.UnionType):
+        return " or ".join(dict.fromkeys(_type(argument) for argument in arguments))
+    if origin is dict:
+        return f"mapping of name to {_type(arguments[1])}"
+    if origin is list or (origin is tuple and len(arguments) == 2 and arguments[1] is Ellipsis):
+        return f"list of {_type(arguments[0])}"
+    if origin is tuple:
+        return f"list of {len(arguments)}: {_type(arguments[0])}"
+    raise TypeError(f"{annotation} has no words yet; add them to docs/hooks/recipe_tables.py.")
+
+
+def _default(field: Any) -> str:
+    if field.is_required():
+        return "required"
+    value = field.get_default(call_default_factory=True)
+    if value is PydanticUndefined:
+        return ""
+    if isinstance(value, BaseModel):
+        stated = value.model_dump(exclude_defaults=True, exclude_none=True)
+        return f"`{stated}`" if stated else "its defaults"
+    if value is None or value in ({}, (), ""):
+        return "none"
+    return f"`{list(value)}`" if isinstance(value, tuple) else f"`{value}`"
+
+
+def _cell(text: str) -> str:
+    return " ".join(text.split()).replace("|", "\\|")
+
+
+if __name__ == "__main__":
+    PAGE.write_text(page_with(PAGE.read_text(encoding="utf-8"), tables()), encoding="utf-8")
