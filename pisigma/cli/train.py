@@ -50,6 +50,7 @@ def train(
     from pisigma.correction.model_folder import save_model
     from pisigma.correction.staging import check_replaceable, staged_folder
     from pisigma.evaluation.card import write_card
+    from pisigma.evaluation.training_course import report_course
     from pisigma.evaluation.training_report import report_training
     from pisigma.training.checkpoints import checkpoint_folder, discard_checkpoints
     from pisigma.training.recipe import recipe_hash
@@ -69,7 +70,7 @@ def train(
     discard_checkpoints(checkpoints)
     result = {"model": str(folder), "seconds": round(time.perf_counter() - started, 3), **report}
     if as_json:
-        print_json(result)
+        print_json(result | report_course(stated, run))
     else:
         _print_report(result)
 

@@ -42,6 +42,7 @@ def train_geometric(
     from pisigma.evaluation.calibration_card import write_calibration_card
     from pisigma.evaluation.calibration_report import report_calibration
     from pisigma.evaluation.calibration_validation import errors_under
+    from pisigma.evaluation.elimination_cases import report_correlations, report_eliminations
     from pisigma.robot.description import Robot
     from pisigma.training.recipe import recipe_hash
     from pisigma.training.recipe_data import simulate_held_out, simulate_training
@@ -71,7 +72,13 @@ def train_geometric(
     with staged_folder(folder) as scratch:
         save_model(replace(model, metrics=report), scratch)
         write_calibration_card(model, result, rows, None, report, texts, scratch)
-    finished = {"model": str(folder), "seconds": round(time.perf_counter() - started, 3), **report}
+    comparison = {**report_eliminations(stated, result, rows, held_out), **report_correlations(result)}
+    finished = {
+        "model": str(folder),
+        "seconds": round(time.perf_counter() - started, 3),
+        **report,
+        **comparison,
+    }
     if as_json:
         print_json(finished)
         return

@@ -174,15 +174,20 @@ def parameter_table(run: JigRun) -> list[dict[str, Any]]:
 def seed_figures(
     seeds: dict[str, dict[str, Float64[np.ndarray, " seeds"]]], frames: tuple[str, ...]
 ) -> dict[str, Any]:
-    """Averages over the seeds, and the ratios that are promised; figures in millimetres."""
+    """Averages over the seeds, their standard deviations (divided by n), and the promised ratios [mm]."""
     averages = {
         setup: {f"{name}_mm": float(values.mean()) * 1e3 for name, values in figures.items()}
+        for setup, figures in seeds.items()
+    }
+    spreads = {
+        setup: {f"{name}_mm": float(values.std()) * 1e3 for name, values in figures.items()}
         for setup, figures in seeds.items()
     }
     single = {name: np.mean([seeds[frame][name] for frame in frames], axis=0) for name in FIGURES}
     return {
         "count": len(seeds[BOTH]["rms"]),
         "averages": averages,
+        "spreads": spreads,
         "ratios": {
             "both_over_single": _ratios(seeds[BOTH], single),
             "default_over_paper": _ratios(seeds[DEFAULT], seeds[BOTH]),

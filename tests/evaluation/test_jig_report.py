@@ -99,6 +99,7 @@ def test_ratios_are_averages_over_averages():
     found = seed_figures(values, ("jig_1", "jig_2"))
     assert found["count"] == 2
     assert_close(found["averages"]["both"]["rms_mm"], 6000.0)
+    assert_close(found["spreads"]["both"]["rms_mm"], 3000.0)
     assert_close(found["ratios"]["both_over_single"]["rms"], 2.0)
     assert_close(found["ratios"]["planned_over_random"]["mean"], 5 / 6)
     assert found["share_of_seeds_won_by_both"] == 0
