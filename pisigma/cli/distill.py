@@ -30,7 +30,8 @@ def distill(
     joints: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file with q1_deg and so on: the region lies between these joint values instead."
+            help="CSV file with q1_deg and so on: the region lies between each of these rows and the rows near it instead, "
+            "so that the rows have to fill it."
         ),
     ] = None,
     poses: Annotated[int, typer.Option(help="Poses to fit to.")] = 5000,
@@ -151,4 +152,6 @@ def _print(result: dict[str, Any]) -> None:
     print_table("absolute joint corrections, and errors of the distilled ones", *joint_rows(result["joints"]))
     for sentence in result["gives_up"]:
         typer.echo(sentence)
+    for sentence in result["doubts"]:
+        typer.echo(f"Warning: {sentence}")
     typer.echo(f"Model written to {result['model']} in {result['seconds']:.1f} s; read its README.md.")

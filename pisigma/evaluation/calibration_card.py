@@ -1,15 +1,17 @@
 """The card of a calibration: the parameters, what the data do not tell, and how good it is."""
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any
 
 from pisigma.correction.calibrated_model import CalibratedModel
 from pisigma.evaluation.calibration_figures import (
     CORRELATION_PNG,
+    HELD_OUT_PNG,
     RESIDUALS_PNG,
     draw_correlations,
+    draw_held_out,
     draw_residuals,
 )
 from pisigma.evaluation.calibration_report import PARAMETERS_CSV, write_parameters
@@ -49,13 +51,16 @@ def write_calibration_card(
     held_out = {} if validation is None else validation.models
     lengths = {name: errors.position.numpy() for name, errors in held_out.items()}
     under = ", geometric" if isinstance(found, HybridResult) else ""
-    draw_residuals(result.residuals, lengths, folder / RESIDUALS_PNG, under)
+    draw_residuals(result.residuals, folder / RESIDUALS_PNG, under)
+    if lengths:
+        draw_held_out(lengths, folder / HELD_OUT_PNG)
     tables = (result.pairwise.lengths, result.pairwise.angles)
     draw_correlations(tables, folder / CORRELATION_PNG)
     write_correlations(tables, folder / CORRELATION_CSV)
     if isinstance(found, HybridResult):
         write_hybrid_figures(found, measurements, validation, report, folder)
-    (folder / CARD).write_text(_text(model, result, report, texts), encoding="utf-8")
+    drawn = {entry.name for entry in folder.glob("*.png")}
+    (folder / CARD).write_text(_text(model, result, report, texts, drawn), encoding="utf-8")
 
 
 PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")
@@ -123,7 +128,11 @@ def held_out_lines(found: Mapping[str, Any]) -> list[str]:
 
 
 def _text(
-    model: CalibratedModel, result: CalibrationResult, report: Mapping[str, Any], texts: Mapping[str, str]
+    model: CalibratedModel,
+    result: CalibrationResult,
+    report: Mapping[str, Any],
+    texts: Mapping[str, str],
+    figures: Collection[str],
 ) -> str:
     provenance = model.provenance
     source = f"`{provenance.data_source}`" if "." in provenance.data_source else f"a {provenance.data_source}"
@@ -135,9 +144,9 @@ def _text(
     ]
     if "position" in result.residuals:
         under = " under the geometric calibration" if "hybrid" in report else ""
-        parts.append(
-            f"![residuals of the calibration rows{under}, and errors of held-out rows]({RESIDUALS_PNG})"
-        )
+        if HELD_OUT_PNG in figures:
+            parts.append(f"![errors of rows that the calibration did not see]({HELD_OUT_PNG})")
+        parts.append(f"![residuals of the calibration rows{under}]({RESIDUALS_PNG})")
     parts += hybrid_parts(report)
     parts += [
         "## Parameters",

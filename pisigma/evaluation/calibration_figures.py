@@ -13,6 +13,7 @@ from pisigma.evaluation.figures import save_figure
 from pisigma.identification.pairwise import CorrelationTable
 
 RESIDUALS_PNG = "residuals.png"
+HELD_OUT_PNG = "held_out_errors.png"
 CORRELATION_PNG = "correlation.png"
 
 _UNITS = {"position": ("mm", 1e3), "rotation": ("deg", float(np.rad2deg(1.0)))}
@@ -20,28 +21,22 @@ _REDUNDANT = 1 - 1e-6
 
 
 def draw_residuals(
-    residuals: Mapping[str, Float64[np.ndarray, "rows 3"]],
-    held_out: Mapping[str, Float64[np.ndarray, " held"]],
-    path: Path,
-    under: str = "",
+    residuals: Mapping[str, Float64[np.ndarray, "rows 3"]], path: Path, under: str = ""
 ) -> None:
-    """Draw the residuals per coordinate over the rows, and how the held-out errors are spread.
+    """Draw the residuals per coordinate over the rows.
 
     Args:
         residuals: by sensor, measured minus predicted of the calibration rows [m or rad], NaN where nothing
             was measured.
-        held_out: by model, lengths of the held-out position errors [m]; may be empty.
         path: the PNG to write.
         under: which calibration the residuals are of, for the title.
     """
     shown = [name for name in _UNITS if name in residuals]
-    count = len(shown) + bool(held_out)
-    figure = Figure(figsize=(7.6, 3.3 * max(count, 1)), layout="constrained")
-    panels = figure.subplots(max(count, 1), 1, squeeze=False)[:, 0]
+    count = max(len(shown), 1)
+    figure = Figure(figsize=(7.6, 3.3 * count), layout="constrained")
+    panels = figure.subplots(count, 1, squeeze=False)[:, 0]
     for axes, name in zip(panels, shown, strict=False):
         _draw_over_rows(axes, name, residuals[name], under)
-    if held_out:
-        _draw_shares(panels[-1], held_out)
     save_figure(figure, path)
 
 
@@ -58,7 +53,15 @@ def _draw_over_rows(axes: Axes, name: str, residuals: np.ndarray, under: str) ->
     axes.legend(ncols=3, loc="lower right", bbox_to_anchor=(1, 1), frameon=False, markerscale=2)
 
 
-def _draw_shares(axes: Axes, held_out: Mapping[str, np.ndarray]) -> None:
+def draw_held_out(held_out: Mapping[str, Float64[np.ndarray, " held"]], path: Path) -> None:
+    """Draw how the errors of rows that the calibration did not see are spread, one line for every model.
+
+    Args:
+        held_out: by model, lengths of the position errors [m].
+        path: the PNG to write.
+    """
+    figure = Figure(figsize=(7.6, 3.8), layout="constrained")
+    axes = figure.subplots()
     for (name, lengths), style in zip(held_out.items(), ("--", "-", "-.", ":"), strict=False):
         known = np.maximum(np.sort(lengths[np.isfinite(lengths)]) * 1e3, 1e-15)
         share = np.arange(1, len(known) + 1) / len(known) * 100
@@ -72,7 +75,8 @@ def _draw_shares(axes: Axes, held_out: Mapping[str, np.ndarray]) -> None:
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(alpha=0.3)
-    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2, fontsize=9, frameon=False)
+    axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=9, frameon=False)
+    save_figure(figure, path)
 
 
 def draw_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:

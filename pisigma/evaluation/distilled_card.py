@@ -67,6 +67,7 @@ def _text(found: Distillation, command: str, report: Mapping[str, Any]) -> str:
         f"On {report['poses']['held_out']} poses of the region that were neither fitted to nor chosen by: where the "
         "tool comes to lie under the full calibrated model, from where it was wanted. Nominal is without correction.",
         pose_table(report["held_out"]),
+        *(f"**Warning.** {sentence}" for sentence in report["doubts"]),
         "Absolute values per joint: what the full solution adds (correction), and what the network is off it (error).",
         markdown_table(*joint_rows(report["joints"])),
         "## Sizes tried",

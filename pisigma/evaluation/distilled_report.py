@@ -48,7 +48,34 @@ def report_distillation(found: Distillation) -> dict[str, Any]:
         },
         "joints": _joints(parent.robot, poses.correction, found.predicted),
     }
-    return report | {"gives_up": gives_up(found, report)}
+    return report | {"doubts": doubts(found, report), "gives_up": gives_up(found, report)}
+
+
+USEFUL = 0.2
+"""A distilled model whose error against the full solution is larger than this share of the nominal one is warned of."""
+
+_FEW_ROWS = 20
+"""Rows per joint from which a region is taken as filled."""
+
+
+def doubts(found: Distillation, report: dict[str, Any]) -> list[str]:
+    """Why the distilled model should perhaps not be used, a sentence each; empty where nothing speaks against it."""
+    held_out, sentences = report["held_out"], []
+    for key, what, unit in (("rms_mm", "position", "mm"), ("rms_deg", "orientation", "deg")):
+        own, nominal = held_out["distilled"][key], held_out["nominal"][key]
+        if own > USEFUL * nominal:
+            sentences.append(
+                f"It takes only {max(1 - own / nominal, 0):.0%} off the nominal error in {what} ({own:.3g} of {nominal:.3g} "
+                f"{unit} RMS are left): the region is too large for so small a network; give a smaller --region, more "
+                "--poses, or use the parent."
+            )
+    rows, joints = len(found.region.q), found.parent.robot.dof
+    if rows < _FEW_ROWS * joints:
+        sentences.append(
+            f"The region is told by only {rows} rows of joint values, {_FEW_ROWS * joints} or more fill it: between few "
+            "rows it is thin, and the errors hold in there only."
+        )
+    return sentences
 
 
 def gives_up(found: Distillation, report: dict[str, Any]) -> list[str]:

@@ -18,7 +18,7 @@ from pisigma.robot import Robot
 POSITION = {"rms_mm", "mean_mm", "p95_mm", "max_mm"}
 POSE = POSITION | {name.replace("mm", "deg") for name in POSITION}
 FILES = {"README.md", "compiled.npz", "correlation.png", "model.safetensors", "model.yaml", "parameters.csv"}
-FILES |= {"residuals.png"}
+FILES |= {"held_out_errors.png", "residuals.png"}
 FILES |= {"correlation.csv", "held_out.csv"}
 RECIPES = {"rb5_redundancy": (28, 20, 6), "panda_redundancy": (35, 24, 5)}
 

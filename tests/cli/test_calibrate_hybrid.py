@@ -17,6 +17,7 @@ from pisigma.measurement.dataset import Measurements
 
 POSITION = {"rms_mm", "mean_mm", "p95_mm", "max_mm"}
 FIGURES = {"joint_corrections.png", "predicted_spread.png", "residuals.png", "correlation.png"}
+FIGURES |= {"held_out_errors.png"}
 TRIAL = {"name", "unknowns", "log_evidence", "left_out", "seconds", "kept"}
 
 
