@@ -11,7 +11,7 @@ from pisigma.compiled.codes import UNREACHABLE
 from pisigma.compiled.corrected import add_correction, choose_corrected, finish_corrected
 from pisigma.compiled.finishing import finish
 from pisigma.compiled.newton import ACCEPTED, TOLERANCE, newton, search
-from pisigma.compiled.recovery import branch_of, nearest_starts, recover, within_reach
+from pisigma.compiled.recovery import MORE_ATTEMPTS, branch_of, nearest_starts, recover, within_reach
 from pisigma.compiled.rotations import wrap
 from pisigma.compiled.rows import copy, fill
 
@@ -230,16 +230,27 @@ def _distance(arms: Record, q: Array, near: Array) -> float:
 @njit(error_model="numpy")
 @no_type_check
 def _solve_without_branches(description: Record, memory: Record, has_near: bool) -> bool:
-    """Numeric inverse from `near`, then from the starts whose poses are nearest; whether one leads there."""
-    count = nearest_starts(description, memory, memory.pose)
+    """Numeric inverse from `near`, then from the starts whose poses are nearest; whether one leads there.
+
+    The first that leads there inside the joint limits is taken, else the first that leads there.
+    """
+    count, reached = nearest_starts(description, memory, memory.pose, MORE_ATTEMPTS), False
     for attempt in range(-1 if has_near else 0, count):
         if attempt < 0:
             copy(memory.near, memory.q)
         else:
             copy(description.starts.q[memory.nearest[attempt]], memory.q)
-        if search(description, memory, memory.pose, memory.q):
-            copy(memory.q, memory.solution)
-            fill(memory.checked, math.nan)
-            _solve_nominal(description, memory)
-            return True
-    return False
+        if not search(description, memory, memory.pose, memory.q):
+            continue
+        copy(memory.q, memory.trial)
+        inside = turn_into_limits(description.arms, memory.trial)
+        if inside or not reached:
+            copy(memory.q, memory.kept)
+        reached = True
+        if inside:
+            break
+    if reached:
+        copy(memory.kept, memory.solution)
+        fill(memory.checked, math.nan)
+        _solve_nominal(description, memory)
+    return reached

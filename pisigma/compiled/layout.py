@@ -137,9 +137,11 @@ MEMORY = np.dtype(
         share=(),  # of the correction
         seen=(SEEN,),  # scaled inputs of a network
         angles=(3,),  # roll, pitch and yaw
-        distance=(SAMPLES,),  # squared, of scaled inputs from the rows of a domain
+        distance=(
+            SAMPLES,
+        ),  # squared, of scaled inputs from the rows of a domain, or of poses from stored ones
     )
-    + _integers(nearest=(4,))  # stored starts
+    + _integers(nearest=(128,))  # stored starts
 )
 """What kernels work in: overwritten all the time, and nothing in it outlives a pose."""
 

@@ -15,6 +15,8 @@ from pisigma.compiled.rows import copy, fill
 Array = Any
 Record = Any
 
+ATTEMPTS, MORE_ATTEMPTS = 4, 128
+"""Stored starts that are tried, nearest first; the latter number on arms without closed form."""
 PULL = 0.02
 """Share of the reach by which a pose beyond the nominal workspace is drawn towards a stored one."""
 
@@ -30,11 +32,11 @@ def within_reach(description: Record, T: Array) -> bool:
 
 @njit(error_model="numpy")
 @no_type_check
-def nearest_starts(description: Record, memory: Record, T: Array) -> int:
+def nearest_starts(description: Record, memory: Record, T: Array, most: int) -> int:
     """Write the indices of the starts whose poses are nearest into `memory.nearest`, nearest first; their number."""
     starts, near = description.starts, memory.nearest
-    count = min(near.shape[0], starts.count)
-    best = memory.right  # squared distances; nothing else works while starts are compared
+    count = min(most, starts.count)
+    best = memory.distance  # squared
     fill(best, math.inf)
     for s in range(starts.count):
         point, distance = starts.points[s], 0.0
@@ -69,7 +71,7 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
     form, starts, arms, drawn = description.closed_form, description.starts, description.arms, memory.others
     if starts.count == 0:
         return -1
-    count = nearest_starts(description, memory, memory.pose)
+    count = nearest_starts(description, memory, memory.pose, ATTEMPTS)
     _draw(description, memory.pose, memory.nearest[0], memory.drawn)
     all_branches(arms, form, memory.drawn, -1, memory.wanted, drawn)
     for attempt in range(1 + form.branches + count if any_branch else 1):

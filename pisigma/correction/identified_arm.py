@@ -1,13 +1,13 @@
 """Inverse kinematics of an identified geometry, which has no closed form of its own."""
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.correction.hybrid_motion import hybrid_motion
+from pisigma.correction.hybrid_motion import HybridMotion
 from pisigma.correction.stored_starts import StoredStarts
 from pisigma.hybrid.arms import HybridArm
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
@@ -26,7 +26,7 @@ ATTEMPTS = 4
 HYBRID_TOLERANCE = 1e-12
 """[m and rad] Residuals of a hybrid arm; blending two arms costs a few more roundings than one."""
 
-CHEAP_ITERATIONS, EXACT_ITERATIONS = 10, 25
+ITERATIONS, CHEAP_ITERATIONS, EXACT_ITERATIONS = 60, 10, 25
 
 NEARLY = 0.01
 """Share of the reach, and angle [rad]: a pose that the geometric arm misses by less the hybrid one may take."""
@@ -43,7 +43,8 @@ def search(
     robot: Robot,
     T: Float64[Tensor, "poses 4 4"],
     starts: Float64[Tensor, "poses _starts dof"],
-    hybrid: HybridArm | None = None,
+    hybrid: HybridMotion | None = None,
+    inside: bool = False,
 ) -> tuple[Float64[Tensor, "poses dof"], Int64[Tensor, " poses"]]:
     """Solve for poses from one start after the other, until one leads there.
 
@@ -51,7 +52,8 @@ def search(
         robot: the arm, or the geometric part of a hybrid one.
         T: wanted poses.
         starts: joint values to begin with [rad or m].
-        hybrid: the hybrid arm that is to take the poses, where it is one.
+        hybrid: how the hybrid arm that is to take the poses moves, where it is one.
+        inside: whether a start that leads there inside the joint limits goes before earlier ones that do not.
 
     Returns:
         Joint values [rad or m], NaN where the status is UNREACHABLE; poses beyond the reach are not tried.
@@ -59,31 +61,39 @@ def search(
     q = T.new_full((len(T), robot.dof), torch.nan)
     status = torch.full((len(T),), int(Status.UNREACHABLE))
     near = within_reach(robot, T)
-    for attempt in range(starts.shape[1]):
-        usable = torch.isfinite(starts[:, attempt]).all(-1)
-        left = (near & usable & (status == Status.UNREACHABLE)).nonzero()[:, 0]
-        if len(left):
-            found = _solve(robot, T[left], starts[left, attempt], hybrid)
-            good = found.status != Status.NOT_CONVERGED
-            q[left[good]], status[left[good]] = found.q[good], found.status[good]
+    alone = 0 if inside else 1
+    for tried in (slice(0, alone), slice(alone, None)):  # all but the first at once
+        usable = torch.isfinite(starts[:, tried]).all(-1) & (near & (status == Status.UNREACHABLE))[:, None]
+        pose, attempt = usable.nonzero().unbind(1)
+        if not len(pose):
+            continue
+        found = _solve(robot, T[pose], starts[:, tried][pose, attempt], hybrid)
+        good = found.status != Status.NOT_CONVERGED
+        if inside:
+            attempt = attempt + starts.shape[1] * (found.status == Status.OUTSIDE_JOINT_LIMITS)
+        first = torch.full((len(T),), 2 * starts.shape[1]).scatter_reduce(
+            0, pose[good], attempt[good], "amin"
+        )
+        kept = (good & (attempt == first[pose])).nonzero()[:, 0]
+        q[pose[kept]], status[pose[kept]] = found.q[kept], found.status[kept]
     return q, status
 
 
-def _solve(robot: Robot, T: Tensor, start: Tensor, hybrid: HybridArm | None) -> NumericSolution:
+def _solve(robot: Robot, T: Tensor, start: Tensor, hybrid: HybridMotion | None) -> NumericSolution:
     """Solve for the arm, and from there for the hybrid one, which may reach a little farther.
 
     First with a Jacobian that is cheap; what it does not solve, near singular poses, with the exact one.
     """
-    found = solve_numeric(robot, T, start)
+    found = solve_numeric(robot, T, start, max_iterations=ITERATIONS)
     if hybrid is None:
         return found
     close = (found.position_residual < NEARLY * robot.reach) & (found.rotation_residual < NEARLY)
     q, status = found.q.clone(), torch.full_like(found.status, int(Status.NOT_CONVERGED))
     for exact, rounds in ((False, CHEAP_ITERATIONS), (True, EXACT_ITERATIONS)):
         rows = (close & (status == Status.NOT_CONVERGED)).nonzero()[:, 0]
-        motion = partial(hybrid_motion, hybrid, exact=exact)
+        motion = partial(hybrid, exact=exact)
         better = solve_numeric(
-            hybrid.hybrid,
+            hybrid.arm.hybrid,
             T[rows],
             q[rows],
             tolerance=HYBRID_TOLERANCE,
@@ -112,6 +122,11 @@ class IdentifiedArm:
     starts: StoredStarts
     hybrid: HybridArm | None = None
 
+    @cached_property
+    def motion(self) -> HybridMotion | None:
+        """How the hybrid arm moves, where there is one."""
+        return None if self.hybrid is None else HybridMotion(self.hybrid)
+
     def follow(
         self, T: Float64[Tensor, "*batch 4 4"], q: Float64[Tensor, "*batch dof"]
     ) -> tuple[Float64[Tensor, "*batch dof"], Int64[Tensor, "*batch"]]:
@@ -121,7 +136,7 @@ class IdentifiedArm:
             Joint values [rad or m] on the turns of q, and a status.
         """
         found, status = search(
-            self.calibrated, T.reshape(-1, 4, 4), q.reshape(-1, 1, q.shape[-1]), self.hybrid
+            self.calibrated, T.reshape(-1, 4, 4), q.reshape(-1, 1, q.shape[-1]), self.motion
         )
         return self.turned_like(found.reshape(q.shape), q), status.reshape(q.shape[:-1])
 
@@ -153,11 +168,11 @@ class IdentifiedArm:
             return q, status, branch
         T_near, wanted = T[chosen], branch[chosen]
         index = self.starts.nearest(T_near, ATTEMPTS)
-        drawn = self.solver.solve(self._drawn(T_near, self.starts.T[index[:, 0], :3, 3])).q
+        drawn = self.solver.solve(self.drawn(T_near, self.starts.T[index[:, 0], :3, 3])).q
         first = drawn[torch.arange(len(chosen)), wanted][:, None]
         others = torch.cat([drawn, self.starts.q[index]], 1)
         others = torch.where(anywhere[chosen, None, None], others, torch.nan)
-        found, reached = search(self.calibrated, T_near, torch.cat([first, others], 1), self.hybrid)
+        found, reached = search(self.calibrated, T_near, torch.cat([first, others], 1), self.motion)
         lies = self.branch_of(found)
         lost = (lies != wanted) & ~anywhere[chosen]
         found[lost], reached[lost] = torch.nan, int(Status.UNREACHABLE)
@@ -183,7 +198,7 @@ class IdentifiedArm:
         difference = q - other
         return torch.where(torch.tensor(self.nominal.revolute), wrap_to_pi(difference), difference)
 
-    def _drawn(
+    def drawn(
         self, T: Float64[Tensor, "poses 4 4"], towards: Float64[Tensor, "poses 3"]
     ) -> Float64[Tensor, "poses 4 4"]:
         """Every pose moved by `PULL`, but no farther than to the other position."""

@@ -1,6 +1,6 @@
 """What corrected inverse kinematics gives back."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -94,6 +94,13 @@ class Solution:
             return values.gather(-2, place)[..., 0, :]
 
         return self._map(vector, lambda values: values.gather(-1, index[..., None])[..., 0])
+
+    def reshaped(self, batch: Sequence[int]) -> "Solution":
+        """The same with other batch axes."""
+        return self._map(
+            lambda values: values.reshape((*batch, values.shape[-1])),
+            lambda values: values.reshape(tuple(batch)),
+        )
 
     def with_branch_axis(self) -> "Solution":
         """The same with a last batch axis of one branch."""

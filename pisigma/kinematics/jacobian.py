@@ -1,5 +1,7 @@
 """Joint Jacobian of the tool pose, batched and in closed form."""
 
+from collections.abc import Sequence
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -16,6 +18,7 @@ from pisigma.kinematics.components import (
     subtract,
 )
 from pisigma.kinematics.forward import Geometry, iterate_chunks, iterate_rows
+from pisigma.kinematics.matrix_chain import FEW, matrix_chain
 from pisigma.robot.description import Robot
 
 
@@ -41,12 +44,15 @@ def joint_jacobian(
         PoseError: q has another number of columns than the robot has joints.
     """
     robot.check_joint_count(q.shape[-1])
+    batch = q.shape[:-1]
+    if q[..., 0].numel() < FEW:
+        T, J = matrix_chain(robot).motion(q.reshape(-1, q.shape[-1]))
+        return T.reshape(*batch, 4, 4), J.reshape(*batch, 6, robot.dof)
     geometry = Geometry.of(robot)
     chunks = [_jacobian_chunk(robot, geometry, chunk) for chunk in iterate_chunks(q)]
     T, J = chunks[0]
     if len(chunks) > 1:
         T, J = _join([T for T, _ in chunks]), _join([J for _, J in chunks])
-    batch = q.shape[:-1]
     return T.reshape(*batch, 4, 4), J.reshape(*batch, 6, robot.dof)
 
 
@@ -59,9 +65,24 @@ def _jacobian_chunk(
     robot: Robot, geometry: Geometry, q: Float[Tensor, "poses dof"]
 ) -> tuple[Float[Tensor, "poses 4 4"], Float[Tensor, "poses 6 dof"]]:
     columns = q.t().contiguous().unbind(0)
+    tool, rows = motion_components(robot, geometry, columns)
+    J = stack_components([value for entries in rows for value in entries], like=columns[0])
+    return as_transform(tool, like=columns[0]), J.reshape(-1, 6, robot.dof)
+
+
+def motion_components(
+    robot: Robot, geometry: Geometry, q: Sequence[Scalar]
+) -> tuple[Frame, list[list[Scalar]]]:
+    """Frame of the tool and the six rows of the joint Jacobian, as `joint_jacobian` gives them, on components.
+
+    Args:
+        robot: the robot.
+        geometry: its parameters, or others for the same rows.
+        q: one joint value [rad or m] per joint, each a tensor with the batch shape.
+    """
     joints: list[Frame] = []
     frame = IDENTITY
-    for row, frames in zip(robot.rows, iterate_rows(robot, geometry, columns), strict=True):
+    for row, frames in zip(robot.rows, iterate_rows(robot, geometry, q), strict=True):
         if row.type != "fixed":
             joints.append(frames.before)
         frame = frames.after
@@ -73,5 +94,4 @@ def _jacobian_chunk(
         angular = (0.0, 0.0, 0.0) if joint.type == "prismatic" else axis
         for entries, value in zip(rows, (*linear, *angular), strict=True):
             entries.append(product(float(joint.direction), value))
-    J = stack_components([value for entries in rows for value in entries], like=columns[0])
-    return as_transform(tool, like=columns[0]), J.reshape(-1, 6, robot.dof)
+    return tool, rows

@@ -32,6 +32,7 @@ def test_the_folder_is_whole(trained):
         "energy.csv",
         "energy.png",
         "errors_over_workspace.png",
+        "compiled.npz",
         "model.safetensors",
         "model.yaml",
     }

@@ -14,6 +14,7 @@ from pisigma.correction.corrected_ik import CorrectedIK, load
 from pisigma.correction.geometric_model import model_of_hybrid
 from pisigma.correction.model_folder import save_model
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.singularity import singularity_measure
 from pisigma.kinematics.status import Status
 from pisigma.se3 import pose_error
 
@@ -82,7 +83,11 @@ def test_all_branches_take_the_poses(solver):
         alone = ik(T, branch=name)
         there = found(alone)
         assert torch.equal(there, reached[:, ik.branches.index(name)])
-        assert_close(alone.q[there], every.q[:, ik.branches.index(name)][there], atol=1e-9)
+        assert_close(alone.position_residual[there], 0.0, atol=1e-9)
+        clear = there.clone()  # of a joint arrangement where two branches meet, such as a straight elbow
+        clear[there] = singularity_measure(ik.model.calibrated, alone.q[there]) > 0.005
+        assert int(clear.sum()) > 0.9 * int(there.sum())
+        assert_close(alone.q[clear], every.q[:, ik.branches.index(name)][clear], atol=1e-9)
 
 
 def test_nominal_values_and_correction_go_with_the_solution(solver):

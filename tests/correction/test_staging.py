@@ -35,7 +35,7 @@ def test_a_model_is_replaced_and_nothing_is_left_behind(tmp_path):
     (tmp_path / "model" / "stale.png").write_text("old")
     write(tmp_path / "model", "kiro4")
     assert names(tmp_path) == ["model"]
-    assert names(tmp_path / "model") == ["model.safetensors", "model.yaml"]
+    assert names(tmp_path / "model") == ["compiled.npz", "model.safetensors", "model.yaml"]
     assert load_model(tmp_path / "model").robot.name == "kiro4"
 
 

@@ -377,6 +377,10 @@ def test_what_is_no_pose_is_refused(name, T, words, robots):
 
 def test_every_status_says_what_to_do():
     sentences = [status.sentence for status in Status]
-    assert len(set(sentences)) == len(sentences) == 6
+    assert len(set(sentences)) == len(sentences) == 7
     assert all(";" in s or "limits." in s for s in sentences)
-    assert [s for s in Status if not s.reaches] == [Status.UNREACHABLE, Status.NOT_CONVERGED]
+    assert [s for s in Status if not s.reaches] == [
+        Status.UNREACHABLE,
+        Status.NOT_CONVERGED,
+        Status.INVALID_POSE,
+    ]

@@ -1,16 +1,18 @@
 """Closed form of planar SCARA robots: turn, turn, slide, turn about parallel axes."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from pisigma.kinematics.closed_form.canonical import canonical_rows
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
 from pisigma.kinematics.closed_form.tolerance import rounding
 from pisigma.kinematics.closed_form.two_link import solve_two_link
+from pisigma.kinematics.components import Frame, Scalar, as_tensors
 from pisigma.robot.description import Robot
 
 TILT_TOLERANCE = 1e-9
@@ -49,18 +51,20 @@ class Scara(AbstractClosedForm):
         y = self.rows.a[2] * math.sin(self.rows.theta[2])
         return math.hypot(x, y), math.atan2(y, x)
 
-    def _solve_canonical(
-        self, T: Float[Tensor, "*batch 4 4"]
-    ) -> tuple[Float[Tensor, "*batch 2 4"], Bool[Tensor, "*batch 2"], Bool[Tensor, "*batch 2"]]:
+    @property
+    def _forks(self) -> int:
+        return 1
+
+    def _solve_components(
+        self, T: Frame, signs: Sequence[Scalar]
+    ) -> tuple[list[Scalar], Bool[Tensor, "..."], Bool[Tensor, "..."]]:
         rows = self.rows
         length, angle = self._second_link
-        signs = T.new_tensor([1.0, -1.0]).expand(*T.shape[:-2], 2)
-        x, y = T[..., 0, 3, None].expand(signs.shape), T[..., 1, 3, None].expand(signs.shape)
-        arm = solve_two_link(x, y, rows.a[0], length, signs, rows.variable_at_zero(0))
+        (r_00, r_10, _), _, (r_02, r_12, r_22), (x, y, z) = as_tensors(T)
+        arm = solve_two_link(x, y, rows.a[0], length, signs[0], rows.variable_at_zero(0))
         t_2 = arm.elbow - angle
-        d_3 = (T[..., 2, 3] - rows.d[0] - rows.d[1])[..., None].expand(signs.shape)
-        turn = torch.atan2(T[..., 1, 0], T[..., 0, 0])[..., None]
-        t_4 = turn - arm.first - t_2 - rows.theta[2]
-        tilt = torch.hypot(T[..., 0, 2], T[..., 1, 2])
-        upright = (tilt <= max(TILT_TOLERANCE, rounding(T.dtype))) & (T[..., 2, 2] > 0)
-        return torch.stack([arm.first, t_2, d_3, t_4], -1), arm.reached & upright[..., None], arm.singular
+        d_3 = z - rows.d[0] - rows.d[1]
+        t_4 = torch.atan2(r_10, r_00) - arm.first - t_2 - rows.theta[2]
+        tilt = torch.hypot(r_02, r_12)
+        upright = (tilt <= max(TILT_TOLERANCE, rounding(x.dtype))) & (r_22 > 0)
+        return [arm.first, t_2, d_3, t_4], arm.reached & upright, arm.singular

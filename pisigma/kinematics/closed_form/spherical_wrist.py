@@ -1,16 +1,18 @@
 """Closed form of six-joint arms whose last three axes meet in a point."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from pisigma.kinematics.closed_form.canonical import canonical_rows
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
 from pisigma.kinematics.closed_form.tolerance import rounding, singular_tolerance
 from pisigma.kinematics.closed_form.two_link import solve_two_link
+from pisigma.kinematics.components import Columns, Frame, Scalar, as_tensors
 from pisigma.robot.description import Robot
 
 _RIGHT = math.pi / 2
@@ -64,69 +66,62 @@ class SphericalWristArm(AbstractClosedForm):
             for wrist in ("no_flip", "flip")
         )
 
-    def _solve_canonical(
-        self, T: Float[Tensor, "*batch 4 4"]
-    ) -> tuple[Float[Tensor, "*batch 8 6"], Bool[Tensor, "*batch 8"], Bool[Tensor, "*batch 8"]]:
-        signs = T.new_tensor([[shoulder, elbow] for shoulder in (1.0, -1.0) for elbow in (1.0, -1.0)])
-        t_123, reached, arm_singular = self._solve_arm(T[..., None, :3, 3], signs[:, 0], signs[:, 1])
-        t_456, wrist_singular = self._solve_wrist(T[..., None, :3, :3], t_123)
-        variables = torch.cat([t_123[..., None, :].expand(t_456.shape), t_456], -1)
-        singular = (arm_singular | wrist_singular).repeat_interleave(2, -1)
-        return variables.flatten(-3, -2), reached.repeat_interleave(2, -1), singular
+    @property
+    def _forks(self) -> int:
+        return 3
+
+    def _solve_components(
+        self, T: Frame, signs: Sequence[Scalar]
+    ) -> tuple[list[Scalar], Bool[Tensor, "..."], Bool[Tensor, "..."]]:
+        shoulder, elbow, wrist = signs
+        columns = as_tensors(T)
+        t_123, reached, arm_singular = self._solve_arm(columns[3], shoulder, elbow)
+        t_456, wrist_singular = self._solve_wrist(columns, t_123, wrist)
+        return [*t_123, *t_456], reached, arm_singular | wrist_singular
 
     def _solve_arm(
-        self, p: Float[Tensor, "*batch 1 3"], shoulder: Float[Tensor, " 4"], elbow: Float[Tensor, " 4"]
-    ) -> tuple[Float[Tensor, "*batch 4 3"], Bool[Tensor, "*batch 4"], Bool[Tensor, "*batch 4"]]:
+        self, p: tuple[Tensor, Tensor, Tensor], shoulder: Scalar, elbow: Scalar
+    ) -> tuple[list[Tensor], Tensor, Tensor]:
         """Joints 1 to 3 that bring the wrist centre to p."""
         (a_1, a_2, a_3, *_), (d_1, d_2, d_3, d_4, *_) = self.rows.a, self.rows.d
         scale = abs(a_1) + abs(a_2) + math.hypot(a_3, d_4) + abs(d_2 + d_3)
-        x, y, z = p.expand(*p.shape[:-2], 4, 3).unbind(-1)
+        x, y, z = p
         side = d_2 + d_3
         square = x * x + y * y - side * side
-        beside_axis = square >= -rounding(p.dtype) * scale * scale
+        beside_axis = square >= -rounding(x.dtype) * scale * scale
         ahead = shoulder * square.clamp(min=0).sqrt()
-        azimuth = torch.atan2(y, x)
-        on_axis = torch.hypot(x, y) <= rounding(p.dtype) * scale
-        azimuth = torch.where(on_axis, self.rows.variable_at_zero(0), azimuth)
+        on_axis = torch.hypot(x, y) <= rounding(x.dtype) * scale
+        azimuth = torch.where(on_axis, self.rows.variable_at_zero(0), torch.atan2(y, x))
         t_1 = azimuth - torch.atan2(torch.full_like(ahead, side), ahead)
-        t_1 = torch.where((shoulder < 0) & on_axis, azimuth - math.pi, t_1)
-        upwards = shoulder * elbow * math.copysign(1.0, a_2)
+        t_1 = torch.where(on_axis & ahead.signbit(), azimuth - math.pi, t_1)
         arm = solve_two_link(
             ahead - a_1,
             d_1 - z,
             a_2,
             math.hypot(a_3, d_4),
-            upwards.expand(x.shape),
+            math.copysign(1.0, a_2) * shoulder * elbow,
             self.rows.variable_at_zero(1),
         )
-        t_3 = arm.elbow - math.atan2(d_4, a_3)
-        singular = arm.singular | (ahead.abs() < singular_tolerance(p.dtype) * scale)
-        return torch.stack([t_1, arm.first, t_3], -1), arm.reached & beside_axis, singular
+        singular = arm.singular | (ahead.abs() < singular_tolerance(x.dtype) * scale)
+        return [t_1, arm.first, arm.elbow - math.atan2(d_4, a_3)], arm.reached & beside_axis, singular
 
-    def _solve_wrist(
-        self, R: Float[Tensor, "*batch 1 3 3"], t_123: Float[Tensor, "*batch 4 3"]
-    ) -> tuple[Float[Tensor, "*batch 4 2 3"], Bool[Tensor, "*batch 4"]]:
-        """Joints 4 to 6, both flips, from `M = R_03^T · R = RotZ(t_4) RotY(-t_5) RotZ(t_6)`."""
-        M = _rotation_of_arm(t_123).mT @ R
-        sine = torch.hypot(M[..., 0, 2], M[..., 1, 2])
-        t_4 = torch.atan2(-M[..., 1, 2], -M[..., 0, 2])
-        t_4 = torch.where(sine <= rounding(R.dtype), self.rows.variable_at_zero(3), t_4)
-        t_5 = torch.atan2(sine, M[..., 2, 2])
+    def _solve_wrist(self, R: Columns, t_123: Sequence[Tensor], wrist: Scalar) -> tuple[list[Tensor], Tensor]:
+        """Joints 4 to 6 from `M = R_03ᵀ · R = RotZ(t_4) RotY(-t_5) RotZ(t_6)`; flipped, `t_5` is negative.
+
+        `R_03 = RotZ(t_1) RotX(-90 deg) RotZ(t_2 + t_3) RotX(-90 deg)`.
+        """
+        c_1, s_1 = torch.cos(t_123[0]), torch.sin(t_123[0])
+        c_23, s_23 = torch.cos(t_123[1] + t_123[2]), torch.sin(t_123[1] + t_123[2])
+        along = [c_1 * column[0] + s_1 * column[1] for column in R]
+        m_0 = [c_23 * ahead - s_23 * column[2] for ahead, column in zip(along, R, strict=True)]
+        m_1 = [s_1 * column[0] - c_1 * column[1] for column in R]
+        m_22 = -s_23 * along[2] - c_23 * R[2][2]
+        sine = torch.hypot(m_0[2], m_1[2])
+        t_4 = torch.atan2(-m_1[2], -m_0[2])
+        t_4 = torch.where(sine <= rounding(sine.dtype), self.rows.variable_at_zero(3), t_4)
         cos, sin = torch.cos(t_4), torch.sin(t_4)
-        t_6 = torch.atan2(cos * M[..., 1, 0] - sin * M[..., 0, 0], cos * M[..., 1, 1] - sin * M[..., 0, 1])
-        no_flip = torch.stack([t_4, t_5, t_6], -1)
-        flip = torch.stack([t_4 + math.pi, -t_5, t_6 + math.pi], -1)
-        return torch.stack([no_flip, flip], -2), sine < singular_tolerance(R.dtype)
-
-
-def _rotation_of_arm(t_123: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """`R_03 = RotZ(t_1) RotX(-90 deg) RotZ(t_2 + t_3) RotX(-90 deg)`."""
-    t_23 = t_123[..., 1] + t_123[..., 2]
-    c_1, s_1 = torch.cos(t_123[..., 0]), torch.sin(t_123[..., 0])
-    c_23, s_23 = torch.cos(t_23), torch.sin(t_23)
-    rows = [
-        torch.stack([c_1 * c_23, s_1, -c_1 * s_23], -1),
-        torch.stack([s_1 * c_23, -c_1, -s_1 * s_23], -1),
-        torch.stack([-s_23, torch.zeros_like(c_1), -c_23], -1),
-    ]
-    return torch.stack(rows, -2)
+        t_6 = torch.atan2(cos * m_1[0] - sin * m_0[0], cos * m_1[1] - sin * m_0[1])
+        flip = math.pi / 2 * (1 - wrist)
+        return [t_4 + flip, wrist * torch.atan2(sine, m_22), t_6 + flip], sine < singular_tolerance(
+            sine.dtype
+        )

@@ -1,17 +1,18 @@
 """Closed form of six-joint arms whose axes 2, 3 and 4 are parallel: the usual collaborative robots."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 from torch import Tensor
 
 from pisigma.kinematics.closed_form.canonical import canonical_rows
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
 from pisigma.kinematics.closed_form.tolerance import rounding, singular_tolerance
 from pisigma.kinematics.closed_form.two_link import TwoLink, solve_two_link
+from pisigma.kinematics.components import Columns, Frame, Scalar, as_tensors
 from pisigma.robot.description import Robot
 
 _RIGHT = math.pi / 2
@@ -68,59 +69,58 @@ class ThreeParallelArm(AbstractClosedForm):
         a, d = self.rows.a, self.rows.d
         return abs(a[0]) + abs(a[1]) + abs(a[2]) + math.hypot(a[3], d[4]) + abs(d[1] + d[2] + d[3])
 
-    def _solve_canonical(
-        self, T: Float[Tensor, "*batch 4 4"]
-    ) -> tuple[Float[Tensor, "*batch 8 6"], Bool[Tensor, "*batch 8"], Bool[Tensor, "*batch 8"]]:
-        shoulder, elbow, wrist = (
-            T.new_tensor([1.0, -1.0]).reshape(shape) for shape in ((2, 1, 1), (1, 2, 1), (1, 1, 2))
-        )
-        each = T[..., None, None, None, :, :]
-        t_1, ahead, beside = self._solve_first(each[..., :3, 3], shoulder)
-        t_5, t_6, straight = self._solve_wrist(each[..., :3, :3], t_1, wrist)
-        x, y = ahead - self.rows.a[0], each[..., 2, 3] - self.rows.d[0]
-        shape = np.broadcast_shapes(x.shape, elbow.shape, t_6.shape)
-        t_1, ahead, x, y, t_5, t_6 = (values.expand(shape) for values in (t_1, ahead, x, y, t_5, t_6))
-        upwards = (-shoulder * elbow * math.copysign(1.0, self.rows.a[1])).expand(shape)
-        arm, t_234 = self._solve_plane(each[..., :3, :3], t_1, t_6, x, y, upwards)
-        free = (straight <= rounding(T.dtype)).expand(shape) & ~arm.reached
+    @property
+    def _forks(self) -> int:
+        return 3
+
+    def _solve_components(
+        self, T: Frame, signs: Sequence[Scalar]
+    ) -> tuple[list[Scalar], Bool[Tensor, "..."], Bool[Tensor, "..."]]:
+        shoulder, elbow, wrist = signs
+        columns = as_tensors(T)
+        p = columns[3]
+        t_1, ahead, beside = self._solve_first(p[0], p[1], shoulder)
+        t_5, t_6, straight = self._solve_wrist(columns, t_1, wrist)
+        x, y = ahead - self.rows.a[0], p[2] - self.rows.d[0]
+        upwards = -math.copysign(1.0, self.rows.a[1]) * shoulder * elbow
+        arm, t_234 = self._solve_plane(columns, t_1, t_6, x, y, upwards)
+        free = (straight <= rounding(x.dtype)) & ~arm.reached
         if free.any():
             t_6 = torch.where(free, self._turned_wrist(t_234, t_5, t_6, x, y), t_6)
-            arm, t_234 = self._solve_plane(each[..., :3, :3], t_1, t_6, x, y, upwards)
+            arm, t_234 = self._solve_plane(columns, t_1, t_6, x, y, upwards)
         t_3 = arm.elbow - (math.pi if self.rows.a[2] < 0 else 0.0)
-        variables = torch.stack([t_1, arm.first, t_3, t_234 - arm.first - t_3, t_5, t_6], -1)
-        tolerance = singular_tolerance(T.dtype)
+        tolerance = singular_tolerance(x.dtype)
         singular = arm.singular | (ahead.abs() < tolerance * self._scale) | (straight < tolerance)
-        return variables.flatten(-4, -2), (arm.reached & beside).flatten(-3), singular.flatten(-3)
+        return [t_1, arm.first, t_3, t_234 - arm.first - t_3, t_5, t_6], arm.reached & beside, singular
 
-    def _solve_first(self, p: Tensor, shoulder: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _solve_first(self, x: Tensor, y: Tensor, shoulder: Scalar) -> tuple[Tensor, Tensor, Tensor]:
         """Joint 1 from `s_1 x - c_1 y = d_2 + d_3 + d_4`; `c_1 x + s_1 y`; and whether there is such a joint."""
         side = sum(self.rows.d[1:4])
-        x, y = p[..., 0], p[..., 1]
         square = x * x + y * y - side * side
-        beside = square >= -rounding(p.dtype) * self._scale**2
+        beside = square >= -rounding(x.dtype) * self._scale**2
         ahead = shoulder * square.clamp(min=0).sqrt()
-        on_axis = torch.hypot(x, y) <= rounding(p.dtype) * self._scale
+        on_axis = torch.hypot(x, y) <= rounding(x.dtype) * self._scale
         azimuth = torch.where(on_axis, self.rows.variable_at_zero(0), torch.atan2(y, x))
         t_1 = azimuth + torch.atan2(torch.full_like(ahead, side), ahead)
-        return torch.where((shoulder < 0) & on_axis, azimuth + math.pi, t_1), ahead, beside
+        return torch.where(on_axis & (ahead.signbit()), azimuth + math.pi, t_1), ahead, beside
 
-    def _solve_wrist(self, R: Tensor, t_1: Tensor, wrist: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _solve_wrist(self, R: Columns, t_1: Tensor, wrist: Scalar) -> tuple[Tensor, Tensor, Tensor]:
         """Joints 5 and 6, and the size of `s_5`: axis 2 in the wanted frame is `(s_5 c_6, -s_5 s_6, c_5)`."""
-        axis = torch.sin(t_1)[..., None] * R[..., 0, :] - torch.cos(t_1)[..., None] * R[..., 1, :]
-        x, y, z = axis.unbind(-1)
+        cos, sin = torch.cos(t_1), torch.sin(t_1)
+        x, y, z = (sin * R[j][0] - cos * R[j][1] for j in range(3))
         sine = torch.hypot(x, y)
         t_6 = torch.where(
-            sine <= rounding(R.dtype), self.rows.variable_at_zero(5), torch.atan2(-wrist * y, wrist * x)
+            sine <= rounding(x.dtype), self.rows.variable_at_zero(5), torch.atan2(-wrist * y, wrist * x)
         )
         return wrist * torch.atan2(sine, z), t_6, sine
 
     def _solve_plane(
-        self, R: Tensor, t_1: Tensor, t_6: Tensor, x: Tensor, y: Tensor, upwards: Tensor
+        self, R: Columns, t_1: Tensor, t_6: Tensor, x: Tensor, y: Tensor, upwards: Scalar
     ) -> tuple[TwoLink, Tensor]:
         """The two links that carry axis 4, and `t_2 + t_3 + t_4`, from axis 5 `(s_234, -c_234)` in the plane."""
-        axis = -torch.sin(t_6)[..., None] * R[..., :, 0] - torch.cos(t_6)[..., None] * R[..., :, 1]
-        sine = torch.cos(t_1) * axis[..., 0] + torch.sin(t_1) * axis[..., 1]
-        t_234 = torch.atan2(sine, -axis[..., 2])
+        cos, sin = torch.cos(t_6), torch.sin(t_6)
+        axis = [-sin * R[0][i] - cos * R[1][i] for i in range(3)]
+        t_234 = torch.atan2(torch.cos(t_1) * axis[0] + torch.sin(t_1) * axis[1], -axis[2])
         cos, sin = torch.cos(t_234), torch.sin(t_234)
         along, across = self.rows.a[3], -self.rows.d[4]
         arm = solve_two_link(

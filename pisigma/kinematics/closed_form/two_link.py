@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pisigma.kinematics.closed_form.tolerance import rounding, singular_tolerance
+from pisigma.kinematics.components import Scalar
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,16 +23,16 @@ class TwoLink:
 
     first: Float[Tensor, "*batch"]
     elbow: Float[Tensor, "*batch"]
-    reached: Bool[Tensor, "*batch"]
-    singular: Bool[Tensor, "*batch"]
+    reached: Bool[Tensor, "..."]
+    singular: Bool[Tensor, "..."]
 
 
 def solve_two_link(
-    x: Float[Tensor, "*batch"],
-    y: Float[Tensor, "*batch"],
+    x: Tensor,
+    y: Tensor,
     a: float,
     b: float,
-    elbow_sign: Float[Tensor, "*batch"],
+    elbow_sign: Scalar,
     first_when_free: float,
 ) -> TwoLink:
     """Angles of two links that end in a point: appendix A's `C_2`, `S_2`, `K_1`, `K_2` for any lengths.
@@ -41,7 +42,7 @@ def solve_two_link(
         y: the point [m].
         a: length of the first link [m], not 0; may be negative.
         b: length of the second link [m], positive.
-        elbow_sign: +1 or -1, the sign of the sine of the elbow angle.
+        elbow_sign: +1 or -1, the sign of the sine of the elbow angle; broadcasts.
         first_when_free: the first angle [rad] where the point lies on its axis, so that any would do.
 
     Returns:

@@ -1,0 +1,67 @@
+"""Calibrated arms with random errors and a random joint correction, made without measurements."""
+
+import functools
+import math
+
+import numpy as np
+import torch
+
+from pisigma.correction.calibrated_model import CalibratedModel
+from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.coverage import JointCoverage
+from pisigma.network.features import FourierSeries, GravityTorques, SharedFeatures
+from pisigma.network.joint_correction import JointCorrection
+from pisigma.robot import Robot
+
+BASE, TOOL = np.array([0.1, -0.2, 0.3, 0.4, 0.1, -0.2]), np.array([0.02, 0.03, 0.1, 0.1, 0.2, 0.3])
+ERRORS = np.array([1e-3, 5e-4, 5e-4, 1e-3, 1e-3])
+"""Standard deviations of the errors of a row: theta, d, a, alpha, beta [rad, m]."""
+
+
+def joints_of(robot: Robot, rows: int, seed: int = 1, share: float = 1.0) -> torch.Tensor:
+    """Joint values [rad or m] over a share of the limits, at most a turn."""
+    limits = np.clip(robot.limits, -math.pi, math.pi) * share
+    return torch.from_numpy(
+        np.random.default_rng(seed).uniform(limits[:, 0], limits[:, 1], (rows, robot.dof))
+    )
+
+
+def random_correction(
+    robot: Robot, shared: tuple[str, ...] = ("sin_cos",), harmonics: int = 12
+) -> JointCorrection:
+    """A correction of about 1e-3 rad with all kinds of features, and product units."""
+    features = [FourierSeries(robot, harmonics), GravityTorques(robot, (0.1, -0.2, -1.0))]
+    features += [SharedFeatures(robot, name) for name in shared]
+    correction = JointCorrection(robot, features, (2, 3))
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for weight, chosen in zip(correction.linear, features, strict=True):
+            drawn = torch.randn(weight.shape, generator=generator, dtype=torch.float64)
+            weight.copy_(5e-4 / math.sqrt(chosen.count) * drawn * chosen.used)
+        for weight in (correction.weight, correction.bias):
+            weight.copy_(0.02 * torch.randn(weight.shape, generator=generator, dtype=torch.float64))
+    return correction.requires_grad_(False)
+
+
+@functools.cache
+def calibrated_arm(
+    name: str, hybrid: bool = True, covered: float = 1.0, shared: tuple[str, ...] = ("sin_cos",)
+) -> CalibratedModel:
+    """A calibrated robot of the catalogue.
+
+    Args:
+        name: of the robot.
+        hybrid: whether it has a joint correction.
+        covered: share of the joint range that was measured.
+        shared: features besides the series and gravity.
+    """
+    rng = np.random.default_rng(0)
+    robot = Robot.load(name).with_geometry(base=BASE, tool=TOOL)
+    geometric = robot.with_geometry(dh=robot.dh + ERRORS * rng.normal(size=robot.dh.shape))
+    arm, starts = None, joints_of(robot, 400, share=covered)
+    if hybrid:
+        other = geometric.with_geometry(dh=geometric.dh + 0.2 * ERRORS * rng.normal(size=robot.dh.shape))
+        arm = HybridArm(geometric, other, random_correction(robot, shared), JointCoverage.of(robot, starts))
+    return CalibratedModel(
+        f"calibrated {name}", "test", robot, None, None, (), starts, calibrated=geometric, hybrid=arm
+    )
