@@ -30,8 +30,8 @@ def distill(
     joints: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file with q1_deg and so on: the region lies between each of these rows and the rows near it instead, "
-            "so that the rows have to fill it."
+            help="CSV file with q1_deg and so on: the region lies between each of these rows and the rows near it "
+            "instead, so that the rows have to fill it."
         ),
     ] = None,
     poses: Annotated[int, typer.Option(help="Poses to fit to.")] = 5000,

@@ -65,15 +65,15 @@ def doubts(found: Distillation, report: dict[str, Any]) -> list[str]:
         own, nominal = held_out["distilled"][key], held_out["nominal"][key]
         if own > USEFUL * nominal:
             sentences.append(
-                f"It takes only {max(1 - own / nominal, 0):.0%} off the nominal error in {what} ({own:.3g} of {nominal:.3g} "
-                f"{unit} RMS are left): the region is too large for so small a network; give a smaller --region, more "
-                "--poses, or use the parent."
+                f"It takes only {max(1 - own / nominal, 0):.0%} off the nominal error in {what} ({own:.3g} of "
+                f"{nominal:.3g} {unit} RMS are left): the region is too large for so small a network; give a "
+                "smaller --region, more --poses, or use the parent."
             )
     rows, joints = len(found.region.q), found.parent.robot.dof
     if rows < _FEW_ROWS * joints:
         sentences.append(
-            f"The region is told by only {rows} rows of joint values, {_FEW_ROWS * joints} or more fill it: between few "
-            "rows it is thin, and the errors hold in there only."
+            f"The region is told by only {rows} rows of joint values, {_FEW_ROWS * joints} or more fill it: between "
+            "few rows it is thin, and the errors hold in there only."
         )
     return sentences
 

@@ -1,7 +1,7 @@
 """Square linear systems written out on components: one system a pose, every entry a vector over the poses.
 
-LAPACK solves a stack of 6x6 systems one by one, at some microseconds each; written out, a step costs a tenth of that, but
-takes several hundred operations, so that few systems are left to LAPACK.
+LAPACK solves a stack of 6x6 systems one by one, at some microseconds each; written out, a step costs a tenth of that,
+but takes several hundred operations, so that few systems are left to LAPACK.
 """
 
 from collections.abc import Sequence
@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
-
 
 FEW = 192
 """Fewer systems than this are left to LAPACK."""
