@@ -254,12 +254,12 @@ def test_an_interruption_leaves_nothing(run, models, tmp_path, monkeypatch):
     out, chunks = tmp_path / "joints.csv", []
     monkeypatch.setattr("pisigma.cli.joint_file.CHUNK_ROWS", 2)
 
-    def interrupted(solver, T, branch):
+    def interrupted(solver, T, branch, path):
         chunks.append(len(T))
         if len(chunks) == 2:
             assert len(list(tmp_path.iterdir())) == 2  # the poses, and what was written so far
             raise KeyboardInterrupt
-        return solver(T, branch=branch)
+        return solver(T, branch=branch), ()
 
     monkeypatch.setattr("pisigma.cli.joint_file._solve", interrupted)
     result = run("ik", models / "kiro3", "--poses", tmp_path / "poses.csv", "--out", out)

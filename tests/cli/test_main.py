@@ -70,8 +70,8 @@ def test_problem_in_a_process_of_its_own(tmp_path):
     assert done.returncode == 2
     assert done.stdout == ""
     assert done.stderr == (
-        f"pisigma: {tmp_path}/nothing: there is no such model folder; give a folder that `pisigma train` "
-        "wrote.\n"
+        f"pisigma: {tmp_path}/nothing: there is no such model folder; give a folder that `pisigma calibrate` or "
+        "`pisigma train` wrote.\n"
     )
 
 

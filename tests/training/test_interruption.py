@@ -53,6 +53,11 @@ def environment() -> dict[str, str]:
     return os.environ | {"OMP_NUM_THREADS": "1"}
 
 
+def heed_ctrl_c() -> None:
+    """Undo what a shell does to processes in the background, these tests among them: they ignore Ctrl-C."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def start_and_wait_for_a_checkpoint(cwd: Path, recipe: Path) -> subprocess.Popen[bytes]:
     process = subprocess.Popen(
         command(0.1, "train", str(recipe), "--out", "model"),
@@ -60,6 +65,7 @@ def start_and_wait_for_a_checkpoint(cwd: Path, recipe: Path) -> subprocess.Popen
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env=environment(),
+        preexec_fn=heed_ctrl_c,
     )
     checkpoint = cwd / ".model.training" / "last.ckpt"
     for _ in range(600):
