@@ -107,16 +107,19 @@ class CorrectedIK:
                 bring them. Distances count radians and metres alike.
             branch: name of the branch to take; with `near` too, that only chooses the turns. With neither it is the
                 first in `order` that reaches the pose, inside the joint limits if there is one.
-            throw: False for control loops: a matrix that is no pose, or `near` that is not finite, raises nothing but
-                gets the status INVALID_POSE and NaN.
+            throw: False for control loops: a matrix that is no pose, or `near` that is not finite or no posture of the
+                robot, raises nothing but gets the status INVALID_POSE and NaN.
 
         Returns:
             One solution per pose: arrays for arrays, in float64; tensors for tensors, in their dtype and on their
             device.
 
         Raises:
-            PoseError: a matrix is no pose, `near` does not fit, or the branch is unknown.
+            PoseError: a matrix is no pose, `near` does not fit or lies far beyond the joint limits, or the branch is
+                unknown.
         """
+        if near is not None:
+            near = self.as_posture(near, throw)
         kernels = None if _is_tensor(T_base_tool) else self.compiled
         if kernels is not None:
             return self._by_kernels(kernels, T_base_tool, near, branch, throw)
@@ -164,6 +167,44 @@ class CorrectedIK:
         from pisigma.correction.accuracy import position_accuracy
 
         return position_accuracy(self.model, torch.from_numpy(np.array(q, dtype=np.float64))).numpy()
+
+    @cached_property
+    def posture_limits(self) -> Any:
+        """`(2, dof)` values [rad or m] that `near` lies between: a full turn, or the stroke and 1 m, beyond the limits.
+
+        What lies farther off is no posture of the robot but in degrees or millimetres.
+        """
+        slack = np.where(self.revolute, 2 * np.pi, np.maximum(1.0, self.limits[:, 1] - self.limits[:, 0]))
+        return np.stack([self.limits[:, 0] - slack, self.limits[:, 1] + slack])
+
+    def as_posture(self, near: Any, throw: bool = True) -> Any:
+        """`near`, with NaN for values that are in no posture of the robot; what does not fit at all as it came.
+
+        Raises:
+            PoseError: there are such values, and `throw`.
+        """
+        tensor = _is_tensor(near)
+        try:
+            values = near.numpy(force=True) if tensor else np.asarray(near, dtype=np.float64)
+        except (TypeError, ValueError):
+            return near
+        if values.shape[-1:] != (len(self.joints),):
+            return near
+        lowest, highest = self.posture_limits
+        beyond = (values < lowest) | (values > highest)
+        if not beyond.any():
+            return near if tensor else values
+        if throw:
+            row = tuple(int(index) for index in np.argwhere(beyond)[0])
+            low, high = self.limits[row[-1]]
+            turns = self.revolute[row[-1]]
+            what, unit = ("a full turn", "rad") if turns else (f"{highest[row[-1]] - high:g} m", "m")
+            raise PoseError(
+                f"near holds {values[row]:g} for joint {self.joints[row[-1]]}, more than {what} beyond its limits "
+                f"{low:g} to {high:g} {unit}; give joint values in radians and metres."
+            )
+        marked = np.where(beyond, np.nan, values)
+        return near.new_tensor(marked) if tensor else marked
 
     def _by_kernels(
         self,

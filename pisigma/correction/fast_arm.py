@@ -32,7 +32,7 @@ ACCEPTED = 1e-11
 REGULAR = 1e-4
 """A bound from below on the smallest singular value; where it is smaller the value itself is computed."""
 
-SETTLED = 1e-12
+SETTLED = 2e-12
 """[rad] Left of an error of `q + Δ(q)`."""
 
 _ROUNDS = 8
@@ -128,19 +128,25 @@ class FastArm:
     def _before_correction(self, p: Tensor) -> tuple[Tensor, Tensor]:
         """Q with `q + Δ(q) = p`, and where that holds.
 
-        Changes shrink by about the same factor every time, so the one to come says what is left.
+        Changes shrink by about the same factor every time, so the largest of two rounds say what is left of each.
         """
         assert self._correction is not None
         delta, slope = self._correction(p, slope=True)
-        gain, q, before = 1 / (1 + slope), p - delta / (1 + slope), 1.0
+        gain, before = 1 / (1 + slope), 1.0
+        q, settled = p - delta * gain, torch.zeros_like(p[0], dtype=torch.bool)
+        rows, found = torch.arange(p.shape[1]), q
         for _ in range(_ROUNDS):
-            change = (p - q - self._correction(q)[0]) * gain
-            q = q + change
-            largest = float(change.abs().amax()) if change.numel() else 0.0
-            factor, before = largest / before, largest
-            if factor * largest < SETTLED:
+            if not len(rows):
                 break
-        return q, change.abs().amax(0) * factor < SETTLED
+            change = (p - found - self._correction(found)[0]) * gain
+            found, size = found + change, change.abs().amax(0)
+            largest = float(size.nan_to_num(0.0).amax())
+            factor, before = largest / before, largest
+            done = size * factor < SETTLED
+            q[:, rows], settled[rows] = found, done
+            left = (~done).nonzero()[:, 0]
+            rows, p, found, gain = rows[left], p[:, left], found[:, left], gain[:, left]
+        return q, settled
 
     def _share(self, q: Tensor) -> Tensor:
         assert self._coverage is not None

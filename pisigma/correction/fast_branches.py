@@ -105,5 +105,6 @@ class ChunkOfPoses:
         return follow(self._model, self._frame(rows), nominal, branch, near)
 
     def _frame(self, rows: Tensor | slice) -> Frame:
-        """Some of the poses on components."""
-        return as_frame(self._entries[:, rows])
+        """Some of the poses on components, in their order."""
+        all_of_them = isinstance(rows, Tensor) and len(rows) == self._entries.shape[1]
+        return as_frame(self._entries if all_of_them else self._entries[:, rows])

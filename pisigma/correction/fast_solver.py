@@ -12,7 +12,7 @@ from pisigma.correction.fast_rows import FastRows
 from pisigma.correction.identified_arm import IdentifiedArm
 from pisigma.correction.patient_poses import PatientPoses
 
-CHUNK = 16_384
+CHUNK = 65_536
 """Poses worked on together: few enough to stay in the processor's cache, many enough for Python not to count."""
 
 FEW = 1_024

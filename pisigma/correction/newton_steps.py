@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
+from pisigma.correction.damped_steps import DampedSteps
 from pisigma.kinematics.components import (
     Columns,
     Frame,
@@ -61,6 +62,7 @@ class MovingArm:
         base, tool = (transform_from_xyzrpy(torch.from_numpy(end.copy())) for end in (robot.base, robot.tool))
         self._first, self._last = constant_frame(invert(base)), constant_frame(invert(tool))
         self._length = characteristic_length(robot)
+        self._few = DampedSteps(matrix_chain(self._robot), self._length)
         self._lever = 1.0 + float(np.linalg.norm(robot.tool[:3]))
 
     def wanted(self, T_base_tool: Frame) -> Columns:
@@ -88,9 +90,14 @@ class MovingArm:
         q, factor = q.clone(), torch.full_like(q[0], 0.1)
         before = torch.full_like(factor, torch.inf)
         active = torch.arange(q.shape[1])
+        poses = torch.stack([torch.stack(axis, -1) for axis in wanted], -1)
         for _ in range(-(-rounds // BLOCK)):
-            part = select_rows(wanted, active)
-            q[:, active], left, factor = self._damped(part, q[:, active], factor)
+            if len(active) < FEW:
+                found, left, factor = self._few.take(poses[active], q[:, active].T, factor, BLOCK)
+                q[:, active] = found.T
+            else:
+                part = select_rows(wanted, active)
+                q[:, active], left, factor = self._damped(part, q[:, active], factor)
             kept = ((left > target**2) & (left < 0.99 * before)).nonzero()[:, 0]
             if not len(kept):
                 break

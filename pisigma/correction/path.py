@@ -79,10 +79,15 @@ def follow_path(
         raise PoseError(f"a path of shape (poses, 4, 4) was wanted, got {T.shape}; give at least one pose.")
     if branch is not None and branch not in ik.branches:
         raise PoseError(f"there is no branch '{branch}'; {nearest_choice(branch, ik.branches)}")
-    beside = None if near is None else np.asarray(near, dtype=np.float64)
+    beside = None if near is None else np.asarray(ik.as_posture(near), dtype=np.float64)
     guide = _guide(ik, T, beside, branch) if ik.closed_form else _one_by_one(ik, T, beside)
-    solution = ik(T, near=guide)
+    solution = _solve(ik, T, guide)
     return JointPath(solution, _switches(ik, T, np.asarray(solution.q), solution))
+
+
+def _solve(ik: "pisigma.correction.corrected_ik.CorrectedIK", T: Array, near: Array | None) -> Any:
+    """Solutions near joint values, which may be those of a solution far outside the joint limits."""
+    return ik(T, near=None if near is None else np.clip(near, *ik.posture_limits))
 
 
 def _guide(
@@ -123,7 +128,7 @@ def _one_by_one(ik: "pisigma.correction.corrected_ik.CorrectedIK", T: Array, nea
     """Joint values of every pose from those of the pose before."""
     found, last = np.empty((len(T), len(ik.joints))), near
     for row, wanted in enumerate(T):
-        q = np.asarray(ik(wanted, near=last).q)
+        q = np.asarray(_solve(ik, wanted, last).q)
         if np.isfinite(q).all():
             last = q
         found[row] = np.clip(0.0, ik.limits[:, 0], ik.limits[:, 1]) if last is None else last
@@ -142,7 +147,7 @@ def _switches(
     far = np.flatnonzero((np.abs(step).max(-1) > 0.1) | (lies[after] != lies[before]))
     middle = halfway(T[before[far]], T[after[far]])
     between = q[before[far]] + wrapped(step[far], ik.revolute) / 2
-    way = np.asarray(ik(middle, near=between).q) if len(far) else between
+    way = np.asarray(_solve(ik, middle, between).q) if len(far) else between
     jumps = is_jump(q[before[far]], way, q[after[far]], ik.revolute)
     for place, jump in zip(far, jumps, strict=True):
         found += _at(ik, int(after[place]), step[place], bool(jump), lies[before[place]], lies[after[place]])

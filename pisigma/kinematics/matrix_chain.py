@@ -48,7 +48,7 @@ class MatrixChain:
                 still.append(turned)
         still[-1] = still[-1] @ as_transform(follow_xyzrpy(IDENTITY, robot.tool.tolist()), like)
         self._first = still[0]
-        self._turns = torch.tensor(robot.revolute)
+        self._turns, self._all_turn = torch.tensor(robot.revolute), all(robot.revolute)
         parts = [_parts(M, turns) for M, turns in zip(still[1:], robot.revolute, strict=True)]
         self._P, self._Q, self._R = (torch.stack(part) for part in zip(*parts, strict=True))
         self._sign = torch.from_numpy(robot.directions)
@@ -62,19 +62,19 @@ class MatrixChain:
     ) -> tuple[Float[Tensor, "poses 4 4"], Float[Tensor, "poses 6 dof"]]:
         """Tool pose and joint Jacobian, as `joint_jacobian` gives them."""
         P, Q, R = (part.to(q) for part in (self._P, self._Q, self._R))
-        turns, sign = self._turns.to(q.device), self._sign.to(q)
+        sign = self._sign.to(q)
         t = (q * sign + self._offset.to(q))[..., None, None]
-        links = torch.where(turns[:, None, None], t.cos(), t) * P + t.sin() * Q + R
-        frame = self._first.to(q).expand(len(q), 4, 4)
-        before = []
-        for link in links.unbind(1):
-            before.append(frame[:, :3, 2:])
-            frame = frame @ link
-        axis, origin = (torch.stack(before, 1) * sign[:, None, None]).unbind(-1)
-        origin = origin * sign[:, None]
-        linear = torch.linalg.cross(axis, frame[:, None, :3, 3] - origin)
-        linear = torch.where(turns[:, None], linear, axis)
-        angular = torch.where(turns[:, None], axis, torch.zeros_like(axis))
+        turns = None if self._all_turn else self._turns.to(q.device)[:, None]
+        first = t.cos() if turns is None else torch.where(turns[..., None], t.cos(), t)
+        frames = [self._first.to(q).expand(len(q), 4, 4)]
+        for link in (first * P + t.sin() * Q + R).unbind(1):
+            frames.append(frames[-1] @ link)
+        frame = frames.pop()
+        axis, origin = torch.stack(frames, 1)[:, :, :3, 2:].unbind(-1)
+        axis = axis * sign[:, None]
+        linear, angular = torch.linalg.cross(axis, frame[:, None, :3, 3] - origin), axis
+        if turns is not None:
+            linear, angular = torch.where(turns, linear, axis), torch.where(turns, axis, 0.0)
         return frame, torch.cat([linear, angular], -1).mT
 
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pisigma.kinematics.components import Vector
+from pisigma.kinematics.components import Vector, add_product, product
 from pisigma.kinematics.forward import Geometry, iterate_rows
 from pisigma.network.features import (
     AbstractFeatures,
@@ -97,20 +97,23 @@ class BatchedTorques:
     """Weighted `GravityTorques`: `Δ_j = (g × z_j) · Σ_k A_jk`, with all masses of a joint summed before the product.
 
     `A_jk` is `(w_0 / reach) (p_k - p_j) + ARM (w_1 x_k + w_2 y_k + w_3 z_k)` with the weights of mass k; on a prismatic
-    joint `Δ_j = z_j · g Σ_k w_0`.
+    joint `Δ_j = z_j · g Σ_k w_0`. All is computed in a frame whose z axis gravity falls along, where only the other
+    two components of the arms turn anything.
     """
 
     def __init__(self, robot: Robot, features: GravityTorques, weight: Float[Tensor, "dof columns"]) -> None:
         """Scale the weights of a choice of features."""
         self._robot = robot
-        self._g = features.gravity
-        self._geometry = Geometry(robot.dh.tolist(), [0.0] * 6, [0.0] * 6)
+        base, self._fall = _upright(features.gravity)
+        self._geometry = Geometry(robot.dh.tolist(), base, [0.0] * 6)
         used = weight * features.used.to(weight)
         masses = used.reshape(robot.dof, robot.dof, 4)
         self._force = masses[:, :, 0].sum(1).tolist()
         scale = masses.new_tensor([1 / robot.reach, *[features.ARM] * 3])
-        self._masses = (masses * scale).flatten(1)
-        self._all = self._masses[:, ::4].sum(1, keepdim=True)
+        columns = (masses * scale).flatten(1)
+        self._all = columns[:, ::4].sum(1).tolist()
+        self._kept = (columns != 0).any(0).nonzero()[:, 0].tolist()
+        self._masses = columns[:, self._kept]
 
     def __call__(self, q: Float[Tensor, "dof poses"]) -> Float[Tensor, "dof poses"]:
         """The weighted torques."""
@@ -119,33 +122,32 @@ class BatchedTorques:
             self._robot.rows, iterate_rows(self._robot, self._geometry, q.unbind(0)), strict=True
         ):
             if row.type != "fixed":
-                joints.append((step.before[2], step.before[3]))
+                joints.append((row.type == "revolute", float(row.direction), step.before[2], step.before[3]))
                 carried += [step.after[3], *step.after[:3]]
-        A = self._sums(carried, q[0])
-        axes, origins = (_stacked([pair[i] for pair in joints], q[0]) for i in range(2))
-        A = A - self._all.to(q)[..., None] * origins
-        g = self._g
-        moment = (
-            (g[1] * axes[:, 2] - g[2] * axes[:, 1]) * A[:, 0]
-            + (g[2] * axes[:, 0] - g[0] * axes[:, 2]) * A[:, 1]
-            + (g[0] * axes[:, 1] - g[1] * axes[:, 0]) * A[:, 2]
-        )
-        moment = moment * q.new_tensor(self._robot.directions)[:, None]
-        if all(self._robot.revolute):
-            return moment
-        along = sum(value * axes[:, i] for i, value in enumerate(g)) * q.new_tensor(self._force)[:, None]
-        turning = torch.tensor(self._robot.revolute, device=q.device)[:, None]
-        return torch.where(turning, moment, along * q.new_tensor(self._robot.directions)[:, None])
+        found = torch.zeros_like(q)
+        arms = self._sums([carried[place] for place in self._kept], q)
+        for j, (turns, direction, axis, origin) in enumerate(joints):
+            if not turns:
+                found[j] += product(self._fall * direction * self._force[j], axis[2])
+                continue
+            x, y = (add_product(arms[j, i], -self._all[j], origin[i]) for i in range(2))
+            turned = add_product(product(axis[0], y), axis[1], x, -1.0)
+            found[j] += product(self._fall * direction, turned)
+        return found
 
-    def _sums(self, carried: list[Vector], like: Tensor) -> Float[Tensor, "dof 3 poses"]:
-        columns = _stacked(carried, like)
-        return (self._masses.to(like) @ columns.flatten(1)).reshape(len(self._masses), *columns.shape[1:])
+    def _sums(self, carried: list[Vector], q: Tensor) -> Float[Tensor, "dof 2 poses"]:
+        """Weighted sums of the first two components of vectors."""
+        columns = q.new_empty(len(carried), 2, q.shape[1])
+        for place, vector in zip(columns, carried, strict=True):
+            for row, value in zip(place, vector[:2], strict=True):
+                row.copy_(value) if isinstance(value, Tensor) else row.fill_(value)
+        return (self._masses.to(q) @ columns.flatten(1)).reshape(len(q), *columns.shape[1:])
 
 
-def _stacked(vectors: list[Vector], like: Tensor) -> Float[Tensor, "vectors 3 poses"]:
-    """Vectors one under the other."""
-    found = like.new_empty(len(vectors), 3, len(like))
-    for place, vector in zip(found, vectors, strict=True):
-        for row, value in zip(place, vector, strict=True):
-            row.copy_(value) if isinstance(value, Tensor) else row.fill_(value)
-    return found
+def _upright(gravity: tuple[float, ...]) -> tuple[list[float], float]:
+    """A base, as xyzrpy, in which a direction is ±z, and which of the two; no turn where it is that already."""
+    x, y, z = gravity
+    sign = math.copysign(1.0, z)
+    yaw = math.atan2(sign * y, sign * z)
+    across = math.hypot(y, z)
+    return [0.0, 0.0, 0.0, 0.0, math.atan2(-sign * x, across), yaw], sign * math.hypot(x, across)

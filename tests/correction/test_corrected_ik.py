@@ -234,7 +234,7 @@ def test_near_brings_joints_onto_its_turn():
         assert_close(solution.q - solution.q_nominal, plain.correction, atol=1e-13)
     far = ik(
         T,
-        near=plain.q + torch.tensor([0, 0, 0, 0, 0, 100.0], dtype=torch.float64),
+        near=plain.q + torch.tensor([0, 0, 0, 0, 0, 23.0], dtype=torch.float64),
         branch=ik.model.branches[0],
     )
     assert 20.0 - 2 * math.pi < float(far.q[5]) <= 20.0  # the nearest turn inside the limits
@@ -270,6 +270,7 @@ def test_near_broadcasts_and_may_be_a_list(name):
         ([0.0] * 5, "has 6 joints"),
         (0.0, "has 6 joints"),
         ([math.nan] * 6, "no finite numbers"),
+        ([0.0, -90.0, 90.0, 0.0, 90.0, 0.0], r"near holds -90 for joint .*2, more than .*radians and metres"),
         (torch.zeros(3, 6, dtype=torch.float64), "does not broadcast"),
         (["left"] * 6, "no array of numbers"),
     ],

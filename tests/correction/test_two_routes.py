@@ -138,6 +138,36 @@ def test_without_raising(ik, poses, kind):
         call(ik, kind(T), branch="up", throw=False)
 
 
+@pytest.mark.parametrize("kind", [np.asarray, torch.from_numpy])
+def test_present_joint_values_in_degrees_are_noticed(ik, poses, kind):
+    T = poses.reshape(-1, 4, 4).numpy()
+    near = np.asarray(call(ik, T).q).copy()
+    turned = near + np.clip(-np.sign(near), -1, 1) * 2 * np.pi  # on other turns, which is no mistake
+    assert_close(call(ik, kind(T), near=kind(turned)).position_residual, 0.0, atol=1e-10)
+    near[5] = np.degrees(near[5])
+    far = np.flatnonzero(np.abs(near[5]) > 4 * np.pi)[0]
+    sentence = rf"near holds {near[5, far]:g} for joint theta_{far + 1}, .* give joint values in radians"
+    for values in (near, near[5]):
+        with pytest.raises(PoseError, match=sentence):
+            call(ik, kind(T), near=kind(values))
+    with pytest.raises(PoseError, match=sentence):
+        call(ik, kind(T[5]), near=kind(near[5]))
+    found = call(ik, kind(T), near=kind(near), throw=False)
+    assert np.flatnonzero(np.asarray(found.status) == Status.INVALID_POSE).tolist() == [5]
+    one = call(ik, kind(T[5]), near=kind(near[5]), throw=False)
+    assert int(one.status) == Status.INVALID_POSE
+    assert np.isnan(np.asarray(one.q)).all()
+    with pytest.raises(PoseError, match=sentence), no_type_checker():
+        ik.path(T, near=near[5])
+
+
+def test_present_joint_values_in_millimetres_are_noticed():
+    with no_type_checker():
+        scara = CorrectedIK(hand_made_model("kiro3"))
+    with pytest.raises(PoseError, match=r"near holds -120 for joint d_3, more than 1 m beyond .* 0 m;"):
+        call(scara, np.eye(4), near=[0.3, 0.8, -120.0, 0.4])
+
+
 def test_no_numbers(ik):
     with pytest.raises(PoseError, match="no array of numbers"):
         call(ik, [["a"] * 4] * 4)

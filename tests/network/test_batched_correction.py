@@ -6,7 +6,8 @@ from testing.calibrated_arm import joints_of, random_correction
 from testing.closeness import assert_close
 
 from pisigma.network.batched_correction import BatchedCorrection
-from pisigma.network.features import FourierSeries
+from pisigma.network.features import FourierSeries, GravityTorques
+from pisigma.network.joint_correction import JointCorrection
 from pisigma.network.series_evaluation import SeriesTable
 from pisigma.robot import Robot
 
@@ -23,6 +24,26 @@ def test_it_is_the_same_correction(name, shared, rows):
     assert_close(delta.T, correction(q), atol=1e-14)
     if rows:
         assert float(delta.abs().max()) > 1e-4
+
+
+@pytest.mark.parametrize(
+    "gravity",
+    [(0.0, 0.0, 1.0), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.3, -0.5, -0.8), (-0.6, 0.0, 0.8)],
+    ids=str,
+)
+@pytest.mark.parametrize("name", ["ur5", "kiro3"])
+def test_gravity_may_fall_anywhere(name, gravity):
+    robot = Robot.load(name)
+    torques = GravityTorques(robot, gravity)
+    correction = JointCorrection(robot, [torques])
+    generator = torch.Generator().manual_seed(3)
+    weight = torch.randn(torques.used.shape, generator=generator, dtype=torch.float64)
+    weight[:, 5] = 0.0
+    correction.linear[0].data.copy_(weight)
+    q = 3 * joints_of(robot, 20)
+    delta, _ = BatchedCorrection(correction)(q.T.contiguous())
+    assert float(delta.abs().max()) > 0.1
+    assert_close(delta.T, correction(q), atol=1e-13)
 
 
 def test_the_slope_is_that_of_the_series():
