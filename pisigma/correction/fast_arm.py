@@ -132,17 +132,17 @@ class FastArm:
         """
         assert self._correction is not None
         delta, slope = self._correction(p, slope=True)
-        gain, before = 1 / (1 + slope), 1.0
-        q, settled = p - delta * gain, torch.zeros_like(p[0], dtype=torch.bool)
+        gain = 1 / (1 + slope)
+        change = delta * gain
+        q, settled, before = p - change, torch.zeros_like(p[0], dtype=torch.bool), _largest(change)
         rows, found = torch.arange(p.shape[1]), q
         for _ in range(_ROUNDS):
             if not len(rows):
                 break
             change = (p - found - self._correction(found)[0]) * gain
-            found, size = found + change, change.abs().amax(0)
-            largest = float(size.nan_to_num(0.0).amax())
-            factor, before = largest / before, largest
-            done = size * factor < SETTLED
+            found, largest = found + change, _largest(change)
+            factor, before = largest / before if before else 0.0, largest
+            done = change.abs().amax(0) * factor < SETTLED
             q[:, rows], settled[rows] = found, done
             left = (~done).nonzero()[:, 0]
             rows, p, found, gain = rows[left], p[:, left], found[:, left], gain[:, left]
@@ -151,6 +151,11 @@ class FastArm:
     def _share(self, q: Tensor) -> Tensor:
         assert self._coverage is not None
         return self._coverage.share(q.T)
+
+
+def _largest(change: Tensor) -> float:
+    """The largest finite absolute value; 0 of none."""
+    return float(change.abs().nan_to_num(0.0, posinf=0.0).amax()) if change.numel() else 0.0
 
 
 def _newton(arm: MovingArm, wanted: Columns, q: Tensor, steps: int) -> tuple[Tensor, Tensor, Tensor, Tensor]:

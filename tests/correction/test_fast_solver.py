@@ -18,6 +18,7 @@ KINDS = {
     "ur5": {},
     "rb5 geometric": {"hybrid": False},
     "kiro4 half covered": {"covered": 0.5},
+    "ur5 small correction": {"size": 0.2},
     "ur5 turns count": {"shared": ("joints",)},
     "ur5 pose inputs": {"shared": ("pose",)},
 }

@@ -27,9 +27,9 @@ def joints_of(robot: Robot, rows: int, seed: int = 1, share: float = 1.0) -> tor
 
 
 def random_correction(
-    robot: Robot, shared: tuple[str, ...] = ("sin_cos",), harmonics: int = 12
+    robot: Robot, shared: tuple[str, ...] = ("sin_cos",), harmonics: int = 12, size: float = 1.0
 ) -> JointCorrection:
-    """A correction of about 1e-3 rad with all kinds of features, and product units."""
+    """A correction of about `size` times 1e-3 rad with all kinds of features, and product units."""
     features = [FourierSeries(robot, harmonics), GravityTorques(robot, (0.1, -0.2, -1.0))]
     features += [SharedFeatures(robot, name) for name in shared]
     correction = JointCorrection(robot, features, (2, 3))
@@ -37,15 +37,19 @@ def random_correction(
     with torch.no_grad():
         for weight, chosen in zip(correction.linear, features, strict=True):
             drawn = torch.randn(weight.shape, generator=generator, dtype=torch.float64)
-            weight.copy_(5e-4 / math.sqrt(chosen.count) * drawn * chosen.used)
+            weight.copy_(size * 5e-4 / math.sqrt(chosen.count) * drawn * chosen.used)
         for weight in (correction.weight, correction.bias):
-            weight.copy_(0.02 * torch.randn(weight.shape, generator=generator, dtype=torch.float64))
+            weight.copy_(0.02 * size * torch.randn(weight.shape, generator=generator, dtype=torch.float64))
     return correction.requires_grad_(False)
 
 
 @functools.cache
 def calibrated_arm(
-    name: str, hybrid: bool = True, covered: float = 1.0, shared: tuple[str, ...] = ("sin_cos",)
+    name: str,
+    hybrid: bool = True,
+    covered: float = 1.0,
+    shared: tuple[str, ...] = ("sin_cos",),
+    size: float = 1.0,
 ) -> CalibratedModel:
     """A calibrated robot of the catalogue.
 
@@ -54,6 +58,7 @@ def calibrated_arm(
         hybrid: whether it has a joint correction.
         covered: share of the joint range that was measured.
         shared: features besides the series and gravity.
+        size: of the correction [1e-3 rad].
     """
     rng = np.random.default_rng(0)
     robot = Robot.load(name).with_geometry(base=BASE, tool=TOOL)
@@ -61,7 +66,9 @@ def calibrated_arm(
     arm, starts = None, joints_of(robot, 400, share=covered)
     if hybrid:
         other = geometric.with_geometry(dh=geometric.dh + 0.2 * ERRORS * rng.normal(size=robot.dh.shape))
-        arm = HybridArm(geometric, other, random_correction(robot, shared), JointCoverage.of(robot, starts))
+        arm = HybridArm(
+            geometric, other, random_correction(robot, shared, size=size), JointCoverage.of(robot, starts)
+        )
     return CalibratedModel(
         f"calibrated {name}", "test", robot, None, None, (), starts, calibrated=geometric, hybrid=arm
     )
