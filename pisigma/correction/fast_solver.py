@@ -15,7 +15,7 @@ from pisigma.correction.patient_poses import PatientPoses
 CHUNK = 65_536
 """Poses worked on together: few enough to stay in the processor's cache, many enough for Python not to count."""
 
-FEW = 1_024
+FEW = 8_192
 """Poses that are worked on together patiently, from some starts each."""
 
 

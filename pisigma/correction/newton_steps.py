@@ -28,6 +28,9 @@ from pisigma.se3 import invert, transform_from_xyzrpy
 BLOCK = 5
 """Damped steps between looks at which poses are still worth it."""
 
+BY_MATRICES = 800
+"""Fewer poses than this take damped steps by matrices."""
+
 
 @dataclass(frozen=True, eq=False)
 class Step:
@@ -92,7 +95,7 @@ class MovingArm:
         active = torch.arange(q.shape[1])
         poses = torch.stack([torch.stack(axis, -1) for axis in wanted], -1)
         for _ in range(-(-rounds // BLOCK)):
-            if len(active) < FEW:
+            if len(active) < BY_MATRICES:
                 found, left, factor = self._few.take(poses[active], q[:, active].T, factor, BLOCK)
                 q[:, active] = found.T
             else:

@@ -22,7 +22,7 @@ def test_few_poses_go_the_way_of_many(monkeypatch, away):
     start = (q + away * torch.sin(5 * q)).T.contiguous()
     found = []
     for few in (1000, 0):
-        monkeypatch.setattr(newton_steps, "FEW", few)
+        monkeypatch.setattr(newton_steps, "BY_MATRICES", few)
         arm = MovingArm(robot)
         found.append(arm.approach(arm.wanted(as_frame(entries_of(T))), start, newton_steps.BLOCK, 1e-9))
     assert not torch.equal(found[0], start)
