@@ -45,7 +45,8 @@ def calibrate(
         float | None, typer.Option(help="Instead of folds, share of the rows held out once.")
     ] = None,
     split: Annotated[
-        str, typer.Option(help="How rows are parted: joints, time, space or placement.")
+        str,
+        typer.Option(help="How rows are parted: joints (at random), interleaved, time, space or placement."),
     ] = "joints",
     seed: Annotated[int, typer.Option(help="Of the parting, and of drawing training rows.")] = 0,
     train_rows: Annotated[

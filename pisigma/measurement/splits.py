@@ -4,7 +4,7 @@ import heapq
 from typing import Literal, get_args
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
@@ -12,9 +12,9 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints as groups_of_equal_joints
 from pisigma.measurement.groups import groups_to_keep_whole, placement_groups
 
-SplitBy = Literal["joints", "time", "space", "placement"]
-"""By joints: at random; by time: blocks of the file's order; by space: blocks of the measured positions; by
-placement: all sockets of a placement together, or all rows of a frame."""
+SplitBy = Literal["joints", "interleaved", "time", "space", "placement"]
+"""By joints: at random; interleaved: in turn, in the file's order; by time: blocks of that order; by space: blocks of
+the measured positions; by placement: all sockets of a placement together, or all rows of a frame."""
 
 TrainTest = tuple[Int64[Tensor, " _train"], Int64[Tensor, " _test"]]
 """Rows to train on and rows to test on, each in the order of the measurements."""
@@ -28,9 +28,10 @@ def k_folds(
     Args:
         measurements: what to part.
         folds: how many, 2 or more; None for as many as there are groups to keep whole.
-        seed: decides which groups come together by joints and by placement; unused by time and by space.
+        seed: decides which groups come together by joints and by placement; unused otherwise.
         by: "joints": groups of equal joints, shuffled and dealt such that folds are as equal as the groups
-            allow; "time": contiguous blocks of the rows' order, a group counting where its first row stands;
+            allow; "interleaved": the same unshuffled, so that groups of one size go to the folds in turn, as
+            scikit-learn's GroupKFold deals them; "time": contiguous blocks of the rows' order, a group counting where its first row stands;
             "space": blocks from cutting the measured positions again and again across their widest axis;
             "placement": dealt like joints, but whole placements (see `placements`); rows of none are in no test.
 
@@ -49,8 +50,9 @@ def k_folds(
             f"ask for 2 to {len(sizes)} folds or measure more {more}."
         )
     fold = torch.zeros(len(sizes), dtype=torch.int64)
-    if by in ("joints", "placement"):
-        _deal(fold, sizes, _shuffled(len(sizes), seed), folds)
+    if by in ("joints", "placement", "interleaved"):
+        order = torch.arange(len(sizes)) if by == "interleaved" else _shuffled(len(sizes), seed)
+        _deal(fold, sizes, order, folds)
     else:
         positions = _group_positions(measurements, group, len(sizes)) if by == "space" else None
         _cut_into_folds(fold, sizes, positions, torch.arange(len(sizes)), 0, folds)
@@ -65,9 +67,10 @@ def holdout(
     Args:
         measurements: what to part.
         share: of the rows for the test, between 0 and 1; met as closely as the groups allow.
-        seed: decides which rows by joints and by placement; unused by time and by space.
-        by: "joints": groups of equal joints at random; "time": the last rows; "space": the far end of the
-            widest axis of the measured positions; "placement": whole placements at random.
+        seed: decides which rows by joints and by placement; unused otherwise.
+        by: "joints": groups of equal joints at random; "interleaved": every so many groups one; "time": the last
+            rows; "space": the far end of the widest axis of the measured positions; "placement": whole placements
+            at random.
 
     Raises:
         MeasurementError: the share is not between 0 and 1, there is one group only, or positions or names that are
@@ -83,6 +86,9 @@ def holdout(
             f"{measurements.source}: {len(sizes)} {_kind(by)} cannot be parted into training and test; measure "
             "more poses."
         )
+    if by == "interleaved":
+        is_test = _interleaved(sizes, share)
+        return _train_test(measurements, is_test[group])
     order = torch.arange(len(sizes))
     if by in ("joints", "placement"):
         order = _shuffled(len(sizes), seed)
@@ -126,6 +132,18 @@ def _deal(
         rows, number = heap[0]
         fold[group] = number
         heapq.heapreplace(heap, (rows + size, number))
+
+
+def _interleaved(sizes: Int64[Tensor, " groups"], share: float) -> Bool[Tensor, " groups"]:
+    """Which groups are the test, so that of the rows up to any group it holds the share as closely as may be."""
+    is_test, seen, held = [], 0, 0
+    for size in sizes.tolist():
+        seen += size
+        is_test.append(abs(held + size - share * seen) < abs(held - share * seen))
+        held += size * is_test[-1]
+    if all(is_test) or not any(is_test):
+        is_test[-1] = not is_test[-1]
+    return torch.tensor(is_test)
 
 
 def _cut_into_folds(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from pisigma.errors import MeasurementError
 from pisigma.measurement import Measurements, groups_of_equal_joints, holdout, k_folds, placements
 
-WAYS = ("joints", "time", "space")
+WAYS = ("joints", "interleaved", "time", "space")
 
 
 def repeated(labels: list[int]) -> Measurements:
@@ -91,6 +91,18 @@ def test_the_seed_decides_and_nothing_else():
 def test_large_groups_are_balanced_by_many_small_ones(seed: int):
     parts = k_folds(repeated([0] * 6 + [1] * 4 + [2] * 3 + list(range(3, 8))), 3, seed)
     assert [len(test) for _, test in parts] == [6, 6, 6]
+
+
+def test_interleaved_deals_in_turn():
+    measurements = repeated([7, 7, 3, 3, 5, 5, 1, 1, 4, 4, 0, 0, 2, 2])
+    folds = k_folds(measurements, 3, seed=5, by="interleaved")
+    assert [test.tolist() for _, test in folds] == [[0, 1, 6, 7, 12, 13], [2, 3, 8, 9], [4, 5, 10, 11]]
+    _, test = holdout(measurements, 1 / 3, seed=5, by="interleaved")
+    assert test.tolist() == [2, 3, 8, 9]
+    for share in (0.01, 0.99):
+        train, test = holdout(measurements, share, seed=5, by="interleaved")
+        assert len(train) > 0
+        assert len(test) > 0
 
 
 def test_by_time_gives_blocks_of_the_file():
