@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pisigma.correction.folder_files import COMPILED, folder_hash
+from pisigma.correction.posture import Postures
 from pisigma.errors import ModelError, PoseError
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
@@ -119,7 +120,7 @@ class CorrectedIK:
                 unknown.
         """
         if near is not None:
-            near = self.as_posture(near, throw)
+            near = self.postures.checked(near, _is_tensor(near), throw)
         kernels = None if _is_tensor(T_base_tool) else self.compiled
         if kernels is not None:
             return self._by_kernels(kernels, T_base_tool, near, branch, throw)
@@ -169,42 +170,9 @@ class CorrectedIK:
         return position_accuracy(self.model, torch.from_numpy(np.array(q, dtype=np.float64))).numpy()
 
     @cached_property
-    def posture_limits(self) -> Any:
-        """`(2, dof)` values [rad or m] that `near` lies between: a full turn, or the stroke and 1 m, beyond the limits.
-
-        What lies farther off is no posture of the robot but in degrees or millimetres.
-        """
-        slack = np.where(self.revolute, 2 * np.pi, np.maximum(1.0, self.limits[:, 1] - self.limits[:, 0]))
-        return np.stack([self.limits[:, 0] - slack, self.limits[:, 1] + slack])
-
-    def as_posture(self, near: Any, throw: bool = True) -> Any:
-        """`near`, with NaN for values that are in no posture of the robot; what does not fit at all as it came.
-
-        Raises:
-            PoseError: there are such values, and `throw`.
-        """
-        tensor = _is_tensor(near)
-        try:
-            values = near.numpy(force=True) if tensor else np.asarray(near, dtype=np.float64)
-        except (TypeError, ValueError):
-            return near
-        if values.shape[-1:] != (len(self.joints),):
-            return near
-        lowest, highest = self.posture_limits
-        beyond = (values < lowest) | (values > highest)
-        if not beyond.any():
-            return near if tensor else values
-        if throw:
-            row = tuple(int(index) for index in np.argwhere(beyond)[0])
-            low, high = self.limits[row[-1]]
-            turns = self.revolute[row[-1]]
-            what, unit = ("a full turn", "rad") if turns else (f"{highest[row[-1]] - high:g} m", "m")
-            raise PoseError(
-                f"near holds {values[row]:g} for joint {self.joints[row[-1]]}, more than {what} beyond its limits "
-                f"{low:g} to {high:g} {unit}; give joint values in radians and metres."
-            )
-        marked = np.where(beyond, np.nan, values)
-        return near.new_tensor(marked) if tensor else marked
+    def postures(self) -> Postures:
+        """What `near` may be."""
+        return Postures(self.limits, self.revolute, self.joints)
 
     def _by_kernels(
         self,

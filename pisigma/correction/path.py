@@ -79,7 +79,7 @@ def follow_path(
         raise PoseError(f"a path of shape (poses, 4, 4) was wanted, got {T.shape}; give at least one pose.")
     if branch is not None and branch not in ik.branches:
         raise PoseError(f"there is no branch '{branch}'; {nearest_choice(branch, ik.branches)}")
-    beside = None if near is None else np.asarray(ik.as_posture(near), dtype=np.float64)
+    beside = None if near is None else np.asarray(ik.postures.checked(near, False), dtype=np.float64)
     guide = _guide(ik, T, beside, branch) if ik.closed_form else _one_by_one(ik, T, beside)
     solution = _solve(ik, T, guide)
     return JointPath(solution, _switches(ik, T, np.asarray(solution.q), solution))
@@ -87,7 +87,7 @@ def follow_path(
 
 def _solve(ik: "pisigma.correction.corrected_ik.CorrectedIK", T: Array, near: Array | None) -> Any:
     """Solutions near joint values, which may be those of a solution far outside the joint limits."""
-    return ik(T, near=None if near is None else np.clip(near, *ik.posture_limits))
+    return ik(T, near=None if near is None else ik.postures.clip(near))
 
 
 def _guide(

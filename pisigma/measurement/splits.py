@@ -31,9 +31,10 @@ def k_folds(
         seed: decides which groups come together by joints and by placement; unused otherwise.
         by: "joints": groups of equal joints, shuffled and dealt such that folds are as equal as the groups
             allow; "interleaved": the same unshuffled, so that groups of one size go to the folds in turn, as
-            scikit-learn's GroupKFold deals them; "time": contiguous blocks of the rows' order, a group counting where its first row stands;
-            "space": blocks from cutting the measured positions again and again across their widest axis;
-            "placement": dealt like joints, but whole placements (see `placements`); rows of none are in no test.
+            scikit-learn's GroupKFold deals them; "time": contiguous blocks of the rows' order, a group counting
+            where its first row stands; "space": blocks from cutting the measured positions again and again
+            across their widest axis; "placement": dealt like joints, but whole placements (see `placements`);
+            rows of none are in no test.
 
     Returns:
         Per fold the rows to train on and the rows to test on.

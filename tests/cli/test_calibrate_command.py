@@ -245,7 +245,7 @@ def test_inverse_calibration_wants_one_frame_and_target(refuses, repository, tar
     [
         (
             ("--split", "tim"),
-            "--split 'tim' is unknown; did you mean 'time'? Valid: joints, placement, space, time.",
+            "--split 'tim' is unknown; did you mean 'time'? Valid: interleaved, joints, placement, space, time.",
         ),
         (("--folds", "1"), "1 folds were wanted"),
         (("--hold-out", "2"), "between 0 and 1 was wanted, got 2."),

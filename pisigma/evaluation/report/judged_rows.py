@@ -11,12 +11,10 @@ from torch import Tensor
 from pisigma.correction.accuracy import deviation_of_rows
 from pisigma.correction.calibrated_model import CalibratedModel
 from pisigma.correction.row_poses import nominal_poses_of_rows, poses_of_rows
-from pisigma.errors import IdentificationError, MeasurementError
-from pisigma.evaluation.calibration_validation import errors_under
+from pisigma.errors import MeasurementError, ModelError
 from pisigma.evaluation.held_out_rows import HeldOutRows
 from pisigma.evaluation.pose_statistics import PoseErrors
-from pisigma.evaluation.trained_calibrations import base_and_tool
-from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.evaluation.reference_models import nominal_model
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.se3 import invert, transform_from_xyzrpy
@@ -224,21 +222,21 @@ def _from_socket(rows: Measurements, ball: Float64[Tensor, "rows 3"]) -> Float64
 
 
 def _nominal_errors(model: CalibratedModel, rows: Measurements, remarks: list[str]) -> PoseErrors:
-    """Errors of the robot as drawn, base and tool fitted to the same rows where the model's own were fitted."""
-    if model.calibrated is None:
-        remarks.append("Nominal is the robot as drawn with the base and tool that the model was given.")
-        return _errors_at(nominal_poses_of_rows(model, rows), rows)
-    drawn = model.drawn or model.robot
+    """Errors of the robot as drawn, with the base and tool that `nominal_model` gives it."""
     try:
-        errors = errors_under(base_and_tool(GeometricCalibrator(drawn)).fit(rows), rows)
-    except (IdentificationError, MeasurementError):
+        nominal = nominal_model(model, rows.rotation is not None)
+    except ModelError:
         remarks.append(
-            "Nominal is the robot as drawn with the model's base and tool: these rows do not tell its own, so it looks "
-            "worse than it is."
+            "Nominal is the robot as drawn with the model's base and tool, as the model keeps too few joint values to "
+            "fit its own; it looks worse than it is."
         )
         return _errors_at(nominal_poses_of_rows(model, rows), rows)
-    remarks.append("Nominal is the robot as drawn, base and tool fitted to these same rows.")
-    return errors
+    remarks.append(
+        "Nominal is the robot as drawn with the base and tool that the model was given."
+        if model.calibrated is None
+        else "Nominal is the robot as drawn, base and tool fitted to the model's own poses where it was measured."
+    )
+    return _model_errors(nominal, rows)[0]
 
 
 def _errors_at(T: Float64[Tensor, "rows 4 4"], rows: Measurements) -> PoseErrors:
