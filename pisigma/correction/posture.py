@@ -23,7 +23,8 @@ class Postures:
 
     def clip(self, q: np.ndarray) -> np.ndarray:
         """The postures nearest to joint values `(*batch, dof)` [rad or m]."""
-        return np.minimum(np.maximum(q, self._lowest), self._highest)
+        clipped: np.ndarray = np.clip(q, self._lowest, self._highest)
+        return clipped
 
     def checked(self, near: Any, tensor: bool, throw: bool = True) -> Any:
         """`near`, with NaN for values that are in no posture; what does not fit at all as it came.
