@@ -10,6 +10,7 @@ from pisigma.identification.base_and_tool import fit_base_and_tool
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.prediction import prediction_errors
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.splits import k_folds
 from pisigma.robot import Robot
 
 
@@ -67,3 +68,15 @@ def test_fanuc_configurations(shared_data: Path) -> None:
     draws = [held_out(robot, data, 6, seed) for seed in range(2)]
     assert np.mean([draw["nominal position"] for draw in draws]) == pytest.approx(0.71e-3, abs=0.03e-3)
     assert np.mean([draw["calibrated position"] for draw in draws]) < 0.23e-3
+
+
+def test_fanuc_configurations_dealt_in_turn(shared_data: Path) -> None:
+    """The folds that scikit-learn's GroupKFold makes: configuration k of the file is in fold k mod 6."""
+    data, robot = Measurements.read_csv(shared_data / "fanuc_r2000" / "positions.csv"), Robot.load("fanuc_r2000")
+    errors = [
+        GeometricCalibrator(robot).fit(data.select(train)).errors_of(data.select(test))["position"]
+        for train, test in k_folds(data, 6, seed=0, by="interleaved")
+    ]
+    found = float(torch.cat(errors).square().sum(-1).mean().sqrt())
+    assert found < 0.23e-3
+    assert found == pytest.approx(0.2281e-3, abs=0.0005e-3)
