@@ -35,6 +35,9 @@ def evaluate(
     max_mean_deg: Annotated[
         float | None, typer.Option(help="Accept only where the mean orientation error is at most this.")
     ] = None,
+    fit_frame: Annotated[
+        bool, typer.Option("--fit-frame", help="The sensor was moved since: fit its frame to these rows.")
+    ] = False,
     resamples: Annotated[
         int, typer.Option(min=2, help="Of the configurations, for confidence intervals.")
     ] = 2000,
@@ -62,7 +65,8 @@ def evaluate(
     everything, measurements = _read(data, next(iter(loaded.values())))
     models = _with_references(names, loaded, measurements.rotation is not None)
     compared = {short.get(name, name): model for name, model in models.items()}
-    report = report_comparison(compare_models(compared, measurements, Bootstrap(resamples, seed)))
+    bootstrap = Bootstrap(resamples, seed)
+    report = report_comparison(compare_models(compared, measurements, bootstrap, fit_frame))
     hashes = everything.content_hash(), measurements.content_hash()
     missed = []
     for name, figures in zip(models, report["models"], strict=True):
@@ -70,7 +74,12 @@ def evaluate(
             trained_on = model.provenance.data_sha256 in hashes
             figures |= {"model": name, "kind": model.kind, "trained_on": trained_on}
             missed += limits.missed(figures)
-    result: dict[str, Any] = {"data": str(data), "rows": measurements.rows, **report}
+    result: dict[str, Any] = {
+        "data": str(data),
+        "rows": measurements.rows,
+        "frame_fitted": fit_frame,
+        **report,
+    }
     if limits.given:
         result |= {"limits": limits.given, "accepted": not missed, "missed": missed}
     if as_json:
@@ -161,6 +170,7 @@ def _with_single(result: dict[str, Any], names: list[str]) -> dict[str, Any]:
 def _print(result: dict[str, Any]) -> None:
     from pisigma.cli.output import print_table
     from pisigma.evaluation.comparison_tables import comparison_table, difference_table
+    from pisigma.evaluation.moved_frames import FITTED
 
     confidence = f"{100 * result['bootstrap']['confidence']:.0f} %"
     rows = f"{result['rows_compared']} rows ({result['configurations']} configurations) of {result['data']}"
@@ -168,6 +178,8 @@ def _print(result: dict[str, Any]) -> None:
     if len(result["models"]) > 1:
         first = result["models"][0]["name"]
         print_table(f"difference to {first} on the same rows, below 0 is better", *difference_table(result))
+    if result["frame_fitted"]:
+        typer.echo(FITTED)
     if result["rows_without_position"]:
         typer.echo(f"{result['rows_without_position']} rows hold no position and are not judged.")
     for model in result["models"]:

@@ -12,6 +12,9 @@ def verify(
         Path,
         typer.Argument(help="New measurements (CSV) at the joint values that the robot was commanded to."),
     ],
+    fit_frame: Annotated[
+        bool, typer.Option("--fit-frame", help="The sensor was moved since: fit its frame to these rows.")
+    ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Tell whether new measurements are explained better by the corrected model than by the nominal robot.
@@ -30,11 +33,12 @@ def verify(
     measurements = verification.read_for_verification(data, loaded)
     with progress_of(f"verifying {model}") as tell:
         tell(f"{measurements.rows} rows")
-        found = verification.verify(loaded, measurements)
+        found = verification.verify(loaded, measurements, fit_frame=fit_frame)
     result: dict[str, Any] = {
         "model": str(model),
         "data": str(data),
         "rows": measurements.rows,
+        "frame_fitted": fit_frame,
         "explained_better": found.verdict == "better",
         "verdict": found.verdict,
         "sentence": found.sentence,

@@ -248,7 +248,10 @@ def _moved(kind: str, X: Float64[Tensor, "rows 4 4"]) -> Part:
     turned = f", turned by {turn:.3g} deg" if turn > 1e-9 else ""
     if kind == "frame":
         what = f"another measuring frame (shifted by {shift}{turned})"
-        advice = "the sensor or what it measures from stands elsewhere than when the model was fitted"
+        advice = (
+            "the sensor or what it measures from stands elsewhere than when the model was fitted (if it was moved, "
+            "verify with --fit-frame)"
+        )
     else:
         what = f"another tool (shifted by {shift}{turned})"
         advice = "another point of the tool was measured than when the model was fitted"

@@ -12,6 +12,7 @@ from pisigma.correction.calibrated_model import CalibratedModel
 from pisigma.correction.row_poses import poses_of_rows
 from pisigma.errors import MeasurementError
 from pisigma.evaluation.bootstrap import Bootstrap, Statistics
+from pisigma.evaluation.moved_frames import poses_in_fitted_frames
 from pisigma.evaluation.paired_comparison import PairedComparison, paired_comparisons
 from pisigma.evaluation.pose_statistics import ErrorVectors
 from pisigma.kinematics.forward import forward_kinematics
@@ -100,6 +101,7 @@ def compare_models(
     models: Mapping[str, CalibratedModel],
     measurements: Measurements,
     bootstrap: Bootstrap | None = None,
+    fit_frame: bool = False,
 ) -> ModelComparison:
     """Judge models on measurements; rows for which one of them predicts nothing count for none.
 
@@ -107,6 +109,7 @@ def compare_models(
         models: by name, one or more.
         measurements: the rows, in the frames that the models were fitted in.
         bootstrap: how confidence intervals are found; `Bootstrap()` where none is given.
+        fit_frame: fit the frames anew, for every model; see `poses_in_fitted_frames`.
 
     Raises:
         MeasurementError: no positions were measured, or in a frame or of a target that a model does not know, or no
@@ -114,8 +117,9 @@ def compare_models(
         PoseError: the joint values do not fit a model's robot.
     """
     bootstrap = bootstrap or Bootstrap()
+    predict = poses_in_fitted_frames if fit_frame else poses_of_rows
     found = {
-        name: ErrorVectors.between(measurements, poses_of_rows(model, measurements))
+        name: ErrorVectors.between(measurements, predict(model, measurements))
         for name, model in models.items()
     }
     assert measurements.position is not None  # or there were no errors

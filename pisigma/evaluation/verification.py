@@ -14,6 +14,7 @@ from pisigma.evaluation.bootstrap import Bootstrap
 from pisigma.evaluation.comparison_report import report_comparison
 from pisigma.evaluation.mix_ups import PLAUSIBLE_SHARE, MixUp, find_mix_ups, length_text
 from pisigma.evaluation.model_comparison import compare_models
+from pisigma.evaluation.moved_frames import FITTED
 from pisigma.evaluation.reference_models import geometric_model, nominal_model
 from pisigma.measurement.csv_rows import LIMIT_TOLERANCE
 from pisigma.measurement.dataset import Measurements
@@ -78,13 +79,16 @@ def read_for_verification(path: str | os.PathLike[str], model: CalibratedModel) 
     return measurements.select(test)
 
 
-def verify(model: CalibratedModel, measurements: Measurements, seed: int = 0) -> Verification:
+def verify(
+    model: CalibratedModel, measurements: Measurements, seed: int = 0, fit_frame: bool = False
+) -> Verification:
     """Judge whether a correction is active and right.
 
     Args:
         model: the model.
         measurements: new rows with positions, in frames and of targets that the model knows.
         seed: of the resamples for confidence intervals.
+        fit_frame: fit the frames anew, as after the sensor was moved; then any frame will do.
 
     Raises:
         MeasurementError: no positions were measured, or in a frame or of a target that the model does not know.
@@ -98,8 +102,12 @@ def verify(model: CalibratedModel, measurements: Measurements, seed: int = 0) ->
     models[CORRECTED] = model
     resamples = int(np.clip(MOST_DRAWN // max(measurements.rows, 1), *RESAMPLES))
     with torch.no_grad():
-        report = report_comparison(compare_models(models, measurements, Bootstrap(resamples, seed)))
+        compared = compare_models(models, measurements, Bootstrap(resamples, seed), fit_frame)
+        report = report_comparison(compared)
+        if fit_frame:
+            measurements = replace(measurements, frame=(next(iter(model.bases), ""),) * measurements.rows)
         mix_ups = find_mix_ups(model, models[NOMINAL], measurements)
+        mix_ups = tuple(found for found in mix_ups if not (fit_frame and found.kinds == ("frame",)))
     nominal, corrected = report["models"][0], report["models"][-1]
     paired = corrected["difference_to_first"]["position"]
     ratio = corrected["mean_mm"] / nominal["mean_mm"] if nominal["mean_mm"] > 0 else float("nan")
@@ -115,7 +123,7 @@ def verify(model: CalibratedModel, measurements: Measurements, seed: int = 0) ->
         better_share=paired["better_share"],
         comparison=report,
         mix_ups=mix_ups,
-        remarks=tuple(_remarks(model, measurements, report, mix_ups)),
+        remarks=(*_remarks(model, measurements, report, mix_ups), *([FITTED] if fit_frame else [])),
     )
 
 

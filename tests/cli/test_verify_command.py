@@ -19,7 +19,9 @@ def files(tmp_path_factory):
     with no_type_checker():
         right, nominal = model.forward(q)[:, :3, 3], forward_kinematics(model.robot, q)[:, :3, 3]
     turned = q * torch.tensor([1, -1, 1, 1])
-    for name, joints, position in (("good", q, right), ("nominal", q, nominal), ("sign", turned, right)):
+    moved = right[:, [1, 0, 2]] * torch.tensor([1.0, -1.0, 1.0]) + 0.3  # a quarter turn about z, and away
+    cases = (("good", q, right), ("nominal", q, nominal), ("sign", turned, right), ("moved", q, moved))
+    for name, joints, position in cases:
         revolute = list(model.robot.revolute)
         Measurements(q=joints, position=position).write_csv(folder / f"{name}.csv", revolute=revolute)
     return folder
@@ -64,6 +66,20 @@ def test_a_mix_up_is_named(run, models, files):
     assert result.exit_code == 3
     assert "the sign of q2 turned" in result.stdout
     assert "something was mixed up" in result.stderr
+
+
+def test_a_moved_sensor(run, models, files):
+    result = run("verify", models / "kiro3", files / "moved.csv")
+    assert result.exit_code == 3
+    assert "with --fit-frame" in result.stdout
+    result = run("verify", models / "kiro3", files / "moved.csv", "--fit-frame")
+    assert result.exit_code == 0
+    assert "Frames were fitted anew" in result.stdout
+    result = run("evaluate", models / "kiro3", files / "moved.csv", "--fit-frame", "--max-p95-mm", "0.001")
+    assert result.exit_code == 0
+    assert "Frames were fitted anew" in result.stdout
+    result = run("evaluate", models / "kiro3", files / "moved.csv", "--max-p95-mm", "0.001")
+    assert result.exit_code == 3
 
 
 def test_things_at_fault(refuses, models, files, tmp_path):

@@ -72,7 +72,10 @@ def test_fanuc_configurations(shared_data: Path) -> None:
 
 def test_fanuc_configurations_dealt_in_turn(shared_data: Path) -> None:
     """The folds that scikit-learn's GroupKFold makes: configuration k of the file is in fold k mod 6."""
-    data, robot = Measurements.read_csv(shared_data / "fanuc_r2000" / "positions.csv"), Robot.load("fanuc_r2000")
+    data, robot = (
+        Measurements.read_csv(shared_data / "fanuc_r2000" / "positions.csv"),
+        Robot.load("fanuc_r2000"),
+    )
     errors = [
         GeometricCalibrator(robot).fit(data.select(train)).errors_of(data.select(test))["position"]
         for train, test in k_folds(data, 6, seed=0, by="interleaved")
