@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
-from testing.models import HOMES, hand_made_model, joints_around, with_limits
+from testing.models import HOMES, hand_made_model, joints_around, poses_around, statuses, with_limits
 
 from pisigma.correction.corrected_ik import CorrectedIK
 from pisigma.correction.torch_ik import NUMERIC
@@ -31,16 +31,8 @@ def ik(name: str) -> CorrectedIK:
     return CorrectedIK(hand_made_model(name))
 
 
-def poses(name: str, *batch: int, seed: int = 3) -> torch.Tensor:
-    return forward_kinematics(Robot.load(name), joints_around(name, *batch, seed=seed, spread=0.15))
-
-
-def statuses(solution) -> list[Status]:
-    return [Status(value) for value in solution.status.reshape(-1).tolist()]
-
-
 def test_correction_is_what_the_network_adds_to_a_nominal_solution(ik, name):
-    T = poses(name, 20)
+    T = poses_around(name, 20)
     solution = ik(T)
     assert set(statuses(solution)) <= {Status.REACHED, Status.OUTSIDE_DOMAIN}
     assert_close(forward_kinematics(ik.model.robot, solution.q_nominal), T, atol=1e-12)
@@ -63,12 +55,12 @@ def test_zero_network_gives_the_nominal_robot(name):
 def test_forward_of_the_model_is_undone(ik, name):
     q = joints_around(name, 4, 5, seed=5, spread=0.15)
     assert_close(ik(ik.model.forward(q)).q, q, atol=1e-9)
-    assert_close(ik.model.forward(ik(poses(name, 7)).q), poses(name, 7), atol=1e-9)
+    assert_close(ik.model.forward(ik(poses_around(name, 7)).q), poses_around(name, 7), atol=1e-9)
 
 
 @pytest.mark.parametrize("batch", [(), (1,), (3, 1, 2), (0,), (2, 0)])
 def test_batched_equals_looped(ik, name, batch):
-    T = poses(name, *batch)
+    T = poses_around(name, *batch)
     solution = ik(T)
     dof = ik.model.robot.dof
     for values in (solution.q, solution.q_nominal, solution.correction):
@@ -84,7 +76,7 @@ def test_batched_equals_looped(ik, name, batch):
 
 
 def test_float32_poses_give_float32_joints(ik, name):
-    T = poses(name, 6)
+    T = poses_around(name, 6)
     exact, rounded = ik(T), ik(T.float())
     for values in (rounded.q, rounded.q_nominal, rounded.correction, rounded.domain_measure):
         assert values.dtype == torch.float32
@@ -104,7 +96,7 @@ def test_scara_with_a_leaning_base_takes_float32_poses():
 
 
 def test_arrays_and_lists_are_poses_too(ik, name):
-    T = poses(name, 2)
+    T = poses_around(name, 2)
     expected = ik(T).q
     assert_close(ik(T.numpy()).q, expected, atol=1e-12)
     assert_close(ik(T.tolist()).q, expected, atol=1e-12)
@@ -135,7 +127,7 @@ def test_what_is_no_pose_is_refused(poses, complaint):
 
 @pytest.mark.parametrize("name", ["kiro3", "kiro4"])
 def test_lengths_in_mm_by_mistake_are_unreachable(name):
-    T = poses(name, 3)
+    T = poses_around(name, 3)
     T[:, :3, 3] *= 1e3
     solution = CorrectedIK(hand_made_model(name))(T)
     assert statuses(solution) == [Status.UNREACHABLE] * 3
@@ -163,7 +155,7 @@ def test_values_are_nan_only_where_unreachable(name):
 @pytest.mark.parametrize("name", ["kiro3", "kiro4"])
 def test_branches_are_named_and_chosen(name):
     ik = CorrectedIK(hand_made_model(name))
-    T = poses(name, 3, 2)
+    T = poses_around(name, 3, 2)
     every = ik.all_branches(T)
     assert every.branches == ik.branches == closed_form_solver(ik.model.robot).branches
     assert every.q.shape == (3, 2, len(ik.branches), ik.model.robot.dof)
@@ -178,7 +170,7 @@ def test_branches_are_named_and_chosen(name):
 
 def test_other_branches_than_the_trained_are_outside_the_domain():
     ik = CorrectedIK(hand_made_model("kiro3"))
-    every = ik.all_branches(poses("kiro3"))
+    every = ik.all_branches(poses_around("kiro3"))
     found = dict(zip(every.branches, statuses(every), strict=True))
     assert found == {"elbow_positive": Status.REACHED, "elbow_negative": Status.OUTSIDE_DOMAIN}
 
@@ -186,7 +178,7 @@ def test_other_branches_than_the_trained_are_outside_the_domain():
 @pytest.mark.parametrize("name", ROBOTS)
 def test_unknown_branch_is_refused(name):
     with pytest.raises(PoseError, match="there is no branch 'elbow_positve'"):
-        CorrectedIK(hand_made_model(name))(poses(name), branch="elbow_positve")
+        CorrectedIK(hand_made_model(name))(poses_around(name), branch="elbow_positve")
 
 
 def bent_ur10() -> Robot:
@@ -209,94 +201,6 @@ def test_robot_without_closed_form_has_one_branch():
     assert_close(every.q[..., 0, :], ik(T, branch=NUMERIC).q)
 
 
-@pytest.mark.parametrize("name", ["kiro3", "kiro4"])
-def test_near_chooses_the_branch(name):
-    ik = CorrectedIK(hand_made_model(name))
-    T = poses(name)
-    every = ik.all_branches(T)
-    for index, status in enumerate(statuses(every)):
-        if status not in (Status.UNREACHABLE, Status.OUTSIDE_JOINT_LIMITS):
-            solution = ik(T, near=every.q[index] + 0.01)
-            assert int(solution.branch) == index
-            assert_close(solution.q, every.q[index], atol=1e-12)
-
-
-def test_near_brings_joints_onto_its_turn():
-    robot = with_limits(Robot.load("kiro4"), 5, -20.0, 20.0)
-    ik = CorrectedIK(hand_made_model("kiro4", robot=robot))
-    T = poses("kiro4")
-    plain = ik(T)
-    for turns in (-3, -1, 0, 2, 3):
-        shift = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.0, 2 * math.pi * turns], dtype=torch.float64)
-        solution = ik(T, near=plain.q + shift + 0.1)
-        assert_close(solution.q, plain.q + shift, atol=1e-12)
-        assert_close(solution.correction, plain.correction, atol=1e-14)
-        assert_close(solution.q - solution.q_nominal, plain.correction, atol=1e-13)
-    far = ik(
-        T,
-        near=plain.q + torch.tensor([0, 0, 0, 0, 0, 23.0], dtype=torch.float64),
-        branch=ik.model.branches[0],
-    )
-    assert 20.0 - 2 * math.pi < float(far.q[5]) <= 20.0  # the nearest turn inside the limits
-    assert statuses(far) == statuses(plain)
-
-
-def test_near_does_not_reach_across_a_limit():
-    """A joint at -179 deg is a long way from 179 deg where the limits are ±180 deg."""
-    ik = CorrectedIK(hand_made_model("kiro4", scale=0.0))
-    near = torch.tensor([math.radians(179), 0.5, 0.4, 0.3, 0.8, 0.2], dtype=torch.float64)
-    q = near.clone()
-    q[0] = math.radians(-179)
-    solution = ik(forward_kinematics(ik.model.robot, q), near=near)
-    every = ik.all_branches(forward_kinematics(ik.model.robot, q))
-    distance = (every.q - near).norm(dim=-1).nan_to_num(math.inf)
-    assert int(solution.branch) == int(distance.argmin())
-    assert_close((solution.q - near).norm(), distance.amin(), atol=1e-12)
-
-
-@pytest.mark.parametrize("name", ROBOTS)
-def test_near_broadcasts_and_may_be_a_list(name):
-    ik = CorrectedIK(hand_made_model(name))
-    T = poses(name, 3, 1, 2)
-    home = list(HOMES[name])
-    assert_close(ik(T, near=home).q, ik(T).q, atol=1e-10)
-    rows = torch.tensor(home, dtype=torch.float64).expand(3, 1, 2, -1)
-    assert_close(ik(T, near=rows).q, ik(T).q, atol=1e-10)
-
-
-@pytest.mark.parametrize(
-    ("near", "complaint"),
-    [
-        ([0.0] * 5, "has 6 joints"),
-        (0.0, "has 6 joints"),
-        ([math.nan] * 6, "no finite numbers"),
-        ([0.0, -90.0, 90.0, 0.0, 90.0, 0.0], r"near holds -90 for joint .*2, more than .*radians and metres"),
-        (torch.zeros(3, 6, dtype=torch.float64), "does not broadcast"),
-        (["left"] * 6, "no array of numbers"),
-    ],
-)
-@pytest.mark.parametrize("name", ["kiro4", "ur10"])
-@pytest.mark.usefixtures("without_type_checker")
-def test_near_that_does_not_fit_is_refused(name, near, complaint):
-    with pytest.raises(PoseError, match=complaint):
-        CorrectedIK(hand_made_model(name))(poses(name, 2), near=near)
-
-
-def test_near_prefers_a_branch_inside_the_limits():
-    robot = Robot.load("kiro3")
-    T = poses("kiro3")
-    positive = CorrectedIK(hand_made_model("kiro3")).all_branches(T).q[0]
-    limited = with_limits(robot, 1, -2.7, 0.5)  # keeps elbow_negative only
-    ik = CorrectedIK(replace(hand_made_model("kiro3"), robot=limited))
-    chosen = ik(T, near=positive)
-    assert ik.branches[int(chosen.branch)] == "elbow_negative"
-    assert (
-        ik.branches[int(ik(T).branch)] == "elbow_negative"
-    )  # the trained one leads there outside the limits
-    assert statuses(ik(T)) == [Status.OUTSIDE_DOMAIN]
-    assert statuses(ik(T, branch="elbow_positive")) == [Status.OUTSIDE_JOINT_LIMITS]
-
-
 def test_singular_pose_is_never_hidden():
     stretched = forward_kinematics(
         Robot.load("kiro3"), torch.tensor([0.3, 0.0, -0.1, 0.0], dtype=torch.float64)
@@ -317,7 +221,7 @@ def test_far_from_the_rows_is_outside_the_domain(ik, name):
     solution = ik(forward_kinematics(ik.model.robot, home), near=home)
     assert statuses(solution) == [Status.OUTSIDE_DOMAIN]
     assert float(solution.domain_measure) > 1
-    assert float(ik(poses(name)).domain_measure) <= 1
+    assert float(ik(poses_around(name)).domain_measure) <= 1
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -325,7 +229,7 @@ def test_far_from_the_rows_is_outside_the_domain(ik, name):
 def test_limits_are_those_of_the_corrected_joints(name, side):
     """A limit between the nominal and the corrected value: only the corrected one is commanded."""
     model = hand_made_model(name)
-    T = poses(name)
+    T = poses_around(name)
     free = CorrectedIK(model)(T)
     middle = float(free.q[1] + free.q_nominal[1]) / 2
     corrected_above = float(free.correction[1]) > 0
@@ -399,7 +303,7 @@ def test_numeric_inverse_tries_more_than_one_start():
 
 
 def test_select_takes_solutions_of_the_first_axis(ik, name):
-    solution = ik(poses(name, 4, 2))
+    solution = ik(poses_around(name, 4, 2))
     part = solution.select(2)
     assert torch.equal(part.q, solution.q[2])
     assert torch.equal(part.status, solution.status[2])

@@ -12,8 +12,10 @@ import torch
 
 from pisigma.correction.calibrated_model import CalibratedModel
 from pisigma.correction.domain import Domain
+from pisigma.correction.solution import Solution
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.status import Status
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
 from pisigma.network.pi_sigma import PiSigma
@@ -121,3 +123,13 @@ def no_type_checker() -> Iterator[None]:
         yield
     finally:
         jaxtyping.config.update("jaxtyping_disable", False)
+
+
+def poses_around(name: str, *batch: int, seed: int = 3) -> torch.Tensor:
+    """Poses of the nominal robot around its home."""
+    return forward_kinematics(Robot.load(name), joints_around(name, *batch, seed=seed, spread=0.15))
+
+
+def statuses(solution: Solution) -> list[Status]:
+    """The statuses of solutions, one after the other."""
+    return [Status(value) for value in solution.status.reshape(-1).tolist()]
