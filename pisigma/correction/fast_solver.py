@@ -13,7 +13,7 @@ from pisigma.correction.identified_arm import IdentifiedArm
 from pisigma.correction.patient_poses import PatientPoses
 
 CHUNK = 65_536
-"""Poses worked on together: few enough to stay in the processor's cache, many enough for Python not to count."""
+"""Poses worked on together: enough for Python not to count and for torch to take a second thread."""
 
 FEW = 8_192
 """Poses that are worked on together patiently, from some starts each."""
