@@ -2,41 +2,30 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
+from testing.calibrated_ur5 import NOISE, calibrated_ur5, measured
 from testing.closeness import assert_close
-from testing.hybrid import joints_in
 from testing.models import no_type_checker
-from testing.simulated_arm import simulate
 
-from pisigma.correction.geometric_model import model_of_calibration
 from pisigma.correction.row_poses import poses_of_rows
 from pisigma.errors import MeasurementError
 from pisigma.evaluation.moved_frames import poses_in_fitted_frames
 from pisigma.evaluation.verification import verify
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.se3 import transform_from_xyzrpy
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
-ROWS, NOISE = 60, 5e-5
 MOVED = transform_from_xyzrpy(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
 
 
 @pytest.fixture(scope="module")
 def arm():
     """The geometric calibration of a simulated UR5, and new poses of it, with noise in the positions."""
+    model, q, T = calibrated_ur5(60)
     with no_type_checker():
-        found = simulate("ur5", rows=90, noise=NOISE, turn_noise=1e-4)
-        result = GeometricCalibrator(found.nominal).fit(found.measurements)
-        model = model_of_calibration("ur5", found.nominal, result, found.measurements)
-        q = joints_in(found.true, ROWS, seed=3)
-        T = forward_kinematics(found.true, q)
-    noise = NOISE * torch.from_numpy(np.random.default_rng(4).normal(size=(ROWS, 3)))
-    return model, Measurements(q=q, position=T[:, :3, 3] + noise, rotation=T[:, :3, :3].clone())
+        return model, measured(q, T, True)
 
 
 def from_elsewhere(rows: Measurements, turned: bool) -> Measurements:

@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
+from testing.calibrated_ur5 import NOISE, calibrated_ur5, measured
 from testing.closeness import assert_close
 from testing.hybrid import hybrid_of, joints_in
 from testing.models import hand_made_model, joints_around, no_type_checker
@@ -22,25 +22,16 @@ from pisigma.se3 import transform_from_xyzrpy
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
-ROWS, NOISE = 50, 5e-5
+ROWS = 50
 FRAME = transform_from_xyzrpy(torch.tensor([0.3, -0.2, 0.1, 0.5, 0.2, -0.3], dtype=torch.float64))
 TOOL = transform_from_xyzrpy(torch.tensor([0.03, -0.02, 0.05, 0.2, 0.1, 0.0], dtype=torch.float64))
-
-
-def measured(q, T, turned: bool) -> Measurements:
-    noise = NOISE * torch.from_numpy(np.random.default_rng(4).normal(size=(len(q), 3)))
-    return Measurements(q=q, position=T[:, :3, 3] + noise, rotation=T[:, :3, :3].clone() if turned else None)
 
 
 @pytest.fixture(scope="module")
 def geometric():
     """The geometric calibration of a simulated UR5, and new measurements of it: positions, and poses."""
+    model, q, T = calibrated_ur5(ROWS)
     with no_type_checker():
-        found = simulate("ur5", rows=90, noise=NOISE, turn_noise=1e-4)
-        result = GeometricCalibrator(found.nominal).fit(found.measurements)
-        model = model_of_calibration("ur5", found.nominal, result, found.measurements)
-        q = joints_in(found.true, ROWS, seed=3)
-        T = forward_kinematics(found.true, q)
         return model, measured(q, T, False), measured(q, T, True)
 
 
