@@ -192,7 +192,10 @@ class CorrectedIK:
 
     def _beside(self, near: Any, batch: tuple[int, ...]) -> Any:
         """Joint values for every pose of a batch, or the same for all."""
-        values = np.asarray(near, dtype=np.float64)
+        try:
+            values = np.asarray(near, dtype=np.float64)
+        except (TypeError, ValueError):
+            return near  # the kernels say what is wrong
         if values.ndim <= 1:
             return values
         try:

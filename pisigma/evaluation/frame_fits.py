@@ -10,6 +10,8 @@ from pisigma.identification.base_and_tool_start import nearest_rotation, starts_
 from pisigma.measurement.dataset import Measurements
 from pisigma.se3 import transform
 
+LEVER_SHARE = 0.2
+"""A rotation error counts like a position error at this share of the reach."""
 ALTERNATIONS = 200
 SETTLED = 1e-6
 """Alternating ends when a round lowers the cost by less than this share."""

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.correction.calibrated_model import CalibratedModel
 from pisigma.correction.row_poses import nominal_poses_of_rows, poses_of_rows
-from pisigma.evaluation.frame_fits import Seen, best_base, best_base_and_tool, best_tool
+from pisigma.evaluation.frame_fits import LEVER_SHARE, Seen, best_base, best_base_and_tool, best_tool
 from pisigma.evaluation.joint_mix_ups import Part, joint_parts
 from pisigma.evaluation.joint_search import NOTICED, likely_maps
 from pisigma.measurement.dataset import Measurements
@@ -28,8 +28,6 @@ MOST_ROWS = 1_000
 """Rows that explanations are tried on, spread over all of them."""
 FEWEST_SPARE = 6
 """Measured numbers that must be left over beyond what is fitted."""
-LEVER_SHARE = 0.2
-"""A rotation error counts like a position error at this share of the reach."""
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from torch import Tensor
 from pisigma.correction.calibrated_model import CalibratedModel
 from pisigma.correction.row_poses import poses_of_rows
 from pisigma.errors import MeasurementError
-from pisigma.evaluation.frame_fits import Seen, best_base
+from pisigma.evaluation.frame_fits import LEVER_SHARE, Seen, best_base
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.splits import k_folds
@@ -23,8 +23,6 @@ FITTED = (
 FOLDS = 5
 FEWEST = 12
 """Different joint vectors that a frame needs at least."""
-LEVER_SHARE = 0.2
-"""A rotation error counts like a position error at this share of the reach."""
 
 
 def poses_in_fitted_frames(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:

@@ -168,7 +168,13 @@ def test_present_joint_values_in_millimetres_are_noticed():
         call(scara, np.eye(4), near=[0.3, 0.8, -120.0, 0.4])
 
 
-def test_no_numbers(ik):
+def test_no_numbers(ik, poses):
+    T = poses.reshape(-1, 4, 4).numpy()
+    for wanted in (T, T[0]):
+        with pytest.raises(PoseError, match="near is no array of numbers"):
+            call(ik, wanted, near=["left"] * 6)
+        found = call(ik, wanted, near=["left"] * 6, throw=False)
+        assert (np.asarray(found.status) == Status.INVALID_POSE).all()
     with pytest.raises(PoseError, match="no array of numbers"):
         call(ik, [["a"] * 4] * 4)
     with pytest.raises(PoseError, match=r"shape \(2, 3\)"):
