@@ -74,8 +74,8 @@ class SensorView:
         sums: per sensor.
         noise: per sensor, its standard deviation [m or rad], or a factor of 1 or more where the rows give
             their own.
-        repetition: per sensor, 1 or more: by how much repeats of a pose tell less than so many poses,
-            because what the model gets wrong there is the same in all of them.
+        repetition: per sensor, 1 or more: by how much repeats of a pose, and several targets in it, tell less than
+            so many poses, because what the model gets wrong there is the same in all of them.
         widening: of the prior's standard deviations, per group of parameters.
     """
 
@@ -145,18 +145,22 @@ def group_variance_ratio(
     loss: AbstractLoss,
     view: SensorView,
     used: Sequence[float],
-    pose: Int64[Tensor, " rows"],
+    pose: Int64[Tensor, " rows"] | None,
+    configuration: Int64[Tensor, " rows"] | None = None,
 ) -> tuple[float, ...]:
     """Variance of the poses' mean residuals over that of independent rows (Kish 1965: design effect).
+
+    Targets on one tool share what the model gets wrong with the joints; by how much the mean residuals of
+    configurations vary more than those of poses comes on top, at most by the number of targets.
 
     Args:
         sensors: per sensor, which rows it saw.
         loss: weights the rows within a pose.
         view: residuals and noise.
         used: values that the parameters use up, per sensor; they come off the poses, not off their repeats.
-        pose: number of every row's pose.
+        pose: number of every row's pose; None where none is repeated.
+        configuration: number of every row's joint values and frame; None where none has several targets.
     """
-    poses = int(pose.max()) + 1
     found = []
     for k, (sensor, sums) in enumerate(zip(sensors, view.sums, strict=True)):
         if sensor.certain:
@@ -165,13 +169,30 @@ def group_variance_ratio(
         weight = loss.weight(sums.distance / view.scale(k), sensor.components) * sensor.seen
         if sensor.sigma is not None:
             weight = torch.where(sensor.seen, weight / sensor.sigma.square(), 0.0)
-        total = weight.new_zeros(poses).index_add(0, pose, weight)
-        summed = weight.new_zeros((sensor.components, poses)).index_add(1, pose, sums.residual * weight)
-        seen = total > 0
-        square = float((summed[:, seen].square().sum(0) / total[seen]).sum())
-        left = max(int(seen.sum()) * sensor.components - used[k], 1.0)
-        found.append(max(square / left / view.noise[k] ** 2, 1.0))
+        square, values = _group_squares(sums.residual, weight, pose)
+        ratio = 1.0
+        if pose is not None:
+            ratio = max(square / max(values - used[k], 1.0) / view.noise[k] ** 2, 1.0)
+        if configuration is not None and square > 0:
+            shared, fewer = _group_squares(sums.residual, weight, configuration)
+            ratio *= max((shared / fewer) / (square / values), 1.0)
+        found.append(ratio)
     return tuple(found)
+
+
+def _group_squares(
+    residual: Float64[Tensor, "components rows"],
+    weight: Float64[Tensor, " rows"],
+    group: Int64[Tensor, " rows"] | None,
+) -> tuple[float, int]:
+    """Sum of the squared mean residuals of groups of rows, by weight, and of how many values it is."""
+    if group is None:
+        return float((residual.square() * weight).sum()), int((weight > 0).sum()) * len(residual)
+    groups = int(group.max()) + 1
+    total = weight.new_zeros(groups).index_add(0, group, weight)
+    summed = weight.new_zeros((len(residual), groups)).index_add(1, group, residual * weight)
+    seen = total > 0
+    return float((summed[:, seen].square().sum(0) / total[seen]).sum()), int(seen.sum()) * len(residual)
 
 
 def prior_group_of(column: str, drawn: bool) -> int:

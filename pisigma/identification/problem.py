@@ -48,6 +48,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         precision: 1 / variance of their errors, 0 where nothing is known.
         active: indices of the free parameters.
         pose: number of every row's pose (joint values, frame, target), None where no pose is repeated.
+        configuration: number of every row's joint values and frame, None where none is seen of several targets.
         pairs: so many pairs of rows, the first ones, are measured together.
         conditions: payload, temperature (`measurement.conditions`) for corrections that depend on them.
         prior_sizes: "stated": the prior as it is; "widened": wider where the errors are larger than it says;
@@ -65,6 +66,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     precision: Float64[Tensor, " parameters"]
     active: Int64[Tensor, " active"]
     pose: Int64[Tensor, " rows"] | None = None
+    configuration: Int64[Tensor, " rows"] | None = None
     pairs: int = 0
     conditions: Float64[Tensor, "rows _conditions"] | None = None
     prior_sizes: PriorSizes = "widened"
@@ -110,6 +112,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             target=self.target[rows],
             sensors=tuple(sensor.select(rows) for sensor in self.sensors),
             pose=None if self.pose is None else renumbered(self.pose[rows]),
+            configuration=None if self.configuration is None else renumbered(self.configuration[rows]),
             pairs=int((rows < 2 * self.pairs).sum()) // 2,
             conditions=None if self.conditions is None else self.conditions[rows],
             memory=MotionMemory(),
@@ -158,9 +161,10 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             )
         )
         repetition = view.repetition
-        if self.pose is not None:
+        if self.pose is not None or self.configuration is not None:
+            seen = replace(view, noise=noise)
             repetition = group_variance_ratio(
-                self.sensors, self.loss, replace(view, noise=noise), used, self.pose
+                self.sensors, self.loss, seen, used, self.pose, self.configuration
             )
         off = (linearisation.point - self.nominal)[self.active]
         widening = view.widening

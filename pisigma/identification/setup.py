@@ -147,7 +147,8 @@ def build_setup(
         nominal=start,
         precision=torch.from_numpy(space.precision(prior)).to(device),
         active=torch.zeros(0, dtype=torch.int64, device=device),
-        pose=repeated_poses(carried, frame, target),
+        pose=repeated(carried, frame, target),
+        configuration=repeated(carried, frame) if len(space.targets) > 1 else None,
         pairs=len(names_of(measurements.pair)),
         conditions=conditions_of(measurements, told) if told else None,
         prior_sizes=options.prior_sizes,
@@ -187,10 +188,14 @@ def _frame_of(
     return frame[torch.tensor(first, dtype=torch.int64, device=frame.device)].cpu()
 
 
-def repeated_poses(q: Tensor, frame: Tensor, target: Tensor) -> Tensor | None:
-    """Number every row's pose (joint values and payload to 1e-9, frame, target); None where none is repeated."""
-    keys = torch.stack([*(q * 1e9).round().long().unbind(1), frame, target])
-    mixed = torch.zeros_like(frame)
+def repeated(q: Tensor, *names: Tensor) -> Tensor | None:
+    """Number every row's joint values (with payload, to 1e-9) and names, such as of frame and target.
+
+    Returns:
+        None where no two rows are the same.
+    """
+    keys = torch.stack([*(q * 1e9).round().long().unbind(1), *names])
+    mixed = torch.zeros_like(keys[0])
     for key in keys:  # integers wrap around, so equal rows mix equally
         mixed = mixed * 6_364_136_223_846_793_005 + key * 1_442_695_040_888_963_407
     found = renumbered(mixed)

@@ -173,6 +173,34 @@ def test_repeats_of_a_pose_do_not_count_as_new_poses() -> None:
             assert_close(b.standard_error, a.standard_error, rtol=0.15)
 
 
+@pytest.mark.parametrize(("shared", "own"), [(3e-4, 1e-5), (0.0, 3e-4)])
+def test_standard_errors_know_what_targets_on_one_tool_share(shared: float, own: float) -> None:
+    """Three targets whose errors are the same tell as much as one, three with errors of their own three times as much.
+
+    Args:
+        shared: standard deviation of the error that the targets share at a pose [m].
+        own: of every target's own error [m].
+    """
+    arm, generator = simulate("ur5", rows=60), torch.Generator().manual_seed(5)
+    T = forward_kinematics(arm.true, arm.measurements.q)
+    points = torch.tensor([[0.0, 0.0, 0.1], [0.1, 0.0, 0.1], [0.0, 0.1, 0.15]], dtype=torch.float64)
+    exact = T[:, :3, :3] @ points[:, None, :, None] + T[:, :3, 3:]
+    q, target = arm.measurements.q.repeat(3, 1), tuple("A" * 60 + "B" * 60 + "C" * 60)
+    names = ("a_2", "a_3", "theta_3", "theta_4", "d_5", "alpha_1")
+    found = []
+    for _ in range(20):
+        noise = shared * torch.randn(60, 3, dtype=torch.float64, generator=generator)
+        noise = noise + own * torch.randn(3, 60, 3, dtype=torch.float64, generator=generator)
+        measured = Measurements(q=q, position=(exact[..., 0] + noise).reshape(-1, 3), target=target)
+        result = GeometricCalibrator(arm.nominal, prior=None).fit(measured)
+        found.append([(row.estimated, row.standard_error) for row in map(result.parameter, names)])
+    estimated, predicted = np.array(found).transpose(2, 0, 1)
+    ratio = estimated.var(0, ddof=1) / np.square(predicted).mean(0)
+    assert (
+        0.5 < ratio.mean() < 1.6
+    )  # of 6 variances of 20 draws each; 3.7 for shared errors taken for three targets' own
+
+
 def test_what_the_data_do_not_see_stays_at_nominal_and_is_said() -> None:
     on_axis = np.array([1e-4, 2e-4, 0.1, 0.0, 0.0, 0.0])
     arm = simulate("ur10", rows=200, noise=5e-5, tool=on_axis)
