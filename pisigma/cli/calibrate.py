@@ -48,6 +48,13 @@ def calibrate(
         str,
         typer.Option(help="How rows are parted: joints (at random), interleaved, time, space or placement."),
     ] = "joints",
+    dealings: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Times that the rows are dealt to the folds. [default: 200 / different joint values, 1 to 10]",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option(help="Of the parting, and of drawing training rows.")] = 0,
     train_rows: Annotated[
         int | None,
@@ -88,7 +95,7 @@ def calibrate(
     from pisigma.correction.staging import check_replaceable, staged_folder
     from pisigma.evaluation.calibration_card import write_calibration_card
     from pisigma.evaluation.calibration_report import report_calibration
-    from pisigma.evaluation.calibration_validation import judge, validate
+    from pisigma.evaluation.calibration_validation import judge, validate_repeatedly
     from pisigma.evaluation.held_out_rows import HELD_OUT_CSV, held_out_csv, held_out_section
     from pisigma.evaluation.trained_calibrations import fit
     from pisigma.measurement.dataset import Measurements
@@ -104,12 +111,12 @@ def calibrate(
         socket_distances=known_socket_distances(socket_distance, measurements.socket or ()),
     )
     calibrator = _calibrator(model, geometric)
-    parts = _parts(measurements, folds, hold_out, seed, split)
+    parts = _parts(measurements, folds, hold_out, seed, split, dealings)
     rows, parts = _drawn(measurements, parts, train_rows, seed)
     with progress_of("calibration") as tell:
         result = fit(calibrator, rows, tell)
     with progress_of("cross-validation") as tell:
-        validation = validate(calibrator, measurements, parts, tell) if parts else None
+        validation = validate_repeatedly(calibrator, measurements, parts, tell) if parts else None
     kept_aside = None if test is None else judge(calibrator, result, rows, test)
     report = {"rows": rows.rows, **report_calibration(result, validation, kept_aside)}
     held_out = None if validation is None else held_out_csv(validation, measurements, nominal)
@@ -117,7 +124,13 @@ def calibrate(
         report |= held_out_section(held_out, measurements)
     found = replace(_model(out.resolve().name, nominal, result, rows), metrics=report)
     options = {"model": model, "folds": folds, "hold-out": hold_out, "split": split, "seed": seed}
-    options |= {"train-rows": train_rows, "free": free, "prior-mm": prior_mm, "prior-mrad": prior_mrad}
+    options |= {
+        "dealings": dealings,
+        "train-rows": train_rows,
+        "free": free,
+        "prior-mm": prior_mm,
+        "prior-mrad": prior_mrad,
+    }
     options |= {"robust": robust, "socket-distance": socket_distance, "base": base, "tip": tip}
     texts = {
         "description": _description(model, nominal),
@@ -140,12 +153,8 @@ def calibrate(
 def print_calibration(result: dict[str, Any]) -> None:
     """Print what a calibration gave, for people."""
     from pisigma.cli.output import WIDTH_WITHOUT_TERMINAL, print_table
-    from pisigma.evaluation.calibration_card import (
-        PARAMETER_COLUMNS,
-        held_out_lines,
-        not_identified_lines,
-        parameter_table,
-    )
+    from pisigma.evaluation.calibration_card import PARAMETER_COLUMNS, not_identified_lines, parameter_table
+    from pisigma.evaluation.held_out_sentences import folds_text, held_out_lines
     from pisigma.evaluation.hybrid_card import compared, curve_rows
     from pisigma.evaluation.hybrid_report import TRIAL_COLUMNS, coverage_line, learned_lines, trial_rows
     from pisigma.evaluation.tables import pose_rows
@@ -160,13 +169,14 @@ def print_calibration(result: dict[str, Any]) -> None:
             typer.echo(textwrap.fill(line, WIDTH_WITHOUT_TERMINAL))
     for key, title in (
         ("held_out", "pose errors of {rows} other simulated rows"),
-        ("cross_validation", "pose errors of {rows} held-out rows ({folds} folds)"),
+        ("cross_validation", "pose errors of {rows} held-out rows ({how})"),
         ("test", "pose errors of the {rows} rows of the set 'test', which were kept aside"),
     ):
         if key in result:
             models = compared(result[key])
             if models:
-                print_table(title.format(**result[key]), *pose_rows(models))
+                how = folds_text(result[key])
+                print_table(title.format(**result[key], how=how), *pose_rows(models))
             lines = held_out_lines(result[key])
             lines += [coverage_line(result[key])] if "coverage" in result[key] else []
             for line in lines:
@@ -197,30 +207,41 @@ def _command_line(robot: str, data: Path, out: Path, options: dict[str, Any]) ->
 
 
 def _parts(
-    measurements: "Measurements", folds: int | None, hold_out: float | None, seed: int, split: str
-) -> "Sequence[TrainTest]":
+    measurements: "Measurements",
+    folds: int | None,
+    hold_out: float | None,
+    seed: int,
+    split: str,
+    times: int | None,
+) -> "Sequence[Sequence[TrainTest]]":
+    """Per dealing its parts; one part for rows that are held out once."""
     from pisigma.errors import MeasurementError, nearest_choice
-    from pisigma.measurement.splits import SplitBy, holdout, k_folds
+    from pisigma.measurement.splits import SplitBy, dealings, holdout
 
     choices: tuple[str, ...] = get_args(SplitBy)
     if split not in choices:
         raise MeasurementError(f"--split '{split}' is unknown; {nearest_choice(split, choices)}")
+    if times is not None and times > 1 and (hold_out is not None or folds == 0):
+        raise MeasurementError(
+            f"--dealings {times}: rows are dealt to folds; leave out --hold-out and --folds 0."
+        )
+    by: Any = split
     if hold_out is not None:
-        return [holdout(measurements, hold_out, seed, split)]  # type: ignore[arg-type]
+        return [[holdout(measurements, hold_out, seed, by)]]
     if folds is None and split != "placement":
         folds = FOLDS
-    return [] if folds == 0 else k_folds(measurements, folds, seed, split)  # type: ignore[arg-type]
+    return [] if folds == 0 else dealings(measurements, folds, seed, by, times)
 
 
 def _drawn(
-    measurements: "Measurements", parts: "Sequence[TrainTest]", rows: int | None, seed: int
-) -> "tuple[Measurements, Sequence[TrainTest]]":
+    measurements: "Measurements", parts: "Sequence[Sequence[TrainTest]]", rows: int | None, seed: int
+) -> "tuple[Measurements, Sequence[Sequence[TrainTest]]]":
     """The rows to calibrate with, all or some of them, and parts with as many training rows."""
     from pisigma.measurement.drawing import draw_rows, with_fewer
 
     if rows is None:
         return measurements, parts
-    parts = with_fewer(measurements, parts, rows, seed)
+    parts = [with_fewer(measurements, dealt, rows, seed) for dealt in parts]
     return measurements.select(draw_rows(measurements, rows, seed)), parts
 
 

@@ -17,6 +17,7 @@ from pisigma.evaluation.calibration_figures import (
 from pisigma.evaluation.calibration_report import PARAMETERS_CSV, write_parameters
 from pisigma.evaluation.calibration_validation import CalibrationValidation
 from pisigma.evaluation.correlation_csv import CORRELATION_CSV, write_correlations
+from pisigma.evaluation.held_out_sentences import cross_validation_text, held_out_lines
 from pisigma.evaluation.hybrid_card import compared, hybrid_parts, write_hybrid_figures
 from pisigma.evaluation.markdown import CARD, markdown_table, use_text
 from pisigma.evaluation.tables import figure_text, pose_table
@@ -48,7 +49,7 @@ def write_calibration_card(
     """
     result = geometric_result(found)
     write_parameters(result, folder / PARAMETERS_CSV)
-    held_out = {} if validation is None else validation.models
+    held_out = {} if validation is None else validation.all_errors
     lengths = {name: errors.position.numpy() for name, errors in held_out.items()}
     under = ", geometric" if isinstance(found, HybridResult) else ""
     draw_residuals(result.residuals, folder / RESIDUALS_PNG, under)
@@ -97,34 +98,6 @@ def not_identified_lines(report: Mapping[str, Any]) -> list[str]:
         lines.append(f"{', '.join(redundancy['no_effect'])} change no measured value")
     lines += [*report["unseen"], *report["warnings"]]
     return [f"{line.rstrip('.')}." for line in lines] or ["Nothing: every parameter is identified."]
-
-
-def held_out_lines(found: Mapping[str, Any]) -> list[str]:
-    """What else a cross-validation says, in sentences: of sockets and frames that were held out whole."""
-    lines = []
-    if "sockets_held_out" in found:
-        lines.append(
-            f"{found['sockets_held_out']} sockets were held out whole; an error there is how far a row puts the ball "
-            "from where the socket's rows put it on average."
-        )
-    if "socket_distance" in found:
-        distance = found["socket_distance"]
-        *others, (last, best) = compared(distance).items()
-        beside = "; ".join(
-            f"{name} {figure_text(sizes['mean_mm'])} and {figure_text(sizes['max_mm'])} mm"
-            for name, sizes in others
-        )
-        by = f" by the {last} calibration" if last != "geometric" else ""
-        lines.append(
-            f"The known distance of held-out sockets ({distance['count']} of them) is met to "
-            f"{figure_text(best['mean_mm'])} mm on average, {figure_text(best['max_mm'])} mm at worst{by} ({beside})."
-        )
-    if "frames_fitted" in found:
-        lines.append(
-            f"{found['frames_fitted']} frames were held out whole; where the base stands in them, and nothing else, "
-            "was fitted to the held-out rows."
-        )
-    return lines
 
 
 def _text(
@@ -191,8 +164,7 @@ def _held_out_parts(report: Mapping[str, Any]) -> list[str]:
     if "cross_validation" in report:
         found = report["cross_validation"]
         how = (
-            f"{found['folds']}-fold cross-validation: each of {found['rows']} rows is judged by a calibration "
-            "that never saw it"
+            cross_validation_text(found)
             if found["folds"] > 1
             else f"Judged on {found['rows']} rows by a calibration on the others"
         )

@@ -1,7 +1,7 @@
 """Calibrations judged on rows that they never saw: nominal, geometric and hybrid side by side."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float64
@@ -36,6 +36,7 @@ class CalibrationValidation:
             held-out rows themselves, under either arm.
         sockets_held_out: how many sockets were held out whole; their errors are from where their own rows put the
             ball on average.
+        again: the same of the rows dealt to the folds anew, whose errors count in the figures too.
     """
 
     folds: int
@@ -44,17 +45,46 @@ class CalibrationValidation:
     distances: Mapping[str, Float64[Tensor, " _pairs"]] = field(default_factory=dict)
     frames_fitted: int = 0
     sockets_held_out: int = 0
+    again: tuple["CalibrationValidation", ...] = ()
+
+    @property
+    def dealings(self) -> tuple["CalibrationValidation", ...]:
+        """One validation for every time that the rows were dealt to the folds."""
+        return (replace(self, again=()), *self.again)
+
+    @property
+    def all_errors(self) -> dict[str, PoseErrors]:
+        """By model, errors of all rows in all dealings, one dealing after the other."""
+        return {
+            name: PoseErrors.joined([dealing.models[name] for dealing in self.dealings])
+            for name in self.models
+        }
+
+    @property
+    def all_spread(self) -> PredictedSpread | None:
+        """What a hybrid predicts of these errors."""
+        spreads = [dealing.spread for dealing in self.dealings if dealing.spread is not None]
+        return PredictedSpread.joined(spreads) if spreads else None
 
     def in_file_units(self) -> dict[str, object]:
-        """The figures in mm and deg; `rows` counts the held-out ones with a length."""
+        """The figures in mm and deg of all dealings; `rows` counts the held-out ones with a length, once each."""
         last = list(self.models.values())[-1]
         figures: dict[str, object] = {"folds": self.folds, "rows": int(torch.isfinite(last.position).sum())}
-        figures |= {name: errors.in_file_units() for name, errors in self.models.items()}
-        if self.spread is not None:
-            figures |= self.spread.in_file_units()
+        if self.again:
+            figures["dealings"] = len(self.dealings)
+            figures["rms_mm_of_dealings"] = {
+                name: [error_statistics(one.models[name].position)["rms"] * 1e3 for one in self.dealings]
+                for name in self.models
+            }
+        figures |= {name: errors.in_file_units() for name, errors in self.all_errors.items()}
+        if self.all_spread is not None:
+            figures |= self.all_spread.in_file_units()
+        distances = {
+            name: torch.cat([one.distances[name] for one in self.dealings]) for name in self.distances
+        }
         count = max((len(errors) for errors in self.distances.values()), default=0)
         if count:
-            sizes = {name: _sizes(errors) for name, errors in self.distances.items()}
+            sizes = {name: _sizes(errors) for name, errors in distances.items()}
             figures["socket_distance"] = {"count": count, **sizes}
         counts = {"frames_fitted": self.frames_fitted, "sockets_held_out": self.sockets_held_out}
         return figures | {name: count for name, count in counts.items() if count}
@@ -134,6 +164,27 @@ def validate(
         results = trained(chosen, seen, lambda what, fold=fold: progress(f"{fold}: {what}"))  # type: ignore[misc]
         _judge(judged, geometric_of(calibrator), results, seen, (unseen, test))
     return judged.validation(len(parts), frames, sockets)
+
+
+def validate_repeatedly(
+    calibrator: Calibrator,
+    measurements: Measurements,
+    dealings: Sequence[Sequence[TrainTest]],
+    progress: Progress = lambda what: None,
+) -> CalibrationValidation:
+    """The same for rows that were dealt to folds several times over; see `pisigma.measurement.splits.dealings`."""
+    if len(dealings) == 1:
+        return validate(calibrator, measurements, dealings[0], progress)
+    first, *again = (
+        validate(
+            calibrator,
+            measurements,
+            parts,
+            lambda what, done=done: progress(f"dealing {done + 1} of {len(dealings)}, {what}"),  # type: ignore[misc]
+        )
+        for done, parts in enumerate(dealings)
+    )
+    return replace(first, again=tuple(again))
 
 
 def judge(

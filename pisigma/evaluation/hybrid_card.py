@@ -41,8 +41,9 @@ def write_hybrid_figures(
     """
     if result.learned is not None:
         draw_corrections(result.learned.correction, measurements, folder / CORRECTIONS_PNG)
-    if validation is not None and validation.spread is not None and validation.spread.values:
-        draw_spread(validation.spread, folder / SPREAD_PNG)
+    spread = None if validation is None else validation.all_spread
+    if spread is not None and spread.values:
+        draw_spread(spread, folder / SPREAD_PNG)
     if "learning_curve" in report:
         points = report["learning_curve"]
         models = {

@@ -1,5 +1,6 @@
 """Position and orientation errors of measured rows under a model, and their statistics."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -90,6 +91,14 @@ class PoseErrors:
     def between(measurements: Measurements, expected: Float64[Tensor, "rows 4 4"]) -> "PoseErrors":
         """Errors of measurements against expected poses; see `ErrorVectors.between`."""
         return ErrorVectors.between(measurements, expected).sizes
+
+    @staticmethod
+    def joined(parts: Sequence["PoseErrors"]) -> "PoseErrors":
+        """Errors of one part after the other; all have orientations or none has."""
+        rotations = [part.rotation for part in parts if part.rotation is not None]
+        return PoseErrors(
+            torch.cat([part.position for part in parts]), torch.cat(rotations) if rotations else None
+        )
 
     def only(self, rows: Bool[Tensor, " rows"]) -> "PoseErrors":
         """The errors of some rows; NaN in all others."""

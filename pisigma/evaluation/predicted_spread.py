@@ -1,5 +1,6 @@
 """Predicted standard deviations of positions beside the errors that were made."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -31,6 +32,13 @@ class PredictedSpread:
         """Of rows that are not judged yet."""
         nothing = torch.full((rows, 3), torch.nan, dtype=torch.float64)
         return PredictedSpread(nothing, nothing.clone())
+
+    @staticmethod
+    def joined(parts: Sequence["PredictedSpread"]) -> "PredictedSpread":
+        """Rows of one part after the other."""
+        return PredictedSpread(
+            torch.cat([part.error for part in parts]), torch.cat([part.sigma for part in parts])
+        )
 
     @property
     def values(self) -> int:

@@ -16,6 +16,11 @@ SplitBy = Literal["joints", "interleaved", "time", "space", "placement"]
 """By joints: at random; interleaved: in turn, in the file's order; by time: blocks of that order; by space: blocks of
 the measured positions; by placement: all sockets of a placement together, or all rows of a frame."""
 
+AT_RANDOM: tuple[SplitBy, ...] = ("joints", "placement")
+"""Ways that deal groups at random, so that dealing again gives other folds."""
+JUDGED_GROUPS, MOST_DEALINGS = 200, 10
+"""Groups held out, counted anew in every dealing, after which the luck of the dealing hardly shows."""
+
 TrainTest = tuple[Int64[Tensor, " _train"], Int64[Tensor, " _test"]]
 """Rows to train on and rows to test on, each in the order of the measurements."""
 
@@ -58,6 +63,48 @@ def k_folds(
         positions = _group_positions(measurements, group, len(sizes)) if by == "space" else None
         _cut_into_folds(fold, sizes, positions, torch.arange(len(sizes)), 0, folds)
     return tuple(_train_test(measurements, (fold[group] == number) & (group >= 0)) for number in range(folds))
+
+
+def dealings(
+    measurements: Measurements,
+    folds: int | None,
+    seed: int,
+    by: SplitBy = "joints",
+    times: int | None = None,
+) -> tuple[tuple[TrainTest, ...], ...]:
+    """Part the measurements into folds several times over, differently each time.
+
+    With few groups the error of held-out rows depends on which of them came together; over several dealings that
+    averages out (Burman 1989, Biometrika 76(3), 503-514).
+
+    Args:
+        measurements: what to part.
+        folds: how many, 2 or more; None for as many as there are groups.
+        seed: of the first dealing; the others follow from it.
+        by: see `k_folds`.
+        times: how many dealings; None for as many as it takes to hold out `JUDGED_GROUPS` groups, `MOST_DEALINGS` at
+            most, and one where groups are not dealt at random, by placement, or one by one.
+
+    Returns:
+        Per dealing its folds, as from `k_folds`; the first one as with `k_folds`.
+
+    Raises:
+        MeasurementError: several dealings were wanted where they do not differ; see `k_folds` too.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    first = k_folds(measurements, folds, generator, by)
+    groups = len(_groups(measurements, by)[1])
+    differ = by in AT_RANDOM and len(first) < groups
+    if times is None:
+        usual = min(JUDGED_GROUPS // groups, MOST_DEALINGS)
+        times = max(usual, 1) if by == "joints" and differ else 1
+    if times > 1 and not differ:
+        what = f"{groups} folds of {groups} {_kind(by)}" if by in AT_RANDOM else f"folds by {by}"
+        raise MeasurementError(
+            f"{measurements.source}: {times} dealings were wanted, but {what} are the same every time; ask for one "
+            "dealing, or for fewer folds by joints or placement."
+        )
+    return first, *(k_folds(measurements, folds, generator, by) for _ in range(times - 1))
 
 
 def holdout(

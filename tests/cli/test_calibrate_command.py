@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
@@ -64,6 +65,10 @@ def test_json_has_the_agreed_shape(calibrated):
     assert (validation["folds"], validation["rows"]) == (3, 60)
     assert set(validation["nominal"]) == set(validation["geometric"]) == POSE
     assert validation["geometric"]["rms_mm"] < validation["nominal"]["rms_mm"] / 3
+    assert validation["dealings"] == 3  # 200 held-out poses at most
+    for name, rms in validation["rms_mm_of_dealings"].items():
+        assert_close(np.sqrt(np.square(rms).mean()), validation[name]["rms_mm"], rtol=1e-12)
+        assert len(set(rms)) == 3
     assert "test" not in printed
 
 
@@ -89,7 +94,7 @@ def test_the_card_says_everything(calibrated):
         "Made by `pisigma calibrate kiro4 poses.csv --out arm --model geometric --folds 3`, on 60 rows of `poses.csv`."
         in card
     )
-    assert "3-fold cross-validation: each of 60 rows" in card
+    assert "3-fold cross-validation, dealt 3 times: each of 60 rows" in card
     assert f"{printed['cross_validation']['geometric']['rms_mm']:.4f}" in card
     for row in printed["parameters"]:
         assert f"| {row['name']} | {row['unit']} |" in card
@@ -108,7 +113,7 @@ def test_what_is_printed_for_people_fits_in_120_columns(run, data, tmp_path):
     assert max(map(len, lines)) <= 120
     for part in ("theta_6", "in a sum, see below", "is identified, the single values are not.", "Rank 30, "):
         assert part in text
-    assert "pose errors of 60 held-out rows (2 folds)" in text
+    assert "pose errors of 60 held-out rows (2 folds, dealt 3 times)" in text
 
 
 @pytest.mark.parametrize("split", ["joints", "time", "space"])
@@ -249,6 +254,8 @@ def test_inverse_calibration_wants_one_frame_and_target(refuses, repository, tar
         ),
         (("--folds", "1"), "1 folds were wanted"),
         (("--hold-out", "2"), "between 0 and 1 was wanted, got 2."),
+        (("--hold-out", "0.2", "--dealings", "2"), "leave out --hold-out and --folds 0."),
+        (("--split", "time", "--dealings", "2"), "2 dealings were wanted, but folds by time are the same"),
         (("--free", "a_9"), "a_9"),
         (("--prior-mm", "0"), "or both 0 for none, got 0 mm and 1 mrad."),
         (("--prior-mm", "nan"), "got nan mm"),

@@ -8,9 +8,9 @@ from testing.closeness import assert_close
 from testing.sensors import ARM, TRUE_BASES, socket_data, touch_data, true_robot
 
 from pisigma.errors import IdentificationError
-from pisigma.evaluation.calibration_card import held_out_lines
 from pisigma.evaluation.calibration_validation import validate
 from pisigma.evaluation.held_out_frames import with_frames
+from pisigma.evaluation.held_out_sentences import held_out_lines
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.loss import SquaredLoss
 from pisigma.measurement import Measurements, k_folds

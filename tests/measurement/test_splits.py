@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement import Measurements, groups_of_equal_joints, holdout, k_folds, placements
+from pisigma.measurement.splits import SplitBy, dealings
 
 WAYS = ("joints", "interleaved", "time", "space")
 
@@ -218,3 +219,39 @@ def test_refuses_to_split_by_placements_that_are_not_there(names: list[str], com
 def test_refuses_more_folds_than_placements():
     with pytest.raises(MeasurementError, match="3 folds were wanted from 2 placements; ask for 2 to 2 folds"):
         k_folds(in_sockets(["a/0", "b/0", "b/1"]), 3, seed=0, by="placement")
+
+
+def test_dealings_differ_and_start_with_the_folds_of_the_seed():
+    measurements = repeated([row // 3 for row in range(72)])
+    found = dealings(measurements, 6, seed=4)
+    assert len(found) == 8  # 200 of 24 groups
+    assert all(
+        torch.equal(a, b) for a, b in zip(found[0][0], k_folds(measurements, 6, seed=4)[0], strict=True)
+    )
+    assert len({tuple(tuple(test.tolist()) for _, test in dealt) for dealt in found}) == 8
+    for dealt in found:
+        assert sorted(torch.cat([test for _, test in dealt]).tolist()) == list(range(72))
+
+
+@pytest.mark.parametrize(
+    ("groups", "folds", "by", "times"),
+    [
+        (5, 2, "joints", 10),
+        (100, 5, "joints", 2),
+        (101, 5, "joints", 1),
+        (12, 12, "joints", 1),
+        (12, None, "joints", 1),
+        (12, 3, "interleaved", 1),
+        (12, 3, "time", 1),
+    ],
+)
+def test_as_many_dealings_as_there_are_few_poses(groups: int, folds: int | None, by: SplitBy, times: int):
+    assert len(dealings(repeated(list(range(groups))), folds, seed=0, by=by)) == times
+
+
+@pytest.mark.parametrize(("folds", "by"), [(4, "time"), (4, "interleaved"), (12, "joints")])
+def test_refuses_to_deal_what_cannot_be_dealt_anew(folds: int, by: SplitBy):
+    measurements = repeated(list(range(12)))
+    assert len(dealings(measurements, folds, seed=0, by=by, times=1)) == 1
+    with pytest.raises(MeasurementError, match=r"3 dealings were wanted, but .* are the same every time"):
+        dealings(measurements, folds, seed=0, by=by, times=3)

@@ -7,6 +7,7 @@ from typing import Any
 import torch
 
 from pisigma.correction.calibrated_model import CalibratedModel
+from pisigma.evaluation.held_out_sentences import cross_validation_text
 from pisigma.evaluation.pose_statistics import PoseErrors, error_statistics
 from pisigma.evaluation.report.judged_rows import JudgedRows
 
@@ -144,8 +145,5 @@ def _how(key: str, figures: Mapping[str, Any], rows: int) -> str:
     if key == "held_out":
         return f"{rows} other rows of the simulation, which the model never saw."
     if figures.get("folds", 1) > 1:
-        return (
-            f"{figures['folds']}-fold cross-validation: each of {rows} rows is judged by a calibration that never saw "
-            f"it; {nominal}"
-        )
+        return f"{cross_validation_text({**figures, 'rows': rows})}; {nominal}"
     return f"{rows} rows that were held out once, judged by a calibration on the others; {nominal}"
