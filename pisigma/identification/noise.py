@@ -118,7 +118,10 @@ def loss_scale(
     used: Sequence[float],
     refine: bool,
 ) -> tuple[float, ...]:
-    """Standard deviation of every sensor's values; `refine` uses all good rows instead of the median."""
+    """Standard deviation of every sensor's values, or factor of 1 or more on those that its rows give.
+
+    `refine` uses all good rows instead of the median.
+    """
     found = []
     for k, sensor in enumerate(sensors):
         if sensor.certain:
@@ -128,9 +131,10 @@ def loss_scale(
         if view.sums[k].seen < len(distance):
             distance = distance[sensor.seen]
         if refine:
-            found.append(loss.deviation(distance, sensor.components, used[k], view.scale(k)))
+            scale = loss.deviation(distance, sensor.components, used[k], view.scale(k))
         else:
-            found.append(loss.scale(distance, sensor.components, used[k]))
+            scale = loss.scale(distance, sensor.components, used[k])
+        found.append(max(scale, SMALLEST_NOISE if sensor.sigma is None else 1.0))
     return tuple(found)
 
 

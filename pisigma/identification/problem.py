@@ -15,7 +15,6 @@ from pisigma.identification.loss import AbstractLoss, SquaredLoss
 from pisigma.identification.motion_memory import MotionMemory
 from pisigma.identification.noise import (
     ALWAYS_GOOD,
-    SMALLEST_NOISE,
     SMALLEST_PRIOR,
     SensorSums,
     SensorView,
@@ -154,12 +153,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         view = view_of(linearisation)
         covariance = covariance_of(linearisation.normal)
         used = values_used(view, covariance)
-        noise = tuple(
-            max(found, SMALLEST_NOISE if sensor.sigma is None else 1.0)
-            for sensor, found in zip(
-                self.sensors, loss_scale(self.sensors, self.loss, view, used, refine), strict=True
-            )
-        )
+        noise = loss_scale(self.sensors, self.loss, view, used, refine)
         repetition = view.repetition
         if self.pose is not None or self.configuration is not None:
             seen = replace(view, noise=noise)

@@ -99,7 +99,9 @@ def test_calibrate_keeps_what_a_report_shows(run, tmp_path):
         assert found["held_out"]
         assert [frame["name"] for frame in found["frames"]] == ["</script>", "$b"]
         assert found["correlated"]
-        assert (tmp_path / "page.html").read_text().count("</script>") == 2
+        page = (tmp_path / "page.html").read_text()
+        assert page.count("</script>") == 2
+        assert "dealt to the folds 3 times; errors of single rows are those of the first time." in page
     (folder / HELD_OUT_CSV).write_text("q1_deg\n1\n")
     refused = run("report", folder, "--out", tmp_path / "page.html")
     assert refused.exit_code == 2

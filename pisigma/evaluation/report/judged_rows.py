@@ -90,7 +90,7 @@ def rows_of_file(
         kept = bool(torch.isfinite(residual).any())
         known = residual if kept else _model_errors(model, rows)[1]
         origins = ("held_out", "held_out" if kept else "training")
-        return _judged(model, rows, held_out.models, known, origins, remarks)
+        return _judged(model, rows, held_out.models, known, origins, [*remarks, *_dealt(model)])
     origin = "training" if digest == model.provenance.data_sha256 else "unseen"
     remarks += _seen_before(model, rows) if origin == "unseen" else []
     errors, residual = _model_errors(model, rows)
@@ -119,7 +119,17 @@ def rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
     rows = Measurements(
         q=held_out.q, frame=held_out.frame, target=held_out.target, source=model.provenance.data_source
     )
-    return _judged(model, rows, held_out.models, held_out.residual, ("held_out", "held_out"), [])
+    return _judged(model, rows, held_out.models, held_out.residual, ("held_out", "held_out"), _dealt(model))
+
+
+def _dealt(model: CalibratedModel) -> list[str]:
+    """A sentence where the errors that are kept of every row are those of one dealing among several."""
+    times = model.metrics.get("cross_validation", {}).get("dealings", 1)
+    if times == 1:
+        return []
+    return [
+        f"The rows were dealt to the folds {times} times; errors of single rows are those of the first time."
+    ]
 
 
 def place_of(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows 3"]:
