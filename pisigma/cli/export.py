@@ -74,6 +74,15 @@ def export(
             help="With .ls and --targets cartesian: the arm's configuration, such as 'N U T, 0, 0, 0'."
         ),
     ] = None,
+    payload_kg: Annotated[
+        float | None,
+        typer.Option(
+            help="With targets and offsets: what the robot carries, if the model learned that. [default: the usual]"
+        ),
+    ] = None,
+    temperature_c: Annotated[
+        float | None, typer.Option(help="Temperature of the robot, likewise. [default: the usual]")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Write a model for other programs, whole or not at all.
@@ -91,6 +100,13 @@ def export(
     if tip is not None and like is None:
         raise OutputError("--tip names a link of the file that --like gives; give both or none.")
     _check_target_options(form, poses, kind, branch, config)
+    stated = {"payload_kg": payload_kg, "temperature_c": temperature_c}
+    conditions = {name: value for name, value in stated.items() if value is not None}
+    if conditions and form not in ("targets", "offsets"):
+        raise OutputError(
+            f"--{next(iter(conditions)).replace('_', '-')} goes with --format targets or offsets, not with {form}; "
+            "leave it out."
+        )
     from pisigma.correction.model_folder import load_model
     from pisigma.export.output_file import check_output, write_whole
 
@@ -98,9 +114,13 @@ def export(
     if poses is not None:
         from pisigma.cli.export_targets import export_targets
 
-        export_targets(model, out, poses, kind, branch, config, as_json)
+        export_targets(model, out, poses, kind, branch, config, conditions, as_json)
         return
     loaded, as_csv = load_model(model), out.suffix.lower() == ".csv"
+    if conditions:
+        from pisigma.correction.given_conditions import under_conditions
+
+        loaded = under_conditions(loaded, **conditions)
     content: str | bytes
     if form == "onnx":
         content, result = _onnx(loaded, model)

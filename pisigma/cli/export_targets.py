@@ -24,6 +24,7 @@ def export_targets(
     kind: str | None,
     branch: str | None,
     config: str | None,
+    conditions: dict[str, float],
     as_json: bool,
 ) -> None:
     """Write corrected targets, and say what about them is in doubt.
@@ -34,6 +35,8 @@ def export_targets(
     table, cartesian = out.suffix.lower() == ".csv", kind == "cartesian"
     _check_options(out, poses, kind, config)
     solver = load(model)
+    if conditions:
+        solver = solver.under(**conditions)
     if not table:
         check_program(out, solver.model.robot, cartesian, config)
     wanted = read_poses(poses)

@@ -9,6 +9,8 @@ import typer
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from pisigma.correction.corrected_ik import CorrectedIK
+
 Pose = tuple[float, float, float, float, float, float]
 
 
@@ -39,6 +41,13 @@ def ik(
             help="The rows of --poses are a path: stay on one branch as long as possible and say where that ends.",
         ),
     ] = False,
+    payload_kg: Annotated[
+        float | None,
+        typer.Option(help="What the robot carries, if the model learned that. [default: the usual]"),
+    ] = None,
+    temperature_c: Annotated[
+        float | None, typer.Option(help="Temperature of the robot, likewise. [default: the usual]")
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print the joint values that really reach a pose, or write those of a file of poses.
@@ -50,20 +59,25 @@ def ik(
     for name, given in (("--accuracy", accuracy), ("--path", path)):
         if given and poses is None:
             raise typer.BadParameter("it goes with --poses", param_hint=f"'{name}'")
+    from pisigma.correction.corrected_ik import load
+
+    solver = load(model)
+    if payload_kg is not None or temperature_c is not None:
+        solver = solver.under(payload_kg=payload_kg, temperature_c=temperature_c)
     if poses is not None and out is not None:
-        _write_file(model, poses, out, branch, accuracy, path, as_json)
+        _write_file(solver, poses, out, branch, accuracy, path, as_json)
     elif pose is not None:
-        _print_pose(model, pose, branch, all_branches, as_json)
+        _print_pose(solver, pose, branch, all_branches, as_json)
 
 
-def _print_pose(model: Path, pose: Pose, branch: str | None, all_branches: bool, as_json: bool) -> None:
+def _print_pose(
+    solver: "CorrectedIK", pose: Pose, branch: str | None, all_branches: bool, as_json: bool
+) -> None:
     """Print the solutions of one pose."""
     from pisigma.cli.output import fail, print_json
     from pisigma.cli.solutions import failure, print_solutions, solution_records
-    from pisigma.correction.corrected_ik import load
     from pisigma.correction.solution import Solution
 
-    solver = load(model)
     T, places = _transform(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
     if all_branches:
         solution = solver.all_branches(T).select(0)
@@ -80,15 +94,19 @@ def _print_pose(model: Path, pose: Pose, branch: str | None, all_branches: bool,
 
 
 def _write_file(
-    model: Path, poses: Path, out: Path, branch: str | None, accuracy: bool, path: bool, as_json: bool
+    solver: "CorrectedIK",
+    poses: Path,
+    out: Path,
+    branch: str | None,
+    accuracy: bool,
+    path: bool,
+    as_json: bool,
 ) -> None:
     """Write the joint values of a file of poses, of any length."""
     from pisigma.cli.joint_file import write_joint_file
     from pisigma.cli.output import fail, print_json
     from pisigma.cli.progress import progress_of
-    from pisigma.correction.corrected_ik import load
 
-    solver = load(model)
     with progress_of(f"solving {poses}") as tell:
         outcome = write_joint_file(solver, poses, out, branch, tell, accuracy, path)
     statuses = dict(outcome.statuses.most_common())

@@ -10,6 +10,7 @@ from pisigma.correction.calibrated_model import CalibratedModel
 from pisigma.correction.hybrid_motion import corrected_joints
 from pisigma.correction.row_poses import Frames, known_names
 from pisigma.identification.user_coordinates import IdentifiedGeometry
+from pisigma.measurement.conditions import CONDITIONS
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 
@@ -29,7 +30,17 @@ def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) ->
     rows = torch.isfinite(flat).all(-1).nonzero()[:, 0]
     if model.uncertainty is not None and len(rows):
         frame, target = (next(iter(known), "") for known in (model.bases, model.tools))
-        at = Measurements(q=flat[rows], frame=(frame,) * len(rows), target=(target,) * len(rows))
+        payload, temperature = (
+            torch.full((len(rows),), model.conditions.get(name, torch.nan), dtype=torch.float64)
+            for name in CONDITIONS
+        )
+        at = Measurements(
+            q=flat[rows],
+            frame=(frame,) * len(rows),
+            target=(target,) * len(rows),
+            payload=payload,
+            temperature=temperature,
+        )
         found[rows] = deviation_of_rows(model, at).norm(dim=-1)
     return found.reshape(q.shape[:-1])
 

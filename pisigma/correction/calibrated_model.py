@@ -74,6 +74,8 @@ class CalibratedModel:
         uncertainty: of predicted positions, or None.
         unexplained: standard deviation of what the geometric calibration does not explain [m]: noise and all
             that it cannot express.
+        conditions: payload [kg] and temperature [deg C] that it was put under, by name; empty for the usual ones of
+            the rows. See `pisigma.correction.given_conditions`.
         provenance: recipe, data, versions.
         metrics: figures for the card, by name.
     """
@@ -93,6 +95,7 @@ class CalibratedModel:
     hybrid_tools: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
     uncertainty: PositionUncertainty | None = None
     unexplained: float = 0.0
+    conditions: dict[str, float] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)
     metrics: dict[str, Any] = field(default_factory=dict)
 

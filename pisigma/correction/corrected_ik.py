@@ -161,6 +161,20 @@ class CorrectedIK:
 
         return follow_path(self, T_base_tool, near, branch)
 
+    def under(self, *, payload_kg: float | None = None, temperature_c: float | None = None) -> "CorrectedIK":
+        """The same of the robot under other conditions than the usual ones of the calibration rows.
+
+        Args:
+            payload_kg: what it carries [kg]; as usual if None.
+            temperature_c: of the robot [deg C]; as usual if None.
+
+        Raises:
+            ModelError: the model did not learn what a given condition does, or not near the given value.
+        """
+        from pisigma.correction.given_conditions import under_conditions
+
+        return CorrectedIK(under_conditions(self.model, payload_kg, temperature_c))
+
     def accuracy(self, q: Any) -> Any:
         """Predicted standard deviation [m] of the tool's position at joint values `(*batch, dof)`, as an array."""
         import torch

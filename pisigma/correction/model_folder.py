@@ -43,7 +43,14 @@ def save_model(model: CalibratedModel, folder: Path) -> None:
 
     Next to `model.yaml` and `model.safetensors` it gets what the compiled kernels read, where they know the model's
     kind of correction.
+
+    Raises:
+        ModelError: the model is under given conditions.
     """
+    if model.conditions:
+        raise ModelError(
+            f"model '{model.name}' is under given conditions, which a folder does not keep; save it as calibrated."
+        )
     weights = save_tensors(_tensors(model))
     groups = [
         {

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 from pisigma import __version__
 from pisigma.correction.calibrated_model import CalibratedModel
+from pisigma.network.features import ConditionFeatures
 from pisigma.robot.description import Robot
 
 
@@ -47,6 +48,20 @@ def frame_remarks(model: CalibratedModel) -> tuple[str, ...]:
     return tuple(said)
 
 
+def condition_remarks(model: CalibratedModel) -> tuple[str, ...]:
+    """A sentence on the payload and temperature that joint values are for, where the model learned what these do."""
+    own = () if model.hybrid is None else model.hybrid.correction.features
+    usual = {
+        name: mean
+        for chosen in own
+        if isinstance(chosen, ConditionFeatures)
+        for name, mean in zip(chosen.names, chosen.mean, strict=True)
+    }
+    given = [f"{name} {value:g}" for name, value in model.conditions.items()]
+    given += [f"{name} {mean:.4g} (usual)" for name, mean in usual.items()]
+    return (f"Made for {' and '.join(given)}.",) if given else ()
+
+
 def offset_remarks(model: CalibratedModel) -> tuple[str, ...]:
     """The same for a file that holds joint offsets and nothing else."""
     title = f"Joint offsets of model {model.name} (robot {model.robot.name}), by pisigma {__version__}."
@@ -54,6 +69,7 @@ def offset_remarks(model: CalibratedModel) -> tuple[str, ...]:
         return (title,)
     return (
         title,
+        *condition_remarks(model),
         "The learned joint correction of the model is not in this file, but for the constant offsets that come "
         "nearest to it.",
     )

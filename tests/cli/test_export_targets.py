@@ -6,11 +6,15 @@ import json
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.identified import hybrid_model
 from testing.models import joints_around
 from testing.program_readers import READERS
 
-from pisigma.correction.model_folder import load_model
+from pisigma.correction.model_folder import load_model, save_model
+from pisigma.correction.row_poses import poses_of_rows
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.dataset import Measurements
+from pisigma.network.features import ConditionFeatures, FourierSeries
 from pisigma.robot import Robot
 from pisigma.se3 import xyzrpy_from_transform
 
@@ -42,6 +46,40 @@ def poses(tmp_path):
 
 def export(run, model, poses, out, *options):
     return run("export", model, "--format", "targets", "--poses", poses, "--out", out, *options)
+
+
+def test_targets_for_a_payload(run, refuses, poses, tmp_path):
+    robot = Robot.load("ur10")
+    learned = ConditionFeatures(robot, ("payload_kg",), (2.0,), (1.5,))
+    (tmp_path / "arm").mkdir()
+    save_model(hybrid_model("ur10", [FourierSeries(robot, 2), learned]), tmp_path / "arm")
+    path, out = poses(good_poses("ur10")), tmp_path / "targets.csv"
+    assert export(run, tmp_path / "arm", path, out).exit_code == 0
+    assert "Made for payload_kg 2 (usual)." in out.read_text()
+    assert export(run, tmp_path / "arm", path, out, "--payload-kg", 5).exit_code == 0
+    assert "Made for payload_kg 5." in out.read_text()
+    rows = list(csv.DictReader(line for line in out.read_text().splitlines() if not line.startswith("#")))
+    degrees = [[float(row[f"q{i}_deg"]) for i in range(1, 7)] for row in rows]
+    q = torch.deg2rad(torch.tensor(degrees, dtype=torch.float64))
+    wanted = forward_kinematics(robot, joints_around("ur10", 3, seed=6, spread=0.1))
+    payload = torch.full((3,), 5.0, dtype=torch.float64)
+    assert_close(
+        poses_of_rows(load_model(tmp_path / "arm"), Measurements(q=q, payload=payload)), wanted, atol=1e-9
+    )
+    found = run("ik", tmp_path / "arm", "--poses", path, "--out", tmp_path / "q.csv", "--payload-kg", 5)
+    assert found.exit_code == 0
+    joints = list(csv.DictReader((tmp_path / "q.csv").read_text().splitlines()))
+    assert [float(row["q1_deg"]) for row in joints] == pytest.approx([float(row["q1_deg"]) for row in rows])
+    options = ("--format", "offsets", "--out", tmp_path / "offsets.csv", "--payload-kg")
+    assert run("export", tmp_path / "arm", *options, 5).exit_code == 0
+    assert "Made for payload_kg 5." in (tmp_path / "offsets.csv").read_text()
+    assert "payload_kg=50 is not near the measured values" in refuses(
+        "export", tmp_path / "arm", *options, 50
+    )
+    table = ("--format", "dh", "--out", tmp_path / "dh.csv", "--payload-kg", 5)
+    assert "--payload-kg goes with --format targets or offsets, not with dh" in refuses(
+        "export", tmp_path / "arm", *table
+    )
 
 
 def test_a_table(run, models, poses, tmp_path):

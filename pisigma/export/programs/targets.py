@@ -9,7 +9,7 @@ from torch import Tensor
 from pisigma import __version__
 from pisigma.correction.solution import Solution
 from pisigma.errors import UnreachablePoseError
-from pisigma.export.geometry import frame_remarks
+from pisigma.export.geometry import condition_remarks, frame_remarks
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
@@ -36,7 +36,7 @@ class Targets:
         T: T_base_tool that the nominal robot takes at q, `FK_nominal(q)`, NaN where there is no target. A
             controller that computes with the nominal robot commands q when it is told to go there.
         deviation: predicted standard deviation of the position reached [m]; NaN where it is not known.
-        remarks: sentences about the model's frames.
+        remarks: sentences about the model's frames and conditions.
     """
 
     model: str
@@ -130,5 +130,5 @@ def targets_of(solution: Solution, source: str, line: tuple[int, ...], accuracy:
         q=q,
         T=forward_kinematics(model.robot, q).where(given[:, None, None], torch.nan),
         deviation=deviation.double().where(given, torch.nan),
-        remarks=frame_remarks(model),
+        remarks=(*condition_remarks(model), *frame_remarks(model)),
     )
