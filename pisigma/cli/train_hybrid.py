@@ -40,8 +40,9 @@ def train_hybrid(
     from pisigma.errors import RecipeError
     from pisigma.evaluation.calibration_card import write_calibration_card
     from pisigma.evaluation.calibration_validation import judge, validate
+    from pisigma.evaluation.held_out_rows import HELD_OUT_CSV, held_out_csv, held_out_section
     from pisigma.robot.description import Robot
-    from pisigma.training.recipe import recipe_hash
+    from pisigma.training.recipe import MeasuredData, recipe_hash
 
     if resume:
         raise RecipeError(f"{recipe}: a recipe of kind {stated.kind} has no use for --resume; leave it out.")
@@ -56,16 +57,20 @@ def train_hybrid(
     with progress_of("held-out rows") as tell:
         validation = validate(calibrator, everything, parts, tell)
     kept_aside = None if test is None else judge(calibrator, result, rows, test)
-    report = {"rows": rows.rows, "fit_seconds": round(fitting, 3)}
+    report: dict[str, Any] = {"rows": rows.rows, "fit_seconds": round(fitting, 3)}
     report |= _report(stated, result, (validation, kept_aside), everything, parts)
-    model = model_of_hybrid(
-        stated.name, Robot.load(stated.robot), result, rows, (stated.name, recipe_hash(recipe))
-    )
+    nominal = Robot.load(stated.robot)
+    held_out = held_out_csv(validation, rows, nominal) if isinstance(stated.data, MeasuredData) else None
+    if held_out is not None:
+        report |= held_out_section(held_out, rows)
+    model = model_of_hybrid(stated.name, nominal, result, rows, (stated.name, recipe_hash(recipe)))
     command = shlex.join(["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])])
     texts = {"description": stated.description, "command": command, "not_validated": stated.not_validated}
     with staged_folder(folder) as scratch:
         save_model(replace(model, metrics=report), scratch)
         write_calibration_card(model, result, rows, validation, report, texts, scratch)
+        if held_out is not None:
+            (scratch / HELD_OUT_CSV).write_text(held_out, encoding="utf-8", newline="\n")
     finished = {"model": str(folder), "seconds": round(time.perf_counter() - started, 3), **report}
     if as_json:
         print_json(finished)

@@ -267,4 +267,6 @@ def test_a_measured_recipe_is_cross_validated(run, repository, data, tmp_path):
     assert max(map(len, result.stdout.splitlines()[:-1])) <= 120
     card = (tmp_path / "model" / "README.md").read_text()
     assert "2-fold cross-validation: each of 200 rows" in card
+    page = run("report", tmp_path / "model", "--out", tmp_path / "page.html", "--json")
+    assert json.loads(page.stdout)["rows"]["origin"] == "held_out"
     assert "--data rows.csv" in card
