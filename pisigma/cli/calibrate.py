@@ -225,6 +225,10 @@ def _parts(
         raise MeasurementError(
             f"--dealings {times}: rows are dealt to folds; leave out --hold-out and --folds 0."
         )
+    if hold_out is not None and folds is not None:
+        raise MeasurementError(
+            f"--folds {folds} and --hold-out {hold_out:g} exclude each other; leave one out."
+        )
     by: Any = split
     if hold_out is not None:
         return [[holdout(measurements, hold_out, seed, by)]]

@@ -7,7 +7,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.evaluation.held_out_frames import with_frames
+from pisigma.errors import IdentificationError
+from pisigma.evaluation.held_out_frames import judgeable, with_frames
 from pisigma.evaluation.pose_statistics import PoseErrors, error_statistics
 from pisigma.evaluation.predicted_spread import PredictedSpread, predicted_spread
 from pisigma.evaluation.trained_calibrations import Calibrator, Result, geometric_of, trained, without_missing
@@ -36,6 +37,7 @@ class CalibrationValidation:
             held-out rows themselves, under either arm.
         sockets_held_out: how many sockets were held out whole; their errors are from where their own rows put the
             ball on average.
+        not_judged: how many held-out rows have a target or an anchor that the rows calibrated with lack.
         again: the same of the rows dealt to the folds anew, whose errors count in the figures too.
     """
 
@@ -45,6 +47,7 @@ class CalibrationValidation:
     distances: Mapping[str, Float64[Tensor, " _pairs"]] = field(default_factory=dict)
     frames_fitted: int = 0
     sockets_held_out: int = 0
+    not_judged: int = 0
     again: tuple["CalibrationValidation", ...] = ()
 
     @property
@@ -87,6 +90,7 @@ class CalibrationValidation:
             sizes = {name: _sizes(errors) for name, errors in distances.items()}
             figures["socket_distance"] = {"count": count, **sizes}
         counts = {"frames_fitted": self.frames_fitted, "sockets_held_out": self.sockets_held_out}
+        counts["rows_not_judged"] = max(dealing.not_judged for dealing in self.dealings)
         return figures | {name: count for name, count in counts.items() if count}
 
     def means(self, parts: Sequence[TrainTest]) -> dict[str, object]:
@@ -127,10 +131,12 @@ class _Judged:
             self._spread = PredictedSpread.none(self._rows)
         self._spread.error[test], self._spread.sigma[test] = spread.error, spread.sigma
 
-    def validation(self, folds: int, frames: int = 0, sockets: int = 0) -> CalibrationValidation:
+    def validation(
+        self, folds: int, frames: int = 0, sockets: int = 0, left_out: int = 0
+    ) -> CalibrationValidation:
         """Everything together."""
         distances = {name: torch.cat(found) for name, found in self._distances.items()}
-        return CalibrationValidation(folds, self._errors, self._spread, distances, frames, sockets)
+        return CalibrationValidation(folds, self._errors, self._spread, distances, frames, sockets, left_out)
 
 
 def validate(
@@ -149,21 +155,30 @@ def validate(
         progress: called with the part that is being judged, and what is being tried.
 
     Raises:
-        IdentificationError: the training rows of a part do not determine what is asked for, or a test row has
-            a target that its training rows lack.
+        IdentificationError: the training rows of a part do not determine what is asked for, or no test row has a
+            target or anchor that its training rows have too.
     """
     judged = _Judged(measurements)
-    frames = sockets = 0
+    frames = sockets = left_out = 0
     for done, (train, test) in enumerate(parts):
         fold = f"fold {done + 1} of {len(parts)}"
         progress(fold)
-        seen, unseen = measurements.select(train), measurements.select(test)
+        seen, held_out = measurements.select(train), len(test)
+        test = test[judgeable(measurements, test, seen)]
+        left_out += held_out - len(test)
+        unseen = measurements.select(test)
         frames += len(set(unseen.frame) - set(seen.frame))
         sockets += len(_sockets(unseen) - _sockets(seen))
         chosen = without_missing(calibrator, seen, measurements)
-        results = trained(chosen, seen, lambda what, fold=fold: progress(f"{fold}: {what}"))  # type: ignore[misc]
+        try:
+            results = trained(chosen, seen, lambda what, fold=fold: progress(f"{fold}: {what}"))  # type: ignore[misc]
+        except IdentificationError as problem:
+            raise IdentificationError(
+                f"{fold}, calibrated with {seen.rows} of the {measurements.rows} rows: {problem} All rows at once may "
+                "do: leave out the cross-validation, or ask for more folds."
+            ) from None
         _judge(judged, geometric_of(calibrator), results, seen, (unseen, test))
-    return judged.validation(len(parts), frames, sockets)
+    return judged.validation(len(parts), frames, sockets, left_out)
 
 
 def validate_repeatedly(

@@ -1,10 +1,11 @@
-"""Frames that were held out whole: their bases alone are fitted to their own rows."""
+"""Held-out rows of frames, targets or anchors that the rows calibrated with lack."""
 
 from dataclasses import replace
 
 import numpy as np
 import torch
 from jaxtyping import Float64
+from torch import Tensor
 
 from pisigma.errors import IdentificationError
 from pisigma.evaluation.trained_calibrations import Result, geometric_result
@@ -65,3 +66,31 @@ def _bases(
         socket_distances={},
     )
     return apart.fit(rows).bases
+
+
+def judgeable(measurements: Measurements, test: Tensor, seen: Measurements) -> Tensor:
+    """Which test rows have a target, and an anchor or its place, that the training rows have too.
+
+    Args:
+        measurements: all rows.
+        test: numbers of the test rows.
+        seen: the training rows.
+
+    Raises:
+        IdentificationError: none has.
+    """
+    targets, anchors = set(seen.target), {*(seen.anchor or ()), ""}
+    names = measurements.anchor or ("",) * measurements.rows
+    place = measurements.anchor_place
+    placed = torch.zeros(len(test), dtype=torch.bool) if place is None else place[test].isfinite().all(-1)
+    rows = test.tolist()
+    found = [
+        measurements.target[row] in targets and (names[row] in anchors or known)
+        for row, known in zip(rows, placed.tolist(), strict=True)
+    ]
+    if not any(found):
+        raise IdentificationError(
+            f"{measurements.place(rows[0])}: neither this row nor any other that is held out with it has a target and "
+            "an anchor that other rows have; measure more poses with each, or leave out the cross-validation."
+        )
+    return torch.tensor(found, device=test.device)

@@ -53,6 +53,11 @@ def held_out_lines(found: Mapping[str, Any]) -> list[str]:
             f"The known distance of held-out sockets ({distance['count']} of them) is met to "
             f"{figure_text(best['mean_mm'])} mm on average, {figure_text(best['max_mm'])} mm at worst{by} ({beside})."
         )
+    if "rows_not_judged" in found:
+        lines.append(
+            f"{found['rows_not_judged']} rows could not be judged: no row that was calibrated with had their target or "
+            "anchor."
+        )
     if "frames_fitted" in found:
         lines.append(
             f"{found['frames_fitted']} frames were held out whole; where the base stands in them, and nothing else, "

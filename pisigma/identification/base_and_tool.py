@@ -1,5 +1,6 @@
 """Where the measuring frame and the measured point are: base and tool of a robot taken as it is."""
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -89,15 +90,22 @@ def _solved(
 ) -> tuple[BaseToolProblem, Solution[BaseToolState]]:
     """The problem, and the best end of a search from any start."""
     problem = build_base_and_tool_problem(robot, measurements, free_base, free_tool)
-    best: Solution[BaseToolState] | None = None
+    best: tuple[float, Solution[BaseToolState]] | None = None
     for start in base_and_tool_starts(robot, problem):
         found = levenberg_marquardt(problem, start, maximum_iterations)
-        if best is None or found.linearisation.cost < best.linearisation.cost * (1 - 1e-6):
-            best = found
-        if _rms_position(problem, best) < CLEAR_FIT * robot.reach:
+        off = _off(robot, problem, found)  # not the cost, which every search divides by its own noise
+        if best is None or off < best[0] * (1 - 1e-6):
+            best = off, found
+        if _rms_position(problem, best[1]) < CLEAR_FIT * robot.reach:
             break
     assert best is not None
-    return problem, best
+    return problem, best[1]
+
+
+def _off(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolState]) -> float:
+    """How far off the end of a search is [m]; an angle counts as what it moves at the end of the arm."""
+    turn = robot.reach * _rms_rotation(problem, solution.linearisation.point) if problem.turned else 0.0
+    return math.hypot(_rms_position(problem, solution), turn)
 
 
 def _rms_position(problem: BaseToolProblem, solution: Solution[BaseToolState]) -> float:

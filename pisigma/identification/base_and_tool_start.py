@@ -122,8 +122,7 @@ def starts_from_positions(
     assumed = torch.cat([nominal_point[None], torch.zeros_like(nominal_point)[None], along, -along])
     for point in assumed.unbind():
         arm = p_flange + R_flange @ point
-        R_base = _procrustes(arm, position)
-        yield R_base, (position - arm @ R_base.mT).mean(0), point
+        yield *base_by_points(arm, position), point
 
 
 def nearest_rotation(M: Float64[Tensor, "*batch 3 3"]) -> Float64[Tensor, "*batch 3 3"]:
@@ -134,6 +133,14 @@ def nearest_rotation(M: Float64[Tensor, "*batch 3 3"]) -> Float64[Tensor, "*batc
     U, _, Vh = np.linalg.svd(M.cpu().numpy())
     U[..., 2] *= np.sign(np.linalg.det(U @ Vh))[..., None]
     return torch.from_numpy(U @ Vh).to(M)
+
+
+def base_by_points(
+    points: Float64[Tensor, "rows 3"], position: Float64[Tensor, "rows 3"]
+) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"]]:
+    """Rotation and position [m] of the base that puts points, seen from it, best onto measured positions."""
+    R_base = _procrustes(points, position)
+    return R_base, (position - points @ R_base.mT).mean(0)
 
 
 def _tool_start(

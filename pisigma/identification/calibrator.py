@@ -96,6 +96,11 @@ class GeometricCalibrator:
                 f"free='{self.free}' is no choice; valid: identifiable, joint_offsets, or a list of "
                 "parameter names."
             )
+        if not isinstance(self.free, str) and "" in self.free:
+            raise IdentificationError(
+                f"free={tuple(self.free)}: a name is empty; give names of parameters such as a_2, with one "
+                "comma between two."
+            )
         for name, base in self.frames.items():
             if len(base) != 6 or not all(math.isfinite(value) for value in base):
                 raise IdentificationError(

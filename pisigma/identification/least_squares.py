@@ -9,6 +9,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from pisigma.errors import IdentificationError
+
 Point = TypeVar("Point")
 START_DAMPING = 1e-3
 SMALLEST_DAMPING = 1e-9
@@ -159,8 +161,17 @@ def levenberg_marquardt(
 def solve_damped(
     linearisation: Linearisation[Point], step_scale: Float[Tensor, " unknowns"], damping: float
 ) -> Float[Tensor, " unknowns"]:
-    """Solve `(normal + damping / step_scale²) step = descent` by Cholesky with column scaling."""
+    """Solve `(normal + damping / step_scale²) step = descent` by Cholesky with column scaling.
+
+    Raises:
+        IdentificationError: they are not finite.
+    """
     normal = linearisation.normal
+    if not (bool(torch.isfinite(normal).all()) and bool(torch.isfinite(linearisation.descent).all())):
+        raise IdentificationError(
+            "the normal equations are not finite; look for huge values, or standard deviations of next to nothing, in "
+            "the measurements."
+        )
     while True:
         damped = normal.clone()
         damped.diagonal().add_(damping / step_scale.square())

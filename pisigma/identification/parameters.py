@@ -24,6 +24,8 @@ USUAL_LENGTH = 1e-3
 """[m] Scale of length parameters where no prior gives one."""
 USUAL_ANGLE = 1e-3
 """[rad]"""
+SMALLEST_PRIOR = 1e-12
+"""[m or rad] A parameter that is known better is fixed: leave it out of `free`."""
 
 PriorSizes = Literal["stated", "widened", "estimated"]
 """Whether the prior's sizes stand, may only grow, or are estimated."""
@@ -53,10 +55,10 @@ class Prior:
         """Refuse standard deviations that are none."""
         for name in DH_COLUMNS:
             value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0):
+            if not (math.isfinite(value) and value >= SMALLEST_PRIOR):
                 raise IdentificationError(
-                    f"prior '{name}': a positive standard deviation in {'m' if name in LENGTHS else 'rad'} "
-                    f"was wanted, got {value:g}; use prior=None for none."
+                    f"prior '{name}': a standard deviation in {'m' if name in LENGTHS else 'rad'} of "
+                    f"{SMALLEST_PRIOR:g} or more was wanted, got {value:g}; use prior=None for none."
                 )
 
 

@@ -25,8 +25,11 @@ from pisigma.identification.user_coordinates import (
     user_coordinates,
 )
 from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import FRAME_COLUMNS
 from pisigma.se3 import wrap_to_pi
 
+LOST = 1e-10
+"""A base whose information, columns scaled to 1, has a smaller eigenvalue is not told in some direction."""
 HELD = 0.7
 """A parameter whose standard error is more than this share of its prior's is not told by the data."""
 
@@ -172,6 +175,8 @@ def _table(
     errors = np.sqrt(np.maximum(covariance.diagonal(), 0))
     held = errors * np.sqrt(_prior_precision(problem, here)) > HELD
     active = set(problem.active.tolist())
+    silent = _without_rows(problem, here.normal.cpu())
+    untold = (estimate.change[:, silent] != 0).any(1).tolist()
     rows = []
     columns = (nominal.tolist(), values.tolist(), change.tolist())
     for index, (parameter, before, after, moved) in enumerate(zip(space.parameters, *columns, strict=True)):
@@ -179,10 +184,27 @@ def _table(
         remark = _remark(parameter.name, free, index in findings.extended, findings.redundancy)
         if free and held[index]:
             remark += "; the data hardly see it, the prior holds it"
+        if untold[index]:
+            free, remark = False, "too few rows that count show it, the others are outliers"
         error = float(errors[index]) if free else float("nan")
         name, unit = parameter.name, parameter.unit
         rows.append(ParameterEstimate(name, unit, before, after, moved, error, remark))
     return tuple(rows)
+
+
+def _without_rows(problem: CalibrationProblem, normal: Float64[Tensor, "active active"]) -> list[int]:
+    """Free parameters that the rows left over do not hold: those that none shows, and bases that are not all told."""
+    active = problem.active.cpu()
+    lost = normal.diagonal() <= 0
+    bases = problem.space.of("base")
+    for start in range(bases.start, bases.stop, len(FRAME_COLUMNS)):
+        own = ((active >= start) & (active < start + len(FRAME_COLUMNS))).nonzero()[:, 0]
+        block = normal[own[:, None], own]
+        scale = block.diagonal().clamp(min=1e-300).rsqrt()
+        if len(own) and float(torch.linalg.eigvalsh(block * scale * scale[:, None])[0]) < LOST:
+            lost[own] = True
+    found: list[int] = active[lost].tolist()
+    return found
 
 
 def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -> np.ndarray:

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.identification.base_and_tool import find_base_and_tool
+from pisigma.identification.base_and_tool_start import base_by_points
 from pisigma.identification.frame_start import (
     check_frame_names,
     check_frame_values,
@@ -27,12 +28,15 @@ from pisigma.identification.point_start import (
 from pisigma.identification.sensor_building import names_of, numbers_of
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
-from pisigma.se3 import transform_from_xyzrpy
+from pisigma.robot.description import Robot
+from pisigma.se3 import rpy_from_rotation, transform_from_xyzrpy
 
 START_ROWS = 1_024
 """Rows that base and tool start from."""
 START_STEPS = 2
 """Steps by which their closed-form start is polished."""
+FEW = 9
+"""Positions below which a frame's base starts from tools that other frames told, not from tools of its own."""
 ENOUGH = 5
 """Positions in a touched frame from which base and tool are found in closed form."""
 
@@ -137,8 +141,9 @@ def _from_positions(
     positions = (measurements.seen("position") | measurements.seen("pose")).cpu()
     touches = measurements.seen("touch").cpu()
     frame = numbers_of(measurements.frame, space.frames, measurements.rows)
-    for number, name in enumerate(space.frames):
-        rows = (positions & (frame == number)).nonzero()[:, 0]
+    count = [int((positions & (frame == number)).sum()) for number in range(len(space.frames))]
+    for number in sorted(range(len(space.frames)), key=lambda number: -count[number]):
+        name, rows = space.frames[number], (positions & (frame == number)).nonzero()[:, 0]
         if len(rows) == 0 or (len(rows) < ENOUGH and bool((touches & (frame == number)).any())):
             continue
         robot = space.robot if name not in given else space.robot.with_geometry(base=given[name])
@@ -148,12 +153,29 @@ def _from_positions(
         if part.pair is not None:
             part = replace(part, pair=None, distance=None)
         find_base = free_base and name not in given
+        turned = bool(part.seen("pose").any())
+        if find_base and 3 <= len(rows) < FEW and not turned and set(part.target) <= set(tools):
+            bases[name] = _base_by_tools(robot, part, tools)
+            continue
         base, found = find_base_and_tool(robot, part, find_base, free_tool, START_STEPS)
         if free_base:
             bases[name] = base if find_base else robot.base
         if free_tool:
             tools = {**found, **tools}
     return bases, tools
+
+
+def _base_by_tools(
+    robot: Robot, measurements: Measurements, tools: Mapping[str, np.ndarray]
+) -> Float64[np.ndarray, " 6"]:
+    """The base of a frame with few positions, by tools that other frames told."""
+    assert measurements.position is not None
+    arm = robot.with_geometry(base=np.zeros(6), tool=np.zeros(6))
+    T = forward_kinematics(arm, measurements.q.cpu())
+    tool = torch.from_numpy(np.stack([tools[name][:3] for name in measurements.target]))
+    points = (T[:, :3, :3] @ tool[..., None])[..., 0] + T[:, :3, 3]
+    R_base, place = base_by_points(points, measurements.position.cpu())
+    return torch.cat([place, rpy_from_rotation(R_base)]).numpy()
 
 
 def chosen_rows(rows: int, most: int) -> Int64[Tensor, " chosen"]:

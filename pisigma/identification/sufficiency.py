@@ -61,9 +61,12 @@ def check_sufficiency(
     values = distinct_values(problem)
     per_row = values / max(distinct_rows(problem), 1)
     if values <= wanted:
-        missing = int(np.ceil((GOOD_RATIO * wanted - values) / per_row))
+        most = (
+            len(redundancy.names) - len(redundancy.no_effect) + own
+        )  # the rank is at most that of the few values
+        missing = int(np.ceil((GOOD_RATIO * most - values) / per_row))
         raise IdentificationError(
-            f"{source}: {distinct_rows(problem)} different poses give {values} values for {wanted} free "
+            f"{source}: {distinct_rows(problem)} different poses give {values} values for {most} free "
             "parameters, which leaves nothing to tell noise from error; measure about "
             f"{missing} more poses, or free fewer parameters."
         )

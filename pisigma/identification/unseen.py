@@ -9,6 +9,8 @@ from pisigma.identification.least_squares import Linearisation
 from pisigma.identification.noise import view_of
 from pisigma.identification.problem import CalibrationProblem
 
+ROUNDING = 1e-12
+"""Information of less than this share of the largest cannot be told from none."""
 SHOWN = 0.25
 """Parameters with at least this share of a direction are named."""
 
@@ -44,10 +46,11 @@ def unseen_directions(problem: CalibrationProblem, here: Linearisation[Tensor]) 
     names = [problem.space.names[i] for i in problem.active[arm].tolist()]
     end = "it stays near its nominal value" if held else "without a prior it may be anything"
     sentences = []
+    rounding = ROUNDING * float(values[-1])
     for value, vector in zip(values.tolist(), vectors.t(), strict=True):
-        if value >= 1.0:
+        if value >= max(1.0, rounding):
             break
-        width = max(value, 0.0) ** -0.5 if value > 1e-12 else float("inf")
+        width = value**-0.5 if value > max(1e-12, rounding) else float("inf")
         sentences.append(
             f"{_in_words(vector, names)}: the data tell it only to {width:.2g} times its tolerance; {end}"
         )

@@ -84,7 +84,10 @@ def column_choices(name: str) -> str:
     number = re.search(r"[1-9][0-9]?", name)
     joint = number[0] if number else "1"
     joints = (f"q{joint}_{unit}" for unit in (*REVOLUTE_UNITS, *PRISMATIC_UNITS))
-    return nearest_choice(name.lower(), (*joints, *_COLUMNS))
+    meant = name.lower()
+    if re.fullmatch(r"q[1-9][0-9]?", meant):  # most joints turn
+        meant += "_deg"
+    return nearest_choice(meant, (*joints, *_COLUMNS))
 
 
 def quoted(columns: Iterable[Column]) -> str:

@@ -97,17 +97,26 @@ def _find(place: str, name: str, number: int) -> Column:
         raise MeasurementError(
             f"{place}, column {number}: has no name; name it or remove the comma too many."
         )
-    if ";" in name or "\t" in name:
-        raise MeasurementError(
-            f"{place}, column '{name}': fields are separated by semicolons or tabs; save the file with "
-            "commas between fields and points in numbers."
-        )
+    check_separators(name, place)
     if _is_number(name):
         raise MeasurementError(
             f"{place}, column {number}: a header was wanted, but there is the number {name}; begin the file "
             "with the names of the columns, such as q1_deg,q2_deg,x_mm,y_mm,z_mm."
         )
     raise MeasurementError(f"{place}, column '{name}': unknown column; {column_choices(name)}")
+
+
+def check_separators(name: str, place: str) -> None:
+    """Refuse a header whose fields are not separated by commas.
+
+    Raises:
+        MeasurementError: see above.
+    """
+    if ";" in name or "\t" in name:
+        raise MeasurementError(
+            f"{place}, column '{name}': fields are separated by semicolons or tabs; save the file with "
+            "commas between fields and points in numbers."
+        )
 
 
 def _is_number(name: str) -> bool:

@@ -17,6 +17,8 @@ from pisigma.robot import Robot, Row
 LIMIT_TOLERANCE = 1e-9
 """How far [rad or m] a joint value may lie outside its limits, for rounding."""
 
+LARGEST, SMALLEST_SIGMA = 1e9, 1e-9
+"""In the file's units: nothing that is measured is larger, and nothing is measured more exactly."""
 QUATERNION_TOLERANCE = 1e-3
 """How far the norm of a quaternion may be from 1."""
 
@@ -105,12 +107,22 @@ def _numbers(cells: Sequence[str], column: Column, faults: Faults) -> Float64[np
     odd = ~np.isfinite(values)
     if odd.any():
         odd[odd] = [bool(cells[row].strip()) for row in np.flatnonzero(odd).tolist()]
-        remedy = "" if column.joint else ", or leave the cell empty where it is not known"
+        remedy = (
+            "" if column.joint else ", or leave it empty with all that belongs to it where it is not known"
+        )
         faults.add(
             odd,
             lambda row: (
                 f"column '{column.name}': '{cells[row].strip()}' is no finite number; write one such as "
                 f"-12.5{remedy}"
+            ),
+        )
+    with np.errstate(invalid="ignore"):
+        faults.add(
+            np.abs(values) > LARGEST,
+            lambda row: (
+                f"column '{column.name}': {values[row]:.4g} {column.unit} is more than can be measured; "
+                "correct it"
             ),
         )
     return values
@@ -209,7 +221,7 @@ def _check_whole(missing: Bool[np.ndarray, "rows group"], columns: list[Column],
 
 
 def _check_optional(values: _Values, layout: Layout, faults: Faults) -> None:
-    """Standard deviations are above 0, payloads not below."""
+    """Standard deviations are above 0 by what can be told, payloads not below."""
     for quantity in ("sigma_position", "sigma_rotation", "payload"):
         if quantity in layout.index:
             _check_sign(values[:, layout.index[quantity]], layout.column(quantity), faults)
@@ -218,9 +230,9 @@ def _check_optional(values: _Values, layout: Layout, faults: Faults) -> None:
 def _check_sign(values: Float64[np.ndarray, " rows"], column: Column, faults: Faults) -> None:
     """The values of one column are above 0, or not below for a payload."""
     zero_too = column.quantity == "payload"
-    wanted = "0 or more" if zero_too else "more than 0"
+    wanted = "0 or more" if zero_too else f"{SMALLEST_SIGMA:g} or more"
     faults.add(
-        values < 0 if zero_too else values <= 0,
+        values < (0 if zero_too else SMALLEST_SIGMA),
         lambda row: (
             f"column '{column.name}': {values[row]:.6g} was found where {wanted} was wanted; correct it or "
             "leave the cell empty"

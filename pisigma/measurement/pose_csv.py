@@ -13,6 +13,7 @@ from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
 from pisigma.measurement.csv_columns import POSITION, QUATERNION, RPY, Column, find_column, quoted, to_si
+from pisigma.measurement.csv_header import check_separators
 from pisigma.measurement.csv_rows import QUATERNION_TOLERANCE
 from pisigma.measurement.csv_table import split_line
 from pisigma.measurement.dataset import LeftOut
@@ -234,8 +235,10 @@ def _columns(header: Sequence[str], place: str) -> dict[str, tuple[int, Column]]
     for index, name in enumerate(header):
         column = find_column(name)
         if column is None or column.quantity not in (*POSITION, *RPY, *QUATERNION):
+            check_separators(name, place)
             raise MeasurementError(
-                f"{place}, column '{name}': no column of a wanted pose; {nearest_choice(name, valid)}"
+                f"{place}, column '{name}': no column of a wanted pose; {nearest_choice(name, valid)} Lengths "
+                "may be in m and angles in rad."
             )
         if column.quantity in found:
             raise MeasurementError(f"{place}, column '{name}': '{column.quantity}' stands twice; remove one.")

@@ -48,6 +48,7 @@ def k_folds(
         MeasurementError: there are fewer groups than folds, or positions or names that are needed are not there.
     """
     group, sizes = _groups(measurements, by)
+    _check_several(measurements, sizes, by)
     folds = len(sizes) if folds is None else folds
     if folds < 2 or folds > len(sizes):
         more = "placements" if by == "placement" else "poses"
@@ -129,11 +130,7 @@ def holdout(
             f"{measurements.source}: a test share between 0 and 1 was wanted, got {share:g}."
         )
     group, sizes = _groups(measurements, by)
-    if len(sizes) < 2:
-        raise MeasurementError(
-            f"{measurements.source}: {len(sizes)} {_kind(by)} cannot be parted into training and test; measure "
-            "more poses."
-        )
+    _check_several(measurements, sizes, by)
     if by == "interleaved":
         is_test = _interleaved(sizes, share)
         return _train_test(measurements, is_test[group])
@@ -156,6 +153,20 @@ def _groups(
         raise MeasurementError(f"split by '{by}' is unknown; {nearest_choice(by, get_args(SplitBy))}")
     group = (placement_groups if by == "placement" else groups_to_keep_whole)(measurements).cpu()
     return group, torch.bincount(group[group >= 0])
+
+
+def _check_several(measurements: Measurements, sizes: Int64[Tensor, " groups"], by: SplitBy) -> None:
+    """Refuse a single group.
+
+    Raises:
+        MeasurementError: see above.
+    """
+    if len(sizes) < 2:
+        what = "placement" if by == "placement" else "joint vector, so they are one pose"
+        raise MeasurementError(
+            f"{measurements.source}: all {measurements.rows} rows are of one {what}, which cannot be parted into "
+            "training and test; measure at other joint values, spread over the workspace."
+        )
 
 
 def _kind(by: SplitBy) -> str:

@@ -255,6 +255,10 @@ def test_inverse_calibration_wants_one_frame_and_target(refuses, repository, tar
         (("--folds", "1"), "1 folds were wanted"),
         (("--hold-out", "2"), "between 0 and 1 was wanted, got 2."),
         (("--hold-out", "0.2", "--dealings", "2"), "leave out --hold-out and --folds 0."),
+        (
+            ("--hold-out", "0.2", "--folds", "5"),
+            "--folds 5 and --hold-out 0.2 exclude each other; leave one out.",
+        ),
         (("--split", "time", "--dealings", "2"), "2 dealings were wanted, but folds by time are the same"),
         (("--free", "a_9"), "a_9"),
         (("--prior-mm", "0"), "or both 0 for none, got 0 mm and 1 mrad."),

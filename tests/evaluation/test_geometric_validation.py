@@ -6,6 +6,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 from testing.sensors import ARM, TRUE_BASES, socket_data, touch_data, true_robot
+from testing.simulated_arm import simulate
 
 from pisigma.errors import IdentificationError
 from pisigma.evaluation.calibration_validation import validate
@@ -47,6 +48,31 @@ def test_sockets_of_exact_data_are_met_where_they_were_held_out() -> None:
     lines = held_out_lines(figures)
     assert lines[0].startswith("6 sockets were held out whole")
     assert lines[1].startswith("The known distance of held-out sockets (3 of them) is met to")
+
+
+def test_rows_of_a_target_that_is_seen_once_are_not_judged() -> None:
+    arm = simulate("ur5", rows=80, noise=5e-5)
+    rows = replace(arm.measurements, target=("A",) * 79 + ("B",))
+    found = validate(GeometricCalibrator(arm.nominal), rows, k_folds(rows, 4, seed=0))
+    assert int(torch.isnan(found.models["geometric"].position).sum()) == 1
+    figures = found.in_file_units()
+    assert (figures["rows"], figures["rows_not_judged"]) == (79, 1)
+    assert held_out_lines(figures) == [
+        "1 rows could not be judged: no row that was calibrated with had their target or anchor."
+    ]
+    alone = replace(rows, target=tuple(f"target {row}" for row in range(80)))
+    with pytest.raises(
+        IdentificationError, match=r"measure more poses with each, or leave out the cross-validation"
+    ):
+        validate(GeometricCalibrator(arm.nominal), alone, k_folds(alone, 4, seed=0))
+
+
+def test_too_few_training_rows_name_their_fold() -> None:
+    arm = simulate("ur5", rows=12, noise=5e-5)
+    with pytest.raises(
+        IdentificationError, match=r"fold 1 of 4, calibrated with 9 of the 12 rows: .* 9 different"
+    ):
+        validate(GeometricCalibrator(arm.nominal), arm.measurements, k_folds(arm.measurements, 4, seed=0))
 
 
 def test_an_error_of_a_held_out_socket_is_the_distance_to_where_its_rows_meet() -> None:

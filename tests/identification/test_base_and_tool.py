@@ -4,15 +4,16 @@ import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
-from testing.simulated_arm import simulate
+from testing.simulated_arm import BASE, simulate
 
 from pisigma.errors import IdentificationError, PoseError
-from pisigma.identification.base_and_tool import fit_base_and_tool
+from pisigma.identification.base_and_tool import find_base_and_tool, fit_base_and_tool
 from pisigma.identification.base_and_tool_start import nearest_rotation, start_from_poses
+from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.se3 import rotation_from_rpy, rotation_from_vector, transform_from_xyzrpy
+from pisigma.se3 import invert, rotation_from_rpy, rotation_from_vector, transform_from_xyzrpy
 
 
 @pytest.mark.parametrize("name", ["ur10", "kiro4", "panda", "kiro3"])
@@ -36,6 +37,19 @@ def test_parallel_axes_are_said_to_leave_freedom_open() -> None:
         forward_kinematics(arm.true, arm.measurements.q),
         atol=1e-12,
     )
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_poses_of_a_robot_with_parallel_axes_start_well_wherever_base_and_tool_are(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    base, tool = (np.concatenate([rng.normal(size=3), rng.uniform(-1.5, 1.5, 3)]) for _ in range(2))
+    arm = simulate("kiro3", seed, rows=40, noise=5e-5, turn_noise=5e-5, base=base, tool=tool)
+    base_found, tools = find_base_and_tool(arm.nominal, arm.measurements, True, True, 2)
+    robot = arm.nominal.with_geometry(base=base_found, tool=tools[""])
+    errors = forward_kinematics(robot, arm.measurements.q)[:, :3, 3] - arm.measurements.position
+    assert float(errors.norm(dim=1).mean()) < 0.02  # 0.3 to 1 m from starts that are wrong
+    result = GeometricCalibrator(arm.nominal).fit(arm.measurements)
+    assert result.noise[0].sigma < 8e-5
 
 
 def test_no_orientation_is_special() -> None:
@@ -137,3 +151,39 @@ def test_no_positions_are_refused() -> None:
 def test_joint_values_of_another_robot_are_refused() -> None:
     with pytest.raises(PoseError, match="7 joints"):
         fit_base_and_tool(Robot.load("panda"), simulate("ur10", rows=20).measurements)
+
+
+def in_second_frame(few: int, seed: int) -> tuple[Measurements, Measurements]:
+    """60 positions in the frame F and a few in G; and 100 exact ones in G at other joint values."""
+    arm = simulate("ur10", seed, rows=160 + few, noise=5e-5)
+    base = transform_from_xyzrpy(torch.tensor([1.0, -0.2, 0.5, 0.3, -0.4, 0.6], dtype=torch.float64))
+    T = base @ invert(transform_from_xyzrpy(torch.from_numpy(BASE)))
+    q, position = arm.measurements.q, arm.measurements.position.clone()
+    position[60:] = position[60:] @ T[:3, :3].mT + T[:3, 3]
+    position[-100:] = (T @ forward_kinematics(arm.true, q[-100:]))[:, :3, 3]
+    frame = ("F",) * 60 + ("G",) * (100 + few)
+    rows = Measurements(q=q, position=position, frame=frame)
+    return rows.select(torch.arange(60 + few)), rows.select(torch.arange(60 + few, 160 + few))
+
+
+@pytest.mark.parametrize("few", [3, 4, 6])
+def test_few_positions_in_a_second_frame_are_no_outliers(few: int) -> None:
+    for seed in range(6):
+        measurements, others = in_second_frame(few, seed)
+        result = GeometricCalibrator(Robot.load("ur10")).fit(measurements)
+        assert not [outlier for outlier in result.outliers if outlier.row >= 60]
+        assert float(result.errors_of(others)["position"].norm(dim=1).mean()) < 3e-4
+        assert result.parameter("base_G_x").standard_error > 1e-5
+
+
+@pytest.mark.parametrize("seed", [97, 98])  # all three rows of G are outliers, or all but one
+def test_a_base_that_only_outliers_show_has_no_standard_error(seed: int) -> None:
+    measurements, _ = in_second_frame(3, 0)
+    position = measurements.position.clone()
+    position[60:] += 0.05 * torch.randn(3, 3, generator=torch.Generator().manual_seed(seed)).double()
+    result = GeometricCalibrator(Robot.load("ur10")).fit(replace(measurements, position=position))
+    assert len(result.outliers) >= 2
+    row = result.parameter("base_G_x")
+    assert not row.free
+    assert row.remark == "too few rows that count show it, the others are outliers"
+    assert result.parameter("base_F_x").free

@@ -23,6 +23,12 @@ def test_millimetres_for_metres():
     refuses(replace(measurements, position=1000 * measurements.position))
 
 
+@pytest.mark.parametrize("options", [{}, {"prior_sizes": "widened"}])
+def test_metres_for_millimetres(options):
+    measurements = simulate(ROBOT, rows=80).measurements
+    refuses(replace(measurements, position=measurements.position / 1000), **options)
+
+
 def test_a_joint_that_counts_the_other_way():
     measurements = simulate(ROBOT, rows=80).measurements
     refuses(

@@ -21,6 +21,28 @@ def test_too_few_rows_say_how_many_more() -> None:
         GeometricCalibrator(arm.nominal).fit(arm.measurements)
 
 
+def test_values_without_limit_are_refused() -> None:
+    arm = simulate("ur10", rows=60)
+    position = arm.measurements.position.clone()
+    position[7, 0] = 1e300
+    with pytest.raises(
+        IdentificationError, match="the normal equations are not finite; look for huge values"
+    ):
+        GeometricCalibrator(arm.nominal).fit(replace(arm.measurements, position=position))
+
+
+def test_an_empty_name_is_refused() -> None:
+    with pytest.raises(IdentificationError, match=r"free=\('a_2', ''\): a name is empty"):
+        GeometricCalibrator(Robot.load("ur10"), free=("a_2", ""))
+
+
+def test_few_rows_do_not_make_few_parameters() -> None:
+    """The rank of three positions is nine at most; many more have to be told."""
+    arm = simulate("ur10", rows=3)
+    with pytest.raises(IdentificationError, match=r"9 values for 39 free parameters.* about 36 more poses"):
+        GeometricCalibrator(arm.nominal).fit(arm.measurements)
+
+
 def test_a_list_longer_than_the_data_is_refused() -> None:
     arm = simulate("ur10", rows=10)
     names = [f"{column}_{row}" for row in range(1, 7) for column in ("theta", "d", "a", "alpha", "beta")]
@@ -120,5 +142,7 @@ def test_a_misspelt_parameter_is_refused_with_the_nearest_name() -> None:
 
 @pytest.mark.parametrize("value", [0.0, -1e-3, float("nan"), float("inf")])
 def test_a_prior_that_is_none_is_refused(value: float) -> None:
-    with pytest.raises(IdentificationError, match="prior 'alpha': a positive standard deviation in rad"):
+    with pytest.raises(
+        IdentificationError, match="prior 'alpha': a standard deviation in rad of 1e-12 or more"
+    ):
         Prior(alpha=value)

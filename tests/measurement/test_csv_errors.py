@@ -105,13 +105,28 @@ ROWS = {
         (2, "column 'set'", "'trian'", "train or test"),
     ),
     "empty set": (None, f"q1_deg,{POSITION},set\n1,1,2,3,\n", (2, "column 'set'", "''", "train or test")),
-    "zero sigma": (None, f"q1_deg,{POSITION},sigma_mm\n1,1,2,3,0\n", (2, "column 'sigma_mm'", "more than 0")),
+    "zero sigma": (
+        None,
+        f"q1_deg,{POSITION},sigma_mm\n1,1,2,3,0\n",
+        (2, "column 'sigma_mm'", "1e-09 or more was wanted"),
+    ),
     "negative sigma": (None, f"q1_deg,{POSITION},sigma_deg\n1,1,2,3,-1\n", (2, "column 'sigma_deg'", "-1")),
     "negative payload": (
         None,
         f"q1_deg,{POSITION},payload_kg\n1,1,2,3,-1\n",
         (2, "column 'payload_kg'", "0 or more"),
     ),
+    "a sigma of nothing": (
+        None,
+        f"q1_deg,{POSITION},sigma_mm\n1,1,2,3,1e-300\n",
+        (2, "column 'sigma_mm'", "1e-300 was found where 1e-09 or more was wanted"),
+    ),
+    "huge": (
+        None,
+        f"q1_deg,{POSITION}\n1,1,2,3\n2,1e300,2,3\n",
+        (3, "column 'x_mm'", "1e+300 mm is more than can be measured"),
+    ),
+    "joint without a unit": (None, f"q1,{POSITION}\n1,1,2,3\n", (1, "column 'q1'", "did you mean 'q1_deg'")),
     "nothing measured": (
         None,
         f"q1_deg,{POSITION}\n1,1,2,3\n1,,,\n",

@@ -168,7 +168,10 @@ CASES: dict[str, tuple[str, tuple[str, ...]]] = {
     "no socket": ("q1_deg,socket\n1,a\n2,\n", ("line 3", "columns 'socket'", "nothing was measured")),
     "equal sockets": ("q1_deg,socket\n1,a\n1,b\n1,a\n", ("line 4", "equals line 2")),
     "no number": (f"{TOUCH}\n1,left,x,here\n", ("line 2", "column 'touch_mm'", "'here'")),
-    "touch of zero sigma": (f"{TOUCH},sigma_mm\n1,left,x,1,0\n", ("line 2", "'sigma_mm'", "more than 0")),
+    "touch of zero sigma": (
+        f"{TOUCH},sigma_mm\n1,left,x,1,0\n",
+        ("line 2", "'sigma_mm'", "1e-09 or more was wanted"),
+    ),
     "misspelt": ("q1_deg,sokket\n1,a\n", ("line 1", "'sokket'", "did you mean 'socket'")),
     "part of a position": ("q1_deg,x_mm,socket\n1,2,a\n", ("line 1", "'y_mm' is missing")),
 }

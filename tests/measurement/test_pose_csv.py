@@ -42,6 +42,10 @@ def test_quaternions_metres_and_any_order_of_columns(tmp_path):
         (["x_mm,y_mm,z_mm", "1,2,3"], "line 1: the column of 'roll' is missing; a pose has x_mm"),
         (["x_mm,y_mm,z_mm,qx,qy,qz", "1,2,3,0,0,0"], "'qw' is missing; a pose has x_mm, y_mm, z_mm, qx"),
         ([f"{RPY},colour", "1,2,3,4,5,6,7"], "line 1, column 'colour': no column of a wanted pose; Valid:"),
+        (
+            [RPY.replace(",", ";"), "1;2;3;4;5;6"],
+            "fields are separated by semicolons or tabs; save the file with",
+        ),
         ([f"{RPY},q1_deg", "1,2,3,4,5,6,7"], "column 'q1_deg': no column of a wanted pose"),
         ([RPY.replace("roll_deg", "rol_deg"), "1,2,3,4,5,6"], "did you mean 'roll_deg'"),
         ([f"{RPY},x_m", "1,2,3,4,5,6,7"], "column 'x_m': 'x' stands twice"),

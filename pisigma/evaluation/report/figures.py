@@ -180,7 +180,8 @@ def _lengths(axes: Axes, found: Dependence) -> None:
         )
     axes.set(yscale="log", ylabel=f"error [{found.error_unit}]")
     _plain_log(axes)
-    axes.legend(ncols=2, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
+    if axes.get_legend_handles_labels()[0]:  # too few rows for parts have no lines
+        axes.legend(ncols=2, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
 
 
 def _signed(axes: Axes, found: Dependence) -> None:
