@@ -132,7 +132,7 @@ def levenberg_marquardt(
         there = problem.linearise(problem.moved(here.point, step), best)
         if there.cost <= best.cost:
             best, settled = problem.renewed(there)
-            here, uphill, damping = best, 0, max(damping / 10, SMALLEST_DAMPING)
+            here, uphill, damping = best, 0, max(100 * damping, 1.0)
             path.append(best)
             if best.misfit <= best.rounding:
                 status = SolutionStatus.EXACT
@@ -151,7 +151,8 @@ def levenberg_marquardt(
             status = SolutionStatus.STALLED
             break
         uphill += 1
-        if uphill <= PATIENCE and there.cost < float("inf"):
+        lost = not bool(there.descent.any())  # such as where a loss rejects every row
+        if uphill <= PATIENCE and there.cost < float("inf") and not lost:
             here = problem.renewed(there)[0]
         else:
             here, uphill, damping = best, 0, max(100 * damping, 1.0)
