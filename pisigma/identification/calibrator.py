@@ -73,7 +73,7 @@ class GeometricCalibrator:
     elimination: str = "exact"
     prior: Prior | None = field(default_factory=Prior)
     loss: AbstractLoss = field(default_factory=HampelLoss)
-    maximum_iterations: int = 50
+    maximum_iterations: int = 100
     prior_sizes: str = "estimated"
     frames: Mapping[str, Sequence[float]] = field(default_factory=dict)
     socket_distances: Mapping[PairOfSockets, float] = field(default_factory=dict)

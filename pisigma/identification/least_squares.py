@@ -132,7 +132,7 @@ def levenberg_marquardt(
         there = problem.linearise(problem.moved(here.point, step), best)
         if there.cost <= best.cost:
             best, settled = problem.renewed(there)
-            here, uphill, damping = best, 0, max(100 * damping, 1.0)
+            here, uphill, damping = best, 0, max(damping / 10, SMALLEST_DAMPING)
             path.append(best)
             if best.misfit <= best.rounding:
                 status = SolutionStatus.EXACT
@@ -155,7 +155,7 @@ def levenberg_marquardt(
         if uphill <= PATIENCE and there.cost < float("inf") and not lost:
             here = problem.renewed(there)[0]
         else:
-            here, uphill, damping = best, 0, max(100 * damping, 1.0)
+            here, uphill, damping = best, 0, max(100 * damping, 0.1)
     return Solution(best, iterations, status, tuple(path))
 
 

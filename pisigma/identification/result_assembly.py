@@ -1,5 +1,6 @@
 """From a solved problem to a result that can be read: user's coordinates, standard errors, sentences."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -175,7 +176,7 @@ def _table(
     errors = np.sqrt(np.maximum(covariance.diagonal(), 0))
     held = errors * np.sqrt(_prior_precision(problem, here)) > HELD
     active = set(problem.active.tolist())
-    silent = _without_rows(problem, here.normal.cpu())
+    silent = _without_rows(problem, here.normal.cpu(), findings.redundancy.no_effect)
     untold = (estimate.change[:, silent] != 0).any(1).tolist()
     rows = []
     columns = (nominal.tolist(), values.tolist(), change.tolist())
@@ -192,13 +193,20 @@ def _table(
     return tuple(rows)
 
 
-def _without_rows(problem: CalibrationProblem, normal: Float64[Tensor, "active active"]) -> list[int]:
-    """Free parameters that the rows left over do not hold: those that none shows, and bases that are not all told."""
+def _without_rows(
+    problem: CalibrationProblem, normal: Float64[Tensor, "active active"], no_effect: Sequence[str]
+) -> list[int]:
+    """Free parameters that the rows left over do not hold: those that none shows, and bases that are not all told.
+
+    Not those without effect, which no row could show.
+    """
     active = problem.active.cpu()
-    lost = normal.diagonal() <= 0
+    names = [problem.space.names[i] for i in active.tolist()]
+    shown = torch.tensor([name not in no_effect for name in names], dtype=torch.bool)
+    lost = (normal.diagonal() <= 0) & shown
     bases = problem.space.of("base")
     for start in range(bases.start, bases.stop, len(FRAME_COLUMNS)):
-        own = ((active >= start) & (active < start + len(FRAME_COLUMNS))).nonzero()[:, 0]
+        own = ((active >= start) & (active < start + len(FRAME_COLUMNS)) & shown).nonzero()[:, 0]
         block = normal[own[:, None], own]
         scale = block.diagonal().clamp(min=1e-300).rsqrt()
         if len(own) and float(torch.linalg.eigvalsh(block * scale * scale[:, None])[0]) < LOST:

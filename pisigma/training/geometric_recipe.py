@@ -56,7 +56,7 @@ class CalibrationSection(Section):
     elimination: Literal["exact", "pairwise", "none"] = "exact"
     prior: PriorSection | None = PriorSection()
     robust: bool = True
-    maximum_iterations: PositiveInt = 50
+    maximum_iterations: PositiveInt = 100
 
     def calibrator(self, robot: Robot) -> GeometricCalibrator:
         """The calibrator for a robot."""
