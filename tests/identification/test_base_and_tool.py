@@ -39,7 +39,7 @@ def test_parallel_axes_are_said_to_leave_freedom_open() -> None:
     )
 
 
-@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("seed", range(6))
 def test_poses_of_a_robot_with_parallel_axes_start_well_wherever_base_and_tool_are(seed: int) -> None:
     rng = np.random.default_rng(seed)
     base, tool = (np.concatenate([rng.normal(size=3), rng.uniform(-1.5, 1.5, 3)]) for _ in range(2))
@@ -168,7 +168,7 @@ def in_second_frame(few: int, seed: int) -> tuple[Measurements, Measurements]:
 
 @pytest.mark.parametrize("few", [3, 4, 6])
 def test_few_positions_in_a_second_frame_are_no_outliers(few: int) -> None:
-    for seed in range(6):
+    for seed in range(3):
         measurements, others = in_second_frame(few, seed)
         result = GeometricCalibrator(Robot.load("ur10")).fit(measurements)
         assert not [outlier for outlier in result.outliers if outlier.row >= 60]

@@ -188,7 +188,7 @@ def test_standard_errors_know_what_targets_on_one_tool_share(shared: float, own:
     q, target = arm.measurements.q.repeat(3, 1), tuple("A" * 60 + "B" * 60 + "C" * 60)
     names = ("a_2", "a_3", "theta_3", "theta_4", "d_5", "alpha_1")
     found = []
-    for _ in range(20):
+    for _ in range(12):
         noise = shared * torch.randn(60, 3, dtype=torch.float64, generator=generator)
         noise = noise + own * torch.randn(3, 60, 3, dtype=torch.float64, generator=generator)
         measured = Measurements(q=q, position=(exact[..., 0] + noise).reshape(-1, 3), target=target)
@@ -198,7 +198,7 @@ def test_standard_errors_know_what_targets_on_one_tool_share(shared: float, own:
     ratio = estimated.var(0, ddof=1) / np.square(predicted).mean(0)
     assert (
         0.5 < ratio.mean() < 1.6
-    )  # of 6 variances of 20 draws each; 3.7 for shared errors taken for three targets' own
+    )  # of 6 variances of 12 draws each; 3.7 for shared errors taken for three targets' own
 
 
 def test_what_the_data_do_not_see_stays_at_nominal_and_is_said() -> None:
