@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from pisigma.cli.conditions import PayloadKg, TemperatureC, given_conditions
+
 if TYPE_CHECKING:
     from pisigma.correction.calibrated_model import CalibratedModel
 
@@ -74,15 +76,8 @@ def export(
             help="With .ls and --targets cartesian: the arm's configuration, such as 'N U T, 0, 0, 0'."
         ),
     ] = None,
-    payload_kg: Annotated[
-        float | None,
-        typer.Option(
-            help="With targets and offsets: what the robot carries, if the model learned that. [default: the usual]"
-        ),
-    ] = None,
-    temperature_c: Annotated[
-        float | None, typer.Option(help="Temperature of the robot, likewise. [default: the usual]")
-    ] = None,
+    payload_kg: PayloadKg = None,
+    temperature_c: TemperatureC = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Write a model for other programs, whole or not at all.
@@ -100,8 +95,7 @@ def export(
     if tip is not None and like is None:
         raise OutputError("--tip names a link of the file that --like gives; give both or none.")
     _check_target_options(form, poses, kind, branch, config)
-    stated = {"payload_kg": payload_kg, "temperature_c": temperature_c}
-    conditions = {name: value for name, value in stated.items() if value is not None}
+    conditions = given_conditions(payload_kg, temperature_c)
     if conditions and form not in ("targets", "offsets"):
         raise OutputError(
             f"--{next(iter(conditions)).replace('_', '-')} goes with --format targets or offsets, not with {form}; "

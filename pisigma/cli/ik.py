@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pisigma.cli.conditions import PayloadKg, TemperatureC, given_conditions
+
 if TYPE_CHECKING:
     from torch import Tensor
 
@@ -41,13 +43,8 @@ def ik(
             help="The rows of --poses are a path: stay on one branch as long as possible and say where that ends.",
         ),
     ] = False,
-    payload_kg: Annotated[
-        float | None,
-        typer.Option(help="What the robot carries, if the model learned that. [default: the usual]"),
-    ] = None,
-    temperature_c: Annotated[
-        float | None, typer.Option(help="Temperature of the robot, likewise. [default: the usual]")
-    ] = None,
+    payload_kg: PayloadKg = None,
+    temperature_c: TemperatureC = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Print the joint values that really reach a pose, or write those of a file of poses.
@@ -62,8 +59,8 @@ def ik(
     from pisigma.correction.corrected_ik import load
 
     solver = load(model)
-    if payload_kg is not None or temperature_c is not None:
-        solver = solver.under(payload_kg=payload_kg, temperature_c=temperature_c)
+    if conditions := given_conditions(payload_kg, temperature_c):
+        solver = solver.under(**conditions)
     if poses is not None and out is not None:
         _write_file(solver, poses, out, branch, accuracy, path, as_json)
     elif pose is not None:

@@ -1,6 +1,5 @@
 """A hybrid model under a given payload and temperature, instead of the usual ones."""
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 
@@ -103,19 +102,21 @@ def _scaled(
     """The conditions in standard deviations from their mean; 0 for those that are as usual.
 
     Raises:
-        ModelError: one is not finite, or far from all that were measured.
+        ModelError: one is far from all that were measured, not finite, or a payload below 0.
     """
     found = []
     for known, mean, spread in zip(learned.names, learned.mean, learned.spread, strict=True):
         value = given.get(known, mean)
-        scaled = (value - mean) / spread
-        if not math.isfinite(scaled) or abs(scaled) > MOST_SPREADS:
+        low, high = mean - MOST_SPREADS * spread, mean + MOST_SPREADS * spread
+        if known == "payload_kg":
+            low = max(low, 0.0)
+        if not low <= value <= high:  # NaN neither
             raise ModelError(
                 f"model '{name}': {known}={value:g} is not near the measured values, {mean:.4g} on average with a "
-                f"standard deviation of {spread:.4g}; give {mean - MOST_SPREADS * spread:.4g} to "
-                f"{mean + MOST_SPREADS * spread:.4g}, or calibrate with rows measured there."
+                f"standard deviation of {spread:.4g}; give {low:.4g} to {high:.4g}, or calibrate with rows "
+                "measured there."
             )
-        found.append(scaled)
+        found.append((value - mean) / spread)
     return torch.tensor(found, dtype=torch.float64)
 
 

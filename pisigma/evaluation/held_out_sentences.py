@@ -33,8 +33,8 @@ def held_out_lines(found: Mapping[str, Any]) -> list[str]:
             for name, rms in found["rms_mm_of_dealings"].items()
         )
         lines.append(
-            f"RMS position errors of the {found['dealings']} dealings by themselves: {ranges}; with so few different "
-            "joint values it matters which of them come together."
+            f"RMS position errors of the {found['dealings']} dealings by themselves: {ranges}: so much depends on "
+            "which joint values are held out together."
         )
     if "sockets_held_out" in found:
         lines.append(

@@ -1,6 +1,5 @@
 """From a solved problem to a result that can be read: user's coordinates, standard errors, sentences."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -30,7 +29,7 @@ from pisigma.robot.description import FRAME_COLUMNS
 from pisigma.se3 import wrap_to_pi
 
 LOST = 1e-10
-"""A base whose information, columns scaled to 1, has a smaller eigenvalue is not told in some direction."""
+"""Information, columns scaled to 1, with a smaller eigenvalue does not tell some direction."""
 HELD = 0.7
 """A parameter whose standard error is more than this share of its prior's is not told by the data."""
 
@@ -176,7 +175,7 @@ def _table(
     errors = np.sqrt(np.maximum(covariance.diagonal(), 0))
     held = errors * np.sqrt(_prior_precision(problem, here)) > HELD
     active = set(problem.active.tolist())
-    silent = _without_rows(problem, here.normal.cpu(), findings.redundancy.no_effect)
+    silent = _without_rows(problem, here.normal.cpu(), findings)
     untold = (estimate.change[:, silent] != 0).any(1).tolist()
     rows = []
     columns = (nominal.tolist(), values.tolist(), change.tolist())
@@ -194,25 +193,32 @@ def _table(
 
 
 def _without_rows(
-    problem: CalibrationProblem, normal: Float64[Tensor, "active active"], no_effect: Sequence[str]
+    problem: CalibrationProblem, normal: Float64[Tensor, "active active"], findings: Findings
 ) -> list[int]:
     """Free parameters that the rows left over do not hold: those that none shows, and bases that are not all told.
 
-    Not those without effect, which no row could show.
+    Not those that all rows together would not show either.
     """
     active = problem.active.cpu()
     names = [problem.space.names[i] for i in active.tolist()]
-    shown = torch.tensor([name not in no_effect for name in names], dtype=torch.bool)
+    shown = torch.tensor([name not in findings.redundancy.no_effect for name in names], dtype=torch.bool)
     lost = (normal.diagonal() <= 0) & shown
     bases = problem.space.of("base")
     for start in range(bases.start, bases.stop, len(FRAME_COLUMNS)):
         own = ((active >= start) & (active < start + len(FRAME_COLUMNS)) & shown).nonzero()[:, 0]
-        block = normal[own[:, None], own]
-        scale = block.diagonal().clamp(min=1e-300).rsqrt()
-        if len(own) and float(torch.linalg.eigvalsh(block * scale * scale[:, None])[0]) < LOST:
+        at_start = findings.information
+        columns = [at_start.names.index(names[k]) for k in own.tolist()]
+        J = torch.from_numpy(at_start.jacobian[:, columns])
+        if len(own) and _tells_all(J.t() @ J) and not _tells_all(normal[own[:, None], own]):
             lost[own] = True
     found: list[int] = active[lost].tolist()
     return found
+
+
+def _tells_all(information: Float64[Tensor, "own own"]) -> bool:
+    """Whether information holds its parameters in every direction."""
+    scale = information.diagonal().clamp(min=1e-300).rsqrt()
+    return float(torch.linalg.eigvalsh(information * scale * scale[:, None])[0]) >= LOST
 
 
 def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -> np.ndarray:

@@ -105,8 +105,9 @@ def test_the_accuracy_is_that_of_the_conditions() -> None:
     [
         (
             {"payload_kg": 9.0},
-            r"payload_kg=9 is not near the measured values, 2 on average .* give -2\.5 to 6\.5",
+            r"payload_kg=9 is not near the measured values, 2 on average .* give 0 to 6\.5",
         ),
+        ({"payload_kg": -0.5}, "payload_kg=-0.5 is not near"),
         ({"temperature_c": float("nan")}, "temperature_c=nan is not near"),
     ],
 )

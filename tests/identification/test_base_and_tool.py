@@ -10,6 +10,7 @@ from pisigma.errors import IdentificationError, PoseError
 from pisigma.identification.base_and_tool import find_base_and_tool, fit_base_and_tool
 from pisigma.identification.base_and_tool_start import nearest_rotation, start_from_poses
 from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.loss import SquaredLoss
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
@@ -187,3 +188,12 @@ def test_a_base_that_only_outliers_show_has_no_standard_error(seed: int) -> None
     assert not row.free
     assert row.remark == "too few rows that count show it, the others are outliers"
     assert result.parameter("base_F_x").free
+
+
+def test_a_base_that_no_row_ever_told_is_not_laid_to_outliers() -> None:
+    arm = simulate("ur10", rows=60, noise=5e-5)
+    result = GeometricCalibrator(arm.nominal, prior=None, elimination="none", loss=SquaredLoss()).fit(
+        arm.measurements
+    )
+    assert not [row.name for row in result.parameters if "outliers" in row.remark]
+    assert result.parameter("base_x").free
