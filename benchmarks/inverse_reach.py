@@ -15,12 +15,12 @@ import numpy as np
 import torch
 from inverse_speed import draw_joints, make_model
 
-from pisigma.correction.calibrated_model import CalibratedModel
-from pisigma.correction.compiled_model import compile_model
-from pisigma.correction.model_folder import load_model
-from pisigma.correction.torch_ik import TorchIK
 from pisigma.errors import ModelError
+from pisigma.inverse.torch_ik import TorchIK
 from pisigma.kinematics.status import Status
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.compiled_model import compile_model
+from pisigma.model.folder.model_folder import load_model
 
 MODELS = Path(__file__).parents[1] / "models"
 NEAR = 0.3

@@ -21,15 +21,15 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
-from pisigma.correction.calibrated_model import CalibratedModel
-from pisigma.correction.compiled_model import compile_model, save_compiled
-from pisigma.correction.model_folder import load_model
-from pisigma.correction.torch_ik import TorchIK
 from pisigma.hybrid.arms import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
+from pisigma.inverse.torch_ik import TorchIK
+from pisigma.joint_correction.features import FourierSeries, GravityTorques
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kinematics.status import Status
-from pisigma.network.features import FourierSeries, GravityTorques
-from pisigma.network.joint_correction import JointCorrection
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.compiled_model import compile_model, save_compiled
+from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
 
 ERRORS = np.array([1e-3, 5e-4, 5e-4, 1e-3, 1e-3])
@@ -38,7 +38,7 @@ COLD = """
 import time
 start, began = time.perf_counter(), time.process_time()
 import numpy as np
-from pisigma.compiled.solver import CompiledIK
+from pisigma.kernels.solver import CompiledIK
 CompiledIK.load({file!r}).solve(np.load({pose!r}))
 print(time.perf_counter() - start, time.process_time() - began)
 """
@@ -77,7 +77,7 @@ def make_model(name: str, harmonics: int, rng: np.random.Generator) -> Calibrate
 
 def time_scipy(kernels: object, T: np.ndarray, q: np.ndarray) -> float:
     """Seconds a pose by least squares on the geometric arm."""
-    from pisigma.compiled.arrays import GEOMETRIC
+    from pisigma.kernels.arrays import GEOMETRIC
 
     def residual(joints: np.ndarray, wanted: np.ndarray) -> np.ndarray:
         return (kernels.forward(joints[None], GEOMETRIC)[0][0, :3] - wanted[:3]).ravel()  # type: ignore[attr-defined]

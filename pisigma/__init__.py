@@ -7,14 +7,14 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pisigma.correction.corrected_ik import CorrectedIK as CorrectedIK
-    from pisigma.correction.corrected_ik import load as load
-    from pisigma.correction.solution import Solution as Solution
     from pisigma.errors import PisigmaError as PisigmaError
     from pisigma.hybrid.calibrator import HybridCalibrator as HybridCalibrator
     from pisigma.hybrid.result import HybridResult as HybridResult
     from pisigma.identification.calibrator import GeometricCalibrator as GeometricCalibrator
     from pisigma.identification.result import CalibrationResult as CalibrationResult
+    from pisigma.inverse.corrected_ik import CorrectedIK as CorrectedIK
+    from pisigma.inverse.corrected_ik import load as load
+    from pisigma.inverse.solution import Solution as Solution
     from pisigma.kinematics.status import Status as Status
     from pisigma.measurement.dataset import Measurements as Measurements
     from pisigma.network.pi_sigma import PiSigma as PiSigma
@@ -24,7 +24,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "CalibrationResult": "pisigma.identification.result",
-    "CorrectedIK": "pisigma.correction.corrected_ik",
+    "CorrectedIK": "pisigma.inverse.corrected_ik",
     "GeometricCalibrator": "pisigma.identification.calibrator",
     "HybridCalibrator": "pisigma.hybrid.calibrator",
     "HybridResult": "pisigma.hybrid.result",
@@ -32,9 +32,9 @@ _HOMES = {
     "PiSigma": "pisigma.network.pi_sigma",
     "PisigmaError": "pisigma.errors",
     "Robot": "pisigma.robot.description",
-    "Solution": "pisigma.correction.solution",
+    "Solution": "pisigma.inverse.solution",
     "Status": "pisigma.kinematics.status",
-    "load": "pisigma.correction.corrected_ik",
+    "load": "pisigma.inverse.corrected_ik",
 }
 
 __all__ = [

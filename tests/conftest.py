@@ -2,6 +2,7 @@
 
 import os
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 # One thread: the tests' arrays are small, and threads that wait for each other on a busy machine cost minutes.
@@ -11,6 +12,10 @@ import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
+
+from testing.models import no_type_checker
+
+from pisigma.recipes.recipe import Recipe, read_recipe
 
 REPOSITORY = Path(__file__).parent.parent
 
@@ -34,3 +39,32 @@ def shared_data() -> Path:
 def generator() -> torch.Generator:
     """A seeded source of randomness."""
     return torch.Generator().manual_seed(0)
+
+
+@pytest.fixture
+def without_type_checker() -> Iterator[None]:
+    """Call pisigma as users do, whom no type checker stops before our own complaints."""
+    with no_type_checker():
+        yield
+
+
+@pytest.fixture
+def write_recipe(repository: Path, tmp_path: Path) -> Callable[..., Path]:
+    """Write a shipped recipe with replacements into a temporary folder and give its path."""
+
+    def write(name: str, *replacements: tuple[str, str]) -> Path:
+        text = (repository / "training" / f"{name}.yaml").read_text()
+        for old, new in replacements:
+            assert old in text, old
+            text = text.replace(old, new)
+        path = tmp_path / f"{name}.yaml"
+        path.write_text(text)
+        return path
+
+    return write
+
+
+@pytest.fixture
+def small_recipe(write_recipe: Callable[..., Path]) -> Callable[..., Recipe]:
+    """A shipped recipe with replacements, read."""
+    return lambda name, *replacements: read_recipe(write_recipe(name, *replacements))

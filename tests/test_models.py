@@ -9,12 +9,12 @@ from testing.closeness import assert_close
 from testing.models import no_type_checker
 
 import pisigma
-from pisigma.correction.model_folder import load_model
-from pisigma.evaluation.joint_statistics import JointStatistics
-from pisigma.evaluation.tables import joint_table
+from pisigma.judging.joint_statistics import JointStatistics
+from pisigma.model.folder.model_folder import load_model
+from pisigma.recipes.recipe import SimulatedData, read_recipe, recipe_hash
+from pisigma.recipes.recipe_data import simulate_held_out, simulate_training
+from pisigma.reporting.tables import joint_table
 from pisigma.training.pairs import build_pairs
-from pisigma.training.recipe import SimulatedData, read_recipe, recipe_hash
-from pisigma.training.recipe_data import simulate_held_out, simulate_training
 
 FOLDERS = sorted(path for path in (Path(__file__).parent.parent / "models").glob("*") if path.is_dir())
 SECTIONS = ("Joint errors", "Figures", "Domain", "Not validated", "Use", "Provenance")

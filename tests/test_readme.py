@@ -5,8 +5,8 @@ import re
 import pytest
 
 from pisigma.cli.main import app
-from pisigma.correction.model_folder import load_model
-from pisigma.evaluation.tables import figure_text
+from pisigma.model.folder.model_folder import load_model
+from pisigma.reporting.tables import figure_text
 
 
 def _results(repository) -> dict[tuple[str, str], list[str]]:

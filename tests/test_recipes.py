@@ -7,12 +7,12 @@ import torch
 import yaml
 from testing.closeness import assert_close
 
-from pisigma.evaluation.training_report import report_joints
-from pisigma.training.geometric_recipe import GeometricRecipe
-from pisigma.training.recipe import Recipe, SimulatedData, read_recipe
-from pisigma.training.recipe_data import load_measurements
-from pisigma.training.recipe_kinds import read_any_recipe
-from pisigma.training.run import TrainingRun, train_recipe
+from pisigma.recipes.geometric_recipe import GeometricRecipe
+from pisigma.recipes.recipe import Recipe, SimulatedData, read_recipe
+from pisigma.recipes.recipe_data import load_measurements
+from pisigma.recipes.recipe_kinds import read_any_recipe
+from pisigma.reporting.training_report import report_joints
+from pisigma.workflow.run import TrainingRun, train_recipe
 
 FOLDER = Path(__file__).parent.parent / "training"
 INVERSE = sorted(p.stem for p in FOLDER.glob("*.yaml") if "network" in yaml.safe_load(p.read_text()))

@@ -13,10 +13,10 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from pisigma.training.geometric_recipe import GeometricRecipe
-from pisigma.training.hybrid_recipe import HybridRecipe
-from pisigma.training.jig_recipe import JigRecipe
-from pisigma.training.recipe import Recipe
+from pisigma.recipes.geometric_recipe import GeometricRecipe
+from pisigma.recipes.hybrid_recipe import HybridRecipe
+from pisigma.recipes.jig_recipe import JigRecipe
+from pisigma.recipes.recipe import Recipe
 
 PAGE = Path(__file__).parent.parent / "reference" / "recipes.md"
 BEGIN, END = "<!-- begin: keys -->", "<!-- end: keys -->"

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args
 import typer
 
 if TYPE_CHECKING:
-    from pisigma.correction.calibrated_model import CalibratedModel
-    from pisigma.evaluation.trained_calibrations import Calibrator, Result
     from pisigma.identification.calibrator import GeometricCalibrator
+    from pisigma.judging.trained_calibrations import Calibrator, Result
     from pisigma.measurement.dataset import Measurements
     from pisigma.measurement.splits import TrainTest
+    from pisigma.model.calibrated_model import CalibratedModel
     from pisigma.robot.description import Robot
 
 FOLDS = 5
@@ -91,17 +91,17 @@ def calibrate(
     started = time.perf_counter()
     from pisigma.cli.output import print_json
     from pisigma.cli.progress import progress_of
-    from pisigma.correction.model_folder import save_model
-    from pisigma.correction.staging import check_replaceable, staged_folder
-    from pisigma.evaluation.calibration_card import write_calibration_card
-    from pisigma.evaluation.calibration_report import report_calibration
-    from pisigma.evaluation.calibration_validation import judge, validate_repeatedly
-    from pisigma.evaluation.held_out_rows import HELD_OUT_CSV, held_out_csv, held_out_section
-    from pisigma.evaluation.trained_calibrations import fit
+    from pisigma.judging.calibration_validation import judge, validate_repeatedly
+    from pisigma.judging.held_out_rows import HELD_OUT_CSV, held_out_csv, held_out_section
+    from pisigma.judging.trained_calibrations import fit
     from pisigma.measurement.dataset import Measurements
+    from pisigma.model.folder.model_folder import save_model
+    from pisigma.model.folder.staging import check_replaceable, staged_folder
+    from pisigma.recipes.geometric_recipe import calibration_section, known_socket_distances
+    from pisigma.recipes.recipe_data import part_sets
+    from pisigma.reporting.calibration_card import write_calibration_card
+    from pisigma.reporting.calibration_report import report_calibration
     from pisigma.robot.description import Robot
-    from pisigma.training.geometric_recipe import calibration_section, known_socket_distances
-    from pisigma.training.recipe_data import part_sets
 
     check_replaceable(out)
     nominal = Robot.load(robot, base, tip)
@@ -153,11 +153,11 @@ def calibrate(
 def print_calibration(result: dict[str, Any]) -> None:
     """Print what a calibration gave, for people."""
     from pisigma.cli.output import WIDTH_WITHOUT_TERMINAL, print_table
-    from pisigma.evaluation.calibration_card import PARAMETER_COLUMNS, not_identified_lines, parameter_table
-    from pisigma.evaluation.held_out_sentences import folds_text, held_out_lines
-    from pisigma.evaluation.hybrid_card import compared, curve_rows
-    from pisigma.evaluation.hybrid_report import TRIAL_COLUMNS, coverage_line, learned_lines, trial_rows
-    from pisigma.evaluation.tables import pose_rows
+    from pisigma.reporting.calibration_card import PARAMETER_COLUMNS, not_identified_lines, parameter_table
+    from pisigma.reporting.held_out_sentences import folds_text, held_out_lines
+    from pisigma.reporting.hybrid_card import compared, curve_rows
+    from pisigma.reporting.hybrid_report import TRIAL_COLUMNS, coverage_line, learned_lines, trial_rows
+    from pisigma.reporting.tables import pose_rows
 
     print_table("parameters", PARAMETER_COLUMNS, parameter_table(result))
     typer.echo("What the data do not tell:")
@@ -259,8 +259,8 @@ def _calibrator(model: str, geometric: "GeometricCalibrator") -> "Calibrator":
 
 
 def _model(name: str, nominal: "Robot", result: "Result", rows: "Measurements") -> "CalibratedModel":
-    from pisigma.correction.geometric_model import model_of_calibration, model_of_hybrid
     from pisigma.hybrid.result import HybridResult
+    from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 
     if isinstance(result, HybridResult):
         return model_of_hybrid(name, nominal, result, rows)

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from pisigma.correction.calibrated_model import CalibratedModel
-    from pisigma.training.distilled_sizes import Size
-    from pisigma.training.solved_poses import Region
+    from pisigma.model.calibrated_model import CalibratedModel
+    from pisigma.workflow.distilled_sizes import Size
+    from pisigma.workflow.solved_poses import Region
 
 Box = tuple[float, float, float, float, float, float]
 
@@ -53,12 +53,12 @@ def distill(
     started = time.perf_counter()
     from pisigma.cli.output import print_json
     from pisigma.cli.progress import progress_of
-    from pisigma.correction.model_folder import load_model, save_model
-    from pisigma.correction.staging import check_replaceable, staged_folder
-    from pisigma.evaluation.distilled_card import write_distilled_card
-    from pisigma.evaluation.distilled_report import report_distillation
-    from pisigma.training.distillation import DistillationSettings
-    from pisigma.training.distillation import distill as distil
+    from pisigma.model.folder.model_folder import load_model, save_model
+    from pisigma.model.folder.staging import check_replaceable, staged_folder
+    from pisigma.reporting.distilled_card import write_distilled_card
+    from pisigma.reporting.distilled_report import report_distillation
+    from pisigma.workflow.distillation import DistillationSettings
+    from pisigma.workflow.distillation import distill as distil
 
     check_replaceable(out)
     parent = load_model(model)
@@ -83,7 +83,7 @@ def distill(
 def _size(orders: str | None, harmonics: int | None) -> "Size | None":
     """The one size that was asked for."""
     from pisigma.errors import RecipeError
-    from pisigma.training.distilled_sizes import Size
+    from pisigma.workflow.distilled_sizes import Size
 
     if orders is None:
         if harmonics is not None:
@@ -110,13 +110,13 @@ def _region(parent: "CalibratedModel", box: Box | None, joints: Path | None) -> 
     import math
 
     from pisigma.errors import PoseError
-    from pisigma.training.solved_poses import Region
+    from pisigma.workflow.solved_poses import Region
 
     if box is None and joints is None:
         return None
     q = parent.starts.double()
     if joints is not None:
-        from pisigma.measurement.joint_csv import read_joints
+        from pisigma.measurement.csv.joints import read_joints
 
         q = read_joints(joints, parent.robot)
     if box is None:
@@ -143,8 +143,8 @@ def _command(model: Path, out: Path, options: dict[str, Any]) -> str:
 
 def _print(result: dict[str, Any]) -> None:
     from pisigma.cli.output import print_table
-    from pisigma.evaluation.distilled_card import joint_rows, size_rows
-    from pisigma.evaluation.tables import pose_rows
+    from pisigma.reporting.distilled_card import joint_rows, size_rows
+    from pisigma.reporting.tables import pose_rows
 
     print_table("sizes tried", *size_rows(result["sizes"]))
     title = f"tool under the full model, {result['poses']['held_out']} held-out poses"

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from pisigma.correction.calibrated_model import CalibratedModel
     from pisigma.measurement.dataset import Measurements
+    from pisigma.model.calibrated_model import CalibratedModel
 
 REFERENCES = ("nominal", "geometric")
 """Words for what a model is compared with; neither has to meet limits."""
@@ -51,10 +51,10 @@ def evaluate(
     """
     from pisigma.cli.output import print_json
     from pisigma.errors import AcceptanceError
-    from pisigma.evaluation.acceptance import Limits
-    from pisigma.evaluation.bootstrap import Bootstrap
-    from pisigma.evaluation.comparison_report import report_comparison
-    from pisigma.evaluation.model_comparison import compare_models
+    from pisigma.judging.acceptance import Limits
+    from pisigma.judging.bootstrap import Bootstrap
+    from pisigma.judging.model_comparison import compare_models
+    from pisigma.reporting.comparison_report import report_comparison
 
     if len(paths) < 2:
         raise typer.BadParameter("a model folder and, last, a file of measurements were wanted.")
@@ -92,8 +92,8 @@ def evaluate(
 
 def _load(names: list[str]) -> "dict[str, CalibratedModel]":
     """The models of the folders that are given, by what they were called."""
-    from pisigma.correction.model_folder import load_model
     from pisigma.errors import ModelError
+    from pisigma.model.folder.model_folder import load_model
 
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -134,7 +134,7 @@ def _with_references(
     names: list[str], loaded: "dict[str, CalibratedModel]", turned: bool
 ) -> "dict[str, CalibratedModel]":
     """All models by name, in the order in which they were given; nominal before a single one."""
-    from pisigma.evaluation.reference_models import geometric_model, nominal_model
+    from pisigma.judging.reference_models import geometric_model, nominal_model
 
     first = next(iter(loaded.values()))
     identified = next((model for model in loaded.values() if model.calibrated is not None), first)
@@ -169,8 +169,8 @@ def _with_single(result: dict[str, Any], names: list[str]) -> dict[str, Any]:
 
 def _print(result: dict[str, Any]) -> None:
     from pisigma.cli.output import print_table
-    from pisigma.evaluation.comparison_tables import comparison_table, difference_table
-    from pisigma.evaluation.moved_frames import FITTED
+    from pisigma.judging.moved_frames import FITTED
+    from pisigma.reporting.comparison_tables import comparison_table, difference_table
 
     confidence = f"{100 * result['bootstrap']['confidence']:.0f} %"
     rows = f"{result['rows_compared']} rows ({result['configurations']} configurations) of {result['data']}"

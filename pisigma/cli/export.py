@@ -8,7 +8,7 @@ import typer
 from pisigma.cli.conditions import PayloadKg, TemperatureC, given_conditions
 
 if TYPE_CHECKING:
-    from pisigma.correction.calibrated_model import CalibratedModel
+    from pisigma.model.calibrated_model import CalibratedModel
 
 _SUFFIXES = {
     "urdf": (".urdf",),
@@ -101,8 +101,8 @@ def export(
             f"--{next(iter(conditions)).replace('_', '-')} goes with --format targets or offsets, not with {form}; "
             "leave it out."
         )
-    from pisigma.correction.model_folder import load_model
     from pisigma.export.output_file import check_output, write_whole
+    from pisigma.model.folder.model_folder import load_model
 
     check_output(out, _SUFFIXES[form], _CONTENTS[form])
     if poses is not None:
@@ -112,7 +112,7 @@ def export(
         return
     loaded, as_csv = load_model(model), out.suffix.lower() == ".csv"
     if conditions:
-        from pisigma.correction.given_conditions import under_conditions
+        from pisigma.model.stated_conditions import under_conditions
 
         loaded = under_conditions(loaded, **conditions)
     content: str | bytes

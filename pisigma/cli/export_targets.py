@@ -6,13 +6,13 @@ from pathlib import Path
 import typer
 
 from pisigma.cli.output import fail, print_json
-from pisigma.correction.corrected_ik import load
 from pisigma.errors import OutputError, nearest_choice
 from pisigma.export.output_file import write_whole
 from pisigma.export.programs.languages import check_program, program_text, warnings
 from pisigma.export.programs.targets import targets_of
 from pisigma.export.programs.targets_csv import targets_csv
-from pisigma.measurement.pose_csv import read_poses
+from pisigma.inverse.corrected_ik import load
+from pisigma.measurement.csv.poses import read_poses
 
 KINDS = ("joints", "cartesian")
 

@@ -11,7 +11,7 @@ from pisigma.cli.conditions import PayloadKg, TemperatureC, given_conditions
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from pisigma.correction.corrected_ik import CorrectedIK
+    from pisigma.inverse.corrected_ik import CorrectedIK
 
 Pose = tuple[float, float, float, float, float, float]
 
@@ -56,7 +56,7 @@ def ik(
     for name, given in (("--accuracy", accuracy), ("--path", path)):
         if given and poses is None:
             raise typer.BadParameter("it goes with --poses", param_hint=f"'{name}'")
-    from pisigma.correction.corrected_ik import load
+    from pisigma.inverse.corrected_ik import load
 
     solver = load(model)
     if conditions := given_conditions(payload_kg, temperature_c):
@@ -73,7 +73,7 @@ def _print_pose(
     """Print the solutions of one pose."""
     from pisigma.cli.output import fail, print_json
     from pisigma.cli.solutions import failure, print_solutions, solution_records
-    from pisigma.correction.solution import Solution
+    from pisigma.inverse.solution import Solution
 
     T, places = _transform(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
     if all_branches:

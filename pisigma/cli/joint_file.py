@@ -14,15 +14,15 @@ import torch
 from torch import Tensor
 
 from pisigma.cli.solutions import FAILURES, file_units
-from pisigma.compiled.solution import CompiledSolution
-from pisigma.correction.corrected_ik import CorrectedIK
-from pisigma.correction.path import PathSwitch
-from pisigma.correction.solution import Solution
 from pisigma.errors import OutputError
 from pisigma.export.output_file import writing_whole
+from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.inverse.path import PathSwitch
+from pisigma.inverse.solution import Solution
+from pisigma.kernels.solution import CompiledSolution
 from pisigma.kinematics.status import Status
+from pisigma.measurement.csv.poses import CHUNK_ROWS, PoseChunk, read_pose_chunks
 from pisigma.measurement.dataset import LeftOut
-from pisigma.measurement.pose_csv import CHUNK_ROWS, PoseChunk, read_pose_chunks
 from pisigma.robot.description import Robot
 
 BAD_ROW = "bad_row"

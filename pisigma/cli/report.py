@@ -23,13 +23,13 @@ def report(
     """Write a report as one HTML page: how accurate, where worst, what limits it, what to measure next."""
     from pisigma.cli.output import WIDTH_WITHOUT_TERMINAL, print_json
     from pisigma.cli.progress import progress_of
-    from pisigma.correction.model_folder import load_model
-    from pisigma.evaluation.report.content import report_content
-    from pisigma.evaluation.report.figure_files import check_figures, write_figures
-    from pisigma.evaluation.report.page import draw_figures, render_page
-    from pisigma.evaluation.report.summary import summary_of
     from pisigma.export.output_file import check_output, write_whole
     from pisigma.measurement.dataset import Measurements
+    from pisigma.model.folder.model_folder import load_model
+    from pisigma.reporting.page.content import report_content
+    from pisigma.reporting.page.figure_files import check_figures, write_figures
+    from pisigma.reporting.page.page import draw_figures, render_page
+    from pisigma.reporting.page.summary import summary_of
 
     check_output(out, (".html", ".htm"), "a report")
     if figures is not None:

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from pisigma.correction.solution import Solution
+from pisigma.inverse.solution import Solution
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
 

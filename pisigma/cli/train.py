@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from pisigma.evaluation.cross_validation import CrossValidation
+    from pisigma.judging.cross_validation import CrossValidation
     from pisigma.measurement.dataset import Measurements
-    from pisigma.training.recipe import Recipe
+    from pisigma.recipes.recipe import Recipe
 
 
 def train(
@@ -28,10 +28,10 @@ def train(
 ) -> None:
     """Train the model of a recipe and write it as a model folder with card and figures."""
     started = time.perf_counter()
-    from pisigma.training.geometric_recipe import GeometricRecipe
-    from pisigma.training.hybrid_recipe import HybridRecipe
-    from pisigma.training.jig_recipe import JigRecipe
-    from pisigma.training.recipe_kinds import read_any_recipe
+    from pisigma.recipes.geometric_recipe import GeometricRecipe
+    from pisigma.recipes.hybrid_recipe import HybridRecipe
+    from pisigma.recipes.jig_recipe import JigRecipe
+    from pisigma.recipes.recipe_kinds import read_any_recipe
 
     stated = read_any_recipe(recipe)
     if isinstance(stated, JigRecipe):
@@ -47,15 +47,15 @@ def train(
 
         return train_hybrid(stated, recipe, data, out, resume, as_json)
     from pisigma.cli.output import print_json
-    from pisigma.correction.model_folder import save_model
-    from pisigma.correction.staging import check_replaceable, staged_folder
-    from pisigma.evaluation.card import write_card
-    from pisigma.evaluation.training_course import report_course
-    from pisigma.evaluation.training_report import report_training
+    from pisigma.model.folder.model_folder import save_model
+    from pisigma.model.folder.staging import check_replaceable, staged_folder
+    from pisigma.recipes.recipe import recipe_hash
+    from pisigma.recipes.recipe_data import load_measurements, part_sets
+    from pisigma.reporting.card import write_card
+    from pisigma.reporting.training_course import report_course
+    from pisigma.reporting.training_report import report_training
     from pisigma.training.checkpoints import checkpoint_folder, discard_checkpoints
-    from pisigma.training.recipe import recipe_hash
-    from pisigma.training.recipe_data import load_measurements, part_sets
-    from pisigma.training.run import RunOptions, train_recipe
+    from pisigma.workflow.run import RunOptions, train_recipe
 
     folder = out or Path("runs") / stated.name
     check_replaceable(folder)
@@ -79,8 +79,8 @@ def _cross_validate(recipe: "Recipe", measurements: "Measurements") -> "CrossVal
     """Cross-validate a recipe for measured data; a simulated one has held-out rows of its own."""
     from rich.console import Console
 
-    from pisigma.evaluation.cross_validation import cross_validate
-    from pisigma.training.recipe import MeasuredData
+    from pisigma.judging.cross_validation import cross_validate
+    from pisigma.recipes.recipe import MeasuredData
 
     if not isinstance(recipe.data, MeasuredData):
         return None
@@ -94,7 +94,7 @@ def _cross_validate(recipe: "Recipe", measurements: "Measurements") -> "CrossVal
 
 def _print_report(result: dict[str, Any]) -> None:
     from pisigma.cli.output import print_table
-    from pisigma.evaluation.tables import joint_rows, pose_rows
+    from pisigma.reporting.tables import joint_rows, pose_rows
 
     columns = [
         f"{when}\n{name}" for when in ("before", "after") for name in ("average", "deviat.", "maximum")

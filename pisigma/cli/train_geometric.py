@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pisigma.identification.result import CalibrationResult
-    from pisigma.training.geometric_recipe import GeometricRecipe
+    from pisigma.recipes.geometric_recipe import GeometricRecipe
 
 _WIDTH = 44
 """Columns of a list of parameters."""
@@ -35,17 +35,17 @@ def train_geometric(
     started = time.perf_counter()
     from pisigma.cli.calibrate import print_calibration
     from pisigma.cli.output import print_json
-    from pisigma.correction.geometric_model import model_of_calibration
-    from pisigma.correction.model_folder import save_model
-    from pisigma.correction.staging import check_replaceable, staged_folder
     from pisigma.errors import RecipeError
-    from pisigma.evaluation.calibration_card import write_calibration_card
-    from pisigma.evaluation.calibration_report import report_calibration
-    from pisigma.evaluation.calibration_validation import errors_under
-    from pisigma.evaluation.elimination_cases import report_correlations, report_eliminations
+    from pisigma.judging.calibration_validation import errors_under
+    from pisigma.model.folder.model_folder import save_model
+    from pisigma.model.folder.staging import check_replaceable, staged_folder
+    from pisigma.model.geometric_model import model_of_calibration
+    from pisigma.recipes.recipe import recipe_hash
+    from pisigma.recipes.recipe_data import simulate_held_out, simulate_training
+    from pisigma.reporting.calibration_card import write_calibration_card
+    from pisigma.reporting.calibration_report import report_calibration
+    from pisigma.reporting.elimination_cases import report_correlations, report_eliminations
     from pisigma.robot.description import Robot
-    from pisigma.training.recipe import recipe_hash
-    from pisigma.training.recipe_data import simulate_held_out, simulate_training
 
     if data is not None or resume:
         given = "--data" if data is not None else "--resume"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pisigma.measurement.dataset import Measurements
     from pisigma.measurement.splits import TrainTest
-    from pisigma.training.hybrid_recipe import HybridRecipe
+    from pisigma.recipes.hybrid_recipe import HybridRecipe
 
     Given = tuple[Measurements, Measurements, Measurements | None, tuple[TrainTest, ...]]
 
@@ -34,15 +34,15 @@ def train_hybrid(
     from pisigma.cli.calibrate import print_calibration
     from pisigma.cli.output import print_json
     from pisigma.cli.progress import progress_of
-    from pisigma.correction.geometric_model import model_of_hybrid
-    from pisigma.correction.model_folder import save_model
-    from pisigma.correction.staging import check_replaceable, staged_folder
     from pisigma.errors import RecipeError
-    from pisigma.evaluation.calibration_card import write_calibration_card
-    from pisigma.evaluation.calibration_validation import judge, validate
-    from pisigma.evaluation.held_out_rows import HELD_OUT_CSV, held_out_csv, held_out_section
+    from pisigma.judging.calibration_validation import judge, validate
+    from pisigma.judging.held_out_rows import HELD_OUT_CSV, held_out_csv, held_out_section
+    from pisigma.model.folder.model_folder import save_model
+    from pisigma.model.folder.staging import check_replaceable, staged_folder
+    from pisigma.model.geometric_model import model_of_hybrid
+    from pisigma.recipes.recipe import MeasuredData, recipe_hash
+    from pisigma.reporting.calibration_card import write_calibration_card
     from pisigma.robot.description import Robot
-    from pisigma.training.recipe import MeasuredData, recipe_hash
 
     if resume:
         raise RecipeError(f"{recipe}: a recipe of kind {stated.kind} has no use for --resume; leave it out.")
@@ -81,8 +81,8 @@ def train_hybrid(
 def _rows(recipe: "HybridRecipe", data: Path | None) -> "Given":
     """Rows to calibrate with, all rows to judge on, those of the set `test`, and how the rows are parted."""
     from pisigma.measurement.splits import k_folds
-    from pisigma.training.recipe import MeasuredData
-    from pisigma.training.recipe_data import load_measurements, part_sets, simulate_repeats
+    from pisigma.recipes.recipe import MeasuredData
+    from pisigma.recipes.recipe_data import load_measurements, part_sets, simulate_repeats
 
     rows, test = part_sets(load_measurements(recipe, data))
     if isinstance(recipe.data, MeasuredData):
@@ -100,9 +100,9 @@ def _report(
 ) -> dict[str, Any]:
     """Figures of the calibration, of held-out rows and of the learning curve."""
     from pisigma.cli.progress import progress_of
-    from pisigma.evaluation.calibration_report import report_calibration
-    from pisigma.evaluation.learning_curve import learning_curve
-    from pisigma.training.recipe import MeasuredData
+    from pisigma.judging.learning_curve import learning_curve
+    from pisigma.recipes.recipe import MeasuredData
+    from pisigma.reporting.calibration_report import report_calibration
 
     validation, test = judged
     if isinstance(recipe.data, MeasuredData):

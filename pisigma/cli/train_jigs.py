@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pisigma.training.jig_recipe import JigRecipe
+    from pisigma.recipes.jig_recipe import JigRecipe
 
 
 def train_jigs(
@@ -22,14 +22,14 @@ def train_jigs(
     from rich.console import Console
 
     from pisigma.cli.output import print_json
-    from pisigma.correction.geometric_model import model_of_calibration
-    from pisigma.correction.model_folder import save_model
-    from pisigma.correction.staging import check_replaceable, staged_folder
     from pisigma.errors import RecipeError
-    from pisigma.evaluation.jig_card import write_jig_card
-    from pisigma.evaluation.jig_report import DEFAULT, report_jigs, run_jigs
+    from pisigma.model.folder.model_folder import save_model
+    from pisigma.model.folder.staging import check_replaceable, staged_folder
+    from pisigma.model.geometric_model import model_of_calibration
+    from pisigma.recipes.recipe import recipe_hash
     from pisigma.robot.description import Robot
-    from pisigma.training.recipe import recipe_hash
+    from pisigma.studies.jig_card import write_jig_card
+    from pisigma.studies.jig_report import DEFAULT, report_jigs, run_jigs
 
     if data is not None or resume:
         given = "--data" if data is not None else "--resume"
@@ -68,7 +68,7 @@ def print_jigs(result: dict[str, object]) -> None:
     import typer
 
     from pisigma.cli.output import print_table
-    from pisigma.evaluation.jig_tables import all_tables
+    from pisigma.studies.jig_tables import all_tables
 
     for table in all_tables(result):
         print_table(table.title, table.columns, table.rows)

@@ -25,9 +25,9 @@ def verify(
     """
     from pisigma.cli.output import print_json
     from pisigma.cli.progress import progress_of
-    from pisigma.correction.model_folder import load_model
     from pisigma.errors import AcceptanceError
-    from pisigma.evaluation import verification
+    from pisigma.model.folder.model_folder import load_model
+    from pisigma.verification import verification
 
     loaded = load_model(model)
     measurements = verification.read_for_verification(data, loaded)
@@ -58,7 +58,7 @@ def verify(
 
 def _print(result: dict[str, Any]) -> None:
     from pisigma.cli.output import print_table
-    from pisigma.evaluation.comparison_tables import comparison_table, difference_table
+    from pisigma.reporting.comparison_tables import comparison_table, difference_table
 
     confidence = f"{100 * result['bootstrap']['confidence']:.0f} %"
     rows = f"{result['rows_compared']} rows ({result['configurations']} configurations) of {result['data']}"

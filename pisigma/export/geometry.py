@@ -3,8 +3,8 @@
 from dataclasses import replace
 
 from pisigma import __version__
-from pisigma.correction.calibrated_model import CalibratedModel
-from pisigma.network.features import ConditionFeatures
+from pisigma.joint_correction.features import ConditionFeatures
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
 
 

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.correction.calibrated_model import CalibratedModel
 from pisigma.errors import ModelError
 from pisigma.export.offset_fit import OffsetProblem, solve_offsets
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_vector
 

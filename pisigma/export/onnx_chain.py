@@ -7,8 +7,8 @@ import numpy as np
 import torch
 
 from pisigma.export.onnx_graph import OnnxGraph
+from pisigma.joint_correction.features import GravityTorques
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.network.features import GravityTorques
 from pisigma.robot.description import Robot, Row
 from pisigma.se3 import transform_from_xyzrpy
 

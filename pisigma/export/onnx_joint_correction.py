@@ -10,7 +10,7 @@ from pisigma.export.onnx_chain import add_gravity, add_pose
 from pisigma.export.onnx_graph import OnnxGraph
 from pisigma.export.onnx_network import add_roll_pitch_yaw
 from pisigma.hybrid.coverage import JointCoverage
-from pisigma.network.features import (
+from pisigma.joint_correction.features import (
     AbstractFeatures,
     ConditionFeatures,
     FourierSeries,
@@ -19,7 +19,7 @@ from pisigma.network.features import (
     scaled_joints,
     turning_rate,
 )
-from pisigma.network.joint_correction import JointCorrection
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.robot.description import Robot
 
 
@@ -93,14 +93,14 @@ def _add_series(graph: OnnxGraph, harmonics: int, weight: np.ndarray, robot: Rob
 
 
 def _add_scaled(graph: OnnxGraph, robot: Robot, q: str) -> str:
-    """See `pisigma.network.features.scaled_joints`."""
+    """See `pisigma.joint_correction.features.scaled_joints`."""
     zero = scaled_joints(robot, torch.zeros(robot.dof, dtype=torch.float64)).numpy()
     one = scaled_joints(robot, torch.ones(robot.dof, dtype=torch.float64)).numpy()
     return graph.node("Add", graph.node("Mul", q, one - zero), zero)
 
 
 def _add_unit_inputs(graph: OnnxGraph, robot: Robot, q: str) -> str:
-    """See `pisigma.network.features.unit_inputs`."""
+    """See `pisigma.joint_correction.features.unit_inputs`."""
     turning = np.flatnonzero(robot.revolute).tolist()
     sliding = np.flatnonzero(~np.array(robot.revolute)).tolist()
     angle = graph.columns(q, turning)
@@ -111,7 +111,7 @@ def _add_unit_inputs(graph: OnnxGraph, robot: Robot, q: str) -> str:
 
 
 def _add_pose_values(graph: OnnxGraph, robot: Robot, q: str) -> str:
-    """See `pisigma.network.features.SharedFeatures`: x, y, z over the reach, roll, pitch, yaw."""
+    """See `pisigma.joint_correction.features.SharedFeatures`: x, y, z over the reach, roll, pitch, yaw."""
     place, R = add_pose(graph, robot, q)
     scaled = graph.node("Div", place, robot.reach)
     return graph.node("Concat", scaled, *add_roll_pitch_yaw(graph, R), axis=1)

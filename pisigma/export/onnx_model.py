@@ -3,14 +3,14 @@
 import json
 from typing import Any
 
-from pisigma.correction.calibrated_model import CalibratedModel
 from pisigma.errors import ModelError
 from pisigma.export.onnx_graph import OnnxGraph, import_onnx
 from pisigma.export.onnx_joint_correction import add_joint_correction, add_share
 from pisigma.export.onnx_network import add_network, needs_pose
 from pisigma.hybrid.arms import HybridArm
+from pisigma.joint_correction.features import ConditionFeatures
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.network.correction_network import CorrectionNetwork
-from pisigma.network.features import ConditionFeatures
 
 FORWARD = "forward_joint_correction"
 INVERSE = "inverse_joint_correction"

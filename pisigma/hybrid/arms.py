@@ -7,8 +7,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from pisigma.hybrid.coverage import JointCoverage
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.network.joint_correction import JointCorrection
 from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_from_vector, rotation_vector
 

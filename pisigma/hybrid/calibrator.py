@@ -16,21 +16,21 @@ from pisigma.hybrid.search import MOST_TOLD, Additive, Search, described
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.noise import view_of
-from pisigma.identification.problem import CalibrationProblem
+from pisigma.identification.initial_guess.initial_guess import chosen_rows
+from pisigma.identification.problem.noise import view_of
+from pisigma.identification.problem.problem import CalibrationProblem
+from pisigma.identification.problem.user_coordinates import identified_geometry
 from pisigma.identification.result_assembly import SolvedCalibration
-from pisigma.identification.starting import chosen_rows
-from pisigma.identification.user_coordinates import identified_geometry
-from pisigma.measurement.conditions import told_conditions
-from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.groups import groups_of_equal_joints
-from pisigma.network.features import (
+from pisigma.joint_correction.features import (
     AbstractFeatures,
     ConditionFeatures,
     FourierSeries,
     GravityTorques,
     SharedFeatures,
 )
+from pisigma.measurement.conditions import told_conditions
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import groups_of_equal_joints
 
 FEATURES = ("series", "gravity", "conditions", *SharedFeatures.CHOICES)
 """Features that may be chosen."""

@@ -8,10 +8,10 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.hybrid.refinement import Refined
+from pisigma.identification.identifiability.unobservable import frames_adrift
 from pisigma.identification.prediction import predicted_poses
+from pisigma.identification.problem.user_coordinates import IdentifiedGeometry, identified_geometry
 from pisigma.identification.result_assembly import SolvedCalibration
-from pisigma.identification.untold import frames_adrift
-from pisigma.identification.user_coordinates import IdentifiedGeometry, identified_geometry
 from pisigma.measurement.dataset import Measurements
 from pisigma.se3 import transform, transform_from_xyzrpy, xyzrpy_from_transform
 

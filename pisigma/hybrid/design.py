@@ -9,8 +9,8 @@ from torch import Tensor
 
 from pisigma.hybrid.evidence import FIRST_SIZE, GaussianPrior, Sums
 from pisigma.hybrid.sensor_values import SensorValues
-from pisigma.identification.problem import CalibrationProblem
-from pisigma.network.features import AbstractFeatures
+from pisigma.identification.problem.problem import CalibrationProblem
+from pisigma.joint_correction.features import AbstractFeatures
 
 CHUNK = 1_024
 """Rows whose columns are in memory at a time."""

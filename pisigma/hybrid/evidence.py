@@ -8,7 +8,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
-from pisigma.identification.noise import LEAST_TOLD, SMALLEST_NOISE, SMALLEST_PRIOR
+from pisigma.identification.problem.noise import LEAST_TOLD, SMALLEST_NOISE, SMALLEST_PRIOR
 
 SMALLEST_SIZE = 1e-9
 """Prior size [rad] below which a group of weights is off."""

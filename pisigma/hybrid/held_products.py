@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from pisigma.network.features import AbstractFeatures, unit_inputs
+from pisigma.joint_correction.features import AbstractFeatures, unit_inputs
 from pisigma.network.pi_sigma import sum_of_products
 from pisigma.robot.description import Robot
 

@@ -11,7 +11,7 @@ from pisigma.hybrid.design import Design, weighted_columns
 from pisigma.hybrid.evidence import GaussianPrior, Posterior, Sums, maximise_evidence
 from pisigma.hybrid.held_products import HeldProducts, InputPairs, normalised
 from pisigma.hybrid.sensor_values import SensorValues
-from pisigma.network.features import AbstractFeatures
+from pisigma.joint_correction.features import AbstractFeatures
 
 ROUNDS = 12
 """Alternations; every factor of a unit of order 2 is solved six times."""

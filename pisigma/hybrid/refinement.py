@@ -14,10 +14,10 @@ from pisigma.hybrid.products import ProductFit
 from pisigma.hybrid.rows import Rows, weigh
 from pisigma.hybrid.search import Additive
 from pisigma.hybrid.sensor_values import sensor_values
-from pisigma.identification.loss import AbstractLoss
+from pisigma.identification.problem.loss import AbstractLoss
 from pisigma.identification.result_assembly import SolvedCalibration
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.groups import groups_of_equal_joints
-from pisigma.network.joint_correction import JointCorrection
 
 MOST_ROUNDS = 5
 SETTLED = 0.02

@@ -12,10 +12,10 @@ from pisigma.hybrid.coverage import JointCoverage
 from pisigma.hybrid.search import Trial
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.prediction import errors_of_poses, predicted_poses
+from pisigma.identification.problem.user_coordinates import IdentifiedGeometry
 from pisigma.identification.result import CalibrationResult
-from pisigma.identification.user_coordinates import IdentifiedGeometry
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
-from pisigma.network.joint_correction import JointCorrection
 
 
 @dataclass(frozen=True, eq=False)

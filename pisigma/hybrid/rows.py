@@ -10,8 +10,8 @@ from torch import Tensor
 from pisigma.hybrid.design import Design
 from pisigma.hybrid.evidence import Posterior
 from pisigma.hybrid.sensor_values import SensorValues
-from pisigma.identification.loss import AbstractLoss, SquaredLoss
-from pisigma.identification.problem import CalibrationProblem
+from pisigma.identification.problem.loss import AbstractLoss, SquaredLoss
+from pisigma.identification.problem.problem import CalibrationProblem
 
 
 @dataclass(frozen=True, eq=False)

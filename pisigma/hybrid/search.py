@@ -8,7 +8,7 @@ from pisigma.hybrid.design import Design, sum_up
 from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence, told_share
 from pisigma.hybrid.left_out import left_out
 from pisigma.hybrid.rows import Rows
-from pisigma.network.features import AbstractFeatures, FourierSeries
+from pisigma.joint_correction.features import AbstractFeatures, FourierSeries
 
 LEVEL = 1.03
 """Features that the evidence is for are kept unless the left-out RMS rises above so many times what it was."""

@@ -7,10 +7,10 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.identification.noise import renumbered
-from pisigma.identification.parameters import ParameterSpace
-from pisigma.identification.problem import CalibrationProblem
-from pisigma.network.features import AbstractFeatures
+from pisigma.identification.problem.noise import renumbered
+from pisigma.identification.problem.parameters import ParameterSpace
+from pisigma.identification.problem.problem import CalibrationProblem
+from pisigma.joint_correction.features import AbstractFeatures
 
 Shift = Callable[[Tensor], Tensor]
 """Joint corrections [rad or m] as a function of joint values and, behind them, conditions."""

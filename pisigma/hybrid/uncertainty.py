@@ -12,13 +12,13 @@ from pisigma.hybrid.evidence import Posterior, Sums, told_share
 from pisigma.hybrid.left_out import LeftOut, folds_left_out, left_out
 from pisigma.hybrid.rows import Rows
 from pisigma.hybrid.sensor_values import joint_columns
-from pisigma.identification.jacobian import identification_jacobian
-from pisigma.identification.parameters import ParameterSpace
-from pisigma.identification.sensor_building import numbers_of
-from pisigma.identification.user_coordinates import IdentifiedGeometry
+from pisigma.identification.problem.parameters import ParameterSpace
+from pisigma.identification.problem.user_coordinates import IdentifiedGeometry
+from pisigma.joint_correction.features import AbstractFeatures, ConditionFeatures
+from pisigma.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.measurement.conditions import with_conditions
 from pisigma.measurement.dataset import Measurements
-from pisigma.network.features import AbstractFeatures, ConditionFeatures
+from pisigma.sensors.building import numbers_of
 
 CHUNK = 512
 """Rows whose columns are in memory at a time."""

@@ -10,25 +10,25 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
-from pisigma.identification.extension import told_besides
-from pisigma.identification.information import Information, information
-from pisigma.identification.least_squares import Solution, levenberg_marquardt
-from pisigma.identification.loss import AbstractLoss, HampelLoss
-from pisigma.identification.noise import view_of
-from pisigma.identification.pairwise import find_pairwise_redundancy
-from pisigma.identification.parameters import ParameterSpace, Prior
-from pisigma.identification.plausibility import refuse_implausible
-from pisigma.identification.problem import CalibrationProblem
-from pisigma.identification.redundancy import Redundancy, find_redundancy
+from pisigma.identification.identifiability.pairwise import find_pairwise_redundancy
+from pisigma.identification.identifiability.plausibility import refuse_implausible
+from pisigma.identification.identifiability.rank_extension import told_besides
+from pisigma.identification.identifiability.redundancy import Redundancy, find_redundancy
+from pisigma.identification.identifiability.sufficiency import check_sufficiency
+from pisigma.identification.identifiability.unobservable import tells_scale, untold
+from pisigma.identification.initial_guess.initial_guess import chosen_rows
+from pisigma.identification.problem.information import Information, information
+from pisigma.identification.problem.least_squares import Solution, levenberg_marquardt
+from pisigma.identification.problem.loss import AbstractLoss, HampelLoss
+from pisigma.identification.problem.noise import view_of
+from pisigma.identification.problem.parameters import ParameterSpace, Prior
+from pisigma.identification.problem.problem import CalibrationProblem
+from pisigma.identification.problem.setup import CalibrationSetup, SetupOptions, build_setup
 from pisigma.identification.result import CalibrationResult
 from pisigma.identification.result_assembly import Findings, SolvedCalibration
-from pisigma.identification.sensor_building import PairOfSockets
-from pisigma.identification.setup import CalibrationSetup, SetupOptions, build_setup
-from pisigma.identification.starting import chosen_rows
-from pisigma.identification.sufficiency import check_sufficiency
-from pisigma.identification.untold import tells_scale, untold
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import FRAME_COLUMNS, Robot
+from pisigma.sensors.building import PairOfSockets
 
 ROUGH_ROWS = 4_096
 """Rows that the first steps and the start are worked out from."""

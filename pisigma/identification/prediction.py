@@ -9,11 +9,11 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError, nearest_choice
-from pisigma.identification.sensor_building import names_of, numbers_of
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_vector, transform_from_xyzrpy
+from pisigma.sensors.building import names_of, numbers_of
 
 
 def predicted_poses(

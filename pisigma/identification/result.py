@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.identification.information import Information
-from pisigma.identification.least_squares import SolutionStatus
-from pisigma.identification.observability import Observability
-from pisigma.identification.pairwise import PairwiseRedundancy, find_pairwise_redundancy
+from pisigma.identification.identifiability.observability import Observability
+from pisigma.identification.identifiability.pairwise import PairwiseRedundancy, find_pairwise_redundancy
+from pisigma.identification.identifiability.redundancy import Redundancy, find_redundancy
 from pisigma.identification.prediction import prediction_errors
-from pisigma.identification.redundancy import Redundancy, find_redundancy
+from pisigma.identification.problem.information import Information
+from pisigma.identification.problem.least_squares import SolutionStatus
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 

@@ -7,23 +7,23 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.identification.covariance import covariance_of
-from pisigma.identification.information import Information
-from pisigma.identification.least_squares import Linearisation, Solution
-from pisigma.identification.mixed_frames import frames_mixed_up
-from pisigma.identification.noise import values_used, view_of
-from pisigma.identification.observability import observability_of
-from pisigma.identification.problem import CalibrationProblem
-from pisigma.identification.redundancy import Redundancy
-from pisigma.identification.result import CalibrationResult, Outlier, ParameterEstimate, SensorNoise
-from pisigma.identification.setup import CalibrationSetup
-from pisigma.identification.unseen import unseen_directions
-from pisigma.identification.user_coordinates import (
+from pisigma.identification.identifiability.mixed_frames import frames_mixed_up
+from pisigma.identification.identifiability.observability import observability_of
+from pisigma.identification.identifiability.redundancy import Redundancy
+from pisigma.identification.identifiability.weak_directions import unseen_directions
+from pisigma.identification.problem.covariance import covariance_of
+from pisigma.identification.problem.information import Information
+from pisigma.identification.problem.least_squares import Linearisation, Solution
+from pisigma.identification.problem.noise import values_used, view_of
+from pisigma.identification.problem.problem import CalibrationProblem
+from pisigma.identification.problem.setup import CalibrationSetup
+from pisigma.identification.problem.user_coordinates import (
     UserCoordinates,
     named_geometry,
     own_places,
     user_coordinates,
 )
+from pisigma.identification.result import CalibrationResult, Outlier, ParameterEstimate, SensorNoise
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import FRAME_COLUMNS
 from pisigma.se3 import wrap_to_pi

@@ -221,7 +221,7 @@ class Measurements:
     def read_csv(
         path: str | os.PathLike[str], robot: Robot | None = None, on_bad_row: OnBadRow = "error"
     ) -> "Measurements":
-        """Read a CSV file; units come from the column names. See `pisigma.measurement.csv_reading.read_csv`.
+        """Read a CSV file; units come from the column names. See `pisigma.measurement.csv.reading.read_csv`.
 
         Args:
             path: the file.
@@ -231,7 +231,7 @@ class Measurements:
         Raises:
             MeasurementError: the file or a row cannot be used; the message names file, line and column.
         """
-        from pisigma.measurement.csv_reading import read_csv
+        from pisigma.measurement.csv.reading import read_csv
 
         return read_csv(path, robot, on_bad_row)
 
@@ -241,7 +241,7 @@ class Measurements:
         robot: Robot | None = None,
         revolute: Sequence[bool] | None = None,
     ) -> None:
-        """Write a CSV file that `read_csv` reads back. See `pisigma.measurement.csv_writing.write_csv`.
+        """Write a CSV file that `read_csv` reads back. See `pisigma.measurement.csv.writing.write_csv`.
 
         Args:
             path: the file; written whole or not at all.
@@ -252,6 +252,6 @@ class Measurements:
             MeasurementError: the measurements cannot be written such that they can be read back.
             OutputError: the file cannot be written there.
         """
-        from pisigma.measurement.csv_writing import write_csv
+        from pisigma.measurement.csv.writing import write_csv
 
         write_csv(self, path, robot, revolute)

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from pisigma.errors import TrainingError
 from pisigma.hybrid.sensor_values import SensorValues, sensor_values
-from pisigma.identification.problem import CalibrationProblem
+from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.training.checkpoints import FINGERPRINT
 from pisigma.training.whitened_unknowns import WhitenedUnknowns
 

@@ -14,7 +14,7 @@ from pisigma.hybrid.calibrator import HybridCalibrator, searched_rows
 from pisigma.hybrid.refinement import Refined, refine, seen_from
 from pisigma.hybrid.result import HybridResult
 from pisigma.hybrid.search import Additive
-from pisigma.identification.loss import AbstractLoss
+from pisigma.identification.problem.loss import AbstractLoss
 from pisigma.identification.result_assembly import SolvedCalibration
 from pisigma.measurement.dataset import Measurements
 from pisigma.training.batch_training import BatchSchedule, BatchTraining

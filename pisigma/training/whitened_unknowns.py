@@ -12,8 +12,8 @@ from pisigma.hybrid.evidence import Posterior
 from pisigma.hybrid.held_products import HeldProducts, normalised
 from pisigma.hybrid.refinement import Refined, with_held_factors
 from pisigma.hybrid.uncertainty import covariance_root
-from pisigma.network.features import AbstractFeatures
-from pisigma.network.joint_correction import JointCorrection
+from pisigma.joint_correction.features import AbstractFeatures
+from pisigma.joint_correction.joint_correction import JointCorrection
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,7 @@ from testing.models import hand_made_model, no_type_checker, small_recipe_text
 from typer.testing import CliRunner, Result
 
 from pisigma.cli.main import app
-from pisigma.correction.model_folder import save_model
+from pisigma.model.folder.model_folder import save_model
 
 Run = Callable[..., Result]
 

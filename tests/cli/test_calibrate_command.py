@@ -11,9 +11,9 @@ from testing.models import no_type_checker
 from testing.simulated_arm import simulate
 
 import pisigma
-from pisigma.correction.model_folder import load_model
 from pisigma.kinematics.status import Status
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
 
 POSITION = {"rms_mm", "mean_mm", "p95_mm", "max_mm"}

@@ -11,9 +11,9 @@ from testing.models import no_type_checker
 from testing.simulated_arm import simulate
 
 import pisigma
-from pisigma.correction.model_folder import load_model
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.folder.model_folder import load_model
 
 POSITION = {"rms_mm", "mean_mm", "p95_mm", "max_mm"}
 FIGURES = {"joint_corrections.png", "predicted_spread.png", "residuals.png", "correlation.png"}

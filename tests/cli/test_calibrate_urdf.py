@@ -12,9 +12,9 @@ from testing.models import no_type_checker
 from testing.simulated_arm import dh_errors, draw_joints
 from testing.urdf import peer_poses
 
-from pisigma.correction.model_folder import load_model
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
 from pisigma.robot.urdf_writing import robot_to_urdf
 

@@ -7,8 +7,8 @@ from testing.identified import geometric_model
 from testing.models import hand_made_model
 
 import pisigma
-from pisigma.correction.model_folder import save_model
 from pisigma.export.onnx_model import INVERSE
+from pisigma.model.folder.model_folder import save_model
 
 SMALL = ("--poses", 200, "--orders", "1,2")
 

@@ -11,10 +11,10 @@ from testing.closeness import assert_close
 from testing.models import joints_around
 from testing.urdf import peer_poses
 
-from pisigma.correction.calibrated_model import CalibratedModel
-from pisigma.correction.model_folder import load_model, save_model
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.robot import Robot
 from pisigma.robot.urdf_writing import robot_to_urdf
 

@@ -10,11 +10,11 @@ from testing.identified import hybrid_model
 from testing.models import joints_around
 from testing.program_readers import READERS
 
-from pisigma.correction.model_folder import load_model, save_model
-from pisigma.correction.row_poses import poses_of_rows
+from pisigma.joint_correction.features import ConditionFeatures, FourierSeries
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
-from pisigma.network.features import ConditionFeatures, FourierSeries
+from pisigma.model.folder.model_folder import load_model, save_model
+from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot import Robot
 from pisigma.se3 import xyzrpy_from_transform
 

@@ -8,7 +8,7 @@ import torch
 from testing.closeness import assert_close
 from testing.models import HOMES, joints_around
 
-from pisigma.correction.corrected_ik import load
+from pisigma.inverse.corrected_ik import load
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot
 from pisigma.se3 import xyzrpy_from_transform

@@ -8,9 +8,9 @@ import torch
 from testing.closeness import assert_close
 from testing.models import hand_made_model
 
-from pisigma.correction.model_folder import load_model, save_model
-from pisigma.evaluation.pose_statistics import compare_on
+from pisigma.judging.pose_statistics import compare_on
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.robot import Robot
 
 

@@ -5,7 +5,7 @@ import json
 import pytest
 from testing.models import small_recipe_text
 
-from pisigma.correction.model_folder import load_model
+from pisigma.model.folder.model_folder import load_model
 
 STATISTICS = {"average_deg", "deviation_deg", "maximum_deg"}
 

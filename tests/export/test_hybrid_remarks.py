@@ -2,8 +2,8 @@
 
 from testing.hybrid import hybrid_of
 
-from pisigma.correction.geometric_model import model_of_hybrid
 from pisigma.export.geometry import offset_remarks, remarks
+from pisigma.model.geometric_model import model_of_hybrid
 
 
 def test_what_a_hybrid_has_learned_is_said_to_be_missing():

@@ -14,8 +14,8 @@ from testing.models import hand_made_model, joints_around, with_limits
 
 from pisigma.errors import ModelError, OutputError
 from pisigma.export.onnx_model import FORWARD, INVERSE, export_onnx
+from pisigma.joint_correction.features import ConditionFeatures, FourierSeries, GravityTorques, SharedFeatures
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.network.features import ConditionFeatures, FourierSeries, GravityTorques, SharedFeatures
 from pisigma.robot import Robot
 from pisigma.se3 import transform_from_xyzrpy
 

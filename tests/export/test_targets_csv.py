@@ -11,13 +11,13 @@ from testing.closeness import assert_close
 from testing.hybrid import hybrid_of
 from testing.models import hand_made_model, joints_around
 
-from pisigma.correction.calibrated_model import CalibratedModel
-from pisigma.correction.geometric_model import model_of_hybrid
-from pisigma.correction.torch_ik import TorchIK
 from pisigma.export.programs.targets import Targets, targets_of
 from pisigma.export.programs.targets_csv import targets_csv
+from pisigma.inverse.torch_ik import TorchIK
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.robot import Robot
 from pisigma.se3 import transform_from_xyzrpy
 

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from pisigma.hybrid.arms import HybridArm, blend
 from pisigma.hybrid.coverage import FADE, JointCoverage, share_beyond
+from pisigma.joint_correction.features import FourierSeries
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.network.features import FourierSeries
-from pisigma.network.joint_correction import JointCorrection
 from pisigma.robot import Robot
 from pisigma.se3 import rotation_from_vector, rotation_vector, transform
 

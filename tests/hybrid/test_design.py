@@ -7,7 +7,7 @@ from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_
 
 from pisigma.hybrid.design import Design, sum_up, weighted_columns
 from pisigma.hybrid.evidence import FIRST_SIZE
-from pisigma.network.features import AbstractFeatures, FourierSeries, GravityTorques, SharedFeatures
+from pisigma.joint_correction.features import AbstractFeatures, FourierSeries, GravityTorques, SharedFeatures
 from pisigma.robot import Robot
 
 

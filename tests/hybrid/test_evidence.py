@@ -21,7 +21,7 @@ from pisigma.hybrid.evidence import (
     solve_mean,
     solve_posterior,
 )
-from pisigma.identification.noise import SMALLEST_PRIOR
+from pisigma.identification.problem.noise import SMALLEST_PRIOR
 
 GROUP = torch.tensor([0, 0, 1, 1, 1, 2, 2, 2])
 NOISE = (0.3, 0.8)

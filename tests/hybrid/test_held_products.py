@@ -7,8 +7,8 @@ from testing.linearised import drawn_joints
 from torch import Tensor
 
 from pisigma.hybrid.held_products import HeldProducts, InputPairs, normalised, product_values, with_bias
-from pisigma.network.features import unit_inputs
-from pisigma.network.joint_correction import JointCorrection
+from pisigma.joint_correction.features import unit_inputs
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.robot import Robot
 
 

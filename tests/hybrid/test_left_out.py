@@ -11,8 +11,8 @@ from testing.sensors import mixed_data, true_robot
 from pisigma.hybrid.design import sum_up
 from pisigma.hybrid.evidence import solve_posterior
 from pisigma.hybrid.left_out import folds_left_out, left_out
+from pisigma.joint_correction.features import AbstractFeatures, FourierSeries, GravityTorques
 from pisigma.measurement.dataset import Measurements
-from pisigma.network.features import AbstractFeatures, FourierSeries, GravityTorques
 from pisigma.robot import Robot
 
 

@@ -14,9 +14,9 @@ from pisigma.hybrid.held_products import HeldProducts, normalised
 from pisigma.hybrid.products import ROUNDS, FittedProducts, ProductFit
 from pisigma.hybrid.refinement import network
 from pisigma.identification.prediction import predicted_poses
-from pisigma.identification.user_coordinates import identified_geometry
-from pisigma.network.features import FourierSeries
-from pisigma.network.joint_correction import JointCorrection
+from pisigma.identification.problem.user_coordinates import identified_geometry
+from pisigma.joint_correction.features import FourierSeries
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.robot import Robot
 
 SERIES = 2

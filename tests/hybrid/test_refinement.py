@@ -9,7 +9,7 @@ from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.held_products import HeldProducts, product_values
 from pisigma.hybrid.refinement import Refined, refine, with_held_factors
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.loss import HampelLoss
+from pisigma.identification.problem.loss import HampelLoss
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot
 

@@ -10,9 +10,9 @@ from torch import Tensor
 from pisigma.hybrid.design import Design, sum_up
 from pisigma.hybrid.sensor_values import SensorValues, sensor_values
 from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.joint_correction.features import FourierSeries
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
-from pisigma.network.features import FourierSeries
 from pisigma.robot import Robot
 
 

@@ -9,7 +9,7 @@ from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_
 
 from pisigma.hybrid.design import Design
 from pisigma.hybrid.rows import weigh
-from pisigma.identification.loss import HampelLoss, SquaredLoss
+from pisigma.identification.problem.loss import HampelLoss, SquaredLoss
 from pisigma.robot import Robot
 
 

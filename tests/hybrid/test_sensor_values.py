@@ -14,14 +14,14 @@ from pisigma.hybrid.design import Design
 from pisigma.hybrid.held_products import HeldProducts
 from pisigma.hybrid.sensor_values import joint_columns, sensor_values
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.motion_memory import MotionMemory
-from pisigma.identification.problem import CalibrationProblem
-from pisigma.identification.sensors import RotationSensor
+from pisigma.identification.problem.problem import CalibrationProblem
+from pisigma.joint_correction.features import FourierSeries, GravityTorques, SharedFeatures
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
-from pisigma.network.features import FourierSeries, GravityTorques, SharedFeatures
-from pisigma.network.joint_correction import JointCorrection
 from pisigma.robot import Robot
+from pisigma.sensors.motion_memory import MotionMemory
+from pisigma.sensors.sensor import RotationSensor
 
 WEIGHTS = ((-4 / 5, 1), (1 / 5, 2), (-4 / 105, 3), (1 / 280, 4))
 """Of central differences of order 8, with the step's multiple."""

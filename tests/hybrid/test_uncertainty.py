@@ -23,9 +23,9 @@ from pisigma.hybrid.uncertainty import (
     position_uncertainty,
 )
 from pisigma.identification.prediction import predicted_poses
-from pisigma.identification.user_coordinates import identified_geometry
-from pisigma.network.features import FourierSeries, GravityTorques
-from pisigma.network.joint_correction import JointCorrection
+from pisigma.identification.problem.user_coordinates import identified_geometry
+from pisigma.joint_correction.features import FourierSeries, GravityTorques
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.robot import Robot
 
 

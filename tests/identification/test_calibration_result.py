@@ -8,9 +8,9 @@ from testing.simulated_arm import BASE, TOOL, draw_joints, simulate
 
 from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.observability import observability_of
+from pisigma.identification.identifiability.observability import observability_of
+from pisigma.identification.problem.user_coordinates import turning_axes
 from pisigma.identification.result import CalibrationResult
-from pisigma.identification.user_coordinates import turning_axes
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot

@@ -7,9 +7,9 @@ from testing.closeness import assert_close
 from testing.simulated_arm import draw_joints, mean_error, simulate
 
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.least_squares import SolutionStatus
-from pisigma.identification.loss import SquaredLoss
-from pisigma.identification.parameters import Prior, row_labels
+from pisigma.identification.problem.least_squares import SolutionStatus
+from pisigma.identification.problem.loss import SquaredLoss
+from pisigma.identification.problem.parameters import Prior, row_labels
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot

@@ -4,8 +4,8 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.errors import PoseError
-from pisigma.identification.jacobian import JACOBIAN_CHUNK, identification_jacobian
 from pisigma.kinematics.forward import Geometry, forward_kinematics
+from pisigma.kinematics.parameter_jacobian import JACOBIAN_CHUNK, identification_jacobian
 from pisigma.robot import Robot
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from pisigma.identification.base_and_tool import fit_base_and_tool
 from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.identification.prediction import prediction_errors
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import k_folds

@@ -8,8 +8,8 @@ from testing.sensors import touch_data, true_robot
 from testing.simulated_arm import dh_errors, mean_error, simulate
 
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.noise import PriorGroup, prior_group_of
-from pisigma.identification.parameters import Prior
+from pisigma.identification.problem.noise import PriorGroup, prior_group_of
+from pisigma.identification.problem.parameters import Prior
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot

@@ -18,8 +18,8 @@ from testing.sensors import (
 )
 
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.loss import SquaredLoss
-from pisigma.identification.noise import view_of
+from pisigma.identification.problem.loss import SquaredLoss
+from pisigma.identification.problem.noise import view_of
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.se3 import wrap_to_pi

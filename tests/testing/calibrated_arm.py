@@ -6,11 +6,11 @@ import math
 import numpy as np
 import torch
 
-from pisigma.correction.calibrated_model import CalibratedModel
 from pisigma.hybrid.arms import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
-from pisigma.network.features import FourierSeries, GravityTorques, SharedFeatures
-from pisigma.network.joint_correction import JointCorrection
+from pisigma.joint_correction.features import FourierSeries, GravityTorques, SharedFeatures
+from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot import Robot
 
 BASE, TOOL = np.array([0.1, -0.2, 0.3, 0.4, 0.1, -0.2]), np.array([0.02, 0.03, 0.1, 0.1, 0.2, 0.3])

@@ -8,11 +8,11 @@ from testing.hybrid import joints_in
 from testing.models import no_type_checker
 from testing.simulated_arm import simulate
 
-from pisigma.correction.calibrated_model import CalibratedModel
-from pisigma.correction.geometric_model import model_of_calibration
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.geometric_model import model_of_calibration
 
 NOISE = 5e-5
 """Standard deviation of a measured coordinate [m]."""

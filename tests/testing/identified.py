@@ -4,11 +4,11 @@ import numpy as np
 import torch
 from testing.models import hand_made_model, joints_around
 
-from pisigma.correction.calibrated_model import CalibratedModel
 from pisigma.hybrid.arms import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
-from pisigma.network.features import AbstractFeatures
-from pisigma.network.joint_correction import JointCorrection
+from pisigma.joint_correction.features import AbstractFeatures
+from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot import Robot
 
 ROWS, SPREAD = 60, 0.5

@@ -12,13 +12,13 @@ from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence
 from pisigma.hybrid.rows import Rows
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.loss import SquaredLoss
-from pisigma.identification.noise import view_of
-from pisigma.identification.setup import CalibrationSetup
+from pisigma.identification.problem.loss import SquaredLoss
+from pisigma.identification.problem.noise import view_of
+from pisigma.identification.problem.setup import CalibrationSetup
+from pisigma.joint_correction.features import AbstractFeatures
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints
-from pisigma.network.features import AbstractFeatures
 from pisigma.robot import Robot
 from pisigma.se3 import invert, rotation_from_vector, transform_from_xyzrpy
 

@@ -10,12 +10,12 @@ from pathlib import Path
 import jaxtyping
 import torch
 
-from pisigma.correction.calibrated_model import CalibratedModel
-from pisigma.correction.domain import Domain
-from pisigma.correction.solution import Solution
+from pisigma.inverse.solution import Solution
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.domain import Domain
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
 from pisigma.network.pi_sigma import PiSigma
@@ -105,9 +105,9 @@ def small_recipe_text(name: str) -> str:
 def trained_run(name: str):
     """What a short training of the shipped recipe gives: the recipe and the run."""
     from pisigma.errors import RecipeError
-    from pisigma.training.recipe import Recipe
-    from pisigma.training.recipe_data import load_measurements
-    from pisigma.training.run import train_recipe
+    from pisigma.recipes.recipe import Recipe
+    from pisigma.recipes.recipe_data import load_measurements
+    from pisigma.workflow.run import train_recipe
     from pisigma.yaml_file import parse_yaml
 
     recipe = parse_yaml(small_recipe_text(name), Recipe, RecipeError, name)

@@ -9,16 +9,16 @@ import torch
 from testing.hybrid import NOISE, HybridArmUnderTest, hybrid_of, joints_in
 from testing.models import no_type_checker
 
-from pisigma.correction.calibrated_model import CalibratedModel
-from pisigma.correction.geometric_model import model_of_calibration, model_of_hybrid
-from pisigma.correction.model_folder import save_model
-from pisigma.evaluation.calibration_report import report_calibration
-from pisigma.evaluation.calibration_validation import CalibrationValidation, judge
-from pisigma.evaluation.correlation_csv import CORRELATION_CSV, write_correlations
-from pisigma.evaluation.held_out_rows import HELD_OUT_CSV, held_out_csv, held_out_section
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.judging.calibration_validation import CalibrationValidation, judge
+from pisigma.judging.held_out_rows import HELD_OUT_CSV, held_out_csv, held_out_section
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import save_model
+from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
+from pisigma.reporting.calibration_report import report_calibration
+from pisigma.reporting.correlation_csv import CORRELATION_CSV, write_correlations
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&\u2028$x_1$"
 """A name that breaks pages which do not show it as text."""

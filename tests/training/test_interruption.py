@@ -12,10 +12,10 @@ import pytest
 from testing.closeness import assert_close
 
 from pisigma.errors import OutputError, TrainingError
+from pisigma.recipes.recipe import read_recipe
+from pisigma.recipes.recipe_data import load_measurements
 from pisigma.training.checkpoints import find_checkpoint, prepare_checkpoints
-from pisigma.training.recipe import read_recipe
-from pisigma.training.recipe_data import load_measurements
-from pisigma.training.run import RunOptions, train_recipe
+from pisigma.workflow.run import RunOptions, train_recipe
 
 # Slow enough to be caught in the middle: every epoch waits, the last ones for long, which changes no number.
 SLOW = """

@@ -8,7 +8,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.errors import IdentificationError, MeasurementError
-from pisigma.identification.base_and_tool import fit_base_and_tool
+from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.singularity import singularity_measure
 from pisigma.measurement.dataset import Measurements

@@ -3,7 +3,7 @@
 import pytest
 
 from pisigma.errors import IdentificationError
-from pisigma.training.geometric_recipe import known_socket_distances
+from pisigma.recipes.geometric_recipe import known_socket_distances
 
 SOCKETS = ("left/0", "left/1", "right/0", "right/1", "right/0", "lonely/0")
 

@@ -7,9 +7,9 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma import __version__
-from pisigma.correction.solution import Solution
 from pisigma.errors import UnreachablePoseError
 from pisigma.export.geometry import condition_remarks, frame_remarks
+from pisigma.inverse.solution import Solution
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot

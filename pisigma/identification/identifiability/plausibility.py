@@ -1,0 +1,69 @@
+"""Fits that no calibration error explains: probably the data are of another robot, or in other units."""
+
+import torch
+from torch import Tensor
+
+from pisigma.errors import IdentificationError
+from pisigma.identification.identifiability.mixed_frames import residual_sizes
+from pisigma.identification.problem.least_squares import Linearisation
+from pisigma.identification.problem.problem import CalibrationProblem
+
+IMPLAUSIBLE_SHARE = 0.01
+"""Share of the robot's reach that half of the rows must be within, once the arm was fitted."""
+
+LONG_SHARE = 0.1
+"""Links longer than this share of the reach are long."""
+RUINED_SHARE = 0.5
+"""A long link that changes by more than this share was not that long."""
+
+
+def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor], source: str) -> None:
+    """Refuse a fit of the arm that leaves most measured positions far from their prediction, or ruins the arm.
+
+    Where no parameter of the arm is free (base and tool alone), nothing is refused: the arm may be far off.
+    Sensors that see less than a position are not judged here.
+
+    Args:
+        problem: with its free parameters.
+        here: its linearisation at the solution.
+        source: what complaints call the measurements.
+
+    Raises:
+        IdentificationError: the median residual of the positions is more than 1 % of the reach, or a link is half
+            as long again as drawn, or less than half as long.
+    """
+    _refuse_ruined_links(problem, here.point, source)
+    robot = problem.space.robot
+    measured = [sensor.seen for sensor in problem.sensors if sensor.name == "position"]
+    sizes = residual_sizes(problem, here)[measured[0]] if measured else problem.q.new_empty(0)
+    if not bool((problem.active < problem.space.arm_size).any()) or len(sizes) == 0 or robot.reach == 0:
+        return
+    typical = float(sizes.median())
+    if typical > IMPLAUSIBLE_SHARE * robot.reach:
+        raise IdentificationError(
+            f"{source}: with the best fit a typical row is still {typical * 1e3:.3g} mm per axis from where robot "
+            f"'{robot.name}' says, {typical / robot.reach:.1%} of its reach, which no calibration error explains; "
+            "check the units (millimetres in a _m column?), order and directions of the joints, and whether this robot "
+            "was measured."
+        )
+
+
+def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str) -> None:
+    """Refuse an arm whose long links changed by half, as where metres stand in a column of millimetres.
+
+    Raises:
+        IdentificationError: see above.
+    """
+    robot = problem.space.robot
+    drawn, found = (
+        torch.from_numpy(robot.dh[:, 2].copy()),
+        point.cpu()[: problem.space.arm_size].view(-1, 5)[:, 2],
+    )
+    ruined = (drawn.abs() > LONG_SHARE * robot.reach) & ((found - drawn).abs() > RUINED_SHARE * drawn.abs())
+    for row in ruined.nonzero()[:1, 0].tolist():
+        raise IdentificationError(
+            f"{source}: the best fit makes {problem.space.names[5 * row + 2]} of robot '{robot.name}' "
+            f"{float(found[row]) * 1e3:.4g} mm instead of {float(drawn[row]) * 1e3:.4g} mm, which no calibration error "
+            "explains; check the units (metres in a _mm column?), order and directions of the joints, and whether this "
+            "robot was measured."
+        )

@@ -1,0 +1,159 @@
+"""Which parameters the data can tell apart: rank, choice of parameters, and every dependency in words."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from pisigma.identification.problem.information import Information
+from pisigma.identification.problem.parameters import Parameter
+
+RANK_TOLERANCE = 1e-6
+"""Singular values of the column-scaled Jacobian below this share of the largest count as zero."""
+NO_EFFECT = 1e-9
+"""Columns smaller than this share of the largest count as zero."""
+PREFERENCE = ("base", "tool", "theta", "a", "d", "alpha", "beta")
+"""Which parameters are kept first; each class counts ten times as much as the next."""
+
+
+@dataclass(frozen=True)
+class Dependency:
+    """A combination of parameters of which the data tell only the sum.
+
+    Attributes:
+        names: the parameter that is kept, then those that act like it.
+        coefficients: of the sum, in SI units; 1 for the first.
+        sentence: the same in words.
+    """
+
+    names: tuple[str, ...]
+    coefficients: tuple[float, ...]
+    sentence: str
+
+
+@dataclass(frozen=True, eq=False)
+class Redundancy:
+    """What the Jacobian at the start says of the parameters.
+
+    Turns of base and tool are meant as small turns about their own axes.
+
+    Attributes:
+        names: the parameters that were looked at.
+        rank: how many independent combinations of them the data see.
+        tolerance: of the rank, as a share of the largest singular value.
+        singular_values: of the column-scaled Jacobian.
+        kept: the parameters that were chosen, `rank` of them.
+        removed: those that act like combinations of kept ones.
+        no_effect: those that change no measured value at all.
+        dependencies: the combinations that are identified where single values are not.
+    """
+
+    names: tuple[str, ...]
+    rank: int
+    tolerance: float
+    singular_values: Float64[np.ndarray, " singular"]
+    kept: tuple[str, ...]
+    removed: tuple[str, ...]
+    no_effect: tuple[str, ...]
+    dependencies: tuple[Dependency, ...]
+
+    def group(self, name: str) -> str | None:
+        """The sentence of a dependency that a parameter is part of, the shortest if several."""
+        found = [dependency for dependency in self.dependencies if name in dependency.names]
+        return min(found, key=lambda dependency: len(dependency.names)).sentence if found else None
+
+
+def find_redundancy(
+    information: Information,
+    sizes: Float64[np.ndarray, " parameters"],
+    tolerance: float = RANK_TOLERANCE,
+) -> Redundancy:
+    """Find rank, a choice of independent parameters and the dependencies of the others on them.
+
+    The columns are scaled to length one; the rank is that of the singular values. The choice is the first
+    `rank` pivots of a QR factorisation with column pivoting (Businger and Golub 1965) of the columns times
+    their preference.
+
+    Args:
+        information: the condensed Jacobian.
+        sizes: nominal values; of equal columns that with the larger one is kept (a group of parallel axes
+            keeps the d that is a real offset).
+        tolerance: see `RANK_TOLERANCE`.
+    """
+    J = information.jacobian
+    lengths = np.linalg.norm(J, axis=0)
+    acting = np.flatnonzero(lengths > NO_EFFECT * max(lengths.max(initial=0.0), 1e-300))
+    unit = J[:, acting] / lengths[acting]
+    singular = np.linalg.svd(unit, compute_uv=False) if len(acting) else np.zeros(0)
+    rank = int((singular > tolerance * singular.max(initial=0.0)).sum())
+    preference = np.array([preference_of(information.parameters[i], float(sizes[i]), int(i)) for i in acting])
+    pivots = pivoted_columns(unit * preference, rank)
+    kept, removed = acting[np.sort(pivots)], np.delete(acting, pivots)
+    names = information.names
+    return Redundancy(
+        names=names,
+        rank=rank,
+        tolerance=tolerance,
+        singular_values=singular,
+        kept=tuple(names[i] for i in kept),
+        removed=tuple(names[i] for i in removed),
+        no_effect=tuple(names[i] for i in range(len(names)) if i not in acting),
+        dependencies=_dependencies(information, lengths, kept, removed),
+    )
+
+
+def preference_of(parameter: Parameter, size: float, index: int) -> float:
+    """How much a parameter is wanted among those that are kept; its place decides ties, the earlier wins."""
+    bonus = 1e-3 if abs(size) > 1e-9 else 0.0
+    return float(10.0 ** -PREFERENCE.index(parameter.group)) * (1 + bonus - 1e-6 * index)
+
+
+def pivoted_columns(A: Float64[np.ndarray, "rows columns"], count: int) -> Int64[np.ndarray, " pivots"]:
+    """The first pivots of a QR factorisation with column pivoting, by modified Gram-Schmidt."""
+    A = A.copy()
+    pivots: list[int] = []
+    for _ in range(count):
+        lengths = np.einsum("ij,ij->j", A, A)
+        lengths[pivots] = -1.0
+        pivots.append(int(lengths.argmax()))
+        direction = A[:, pivots[-1]] / np.sqrt(lengths[pivots[-1]])
+        A -= direction[:, None] * (direction @ A)
+    return np.array(pivots, dtype=np.int64)
+
+
+def _dependencies(
+    information: Information, lengths: np.ndarray, kept: np.ndarray, removed: np.ndarray
+) -> tuple[Dependency, ...]:
+    """One for every kept parameter that removed ones act like."""
+    if len(removed) == 0 or len(kept) == 0:
+        return ()
+    J = information.jacobian
+    scaled, *_ = np.linalg.lstsq(J[:, kept] / lengths[kept], J[:, removed] / lengths[removed], rcond=None)
+    usual = np.array([parameter.usual_error for parameter in information.parameters])
+    found = []
+    for row, index in zip(scaled, kept, strict=True):
+        partners = [k for k in range(len(removed)) if abs(row[k]) > 1e-6]
+        if not partners:
+            continue
+        coefficients = [1.0]
+        for k in partners:
+            change = row[k] * lengths[removed[k]] / lengths[index]
+            coefficients.append(float(change * usual[index] / usual[removed[k]]))
+        members = [information.parameters[index], *(information.parameters[removed[k]] for k in partners)]
+        names = tuple(member.name for member in members)
+        found.append(Dependency(names, tuple(coefficients), sentence_of(members, coefficients)))
+    return tuple(found)
+
+
+def sentence_of(members: list[Parameter], coefficients: list[float]) -> str:
+    """Say that only a sum is identified: "d_2 + d_3 + d_4 is identified, the single values are not"."""
+    terms = sorted(zip(members, coefficients, strict=True), key=lambda term: (term[1] < 0, term[0].name))
+    text = ""
+    for member, coefficient in terms:
+        factor = ""
+        if abs(abs(coefficient) - 1) > 5e-5:
+            units = "" if member.unit == members[0].unit else f" {members[0].unit}/{member.unit}"
+            factor = f"{abs(coefficient):.4g}{units} · "
+        sign = "-" if coefficient < 0 else "+"
+        text += f" {sign} {factor}{member.name}" if text else f"{factor}{member.name}"
+    return f"{text} is identified, the single values are not"

@@ -1,0 +1,160 @@
+"""Where the measuring frame and the measured point are: base and tool of a robot taken as it is."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from pisigma.identification.initial_guess.base_and_tool_closed_form import base_and_tool_starts
+from pisigma.identification.initial_guess.base_and_tool_problem import (
+    BaseToolProblem,
+    BaseToolState,
+    build_base_and_tool_problem,
+)
+from pisigma.identification.problem.least_squares import Solution, levenberg_marquardt
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+from pisigma.se3 import rpy_from_rotation
+
+CLEAR_FIT = 5e-3
+"""A start that ends with an RMS below this share of the reach is taken without trying others."""
+
+
+@dataclass(frozen=True, eq=False)
+class BaseToolFit:
+    """Base and tool that fit the measurements best, the arm itself being taken as it is.
+
+    Attributes:
+        robot: the robot with base and tool set; with several targets the tool of the first.
+        tools: for every target x, y, z [m], roll, pitch, yaw [rad] of its tool.
+        rms_position: root mean square of the position errors' lengths [m].
+        rms_rotation: root mean square of the rotation errors' angles [rad]; NaN where none was measured.
+        iterations: steps of the least squares.
+        status: how the least squares ended, and which freedom the data leave open.
+    """
+
+    robot: Robot
+    tools: dict[str, Float64[np.ndarray, " 6"]]
+    rms_position: float
+    rms_rotation: float
+    iterations: int
+    status: str
+
+
+def fit_base_and_tool(
+    robot: Robot,
+    measurements: Measurements,
+    free_base: bool = True,
+    free_tool: bool = True,
+    maximum_iterations: int = 50,
+) -> BaseToolFit:
+    """Fit base and tool of a robot to measured poses or positions; no initial guess is needed.
+
+    The start is closed form (see `base_and_tool_starts`), then least squares on base (6) and tool: 6 where
+    rotations were measured; else the position of every target, and the tool's orientation stays as it is. The
+    weights are 1 / sigma where the measurements give it; else positions and rotations are weighted by 1 /
+    their own scatter.
+
+    Args:
+        robot: the robot; its base and tool are no guess, they only decide what the data leave open.
+        measurements: rows with `position`, and `rotation` where measured; all in one frame.
+        free_base: whether to fit the base; else the robot's is taken as it is.
+        free_tool: whether to fit the tool; else the robot's is taken as it is.
+        maximum_iterations: steps of the least squares.
+
+    Raises:
+        IdentificationError: no positions, several frames, or too few rows for what has to be found.
+        PoseError: the joint values do not fit the robot.
+    """
+    problem, solution = _solved(robot, measurements, free_base, free_tool, maximum_iterations)
+    return _result(robot, problem, solution)
+
+
+def find_base_and_tool(
+    robot: Robot, measurements: Measurements, free_base: bool, free_tool: bool, maximum_iterations: int
+) -> tuple[Float64[np.ndarray, " 6"], dict[str, Float64[np.ndarray, " 6"]]]:
+    """Base and tools alone that `fit_base_and_tool` finds.
+
+    Raises:
+        IdentificationError: as there.
+        PoseError: as there.
+    """
+    problem, solution = _solved(robot, measurements, free_base, free_tool, maximum_iterations)
+    return _base_and_tools(robot, problem, solution.linearisation.point)
+
+
+def _solved(
+    robot: Robot, measurements: Measurements, free_base: bool, free_tool: bool, maximum_iterations: int
+) -> tuple[BaseToolProblem, Solution[BaseToolState]]:
+    """The problem, and the best end of a search from any start."""
+    problem = build_base_and_tool_problem(robot, measurements, free_base, free_tool)
+    best: tuple[float, Solution[BaseToolState]] | None = None
+    for start in base_and_tool_starts(robot, problem):
+        found = levenberg_marquardt(problem, start, maximum_iterations)
+        off = _off(robot, problem, found)  # not the cost, which every search divides by its own noise
+        if best is None or off < best[0] * (1 - 1e-6):
+            best = off, found
+        if _rms_position(problem, best[1]) < CLEAR_FIT * robot.reach:
+            break
+    assert best is not None
+    return problem, best[1]
+
+
+def _off(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolState]) -> float:
+    """How far off the end of a search is [m]; an angle counts as what it moves at the end of the arm."""
+    turn = robot.reach * _rms_rotation(problem, solution.linearisation.point) if problem.turned else 0.0
+    return math.hypot(_rms_position(problem, solution), turn)
+
+
+def _rms_position(problem: BaseToolProblem, solution: Solution[BaseToolState]) -> float:
+    return float(problem.position_residual(solution.linearisation.point).square().sum(-1).mean().sqrt())
+
+
+def _rms_rotation(problem: BaseToolProblem, state: BaseToolState) -> float:
+    turn = problem.rotation_residual(state)[problem.rotated]
+    return float(turn.square().sum(-1).mean().sqrt())
+
+
+def _result(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolState]) -> BaseToolFit:
+    state = solution.linearisation.point
+    base, tools = _base_and_tools(robot, problem, state)
+    return BaseToolFit(
+        robot=robot.with_geometry(
+            base=base if problem.free_base else None,
+            tool=tools[problem.targets[0]] if problem.free_tool else None,
+        ),
+        tools=tools,
+        rms_position=_rms_position(problem, solution),
+        rms_rotation=_rms_rotation(problem, state) if problem.turned else float("nan"),
+        iterations=solution.iterations,
+        status=_status(solution),
+    )
+
+
+def _base_and_tools(
+    robot: Robot, problem: BaseToolProblem, state: BaseToolState
+) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    rpy_tool = rpy_from_rotation(state.R_tool).cpu().numpy() if problem.turned else robot.tool[3:]
+    tools = {
+        name: np.concatenate([point.cpu().numpy(), rpy_tool])
+        for name, point in zip(problem.targets, state.points, strict=True)
+    }
+    return torch.cat([state.p_base, rpy_from_rotation(state.R_base)]).cpu().numpy(), tools
+
+
+def _status(solution: Solution[BaseToolState]) -> str:
+    """How it ended, and how many unknowns the data do not see."""
+    normal = solution.linearisation.normal
+    if len(normal) == 0:
+        return "nothing was free"
+    scale = normal.diagonal().clamp(min=1e-300).rsqrt()
+    values = torch.linalg.eigvalsh(normal * scale * scale[:, None])
+    rank, free = int((values > 1e-10 * values[-1]).sum()), len(values)
+    if rank == free:
+        return solution.status.value
+    return (
+        f"{solution.status.value}; the data see only {rank} of the {free} unknowns of base and tool, "
+        "the others stay where they started (poses with more different wrist orientations would tell)"
+    )

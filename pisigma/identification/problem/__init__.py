@@ -1,0 +1,1 @@
+"""The geometric calibration as a least-squares problem, and its solver."""

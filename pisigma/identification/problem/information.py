@@ -1,0 +1,124 @@
+"""The identification Jacobian of a whole data set, condensed to a small triangular matrix."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.identification.problem.noise import SensorView
+from pisigma.identification.problem.parameters import Parameter
+from pisigma.identification.problem.problem import CalibrationProblem
+
+SEEN = 1e-10
+"""Columns that lie in others but for this share are taken to lie in them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Information:
+    """What the data say of each parameter, in units of its usual error (1 mm, 1 mrad).
+
+    With J the identification Jacobian of all rows (in mm and mrad, or in standard deviations) and r the
+    residuals, `[1 J r] = Q · root`.
+
+    Attributes:
+        parameters: what the columns of J belong to.
+        root: upper triangular; its first column belongs to ones, its last to the residuals.
+        values: number of rows of J.
+        poses: number of measured rows.
+    """
+
+    parameters: tuple[Parameter, ...]
+    root: Float64[np.ndarray, "rank columns"]
+    values: int
+    poses: int
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def jacobian(self) -> Float64[np.ndarray, "rank parameters"]:
+        """A small matrix with the same Gram matrix as J."""
+        return self.root[:, 1:-1]
+
+    @property
+    def residual(self) -> Float64[np.ndarray, " rank"]:
+        """A small vector with the same products with `jacobian` and itself as r has with J and itself."""
+        return self.root[:, -1]
+
+    @property
+    def centred(self) -> Float64[np.ndarray, "rank parameters"]:
+        """The same after the mean of every column of J was taken off."""
+        return self.root[1:, 1:-1]
+
+    def without(self, column: int) -> "Information":
+        """The same without one parameter."""
+        kept = [i for i in range(len(self.parameters)) if i != column]
+        root = self.root[:, [0, *(i + 1 for i in kept), -1]]
+        return replace(self, parameters=tuple(self.parameters[i] for i in kept), root=root)
+
+    def after(self, nuisance: list[int]) -> "Information":
+        """What is left for the other parameters when these columns may take any value.
+
+        Args:
+            nuisance: numbers of the columns; they are left out.
+        """
+        if not nuisance:
+            return self
+        taken = self.jacobian[:, nuisance]
+        lengths = np.linalg.norm(taken, axis=0)
+        U, singular, _ = np.linalg.svd(taken / np.where(lengths > 0, lengths, 1.0), full_matrices=False)
+        U = U[:, singular > SEEN * singular.max(initial=0.0)]
+        kept = [i for i in range(len(self.parameters)) if i not in set(nuisance)]
+        rest = self.root[:, [0, *(i + 1 for i in kept), -1]]
+        sizes = np.linalg.norm(rest, axis=0)
+        for _ in range(2):
+            rest = rest - U @ (U.T @ rest)
+        rest[:, np.linalg.norm(rest, axis=0) <= SEEN * sizes] = 0.0
+        root: np.ndarray = np.linalg.qr(rest, mode="r")  # type: ignore[assignment]
+        return replace(self, parameters=tuple(self.parameters[i] for i in kept), root=root)
+
+
+def information(
+    problem: CalibrationProblem,
+    point: Float64[Tensor, " parameters"],
+    candidates: list[int],
+    view: SensorView | None = None,
+) -> Information:
+    """Condense the Jacobian at a point by QR factorisations, chunk by chunk.
+
+    No normal equations are formed, so that singular values down to 1e-15 of the largest stay right.
+
+    Args:
+        problem: rows and sensors; the prior does not enter.
+        point: values of all parameters.
+        candidates: indices of the parameters to look at.
+        view: gives the rows' weights, in 1 / standard deviations; in 1/mm and 1/mrad where None.
+    """
+    index = torch.tensor(candidates, dtype=torch.int64, device=point.device)
+    usual = torch.from_numpy(problem.space.usual_errors).to(point)[index, None, None]
+    root = point.new_zeros((0, len(candidates) + 2))
+    own = problem.space.own(point)
+    values = 0
+    for rows in problem.chunks():
+        motion = problem.motion(point, rows, index)
+        blocks = [root.t()]
+        for k, sensor in enumerate(problem.sensors):
+            J, r = problem.derivative(sensor, motion, own, rows, index), sensor.residual(motion, own, rows)
+            weight = torch.full_like(r[0], 1e3) if view is None else problem.row_weights(view, k, rows)
+            if not problem.all_seen[k]:
+                seen = sensor.seen[rows]
+                J, r, weight = J[..., seen], r[..., seen], weight[seen]
+            block = r.new_empty((len(candidates) + 2, *r.shape))
+            block[0] = weight
+            torch.mul(J, usual * weight, out=block[1:-1])
+            torch.mul(r, weight, out=block[-1])
+            blocks.append(block.flatten(1))
+            values += r.numel()
+        root = torch.linalg.qr(torch.cat(blocks, 1).t(), mode="r").R
+    seen = torch.stack([sensor.seen for sensor in problem.sensors]).any(0)
+    parameters = tuple(problem.space.parameters[i] for i in candidates)
+    return Information(parameters, root.cpu().numpy(), values, int(seen.sum()))

@@ -1,0 +1,242 @@
+"""What the residuals say of the noise, of repeated poses and of the prior."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.identification.problem.least_squares import Linearisation
+from pisigma.identification.problem.loss import AbstractLoss
+from pisigma.sensors.sensor import AbstractSensor
+
+SMALLEST_NOISE = 1e-14
+"""[m or rad] Floor of the estimated noise: what rounding does to a pose."""
+ALWAYS_GOOD = 1e-10
+"""[m or rad] Rows nearer to their prediction than this never count as wrong."""
+
+
+class PriorGroup(IntEnum):
+    """Parameters whose errors are believed to be of one size, because they come from the same cause.
+
+    Few groups, because a size is only told by several parameters: one for every parameter (relevance vectors,
+    Tipping 2001) fits the noise. Lengths that are drawn and that are not are apart, because joining them made
+    weak data worse, while it made no difference whether d and a, or alpha and beta, are apart.
+    """
+
+    JOINT_OFFSET = 0
+    """theta: where the zeros of the joints were set."""
+    LENGTH = 1
+    """d and a that are drawn: how long parts are."""
+    NO_LENGTH = 2
+    """d and a drawn as 0, or shorter than their tolerance: how nearly axes meet or are in line."""
+    BETWEEN_AXES = 3
+    """alpha and beta: how square and parallel axes are."""
+
+
+LEAST_TOLD = 0.1
+"""A prior of which the data tell less than so many parameters stays as it is."""
+SMALLEST_PRIOR = 0.03
+"""An estimated prior is not narrower than this share of the stated one."""
+
+
+@dataclass(frozen=True, eq=False)
+class SensorSums:
+    """What one sensor contributes at one point, before division by its noise's variance.
+
+    Attributes:
+        normal: `Σ w J J^T / sigma_row²` over its rows.
+        descent: `Σ w J r / sigma_row²`.
+        residual: measured minus predicted, 0 where nothing was seen [m or rad].
+        distance: length of the residual over sigma_row, 0 where nothing was seen.
+        seen: number of rows that were seen.
+    """
+
+    normal: Float64[Tensor, "active active"]
+    descent: Float64[Tensor, " active"]
+    residual: Float64[Tensor, "components rows"]
+    distance: Float64[Tensor, " rows"]
+    seen: int
+
+    @property
+    def rms(self) -> float:
+        """Root mean square of the residuals' lengths [m or rad]."""
+        return float((self.residual.square().sum() / max(self.seen, 1)).sqrt())
+
+
+@dataclass(frozen=True, eq=False)
+class SensorView:
+    """All sensors at one point, with the noise they are believed to have.
+
+    Attributes:
+        sums: per sensor.
+        noise: per sensor, its standard deviation [m or rad], or a factor of 1 or more where the rows give
+            their own.
+        repetition: per sensor, 1 or more: by how much repeats of a pose, and several targets in it, tell less than
+            so many poses, because what the model gets wrong there is the same in all of them.
+        widening: of the prior's standard deviations, per group of parameters.
+    """
+
+    sums: tuple[SensorSums, ...]
+    noise: tuple[float, ...]
+    repetition: tuple[float, ...]
+    widening: tuple[float, ...] = (1.0,) * len(PriorGroup)
+
+    def scale(self, sensor: int) -> float:
+        """What distances are divided by for the loss."""
+        return max(self.noise[sensor], ALWAYS_GOOD)
+
+    def variance(self, sensor: int) -> float:
+        """What a sensor's sums are divided by."""
+        return self.noise[sensor] ** 2 * self.repetition[sensor]
+
+    def widened(self, precision: Float64[Tensor, " active"], group: Tensor) -> Float64[Tensor, " active"]:
+        """1 / variance of parameters by the prior, as far as it was widened."""
+        return precision / precision.new_tensor(self.widening).square()[group]
+
+
+def view_of(linearisation: Linearisation[Tensor]) -> SensorView:
+    """The sensors' part of a linearisation that a `CalibrationProblem` made."""
+    assert isinstance(linearisation.detail, SensorView)
+    return linearisation.detail
+
+
+def values_used(view: SensorView, covariance: Float64[Tensor, "active active"]) -> tuple[float, ...]:
+    """How many values of every sensor the parameters use up (Förstner 1979); the prior spares some."""
+    return tuple(
+        float(sums.normal.flatten().dot(covariance.flatten())) / view.variance(k)
+        for k, sums in enumerate(view.sums)
+    )
+
+
+def loss_scale(
+    sensors: Sequence[AbstractSensor],
+    loss: AbstractLoss,
+    view: SensorView,
+    used: Sequence[float],
+    refine: bool,
+) -> tuple[float, ...]:
+    """Standard deviation of every sensor's values, or factor of 1 or more on those that its rows give.
+
+    `refine` uses all good rows instead of the median.
+    """
+    found = []
+    for k, sensor in enumerate(sensors):
+        if sensor.certain:
+            found.append(1.0)
+            continue
+        distance = view.sums[k].distance
+        if view.sums[k].seen < len(distance):
+            distance = distance[sensor.seen]
+        if refine:
+            scale = loss.deviation(distance, sensor.components, used[k], view.scale(k))
+        else:
+            scale = loss.scale(distance, sensor.components, used[k])
+        found.append(max(scale, SMALLEST_NOISE if sensor.sigma is None else 1.0))
+    return tuple(found)
+
+
+def renumbered(keys: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
+    """Numbers from 0 on, equal where the keys are equal."""
+    found: Tensor = torch.unique(keys, return_inverse=True)[1]
+    return found
+
+
+def group_variance_ratio(
+    sensors: Sequence[AbstractSensor],
+    loss: AbstractLoss,
+    view: SensorView,
+    used: Sequence[float],
+    pose: Int64[Tensor, " rows"] | None,
+    configuration: Int64[Tensor, " rows"] | None = None,
+) -> tuple[float, ...]:
+    """Variance of the poses' mean residuals over that of independent rows (Kish 1965: design effect).
+
+    Targets on one tool share what the model gets wrong with the joints; by how much the mean residuals of
+    configurations vary more than those of poses comes on top, at most by the number of targets.
+
+    Args:
+        sensors: per sensor, which rows it saw.
+        loss: weights the rows within a pose.
+        view: residuals and noise.
+        used: values that the parameters use up, per sensor; they come off the poses, not off their repeats.
+        pose: number of every row's pose; None where none is repeated.
+        configuration: number of every row's joint values and frame; None where none has several targets.
+    """
+    found = []
+    for k, (sensor, sums) in enumerate(zip(sensors, view.sums, strict=True)):
+        if sensor.certain:
+            found.append(1.0)
+            continue
+        weight = loss.weight(sums.distance / view.scale(k), sensor.components) * sensor.seen
+        if sensor.sigma is not None:
+            weight = torch.where(sensor.seen, weight / sensor.sigma.square(), 0.0)
+        square, values = _group_squares(sums.residual, weight, pose)
+        ratio = 1.0
+        if pose is not None:
+            ratio = max(square / max(values - used[k], 1.0) / view.noise[k] ** 2, 1.0)
+        if configuration is not None and square > 0:
+            shared, fewer = _group_squares(sums.residual, weight, configuration)
+            ratio *= max((shared / fewer) / (square / values), 1.0)
+        found.append(ratio)
+    return tuple(found)
+
+
+def _group_squares(
+    residual: Float64[Tensor, "components rows"],
+    weight: Float64[Tensor, " rows"],
+    group: Int64[Tensor, " rows"] | None,
+) -> tuple[float, int]:
+    """Sum of the squared mean residuals of groups of rows, by weight, and of how many values it is."""
+    if group is None:
+        return float((residual.square() * weight).sum()), int((weight > 0).sum()) * len(residual)
+    groups = int(group.max()) + 1
+    total = weight.new_zeros(groups).index_add(0, group, weight)
+    summed = weight.new_zeros((len(residual), groups)).index_add(1, group, residual * weight)
+    seen = total > 0
+    return float((summed[:, seen].square().sum(0) / total[seen]).sum()), int(seen.sum()) * len(residual)
+
+
+def prior_group_of(column: str, drawn: bool) -> int:
+    """The group of a parameter whose prior is sized by the data.
+
+    Args:
+        column: "theta", "d", "a", "alpha" or "beta"; of others, which have no prior, any group will do.
+        drawn: whether its nominal value is larger than its tolerance.
+    """
+    if column in ("d", "a"):
+        return PriorGroup.LENGTH if drawn else PriorGroup.NO_LENGTH
+    return PriorGroup.BETWEEN_AXES if column in ("alpha", "beta") else PriorGroup.JOINT_OFFSET
+
+
+def prior_widening(
+    off: Float64[Tensor, " active"],
+    precision: Float64[Tensor, " active"],
+    group: Tensor,
+    view: SensorView,
+    covariance: Float64[Tensor, "active active"],
+    floor: float = 1.0,
+) -> tuple[float, ...]:
+    """How much larger than stated the parameters' errors turn out, per group of parameters.
+
+    MacKay's update (1992, Neural Computation 4(3), eq. 4.7): every parameter counts by how much of it the
+    data tell.
+
+    Args:
+        off: distance of the parameters from their nominal values [m or rad].
+        precision: 1 / variance as stated, 0 where nothing is known.
+        group: number of every parameter's group.
+        view: how far the prior is widened now.
+        covariance: of the parameters.
+        floor: smallest answer; 1 where smaller errors than stated do not tighten the prior.
+    """
+    told = (1 - view.widened(precision, group) * covariance.diagonal()) * (precision > 0)
+    square = off.square() * precision
+    sums = off.new_zeros((2, len(view.widening))).index_add(1, group, torch.stack([told, square]))
+    least = 1.0 if floor == 1.0 else LEAST_TOLD
+    return tuple(
+        max(off_square / total, floor**2) ** 0.5 if total > least else now
+        for total, off_square, now in zip(*sums.tolist(), view.widening, strict=True)
+    )

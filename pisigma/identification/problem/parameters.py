@@ -1,0 +1,255 @@
+"""The parameters of an identification: names, units, expected errors, and how they make up a geometry."""
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError, nearest_choice
+from pisigma.kinematics.parameter_jacobian import motion_order
+from pisigma.robot.description import DH_COLUMNS, FRAME_COLUMNS, Robot
+from pisigma.sensors.sensor import OwnUnknowns
+
+SOCKET_COLUMNS = ("x", "y", "z")
+ANCHOR_COLUMNS = ("x", "y", "z", "zero")
+LENGTHS = frozenset({"d", "a", "x", "y", "z", "zero"})
+EVERYWHERE, NOWHERE = -1, -2
+"""Instead of a frame or a target: a parameter that moves the tool in all rows, or in none."""
+USUAL_LENGTH = 1e-3
+"""[m] Scale of length parameters where no prior gives one."""
+USUAL_ANGLE = 1e-3
+"""[rad]"""
+SMALLEST_PRIOR = 1e-12
+"""[m or rad] A parameter that is known better is fixed: leave it out of `free`."""
+
+PriorSizes = Literal["stated", "widened", "estimated"]
+"""Whether the prior's sizes stand, may only grow, or are estimated."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What the maker's tolerances say: standard deviations of the parameters' errors, by class.
+
+    Base and tool have none, they are wherever they were put.
+
+    Attributes:
+        theta: joint offsets [rad].
+        d: link offsets [m].
+        a: link lengths [m].
+        alpha: twists [rad].
+        beta: Hayati's angles [rad].
+    """
+
+    theta: float = 1e-3
+    d: float = 1e-3
+    a: float = 1e-3
+    alpha: float = 1e-3
+    beta: float = 1e-3
+
+    def __post_init__(self) -> None:
+        """Refuse standard deviations that are none."""
+        for name in DH_COLUMNS:
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= SMALLEST_PRIOR):
+                raise IdentificationError(
+                    f"prior '{name}': a standard deviation in {'m' if name in LENGTHS else 'rad'} of "
+                    f"{SMALLEST_PRIOR:g} or more was wanted, got {value:g}; use prior=None for none."
+                )
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number that can be identified.
+
+    Attributes:
+        name: such as "theta_1", "d_EE", "base_x" or, with several targets, "tool_B_x".
+        group: "theta", "d", "a", "alpha", "beta", "base", "tool", "socket" or "anchor".
+        unit: "m" or "rad".
+        owner: the row, frame, target, socket or anchor it belongs to.
+    """
+
+    name: str
+    group: str
+    unit: Literal["m", "rad"]
+    owner: str
+
+    @property
+    def usual_error(self) -> float:
+        """A usual size of its error, for scaling: 1 mm or 1 mrad."""
+        return USUAL_LENGTH if self.unit == "m" else USUAL_ANGLE
+
+
+@dataclass(frozen=True, eq=False)
+class ParameterSpace:
+    """All parameters of a robot measured in some frames with some targets, in their order.
+
+    Attributes:
+        robot: the nominal robot.
+        frames: names of the measuring frames, each with its own base.
+        targets: names of the targets, each with its own tool.
+        sockets: names of the sockets, each with a place.
+        anchors: names of the anchors, each with a place and a zero offset.
+    """
+
+    robot: Robot
+    frames: tuple[str, ...] = ("",)
+    targets: tuple[str, ...] = ("",)
+    sockets: tuple[str, ...] = ()
+    anchors: tuple[str, ...] = ()
+
+    @cached_property
+    def parameters(self) -> tuple[Parameter, ...]:
+        """Rows x (theta, d, a, alpha, beta), frames x base, targets x tool, sockets x 3, anchors x 4."""
+        found = []
+        for label, row in zip(row_labels(self.robot), self.robot.rows, strict=True):
+            found += [_parameter(column, f"{column}_{label}", column, row.name) for column in DH_COLUMNS]
+        for group, owners in (("base", self.frames), ("tool", self.targets)):
+            for owner in owners:
+                stem = f"{group}_{owner}" if len(owners) > 1 else group
+                found += [_parameter(column, f"{stem}_{column}", group, owner) for column in FRAME_COLUMNS]
+        for group, owners, columns in (
+            ("socket", self.sockets, SOCKET_COLUMNS),
+            ("anchor", self.anchors, ANCHOR_COLUMNS),
+        ):
+            for owner in owners:
+                found += [_parameter(column, f"{group}_{owner}_{column}", group, owner) for column in columns]
+        return tuple(found)
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(parameter.name for parameter in self.parameters)
+
+    @property
+    def arm_size(self) -> int:
+        """Number of parameters of the rows, which come first."""
+        return 5 * len(self.robot.rows)
+
+    @cached_property
+    def usual_errors(self) -> Float64[np.ndarray, " parameters"]:
+        """Scale of every parameter [m or rad]."""
+        return np.array([parameter.usual_error for parameter in self.parameters])
+
+    @cached_property
+    def motion_columns(self) -> Int64[Tensor, "3 parameters"]:
+        """Per parameter: its column in a `ToolMotion`, the number of its frame and that of its target."""
+        order = motion_order(len(self.robot.rows))
+        arm, frames, targets = order[:-12], len(self.frames), len(self.targets)
+        others = len(self.parameters) - len(arm) - 6 * (frames + targets)
+        columns = arm + order[-12:-6] * frames + order[-6:] * targets + [0] * others
+        in_frames = [f for f in range(frames) for _ in range(6)]
+        at_targets = [t for t in range(targets) for _ in range(6)]
+        frame = [EVERYWHERE] * len(arm) + in_frames + [EVERYWHERE] * 6 * targets + [NOWHERE] * others
+        target = [EVERYWHERE] * (len(arm) + 6 * frames) + at_targets + [NOWHERE] * others
+        return torch.tensor([columns, frame, target])
+
+    @property
+    def always_moving(self) -> bool:
+        """Whether every parameter moves the tool in all rows."""
+        return len(self.frames) == len(self.targets) == 1 and not self.sockets and not self.anchors
+
+    def index(self, name: str) -> int:
+        """Where a parameter stands.
+
+        Raises:
+            IdentificationError: there is none of that name.
+        """
+        if name not in self.names:
+            raise IdentificationError(
+                f"robot '{self.robot.name}' has no parameter '{name}'; {nearest_choice(name, self.names)}"
+            )
+        return self.names.index(name)
+
+    def indices(self, name: str) -> list[int]:
+        """Where a parameter stands; with several frames or targets "base_x" and "tool_x" mean all of theirs.
+
+        Raises:
+            IdentificationError: there is none of that name.
+        """
+        group, _, column = name.partition("_")
+        several = {"base": len(self.frames) > 1, "tool": len(self.targets) > 1}.get(group, False)
+        if name in self.names or not several or column not in FRAME_COLUMNS:
+            return [self.index(name)]
+        return list(self.of(group))[FRAME_COLUMNS.index(column) :: 6]
+
+    def of(self, group: str) -> range:
+        """Indices of all parameters of a group behind the arm's: "base", "tool", "socket" or "anchor"."""
+        return self._stretches[group]
+
+    @cached_property
+    def _stretches(self) -> dict[str, range]:
+        sizes = {
+            "base": 6 * len(self.frames),
+            "tool": 6 * len(self.targets),
+            "socket": len(SOCKET_COLUMNS) * len(self.sockets),
+            "anchor": len(ANCHOR_COLUMNS) * len(self.anchors),
+        }
+        start, found = self.arm_size, {}
+        for name, size in sizes.items():
+            found[name] = range(start, start + size)
+            start += size
+        return found
+
+    def values(
+        self,
+        bases: Float64[np.ndarray, "frames 6"],
+        tools: Float64[np.ndarray, "targets 6"],
+        sockets: Float64[np.ndarray, "sockets 3"] | None = None,
+        anchors: Float64[np.ndarray, "anchors 4"] | None = None,
+    ) -> Float64[Tensor, " parameters"]:
+        """All parameters as one vector: the robot's rows, and these; sockets and anchors are 0 if not given."""
+        sockets = np.zeros((len(self.sockets), 3)) if sockets is None else sockets
+        anchors = np.zeros((len(self.anchors), 4)) if anchors is None else anchors
+        parts = (self.robot.dh, bases, tools, sockets, anchors)
+        return torch.from_numpy(np.concatenate([part.ravel() for part in parts]))
+
+    def split(
+        self, values: Float64[Tensor, " parameters"]
+    ) -> tuple[Float64[Tensor, "rows 5"], Float64[Tensor, "frames 6"], Float64[Tensor, "targets 6"]]:
+        """Rows, bases and tools of a vector of all parameters."""
+        bases, tools = (values[self.of(group).start : self.of(group).stop] for group in ("base", "tool"))
+        return values[: self.arm_size].view(-1, 5), bases.view(-1, 6), tools.view(-1, 6)
+
+    def own(self, values: Float64[Tensor, " parameters"]) -> OwnUnknowns:
+        """What a vector of all parameters says of sockets and anchors."""
+        sockets, anchors = (
+            values[self.of(group).start : self.of(group).stop] for group in ("socket", "anchor")
+        )
+        return OwnUnknowns(sockets.view(-1, 3).t(), anchors.view(-1, 4).t())
+
+    def places_of(
+        self, group: str, active: Int64[Tensor, " active"]
+    ) -> tuple[Int64[Tensor, " own"], Int64[Tensor, " own"], Int64[Tensor, " own"]]:
+        """Where sockets' or anchors' parameters stand among some: place, number of the owner, and column."""
+        size = len(SOCKET_COLUMNS if group == "socket" else ANCHOR_COLUMNS)
+        stretch = self.of(group)
+        places = ((active >= stretch.start) & (active < stretch.stop)).nonzero()[:, 0]
+        number = active[places] - stretch.start
+        return places, number // size, number % size
+
+    def precision(self, prior: Prior | None) -> Float64[np.ndarray, " parameters"]:
+        """1 / variance of every parameter's error before anything is measured; 0 where nothing is known."""
+        found = np.zeros(len(self.parameters))
+        if prior is not None:
+            for index, parameter in enumerate(self.parameters[: self.arm_size]):
+                found[index] = getattr(prior, parameter.group) ** -2
+        return found
+
+
+def row_labels(robot: Robot) -> tuple[str, ...]:
+    """What names end in: the joint's number, or a fixed row's name ("EE" for an end effector)."""
+    labels, joint = [], 0
+    for row in robot.rows:
+        joint += row.type != "fixed"
+        fixed = "EE" if row.name.lower() in ("end_effector", "ee") else row.name
+        labels.append(fixed if row.type == "fixed" else str(joint))
+    return tuple(labels)
+
+
+def _parameter(column: str, name: str, group: str, owner: str) -> Parameter:
+    return Parameter(name, group, "m" if column in LENGTHS else "rad", owner)

@@ -1,0 +1,298 @@
+"""The calibration as a least-squares problem: normal equations summed over chunks of poses."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.identification.problem.covariance import covariance_of
+from pisigma.identification.problem.least_squares import AbstractLeastSquares, Linearisation
+from pisigma.identification.problem.loss import AbstractLoss, SquaredLoss
+from pisigma.identification.problem.noise import (
+    ALWAYS_GOOD,
+    SMALLEST_PRIOR,
+    SensorSums,
+    SensorView,
+    group_variance_ratio,
+    loss_scale,
+    prior_group_of,
+    prior_widening,
+    renumbered,
+    values_used,
+    view_of,
+)
+from pisigma.identification.problem.parameters import EVERYWHERE, ParameterSpace, PriorSizes
+from pisigma.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion, tool_motion
+from pisigma.sensors.motion_memory import MotionMemory
+from pisigma.sensors.sensor import AbstractSensor, OwnUnknowns
+
+CERTAIN_LOSS = SquaredLoss()
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationProblem(AbstractLeastSquares[Tensor]):
+    """Rows, sensors, the parameters that are free and what is known of them.
+
+    Attributes:
+        space: the parameters; a point is a vector of all of them.
+        q: joint values [rad or m] of the rows.
+        frame: index of every row's frame.
+        target: index of every row's target.
+        sensors: what was measured in the rows.
+        loss: how rows far from their prediction count.
+        nominal: values of all parameters that the prior is about.
+        precision: 1 / variance of their errors, 0 where nothing is known.
+        active: indices of the free parameters.
+        pose: number of every row's pose (joint values, frame, target), None where no pose is repeated.
+        configuration: number of every row's joint values and frame, None where none is seen of several targets.
+        pairs: so many pairs of rows, the first ones, are measured together.
+        conditions: payload, temperature (`measurement.conditions`) for corrections that depend on them.
+        prior_sizes: "stated": the prior as it is; "widened": wider where the errors are larger than it says;
+            "estimated": wider or narrower.
+        memory: the last motion; shared with problems that differ in their free parameters or prior only.
+    """
+
+    space: ParameterSpace
+    q: Float64[Tensor, "rows dof"]
+    frame: Int64[Tensor, " rows"]
+    target: Int64[Tensor, " rows"]
+    sensors: tuple[AbstractSensor, ...]
+    loss: AbstractLoss
+    nominal: Float64[Tensor, " parameters"]
+    precision: Float64[Tensor, " parameters"]
+    active: Int64[Tensor, " active"]
+    pose: Int64[Tensor, " rows"] | None = None
+    configuration: Int64[Tensor, " rows"] | None = None
+    pairs: int = 0
+    conditions: Float64[Tensor, "rows _conditions"] | None = None
+    prior_sizes: PriorSizes = "widened"
+    memory: MotionMemory = field(default_factory=MotionMemory, repr=False)
+
+    @cached_property
+    def step_scale(self) -> Float64[Tensor, " active"]:
+        """1 mm and 1 mrad."""
+        return torch.from_numpy(self.space.usual_errors).to(self.q.device)[self.active]
+
+    @cached_property
+    def values_seen(self) -> tuple[int, ...]:
+        """Number of values of every sensor."""
+        return tuple(int(sensor.seen.sum()) * sensor.components for sensor in self.sensors)
+
+    @cached_property
+    def prior_group(self) -> Int64[Tensor, " active"]:
+        """Which size of the prior every free parameter has: of its `PriorGroup`, or for lengths and for angles."""
+        drawn = (self.nominal.square() * self.precision > 1).tolist()
+        found = []
+        for parameter, is_drawn in zip(self.space.parameters, drawn, strict=True):
+            own = prior_group_of(parameter.group, is_drawn)
+            found.append(own if self.prior_sizes == "estimated" else int(parameter.unit == "m"))
+        return torch.tensor(found, dtype=torch.int64, device=self.q.device)[self.active]
+
+    def with_active(self, active: Sequence[int]) -> "CalibrationProblem":
+        """The same with other free parameters."""
+        return replace(self, active=torch.tensor(sorted(active), dtype=torch.int64, device=self.q.device))
+
+    def without_prior(self) -> "CalibrationProblem":
+        """The same with nothing known beforehand."""
+        return replace(self, precision=torch.zeros_like(self.precision))
+
+    def select(self, rows: Int64[Tensor, " chosen"]) -> "CalibrationProblem":
+        """Some of the rows; of a pair both."""
+        if self.pairs:
+            partner = torch.where(rows < 2 * self.pairs, rows ^ 1, rows)
+            rows = torch.unique(torch.cat([rows, partner]))
+        return replace(
+            self,
+            q=self.q[rows],
+            frame=self.frame[rows],
+            target=self.target[rows],
+            sensors=tuple(sensor.select(rows) for sensor in self.sensors),
+            pose=None if self.pose is None else renumbered(self.pose[rows]),
+            configuration=None if self.configuration is None else renumbered(self.configuration[rows]),
+            pairs=int((rows < 2 * self.pairs).sum()) // 2,
+            conditions=None if self.conditions is None else self.conditions[rows],
+            memory=MotionMemory(),
+        )
+
+    @cached_property
+    def state(self) -> Float64[Tensor, "rows _state"]:
+        """Joint values of the rows, and behind them their conditions."""
+        return self.q if self.conditions is None else torch.cat([self.q, self.conditions], 1)
+
+    def moved(self, point: Tensor, step: Tensor) -> Tensor:
+        """The parameters after a step of the free ones."""
+        return point.index_add(0, self.active, step)
+
+    def linearise(self, point: Tensor, like: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
+        """Sum up the normal equations; rows are weighted by the noise of `like`."""
+        known = None if like is None else view_of(like)
+        sums = [self._empty(k) for k in range(len(self.sensors))]
+        own = self.space.own(point)
+        for rows in self.chunks():
+            motion = self.motion(point, rows, self.active)
+            for k, total in enumerate(sums):
+                self._add(k, total, float("inf") if known is None else known.noise[k], motion, own, rows)
+        ones = (1.0,) * len(sums)
+        view = SensorView(tuple(sums), ones, ones) if known is None else replace(known, sums=tuple(sums))
+        return self.combined(point, view)
+
+    def renewed(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], bool]:
+        """Estimate the noise robustly, what repeats are worth, and how wide the prior has to be."""
+        return self._renewed(linearisation, refine=False)
+
+    def refined(self, linearisation: Linearisation[Tensor]) -> Linearisation[Tensor]:
+        """The same with the noise estimated from all good rows, for the end of a search."""
+        return self._renewed(linearisation, refine=True)[0]
+
+    def _renewed(
+        self, linearisation: Linearisation[Tensor], refine: bool
+    ) -> tuple[Linearisation[Tensor], bool]:
+        view = view_of(linearisation)
+        covariance = covariance_of(linearisation.normal)
+        used = values_used(view, covariance)
+        noise = loss_scale(self.sensors, self.loss, view, used, refine)
+        repetition = view.repetition
+        if self.pose is not None or self.configuration is not None:
+            seen = replace(view, noise=noise)
+            repetition = group_variance_ratio(
+                self.sensors, self.loss, seen, used, self.pose, self.configuration
+            )
+        off = (linearisation.point - self.nominal)[self.active]
+        widening = view.widening
+        if self.prior_sizes != "stated":
+            floor = 1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR
+            widening = prior_widening(off, self._prior, self.prior_group, view, covariance, floor)
+        old, new = (*view.noise, *view.repetition, *view.widening), (*noise, *repetition, *widening)
+        settled = all(abs(b / a - 1) < 1e-2 for a, b in zip(old, new, strict=True))
+        return self.combined(linearisation.point, SensorView(view.sums, noise, repetition, widening)), settled
+
+    def row_weights(self, view: SensorView, sensor: int, rows: slice) -> Float64[Tensor, " poses"]:
+        """1 / standard deviation of each row for a sensor, 0 where it saw nothing [1/m or 1/rad]."""
+        kind = self.sensors[sensor]
+        distance = view.sums[sensor].distance[rows] / view.scale(sensor)
+        root = self.loss_of(kind).weight(distance, kind.components).sqrt() / view.variance(sensor) ** 0.5
+        if kind.sigma is not None:
+            root = root / kind.sigma[rows]
+        return torch.where(kind.seen[rows], root, 0.0)
+
+    def loss_of(self, sensor: AbstractSensor) -> AbstractLoss:
+        """How a sensor's rows count."""
+        return CERTAIN_LOSS if sensor.certain else self.loss
+
+    def chunks(self) -> list[slice]:
+        """Rows that are worked on together."""
+        return [slice(start, start + JACOBIAN_CHUNK) for start in range(0, self.q.shape[0], JACOBIAN_CHUNK)]
+
+    def motion(self, point: Tensor, rows: slice, active: Tensor) -> ToolMotion:
+        """Tool pose of some rows and its derivative by some parameters.
+
+        The columns are 0 for base and tool in rows of other frames and targets, and for parameters that do not
+        move the tool.
+        """
+        if self.chunks() == [rows]:
+            made_from = (point, self.space, self.q, self.frame, self.target, self._turning)
+            motion = self.memory.motion(made_from, lambda: self._whole_motion(point, rows))
+        else:
+            motion = self._whole_motion(point, rows)
+        columns = self.space.motion_columns.to(active.device)
+        J = motion.derivative.index_select(0, columns[0, active])
+        if not self.space.always_moving:
+            f, t = columns[1:, active, None]
+            moving = ((f == EVERYWHERE) | (f == self.frame[rows])) & (
+                (t == EVERYWHERE) | (t == self.target[rows])
+            )
+            J = J * moving[:, None, :]
+        return ToolMotion(motion.position, motion.rotation, J)
+
+    def _whole_motion(self, point: Tensor, rows: slice) -> ToolMotion:
+        """Tool pose of some rows and its derivative by every kind of parameter."""
+        dh, bases, tools = self.space.split(point)
+        frame = None if len(bases) == 1 else self.frame[rows]
+        target = None if len(tools) == 1 else self.target[rows]
+        where = (dh.cpu().numpy(), bases.t(), tools.t(), self.q[rows])
+        return tool_motion(self.space.robot, *where, self._turning, frame, target)
+
+    def derivative(
+        self, sensor: AbstractSensor, motion: ToolMotion, own: OwnUnknowns, rows: slice, active: Tensor
+    ) -> Tensor:
+        """Derivative of a sensor's values by the parameters that the motion was made for."""
+        J = sensor.derivative(motion, own, rows)
+        for part in sensor.own_derivatives(motion, own, rows):
+            places, owner, column = self.space.places_of(part.group, active)
+            if len(places):
+                theirs = (owner[:, None] == part.owner)[:, None, :]
+                J = J.index_add(0, places, part.derivative[column] * theirs)
+        return J
+
+    def combined(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
+        """Divide the sums by their variances and add the prior."""
+        off = (point - self.nominal)[self.active]
+        precision = view.widened(self._prior, self.prior_group)
+        pull = off * precision
+        normal, descent, misfit, rounding = torch.diag(precision), -pull, 0.0, 0.0
+        for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True)):
+            scale, variance = view.scale(k), view.variance(k)
+            cost = self.loss_of(sensor).cost(sums.distance / scale, sensor.components)
+            misfit += float(cost.sum()) * scale**2 / variance
+            normal.add_(sums.normal, alpha=1 / variance)
+            descent.add_(sums.descent, alpha=1 / variance)
+            size = self._reach if sensor.unit == "m" else 1.0
+            rounding += self.values_seen[k] * (torch.finfo(point.dtype).eps * size) ** 2 / variance
+        return Linearisation(point, misfit + float(off.dot(pull)), descent, normal, misfit, rounding, view)
+
+    @cached_property
+    def _reach(self) -> float:
+        return self.space.robot.reach
+
+    @cached_property
+    def _turning(self) -> bool:
+        """Whether any sensor needs the tool's rotation."""
+        return any(sensor.turning for sensor in self.sensors)
+
+    @cached_property
+    def _prior(self) -> Float64[Tensor, " active"]:
+        return self.precision[self.active]
+
+    @cached_property
+    def all_seen(self) -> tuple[bool, ...]:
+        """Per sensor, whether it has a value in every row."""
+        rows = self.q.shape[0]
+        return tuple(
+            seen == rows * sensor.components
+            for seen, sensor in zip(self.values_seen, self.sensors, strict=True)
+        )
+
+    def _empty(self, sensor: int) -> SensorSums:
+        rows, size, components = self.q.shape[0], len(self.active), self.sensors[sensor].components
+        return SensorSums(
+            normal=self.q.new_zeros((size, size)),
+            descent=self.q.new_zeros(size),
+            residual=self.q.new_empty((components, rows)),
+            distance=self.q.new_empty(rows),
+            seen=self.values_seen[sensor] // components,
+        )
+
+    def _add(
+        self, number: int, sums: SensorSums, sigma: float, motion: ToolMotion, own: OwnUnknowns, rows: slice
+    ) -> None:
+        """Add one sensor's part of some rows, in place."""
+        sensor = self.sensors[number]
+        residual = sensor.residual(motion, own, rows)
+        if not self.all_seen[number]:
+            residual = torch.where(sensor.seen[rows], residual, 0.0)
+        distance = residual.square().sum(0).sqrt()
+        if sensor.sigma is not None:
+            distance = torch.where(sensor.seen[rows], distance / sensor.sigma[rows], 0.0)
+        root = self.loss_of(sensor).weight(distance / max(sigma, ALWAYS_GOOD), sensor.components).sqrt()
+        if sensor.sigma is not None:
+            root = root / sensor.sigma[rows]
+        if not self.all_seen[number]:
+            root = torch.where(sensor.seen[rows], root, 0.0)
+        A = (self.derivative(sensor, motion, own, rows, self.active) * root).flatten(1)
+        sums.normal.addmm_(A, A.t())
+        sums.descent.addmv_(A, (residual * root).flatten())
+        sums.residual[:, rows] = residual
+        sums.distance[rows] = distance

@@ -1,0 +1,117 @@
+"""From joint values that reach poses to solutions: turns, limits, the correction, and how far all that holds."""
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from pisigma.inverse.identified_arm import search
+from pisigma.inverse.nearest_turn import turn_near
+from pisigma.inverse.solution import Solution
+from pisigma.kinematics.joint_limits import turn_into_limits
+from pisigma.kinematics.numeric import SINGULAR_TOLERANCE
+from pisigma.kinematics.singularity import singularity_measure
+from pisigma.kinematics.status import Status
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.hybrid_motion import HybridMotion
+
+
+class Finishing:
+    """The last steps to solutions of one model, the same for all ways that lead to joint values."""
+
+    def __init__(
+        self,
+        model: CalibratedModel,
+        branches: tuple[str, ...],
+        trained: Sequence[int],
+        motion: HybridMotion | None,
+    ) -> None:
+        """Prepare for a model.
+
+        Args:
+            model: the model.
+            branches: names of all branches.
+            trained: indices of those that training rows lie on.
+            motion: of its hybrid arm, where it has one.
+        """
+        self._model, self._branches, self._motion = model, branches, motion
+        self._trained = torch.tensor(trained)
+        self._geometric = model.calibrated or model.robot
+
+    def of_nominal(
+        self, T: Tensor, q: Tensor, status: Tensor, branch: Tensor, near: Tensor | None
+    ) -> Solution:
+        """Add the correction to nominal joint values, and everything that limits the trust in it."""
+        found = torch.isfinite(q).all(-1)
+        safe = torch.where(found[..., None], q, torch.zeros_like(q))
+        seen = as_trained(self._model, safe)
+        correction = torch.where(found[..., None], self._model.correction(T, seen), torch.nan)
+        status = self._without_limits(safe, status)
+        corrected = q + correction
+        commanded, inside = self._turned(corrected, near)
+        measure = torch.full(status.shape, torch.nan, dtype=torch.float64)
+        if self._model.network is not None and self._model.domain is not None:
+            measure = self._model.domain.measure(self._model.network.scaled_inputs(T, seen)).where(
+                found, measure
+            )
+            outside = ~(measure <= 1) | ~torch.isin(branch, self._trained)
+            status[(status == Status.REACHED) & outside] = int(Status.OUTSIDE_DOMAIN)
+        status[~inside & (status != Status.UNREACHABLE)] = int(Status.OUTSIDE_JOINT_LIMITS)
+        turned = commanded - corrected  # 0 where no turn was made
+        return Solution(commanded, q + turned, correction, branch, self._branches, status, measure)
+
+    def of_identified(
+        self, T: Tensor, q: Tensor, q_nominal: Tensor, status: Tensor, branch: Tensor, near: Tensor | None
+    ) -> Solution:
+        """Put joint values of the identified arm beside the nominal ones, on the same turns."""
+        found = torch.isfinite(q).all(-1)
+        status = self._without_limits(torch.where(found[..., None], q, 0.0), status)
+        commanded, inside = self._turned(q, near)
+        measure = torch.full(status.shape, torch.nan, dtype=torch.float64)
+        if self._model.hybrid is not None:
+            commanded, inside = self._on_turn(T, commanded, inside)
+            share = self._model.hybrid.coverage.share(commanded)
+            measure = 2 - share
+            status[(status == Status.REACHED) & (share < 1)] = int(Status.OUTSIDE_DOMAIN)
+        status[~inside & found] = int(Status.OUTSIDE_JOINT_LIMITS)
+        q_nominal = torch.where(found[..., None], q_nominal, torch.nan)
+        q_nominal = turn_near(self._model.robot, q_nominal, commanded, within_limits=False)
+        correction = commanded - q_nominal
+        return Solution(commanded, q_nominal, correction, branch, self._branches, status, measure)
+
+    def _on_turn(self, T: Tensor, q: Tensor, inside: Tensor) -> tuple[Tensor, Tensor]:
+        """Solve again on the turns to command where a correction is not the same on all turns."""
+        hybrid = self._model.hybrid
+        assert hybrid is not None
+        if all(features.periodic for features in hybrid.correction.features):
+            return q, inside
+        flat = q.reshape(-1, 1, q.shape[-1])
+        found, status = search(self._geometric, T.reshape(-1, 4, 4), flat, self._motion)
+        settled = torch.where((status == Status.UNREACHABLE)[:, None], flat[:, 0], found).reshape(q.shape)
+        turned, within = turn_into_limits(self._model.robot, settled)
+        return settled, within & (turned == settled).all(-1)
+
+    def _turned(self, q: Tensor, near: Tensor | None) -> tuple[Tensor, Tensor]:
+        """Joint values on the turn to command, and whether they are inside the limits."""
+        commanded, inside = turn_into_limits(self._model.robot, q)
+        if near is not None:
+            commanded = turn_near(self._model.robot, commanded, near, within_limits=True)
+        return commanded, inside
+
+    def _without_limits(self, q: Tensor, status: Tensor) -> Tensor:
+        """A copy of the status as if there were no joint limits, which bind the corrected values only."""
+        status = status.clone()
+        limited = status == Status.OUTSIDE_JOINT_LIMITS
+        if limited.any():
+            robot = self._model.calibrated or self._model.robot
+            singular = singularity_measure(robot, q[limited]) < SINGULAR_TOLERANCE
+            status[limited] = torch.where(singular, int(Status.SINGULAR), int(Status.REACHED))
+        return status
+
+
+def as_trained(model: CalibratedModel, q: Tensor) -> Tensor:
+    """Joint values `(*batch, dof)` turned as those of the training rows, which a network knows."""
+    if not len(model.starts):
+        return q
+    lower, upper = model.starts.aminmax(dim=0)
+    return turn_near(model.robot, q, (lower + upper).double() / 2, within_limits=False)

@@ -1,0 +1,209 @@
+"""Inverse kinematics of an identified geometry, which has no closed form of its own."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from pisigma.hybrid.arms import HybridArm
+from pisigma.kinematics.closed_form.interface import AbstractClosedForm
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.numeric import NumericSolution, solve_numeric
+from pisigma.kinematics.status import Status
+from pisigma.model.hybrid_motion import HybridMotion
+from pisigma.model.stored_starts import StoredStarts
+from pisigma.robot.description import Robot
+from pisigma.se3 import wrap_to_pi
+
+PULL = 0.02
+"""Share of the reach by which a pose beyond the nominal workspace is drawn towards a measured one."""
+
+ATTEMPTS = 4
+"""Stored starts that are tried for a pose, nearest first."""
+
+HYBRID_TOLERANCE = 1e-12
+"""[m and rad] Residuals of a hybrid arm; blending two arms costs a few more roundings than one."""
+
+ITERATIONS, CHEAP_ITERATIONS, EXACT_ITERATIONS = 60, 10, 25
+
+NEARLY = 0.01
+"""Share of the reach, and angle [rad]: a pose that the geometric arm misses by less the hybrid one may take."""
+
+
+def within_reach(robot: Robot, T: Float64[Tensor, "*batch 4 4"]) -> Bool[Tensor, "*batch"]:
+    """Whether poses T_base_tool are not farther away than the robot is long, whatever its joints do."""
+    origin = T.new_tensor(robot.base[:3].tolist())
+    distance: Tensor = (T[..., :3, 3] - origin).norm(dim=-1)
+    return distance <= robot.reach * (1 + 1e-9)
+
+
+def search(
+    robot: Robot,
+    T: Float64[Tensor, "poses 4 4"],
+    starts: Float64[Tensor, "poses _starts dof"],
+    hybrid: HybridMotion | None = None,
+    inside: bool = False,
+) -> tuple[Float64[Tensor, "poses dof"], Int64[Tensor, " poses"]]:
+    """Solve for poses from one start after the other, until one leads there.
+
+    Args:
+        robot: the arm, or the geometric part of a hybrid one.
+        T: wanted poses.
+        starts: joint values to begin with [rad or m].
+        hybrid: how the hybrid arm that is to take the poses moves, where it is one.
+        inside: whether a start that leads there inside the joint limits goes before earlier ones that do not.
+
+    Returns:
+        Joint values [rad or m], NaN where the status is UNREACHABLE; poses beyond the reach are not tried.
+    """
+    q = T.new_full((len(T), robot.dof), torch.nan)
+    status = torch.full((len(T),), int(Status.UNREACHABLE))
+    near = within_reach(robot, T)
+    alone = 0 if inside else 1
+    for tried in (slice(0, alone), slice(alone, None)):  # all but the first at once
+        usable = torch.isfinite(starts[:, tried]).all(-1) & (near & (status == Status.UNREACHABLE))[:, None]
+        pose, attempt = usable.nonzero().unbind(1)
+        if not len(pose):
+            continue
+        found = _solve(robot, T[pose], starts[:, tried][pose, attempt], hybrid)
+        good = found.status != Status.NOT_CONVERGED
+        if inside:
+            attempt = attempt + starts.shape[1] * (found.status == Status.OUTSIDE_JOINT_LIMITS)
+        first = torch.full((len(T),), 2 * starts.shape[1]).scatter_reduce(
+            0, pose[good], attempt[good], "amin"
+        )
+        kept = (good & (attempt == first[pose])).nonzero()[:, 0]
+        q[pose[kept]], status[pose[kept]] = found.q[kept], found.status[kept]
+    return q, status
+
+
+def _solve(robot: Robot, T: Tensor, start: Tensor, hybrid: HybridMotion | None) -> NumericSolution:
+    """Solve for the arm, and from there for the hybrid one, which may reach a little farther.
+
+    First with a Jacobian that is cheap; what it does not solve, near singular poses, with the exact one.
+    """
+    found = solve_numeric(robot, T, start, max_iterations=ITERATIONS)
+    if hybrid is None:
+        return found
+    close = (found.position_residual < NEARLY * robot.reach) & (found.rotation_residual < NEARLY)
+    q, status = found.q.clone(), torch.full_like(found.status, int(Status.NOT_CONVERGED))
+    for exact, rounds in ((False, CHEAP_ITERATIONS), (True, EXACT_ITERATIONS)):
+        rows = (close & (status == Status.NOT_CONVERGED)).nonzero()[:, 0]
+        motion = partial(hybrid, exact=exact)
+        better = solve_numeric(
+            hybrid.arm.hybrid,
+            T[rows],
+            q[rows],
+            tolerance=HYBRID_TOLERANCE,
+            max_iterations=rounds,
+            motion=motion,
+        )
+        q[rows], status[rows] = better.q, better.status
+    return replace(found, q=q, status=status)
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedArm:
+    """An arm as drawn and as identified, on one base and with one tool.
+
+    Attributes:
+        nominal: the arm as drawn.
+        calibrated: the arm as identified.
+        solver: closed form of the nominal arm.
+        starts: joint values of calibration rows, with the poses of the identified arm there.
+        hybrid: the arm with its joint correction, which takes the poses instead, where there is one.
+    """
+
+    nominal: Robot
+    calibrated: Robot
+    solver: AbstractClosedForm
+    starts: StoredStarts
+    hybrid: HybridArm | None = None
+
+    @cached_property
+    def motion(self) -> HybridMotion | None:
+        """How the hybrid arm moves, where there is one."""
+        return None if self.hybrid is None else HybridMotion(self.hybrid)
+
+    def follow(
+        self, T: Float64[Tensor, "*batch 4 4"], q: Float64[Tensor, "*batch dof"]
+    ) -> tuple[Float64[Tensor, "*batch dof"], Int64[Tensor, "*batch"]]:
+        """Solve for poses from the nominal joint values on; NaN there is UNREACHABLE here.
+
+        Returns:
+            Joint values [rad or m] on the turns of q, and a status.
+        """
+        found, status = search(
+            self.calibrated, T.reshape(-1, 4, 4), q.reshape(-1, 1, q.shape[-1]), self.motion
+        )
+        return self.turned_like(found.reshape(q.shape), q), status.reshape(q.shape[:-1])
+
+    def recover(
+        self,
+        T: Float64[Tensor, "poses 4 4"],
+        branch: Int64[Tensor, " poses"],
+        anywhere: Bool[Tensor, " poses"],
+    ) -> tuple[Float64[Tensor, "poses dof"], Int64[Tensor, " poses"], Int64[Tensor, " poses"]]:
+        """Solve for poses that the nominal arm does not take on a branch, but the identified one may.
+
+        The starts are the nominal joint values, on the branch, of the pose drawn a little towards the nearest
+        calibration row; where any branch will do, also those on the others and the nearest rows themselves.
+
+        Args:
+            T: wanted poses.
+            branch: index of the branch wanted.
+            anywhere: where a solution on another branch will do.
+
+        Returns:
+            Joint values [rad or m], status, and index of the branch; UNREACHABLE where nothing was found.
+        """
+        q, status = (
+            T.new_full((len(T), self.nominal.dof), torch.nan),
+            torch.full_like(branch, Status.UNREACHABLE),
+        )
+        chosen = within_reach(self.calibrated, T).nonzero()[:, 0]
+        if not len(chosen) or not len(self.starts.q):
+            return q, status, branch
+        T_near, wanted = T[chosen], branch[chosen]
+        index = self.starts.nearest(T_near, ATTEMPTS)
+        drawn = self.solver.solve(self.drawn(T_near, self.starts.T[index[:, 0], :3, 3])).q
+        first = drawn[torch.arange(len(chosen)), wanted][:, None]
+        others = torch.cat([drawn, self.starts.q[index]], 1)
+        others = torch.where(anywhere[chosen, None, None], others, torch.nan)
+        found, reached = search(self.calibrated, T_near, torch.cat([first, others], 1), self.motion)
+        lies = self.branch_of(found)
+        lost = (lies != wanted) & ~anywhere[chosen]
+        found[lost], reached[lost] = torch.nan, int(Status.UNREACHABLE)
+        branch = branch.index_copy(0, chosen, torch.where(anywhere[chosen], lies, wanted))
+        return q.index_copy(0, chosen, found), status.index_copy(0, chosen, reached), branch
+
+    def branch_of(self, q: Float64[Tensor, "poses dof"]) -> Int64[Tensor, " poses"]:
+        """Index of the nominal arm's branch that is nearest to joint values; 0 for NaN."""
+        known = torch.isfinite(q).all(-1)
+        safe = torch.where(known[:, None], q, 0.0)
+        every = self.solver.solve(forward_kinematics(self.nominal, safe)).q
+        distance = self._difference(every, safe[:, None].expand_as(every)).square().sum(-1)
+        nearest: Tensor = torch.where(torch.isfinite(distance), distance, torch.inf).argmin(-1)
+        return torch.where(known, nearest, 0)
+
+    def turned_like(
+        self, q: Float64[Tensor, "*batch dof"], like: Float64[Tensor, "*batch dof"]
+    ) -> Float64[Tensor, "*batch dof"]:
+        """The same joint values on the turns that are nearest to others."""
+        return like + self._difference(q, like)
+
+    def _difference(self, q: Tensor, other: Tensor) -> Tensor:
+        difference = q - other
+        return torch.where(torch.tensor(self.nominal.revolute), wrap_to_pi(difference), difference)
+
+    def drawn(
+        self, T: Float64[Tensor, "poses 4 4"], towards: Float64[Tensor, "poses 3"]
+    ) -> Float64[Tensor, "poses 4 4"]:
+        """Every pose moved by `PULL`, but no farther than to the other position."""
+        way = towards - T[:, :3, 3]
+        share = (PULL * self.nominal.reach / way.norm(dim=-1).clamp(min=1e-12)).clamp(max=1.0)
+        drawn = T.clone()
+        drawn[:, :3, 3] += share[:, None] * way
+        return drawn

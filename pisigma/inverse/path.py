@@ -1,0 +1,199 @@
+"""Joint values along a path of poses: one branch as long as possible, and word of every place where that ends."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pisigma.errors import PoseError, nearest_choice
+from pisigma.inverse.branch_choice import choose_branches, halfway, is_jump, wrapped
+from pisigma.inverse.path_turns import unroll
+from pisigma.kinematics.status import Status
+
+if TYPE_CHECKING:
+    import pisigma.inverse.corrected_ik
+
+Array = Any
+
+_OTHERS = 1e4
+"""[rad²] What it costs to begin on another branch than the wanted one; less than a jump."""
+_LATER = 1e-3
+"""The same where none is wanted, per place in the order of branches."""
+
+
+@dataclass(frozen=True)
+class PathSwitch:
+    """A place on a path where the joints do not simply go on.
+
+    Attributes:
+        index: of the first pose behind it.
+        kind: "branch": over to another branch, smoothly through a singular pose or by a jump; "jump": by a jump on one
+            branch; "turn": a joint turns back by full turns to stay within its limits; "gap": a pose is not reached.
+        jump: largest joint motion [rad or m] that the joints make without the path needing it; 0 where it is smooth.
+        sentence: all of that in words.
+    """
+
+    index: int
+    kind: str
+    jump: float
+    sentence: str
+
+
+@dataclass(frozen=True, eq=False)
+class JointPath:
+    """Joint values along a path.
+
+    Attributes:
+        solution: solutions of all poses, as a call with `near` gives them; NaN where a pose is not reached.
+        switches: all places where the joints do not simply go on, in order; empty for a path on one branch.
+    """
+
+    solution: Any
+    switches: tuple[PathSwitch, ...]
+
+
+def follow_path(
+    ik: "pisigma.inverse.corrected_ik.CorrectedIK",
+    T_base_tool: Array,
+    near: Array | None = None,
+    branch: str | None = None,
+) -> JointPath:
+    """Find joint values along a path.
+
+    On arms with a closed form the branches are chosen for the path as a whole, by dynamic programming: as few jumps
+    as possible, then as little squared joint motion as possible. On others every pose is solved from the one before.
+
+    Args:
+        ik: the corrected inverse kinematics.
+        T_base_tool: `(poses, 4, 4)` [m].
+        near: `(dof,)` joint values [rad or m] where the robot is before the path.
+        branch: name of the branch to begin on if that costs no jump; with neither it is the one most measured.
+
+    Raises:
+        PoseError: a matrix is no pose, there are none, or `near` or `branch` do not fit.
+    """
+    T = np.asarray(T_base_tool, dtype=np.float64)
+    if T.ndim != 3 or len(T) == 0:
+        raise PoseError(f"a path of shape (poses, 4, 4) was wanted, got {T.shape}; give at least one pose.")
+    if branch is not None and branch not in ik.branches:
+        raise PoseError(f"there is no branch '{branch}'; {nearest_choice(branch, ik.branches)}")
+    beside = None if near is None else np.asarray(ik.postures.checked(near, False), dtype=np.float64)
+    guide = _guide(ik, T, beside, branch) if ik.closed_form else _one_by_one(ik, T, beside)
+    solution = _solve(ik, T, guide)
+    return JointPath(solution, _switches(ik, T, np.asarray(solution.q), solution))
+
+
+def _solve(ik: "pisigma.inverse.corrected_ik.CorrectedIK", T: Array, near: Array | None) -> Any:
+    """Solutions near joint values, which may be those of a solution far outside the joint limits."""
+    return ik(T, near=None if near is None else ik.postures.clip(near))
+
+
+def _guide(
+    ik: "pisigma.inverse.corrected_ik.CorrectedIK", T: Array, near: Array | None, branch: str | None
+) -> Array:
+    """Joint values near which to solve all poses: of chosen branches, on chosen turns."""
+    every = ik.all_branches(T)
+    q, status = np.asarray(every.q), np.asarray(every.status)
+    reached = np.flatnonzero(np.isfinite(q).all(-1).any(-1))
+    if not len(reached):
+        return np.tile(np.clip(0.0, ik.limits[:, 0], ik.limits[:, 1]) if near is None else near, (len(T), 1))
+    first = np.zeros(len(ik.branches))
+    for place, index in enumerate(ik.order):
+        first[index] = _LATER * place
+    if branch is not None:
+        first += _OTHERS * (np.arange(len(first)) != ik.branches.index(branch))
+    elif near is not None:
+        first = np.nan_to_num((wrapped(q[reached[0]] - near, ik.revolute) ** 2).sum(-1), nan=0.0)
+    q, status = q[reached], status[reached]
+    chosen = choose_branches(q, status, _jumps(ik, T[reached], q), first, ik.revolute)
+    rolled, _ = unroll(q[np.arange(len(q)), chosen], ik.limits, ik.revolute, near)
+    before = np.maximum(np.searchsorted(reached, np.arange(len(T)), side="right") - 1, 0)
+    return rolled[before]
+
+
+def _jumps(ik: "pisigma.inverse.corrected_ik.CorrectedIK", T: Array, q: Array) -> Array:
+    """Whether staying on a branch is a jump `(poses - 1, branches)`; long steps are looked at halfway."""
+    step = np.abs(wrapped(np.diff(q, axis=0), ik.revolute)).max(-1)
+    found = np.zeros(step.shape, dtype=bool)
+    rows = np.flatnonzero((np.nan_to_num(step, nan=0.0) > 0.1).any(-1))
+    if len(rows):
+        middle = np.asarray(ik.all_branches(halfway(T[rows], T[rows + 1])).q)
+        found[rows] = is_jump(q[rows], middle, q[rows + 1], ik.revolute)
+    return found
+
+
+def _one_by_one(ik: "pisigma.inverse.corrected_ik.CorrectedIK", T: Array, near: Array | None) -> Array:
+    """Joint values of every pose from those of the pose before."""
+    found, last = np.empty((len(T), len(ik.joints))), near
+    for row, wanted in enumerate(T):
+        q = np.asarray(_solve(ik, wanted, last).q)
+        if np.isfinite(q).all():
+            last = q
+        found[row] = np.clip(0.0, ik.limits[:, 0], ik.limits[:, 1]) if last is None else last
+    return found
+
+
+def _switches(
+    ik: "pisigma.inverse.corrected_ik.CorrectedIK", T: Array, q: Array, solution: Any
+) -> tuple[PathSwitch, ...]:
+    reached = np.isfinite(q).all(-1)
+    rows = np.flatnonzero(reached)
+    status, lies = np.asarray(solution.status), np.asarray(solution.branch)
+    found = [_gap(index, status, reached) for index in _starts_of_gaps(reached)]
+    before, after = rows[:-1], rows[1:]
+    step = q[after] - q[before]
+    far = np.flatnonzero((np.abs(step).max(-1) > 0.1) | (lies[after] != lies[before]))
+    middle = halfway(T[before[far]], T[after[far]])
+    between = q[before[far]] + wrapped(step[far], ik.revolute) / 2
+    way = np.asarray(_solve(ik, middle, between).q) if len(far) else between
+    jumps = is_jump(q[before[far]], way, q[after[far]], ik.revolute)
+    for place, jump in zip(far, jumps, strict=True):
+        found += _at(ik, int(after[place]), step[place], bool(jump), lies[before[place]], lies[after[place]])
+    return tuple(sorted(found, key=lambda switch: switch.index))
+
+
+def _at(
+    ik: "pisigma.inverse.corrected_ik.CorrectedIK",
+    index: int,
+    step: Array,
+    jump: bool,
+    left: int,
+    taken: int,
+) -> Sequence[PathSwitch]:
+    """What happens before a pose, if anything does."""
+    turned = np.abs(step - wrapped(step, ik.revolute)) > 1
+    names = f"from branch '{ik.branches[left]}' to '{ik.branches[taken]}'"
+    if jump:
+        joint = int(np.abs(step).argmax())
+        kind, where = ("branch", names) if left != taken else ("jump", f"on branch '{ik.branches[taken]}'")
+        words = (
+            f"the joints jump {where}, most of all {ik.joints[joint]}, by {_amount(ik, joint, step[joint])}"
+        )
+        return [PathSwitch(index, kind, float(np.abs(step).max()), f"Before pose {index} {words}.")]
+    if turned.any():
+        joint = int(np.flatnonzero(turned)[0])
+        turn = wrapped(step, ik.revolute)[joint] - step[joint]
+        words = f"{ik.joints[joint]} turns back by {_amount(ik, joint, turn)} to stay within its limits"
+        return [PathSwitch(index, "turn", abs(float(turn)), f"Before pose {index} {words}.")]
+    if left != taken:
+        words = f"the path goes over {names} smoothly, close to a singular pose"
+        return [PathSwitch(index, "branch", 0.0, f"Before pose {index} {words}.")]
+    return []
+
+
+def _amount(ik: "pisigma.inverse.corrected_ik.CorrectedIK", joint: int, step: float) -> str:
+    return f"{math.degrees(step):.1f} deg" if ik.revolute[joint] else f"{step * 1e3:.1f} mm"
+
+
+def _starts_of_gaps(reached: Array) -> list[int]:
+    lost = np.concatenate([[False], ~reached])
+    return [int(index) for index in np.flatnonzero(lost[1:] & ~lost[:-1])]
+
+
+def _gap(index: int, status: Array, reached: Array) -> PathSwitch:
+    behind = np.flatnonzero(reached[index:])
+    stop = index + int(behind[0]) if len(behind) else len(reached)
+    poses = f"Pose {index} is" if stop == index + 1 else f"Poses {index} to {stop - 1} are"
+    return PathSwitch(index, "gap", 0.0, f"{poses} not reached: {Status(int(status[index])).name.lower()}.")

@@ -1,0 +1,101 @@
+"""Gradients of joint values with respect to the wanted pose, by the implicit function theorem."""
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from pisigma.inverse.finishing import as_trained
+from pisigma.inverse.solution import Solution
+from pisigma.kinematics.jacobian import joint_jacobian
+from pisigma.kinematics.numeric import SINGULAR_TOLERANCE
+from pisigma.kinematics.singularity import characteristic_length, dimensionless_jacobian
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.hybrid_motion import hybrid_motion
+from pisigma.robot.description import Robot
+
+
+def differentiable(model: CalibratedModel, found: Solution, T: Float[Tensor, "*batch 4 4"]) -> Solution:
+    """The same solutions, from whose `q`, `q_nominal` and `correction` gradients flow to the poses.
+
+    A solution satisfies `FK(q) = T`. When the pose moves by a twist ξ (translation, rotation vector, both in the base
+    frame) the joints follow it by `dq = J⁺ ξ`, with J the Jacobian of the whole calibrated arm, the slope of its
+    correction within. A network on nominal joint values is differentiated as such: `q = q_nominal + Δ(T, q_nominal)`,
+    with `dq_nominal = J_nominal⁺ ξ`.
+
+    J⁺ is the pseudo-inverse in characteristic lengths, without singular values below `SINGULAR_TOLERANCE`: the
+    inverse where there is one; with joints to spare the least motion of them; with fewer than six joints, or at a
+    singular pose, that part of ξ which the tool can follow. Changes of T that are no motion (shear, scale) count as
+    none. A solution that is NaN has the gradient 0, so that it can be masked. There are first derivatives only.
+
+    Args:
+        model: what solved for the poses.
+        found: the solutions, on the CPU in float64.
+        T: the poses that require gradients, in any dtype and on any device.
+    """
+    T = T.to("cpu", torch.float64)
+    twist = _twist(T)
+    q_nominal = _attached(model.robot, twist, found.q_nominal, lambda q: joint_jacobian(model.robot, q)[1])
+    if model.calibrated is not None:
+        calibrated, hybrid = model.calibrated, model.hybrid
+
+        def jacobian(q: Tensor) -> Tensor:
+            return joint_jacobian(calibrated, q)[1] if hybrid is None else hybrid_motion(hybrid, q)[1]
+
+        q = _attached(model.robot, twist, found.q, jacobian)
+        return replace(found, q=q, q_nominal=q_nominal, correction=q - q_nominal)
+    if model.network is None:
+        return replace(found, q=q_nominal + found.correction, q_nominal=q_nominal)
+    known = torch.isfinite(found.q).all(-1, keepdim=True)
+    safe = torch.where(known, q_nominal, 0.0)
+    seen = safe + (as_trained(model, safe.detach()) - safe.detach())
+    correction = torch.where(known, model.network(T, seen), torch.nan)
+    return replace(found, q=q_nominal + correction, q_nominal=q_nominal, correction=correction)
+
+
+def _twist(T: Float64[Tensor, "*batch 4 4"]) -> Float64[Tensor, "*batch 6"]:
+    """Motion of poses from where they are [m, rad]: 0, with the derivatives of the motion."""
+    still = T.detach()
+    turn = T[..., :3, :3] @ still[..., :3, :3].mT
+    turned = [turn[..., k, j] - turn[..., j, k] for j, k in ((1, 2), (2, 0), (0, 1))]
+    return torch.cat([T[..., :3, 3] - still[..., :3, 3], torch.stack(turned, -1) / 2], -1)
+
+
+def _attached(robot: Robot, twist: Tensor, q: Tensor, jacobian: Any) -> Tensor:
+    """Joint values that follow a twist; the Jacobian is that of rows of joint values."""
+    flat = q.detach().reshape(-1, q.shape[-1])
+    rows = torch.isfinite(flat).all(-1).nonzero()[:, 0]
+    inverse = flat.new_zeros(len(flat), q.shape[-1], 6)
+    if len(rows):
+        inverse[rows] = pseudo_inverse(robot, jacobian(flat[rows]))
+    found: Tensor = _Implicit.apply(twist, q.detach(), inverse.reshape(*q.shape, 6))  # type: ignore[no-untyped-call]
+    return found
+
+
+def pseudo_inverse(robot: Robot, J: Float64[Tensor, "poses 6 dof"]) -> Float64[Tensor, "poses dof 6"]:
+    """Takes twists [m, rad] to joint motions [rad or m]; see `differentiable`."""
+    length = characteristic_length(robot)
+    found: Tensor = torch.linalg.pinv(
+        dimensionless_jacobian(robot, J).contiguous(), atol=SINGULAR_TOLERANCE, rtol=0.0
+    )
+    joints = J.new_tensor([1.0 if revolute else length for revolute in robot.revolute])
+    scaled: Tensor = joints[:, None] * found * J.new_tensor([1 / length] * 3 + [1.0] * 3)
+    return scaled
+
+
+class _Implicit(torch.autograd.Function):
+    """Values as they are, with a derivative that is known by other means than differentiating what made them."""
+
+    @staticmethod
+    def forward(ctx: Any, twist: Tensor, q: Tensor, inverse: Tensor) -> Tensor:
+        ctx.save_for_backward(inverse)
+        return q.clone()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
+        (inverse,) = ctx.saved_tensors
+        return (gradient[..., None, :] @ inverse)[..., 0, :], None, None

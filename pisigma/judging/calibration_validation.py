@@ -1,0 +1,294 @@
+"""Calibrations judged on rows that they never saw: nominal, geometric and hybrid side by side."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError
+from pisigma.hybrid.result import HybridResult
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.prediction import predicted_poses
+from pisigma.judging.held_out_frames import judgeable, with_frames
+from pisigma.judging.pose_statistics import PoseErrors, error_statistics
+from pisigma.judging.predicted_spread import PredictedSpread, predicted_spread
+from pisigma.judging.trained_calibrations import Calibrator, Result, geometric_of, trained, without_missing
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.splits import TrainTest
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True, eq=False)
+class CalibrationValidation:
+    """Errors of held-out rows, each under calibrations that never saw it.
+
+    In rows that were never held out they are NaN.
+
+    Attributes:
+        folds: how many times the rows were parted.
+        models: by name: "nominal" (the nominal arm, base and tool fitted to the training rows), "geometric" and
+            "hybrid" where it was asked for, which chooses its features on the training rows alone.
+        spread: errors of positions beside what the hybrid predicts of them; None without one.
+        distances: by model, predicted minus known distances of sockets that were held out [m].
+        frames_fitted: how many frames were held out whole; where the base stands in them was fitted to the
+            held-out rows themselves, under either arm.
+        sockets_held_out: how many sockets were held out whole; their errors are from where their own rows put the
+            ball on average.
+        not_judged: how many held-out rows have a target or an anchor that the rows calibrated with lack.
+        again: the same of the rows dealt to the folds anew, whose errors count in the figures too.
+    """
+
+    folds: int
+    models: Mapping[str, PoseErrors]
+    spread: PredictedSpread | None = None
+    distances: Mapping[str, Float64[Tensor, " _pairs"]] = field(default_factory=dict)
+    frames_fitted: int = 0
+    sockets_held_out: int = 0
+    not_judged: int = 0
+    again: tuple["CalibrationValidation", ...] = ()
+
+    @property
+    def dealings(self) -> tuple["CalibrationValidation", ...]:
+        """One validation for every time that the rows were dealt to the folds."""
+        return (replace(self, again=()), *self.again)
+
+    @property
+    def all_errors(self) -> dict[str, PoseErrors]:
+        """By model, errors of all rows in all dealings, one dealing after the other."""
+        return {
+            name: PoseErrors.joined([dealing.models[name] for dealing in self.dealings])
+            for name in self.models
+        }
+
+    @property
+    def all_spread(self) -> PredictedSpread | None:
+        """What a hybrid predicts of these errors."""
+        spreads = [dealing.spread for dealing in self.dealings if dealing.spread is not None]
+        return PredictedSpread.joined(spreads) if spreads else None
+
+    def in_file_units(self) -> dict[str, object]:
+        """The figures in mm and deg of all dealings; `rows` counts the held-out ones with a length, once each."""
+        last = list(self.models.values())[-1]
+        figures: dict[str, object] = {"folds": self.folds, "rows": int(torch.isfinite(last.position).sum())}
+        if self.again:
+            figures["dealings"] = len(self.dealings)
+            figures["rms_mm_of_dealings"] = {
+                name: [error_statistics(one.models[name].position)["rms"] * 1e3 for one in self.dealings]
+                for name in self.models
+            }
+        figures |= {name: errors.in_file_units() for name, errors in self.all_errors.items()}
+        if self.all_spread is not None:
+            figures |= self.all_spread.in_file_units()
+        distances = {
+            name: torch.cat([one.distances[name] for one in self.dealings]) for name in self.distances
+        }
+        count = max((len(errors) for errors in self.distances.values()), default=0)
+        if count:
+            sizes = {name: _sizes(errors) for name, errors in distances.items()}
+            figures["socket_distance"] = {"count": count, **sizes}
+        counts = {"frames_fitted": self.frames_fitted, "sockets_held_out": self.sockets_held_out}
+        counts["rows_not_judged"] = max(dealing.not_judged for dealing in self.dealings)
+        return figures | {name: count for name, count in counts.items() if count}
+
+    def means(self, parts: Sequence[TrainTest]) -> dict[str, object]:
+        """RMS position errors of every part's held-out rows, and their mean over the parts [mm], by model."""
+        found = {
+            name: [error_statistics(errors.position[test])["rms"] * 1e3 for _, test in parts]
+            for name, errors in self.models.items()
+        }
+        means = {name: sum(figures) / len(figures) for name, figures in found.items()}
+        return {"rms_mm_of_parts": found, "mean_rms_mm": means}
+
+
+class _Judged:
+    """What is gathered of all models: errors of held-out rows, and of known distances of held-out sockets."""
+
+    def __init__(self, measurements: Measurements) -> None:
+        self._turned = measurements.rotation is not None
+        self._rows = measurements.rows
+        self._errors: dict[str, PoseErrors] = {}
+        self._distances: dict[str, list[Tensor]] = {}
+        self._spread: PredictedSpread | None = None
+
+    def add(self, name: str, errors: PoseErrors, distances: Tensor, test: Tensor) -> None:
+        """Errors of some rows under one model."""
+        if name not in self._errors:
+            nothing = torch.full((self._rows,), torch.nan, dtype=torch.float64)
+            self._errors[name] = PoseErrors(nothing, nothing.clone() if self._turned else None)
+            self._distances[name] = []
+        store = self._errors[name]
+        store.position[test] = errors.position
+        if errors.rotation is not None and store.rotation is not None:
+            store.rotation[test] = errors.rotation
+        self._distances[name].append(distances)
+
+    def add_spread(self, spread: PredictedSpread, test: Tensor) -> None:
+        """Errors of positions of some rows and what was predicted of them."""
+        if self._spread is None:
+            self._spread = PredictedSpread.none(self._rows)
+        self._spread.error[test], self._spread.sigma[test] = spread.error, spread.sigma
+
+    def validation(
+        self, folds: int, frames: int = 0, sockets: int = 0, left_out: int = 0
+    ) -> CalibrationValidation:
+        """Everything together."""
+        distances = {name: torch.cat(found) for name, found in self._distances.items()}
+        return CalibrationValidation(folds, self._errors, self._spread, distances, frames, sockets, left_out)
+
+
+def validate(
+    calibrator: Calibrator,
+    measurements: Measurements,
+    parts: Sequence[TrainTest],
+    progress: Progress = lambda what: None,
+) -> CalibrationValidation:
+    """Calibrate on the training rows of every part and judge on its test rows.
+
+    Args:
+        calibrator: the calibration; "nominal" is the geometric one with no parameter of the arm free and no row
+            downweighted. Whatever it chooses, it chooses on the training rows.
+        measurements: the rows.
+        parts: from `k_folds` or `holdout`.
+        progress: called with the part that is being judged, and what is being tried.
+
+    Raises:
+        IdentificationError: the training rows of a part do not determine what is asked for, or no test row has a
+            target or anchor that its training rows have too.
+    """
+    judged = _Judged(measurements)
+    frames = sockets = left_out = 0
+    for done, (train, test) in enumerate(parts):
+        fold = f"fold {done + 1} of {len(parts)}"
+        progress(fold)
+        seen, held_out = measurements.select(train), len(test)
+        test = test[judgeable(measurements, test, seen)]
+        left_out += held_out - len(test)
+        unseen = measurements.select(test)
+        frames += len(set(unseen.frame) - set(seen.frame))
+        sockets += len(_sockets(unseen) - _sockets(seen))
+        chosen = without_missing(calibrator, seen, measurements)
+        try:
+            results = trained(chosen, seen, lambda what, fold=fold: progress(f"{fold}: {what}"))  # type: ignore[misc]
+        except IdentificationError as problem:
+            raise IdentificationError(
+                f"{fold}, calibrated with {seen.rows} of the {measurements.rows} rows: {problem} All rows at once may "
+                "do: leave out the cross-validation, or ask for more folds."
+            ) from None
+        _judge(judged, geometric_of(calibrator), results, seen, (unseen, test))
+    return judged.validation(len(parts), frames, sockets, left_out)
+
+
+def validate_repeatedly(
+    calibrator: Calibrator,
+    measurements: Measurements,
+    dealings: Sequence[Sequence[TrainTest]],
+    progress: Progress = lambda what: None,
+) -> CalibrationValidation:
+    """The same for rows that were dealt to folds several times over; see `pisigma.measurement.splits.dealings`."""
+    if len(dealings) == 1:
+        return validate(calibrator, measurements, dealings[0], progress)
+    first, *again = (
+        validate(
+            calibrator,
+            measurements,
+            parts,
+            lambda what, done=done: progress(f"dealing {done + 1} of {len(dealings)}, {what}"),  # type: ignore[misc]
+        )
+        for done, parts in enumerate(dealings)
+    )
+    return replace(first, again=tuple(again))
+
+
+def judge(
+    calibrator: Calibrator, result: Result, seen: Measurements, test: Measurements
+) -> CalibrationValidation:
+    """Judge a calibration on rows that were kept aside.
+
+    Args:
+        calibrator: what calibrated, for the "nominal" figures; see `validate`.
+        result: what it gave.
+        seen: the rows that it was given.
+        test: other rows.
+
+    Raises:
+        IdentificationError: a test row has a frame or target that was not calibrated.
+    """
+    judged = _Judged(test)
+    results = trained(calibrator, seen, known=result)
+    _judge(judged, None, results, seen, (test, torch.arange(test.rows)))
+    return judged.validation(1)
+
+
+def _judge(
+    judged: _Judged,
+    calibrator: GeometricCalibrator | None,
+    results: Mapping[str, Result],
+    seen: Measurements,
+    held_out: tuple[Measurements, Tensor],
+) -> None:
+    """Judge all models on held-out rows, with frames that they lack fitted by a calibrator, if there is one."""
+    rows, test = held_out
+    for name, found in results.items():
+        result = found if calibrator is None else with_frames(calibrator, found, rows)
+        known = {} if calibrator is None else calibrator.socket_distances
+        judged.add(name, errors_under(result, rows), _distance_errors(known, result, seen, rows), test)
+        if isinstance(result, HybridResult):
+            judged.add_spread(predicted_spread(result, rows), test)
+
+
+def errors_under(result: Result, measurements: Measurements) -> PoseErrors:
+    """Errors of any rows under a calibration, whatever sensor measured them.
+
+    Returns:
+        As "position" the length of the error of whatever length a row has: of a position or a ball in a socket the
+        distance, of a touch, a wire or a pair the difference [m].
+
+    Raises:
+        IdentificationError: a row has a frame, target or anchor that was not calibrated.
+    """
+    lengths = torch.full((measurements.rows,), torch.nan, dtype=torch.float64)
+    rotation: Tensor | None = None
+    for sensor, errors in result.errors_of(measurements).items():
+        size = torch.as_tensor(errors).norm(dim=-1)
+        if sensor == "rotation":
+            rotation = size
+        else:
+            lengths = torch.where(torch.isfinite(size), size, lengths)
+    return PoseErrors(lengths, rotation)
+
+
+def _distance_errors(
+    known: Mapping[tuple[str, str], float], result: Result, seen: Measurements, rows: Measurements
+) -> Float64[Tensor, " pairs"]:
+    """Predicted minus known distance of sockets that are in these rows but not among those seen [m].
+
+    A socket is where its rows put the ball on average.
+    """
+    names, held_out = rows.socket or (), _sockets(rows) - _sockets(seen)
+    pairs = {pair: distance for pair, distance in known.items() if set(pair) <= held_out}
+    if not pairs:
+        return torch.zeros(0, dtype=torch.float64)
+    ball = _poses(result, rows)[:, :3, 3].detach().cpu()
+    place = {
+        name: ball[torch.tensor([other == name for other in names])].mean(0)
+        for name in {name for pair in pairs for name in pair}
+    }
+    return torch.stack([(place[a] - place[b]).norm() - distance for (a, b), distance in pairs.items()])
+
+
+def _poses(result: Result, rows: Measurements) -> Float64[Tensor, "rows 4 4"]:
+    if isinstance(result, HybridResult):
+        return result.predicted_poses(rows)
+    return predicted_poses(result.robot, result.bases, result.tools, rows)
+
+
+def _sockets(rows: Measurements) -> set[str]:
+    return set(rows.socket or ()) - {""}
+
+
+def _sizes(errors: Float64[Tensor, " pairs"]) -> dict[str, float]:
+    """Mean and largest of the errors' sizes [mm]."""
+    return {"mean_mm": float(errors.abs().mean()) * 1e3, "max_mm": float(errors.abs().max()) * 1e3}

@@ -1,0 +1,131 @@
+"""Errors of every held-out row as a file in a model folder, so that a report can show where they are."""
+
+import csv
+import hashlib
+import io
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.errors import ModelError
+from pisigma.judging.calibration_validation import CalibrationValidation
+from pisigma.judging.pose_statistics import PoseErrors
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.robot.description import Robot
+
+HELD_OUT_CSV = "held_out.csv"
+SECTION = "held_out_rows"
+"""Of a model's metrics: SHA-256 of the file, and of the rows that it is of."""
+
+_RESIDUAL = tuple(f"residual_{axis}_mm" for axis in "xyz")
+_DEGREES = float(np.rad2deg(1.0))
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOutRows:
+    """Errors of rows under calibrations that never saw them, in the order of the measurements.
+
+    Attributes:
+        q: commanded joint values [rad or m].
+        frame: per row.
+        target: per row.
+        models: by name, lengths [m] and angles [rad] of the errors; NaN in rows that were never held out.
+        residual: measured minus predicted position under the last model [m], in the row's frame; NaN likewise, and
+            everywhere where it was not kept.
+        data_sha256: hash of the measurements.
+    """
+
+    q: Float64[Tensor, "rows dof"]
+    frame: tuple[str, ...]
+    target: tuple[str, ...]
+    models: Mapping[str, PoseErrors]
+    residual: Float64[Tensor, "rows 3"]
+    data_sha256: str
+
+
+def held_out_csv(validation: CalibrationValidation, measurements: Measurements, robot: Robot) -> str:
+    """The rows as CSV text: joint values, frame and target, and per model the errors in mm and deg.
+
+    Args:
+        validation: of the measurements; the errors are those of its first dealing.
+        measurements: the rows that were held out in turn.
+        robot: says which joints turn (degrees) and which slide (millimetres).
+    """
+    scale = [(_DEGREES, "deg") if turns else (1e3, "mm") for turns in robot.revolute]
+    columns: dict[str, list[str]] = {}
+    for j, (factor, unit) in enumerate(scale):
+        columns[f"q{j + 1}_{unit}"] = [repr(value) for value in (measurements.q[:, j] * factor).tolist()]
+    columns |= {"frame": list(measurements.frame), "target": list(measurements.target)}
+    for name, errors in validation.models.items():
+        columns[f"{name}_mm"] = _cells(errors.position * 1e3)
+        if errors.rotation is not None:
+            columns[f"{name}_deg"] = _cells(errors.rotation * _DEGREES)
+    if validation.spread is not None:
+        for axis, name in enumerate(_RESIDUAL):
+            columns[name] = _cells(validation.spread.error[:, axis] * 1e3)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows(zip(*columns.values(), strict=True))
+    return text.getvalue()
+
+
+def held_out_section(text: str, measurements: Measurements) -> dict[str, dict[str, str]]:
+    """What belongs into the metrics of a model whose folder holds the file.
+
+    Args:
+        text: from `held_out_csv`.
+        measurements: the rows that it is of.
+    """
+    digest = hashlib.sha256(text.encode()).hexdigest()
+    return {SECTION: {"sha256": digest, "data_sha256": measurements.content_hash()}}
+
+
+def read_held_out(folder: Path, model: CalibratedModel) -> HeldOutRows | None:
+    """Read the file of a model folder; None where the model was made without one.
+
+    Raises:
+        ModelError: the file is missing, or is not the one that was written with the model.
+    """
+    section = model.metrics.get(SECTION)
+    if not isinstance(section, dict):
+        return None
+    path = folder / HELD_OUT_CSV
+    try:
+        content = path.read_bytes()
+    except OSError as problem:
+        raise ModelError(f"{path}: cannot be read ({problem.strerror}); copy the model again.") from None
+    if hashlib.sha256(content).hexdigest() != section["sha256"]:
+        raise ModelError(f"{path}: was changed since the model was written; copy the model again.")
+    head, *rows = csv.reader(io.StringIO(content.decode(), newline=""))
+    columns = dict(zip(head, zip(*rows, strict=True), strict=True))
+    names = [name.removesuffix("_mm") for name in head if name.endswith("_mm")]
+    joints = [name for name in head if name[0] == "q" and name[1:].partition("_")[0].isdigit()]
+    q = [_numbers(columns[name]) / (_DEGREES if name.endswith("_deg") else 1e3) for name in joints]
+    models = {
+        name: PoseErrors(
+            _numbers(columns[f"{name}_mm"]) / 1e3,
+            _numbers(columns[f"{name}_deg"]) / _DEGREES if f"{name}_deg" in columns else None,
+        )
+        for name in names
+        if f"{name}_mm" not in (*_RESIDUAL, *joints)
+    }
+    none = torch.full((len(rows), 3), torch.nan, dtype=torch.float64)
+    kept = [_numbers(columns[name]) / 1e3 for name in _RESIDUAL if name in columns]
+    residual = torch.stack(kept, 1) if kept else none
+    frame, target = columns["frame"], columns["target"]
+    return HeldOutRows(torch.stack(q, 1), frame, target, models, residual, section["data_sha256"])
+
+
+def _cells(values: Float64[Tensor, " rows"]) -> list[str]:
+    return ["" if value != value else f"{value:.7g}" for value in values.tolist()]
+
+
+def _numbers(cells: tuple[str, ...]) -> Float64[Tensor, " rows"]:
+    return torch.tensor([float(cell) if cell else torch.nan for cell in cells], dtype=torch.float64)

@@ -1,0 +1,210 @@
+"""What the compiled kernels know of a calibrated arm, as plain arrays."""
+
+from typing import Any, NamedTuple
+
+NOMINAL, GEOMETRIC, HYBRID, DRAWN = 0, 1, 2, 3
+"""Which arm: as modelled, with the identified geometry, with the geometry that goes with the correction, and as
+drawn without base, on which gravity acts."""
+BLENDED = 4
+"""The hybrid arm where joints were measured, going over into the geometric one beyond."""
+
+FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
+"""What moves in a row."""
+
+NO_CLOSED_FORM, SCARA, SPHERICAL_WRIST, THREE_PARALLEL = 0, 1, 2, 3
+"""Which closed form the nominal arm has."""
+
+
+ANGLE, SINE, COSINE = 6, 7, 8
+"""What an input of a network is; 0 to 5 are coordinates of the pose, in the order of `network.inputs.POSE_INPUTS`."""
+
+
+class Arms(NamedTuple):
+    """The rows of the four arms, which have the same joints.
+
+    Attributes:
+        kind: per row FIXED, REVOLUTE or PRISMATIC.
+        rows: `(4, rows, 9)`: theta [rad], d, a [m], cosine and sine of alpha, of beta and of theta.
+        ends: `(4, 2, 3, 4)`: transforms of base and tool without their last rows.
+        reach: of every arm [m].
+        direction: per joint +1 or -1, how the controller counts.
+        revolute: per joint 1 where it turns, else 0.
+        limits: `(dof, 2)` [rad or m].
+        hybrid: 1 where there is a hybrid arm, else 0.
+    """
+
+    kind: Any
+    rows: Any
+    ends: Any
+    reach: Any
+    direction: Any
+    revolute: Any
+    limits: Any
+    hybrid: int
+
+
+class Correction(NamedTuple):
+    """The joint correction Δ(q); see `pisigma.joint_correction.joint_correction.JointCorrection`.
+
+    Attributes:
+        rate: per joint, angle per joint value.
+        series: `(harmonics, 2, dof)`: weights of sines and cosines of a joint's own angle.
+        gravity: direction in which things fall.
+        masses: `(dof, dof, 4)`: weights of joint and moved row, over the reach (mass), and times the arm (first
+            moments); empty without gravity.
+        scaled: `(dof, dof)`: weights of scaled joint values; empty without them.
+        middle: of every joint's values [rad or m].
+        half: of every joint's travel [rad or m].
+        units: `(dof, inputs)`: weights of the sines and cosines of all joints; empty without them.
+        weight: `(factors, inputs, dof)` of the product units.
+        bias: `(factors, dof)` of the product units.
+        orders: number of factors of every product unit.
+        periodic: 1 where the correction is the same on all turns, else 0.
+    """
+
+    rate: Any
+    series: Any
+    gravity: Any
+    masses: Any
+    scaled: Any
+    middle: Any
+    half: Any
+    units: Any
+    weight: Any
+    bias: Any
+    orders: Any
+    periodic: int
+
+
+class Coverage(NamedTuple):
+    """Measured joint values; see `pisigma.hybrid.coverage.JointCoverage`.
+
+    Attributes:
+        joint: of every stretch.
+        middle: of every stretch [rad].
+        half: half its length [rad].
+        rate: per joint, angle per joint value.
+        fade: angle over which a correction fades [rad].
+    """
+
+    joint: Any
+    middle: Any
+    half: Any
+    rate: Any
+    fade: float
+
+
+class Network(NamedTuple):
+    """What corrects nominal joint values; see `network.correction_network` and `correction.domain`.
+
+    Attributes:
+        used: 1 where there is such a network, else 0.
+        source: per input its kind: a coordinate of the pose, ANGLE, SINE or COSINE. Those of a group lie together.
+        factors: `(inputs, dof)`: the angle of an input is their sum over the joint values.
+        offset: of every input.
+        scale: of every input.
+        reference: `(groups, 3, 3)`: rotation from which roll, pitch and yaw are counted.
+        first: `(groups + 1,)`: index of a group's first input.
+        orders: `(groups, units)`: number of factors of every product unit, 0 where there is none.
+        group: per joint; -1 where the joint is not corrected.
+        weight: `(dof, factors, inputs)`.
+        bias: `(dof, factors)`.
+        output_offset: per joint [rad or m].
+        output_scale: per joint [rad or m].
+        centre: per joint the middle of training rows [rad or m], on whose turns the network knows joint values.
+        samples: number of training rows that make the domain; 0 where there is none.
+        column: index of the input that a coordinate of the domain is; inputs that are the same are one coordinate.
+        times: per coordinate the root of how often its input stands in the network.
+        coarse: how many coordinates, the first ones, tell nearly all of a distance.
+        rows: `(coordinates · samples,)`: scaled inputs of the training rows, one coordinate after the other.
+        radius: of the domain, in scaled inputs.
+    """
+
+    used: int
+    source: Any
+    factors: Any
+    offset: Any
+    scale: Any
+    reference: Any
+    first: Any
+    orders: Any
+    group: Any
+    weight: Any
+    bias: Any
+    output_offset: Any
+    output_scale: Any
+    centre: Any
+    samples: int
+    column: Any
+    times: Any
+    coarse: int
+    rows: Any
+    radius: float
+
+
+class ClosedForm(NamedTuple):
+    """The nominal arm with canonical twists; see `pisigma.kinematics.closed_form`.
+
+    Attributes:
+        kind: NO_CLOSED_FORM, SCARA, SPHERICAL_WRIST or THREE_PARALLEL.
+        branches: how many it has; 1 without closed form.
+        order: indices of the branches in the order in which they are tried where none is asked for.
+        trained: how many of these, the first ones, training rows lie on.
+        first: `(3, 4)`: frame of poses in the frame before the first joint.
+        last: `(3, 4)`: frame of the last joint in that of the tool.
+        sign: per joint, `variable = sign · (direction · q + offset)`.
+        direction: per joint.
+        offset: per joint.
+        theta: of every joint's row, with sign [rad].
+        d: of every joint's row, with sign [m].
+        a: of every joint's row [m].
+    """
+
+    kind: int
+    branches: int
+    order: Any
+    trained: int
+    first: Any
+    last: Any
+    sign: Any
+    direction: Any
+    offset: Any
+    theta: Any
+    d: Any
+    a: Any
+
+
+class Starts(NamedTuple):
+    """Joint values to start from.
+
+    Attributes:
+        q: `(starts, dof)` [rad or m].
+        points: `(starts, 12)`: positions [m], and rotations times half a reach over sqrt(2).
+        lever: half a reach over sqrt(2) [m].
+    """
+
+    q: Any
+    points: Any
+    lever: float
+
+
+class Description(NamedTuple):
+    """All of a calibrated arm."""
+
+    arms: Arms
+    correction: Correction
+    coverage: Coverage
+    network: Network
+    closed_form: ClosedForm
+    starts: Starts
+
+
+PARTS: dict[str, Any] = {
+    "arms": Arms,
+    "correction": Correction,
+    "coverage": Coverage,
+    "network": Network,
+    "closed_form": ClosedForm,
+    "starts": Starts,
+}
+"""The parts of a description by name."""

@@ -1,0 +1,188 @@
+"""Damped Newton from a start to a pose, on plain numbers."""
+
+import math
+from typing import Any, no_type_check
+
+from numba import njit
+
+from pisigma.kernels.arrays import BLENDED, GEOMETRIC, HYBRID
+from pisigma.kernels.damped_step import damped_step, scaled_square
+from pisigma.kernels.joint_correction import series_slope
+from pisigma.kernels.motion import correct, move
+from pisigma.kernels.rotations import pose_error
+from pisigma.kernels.rows import copy, copy_rows, fill
+
+Array = Any
+Record = Any
+
+TOLERANCE, HYBRID_TOLERANCE = 1e-13, 1e-12
+"""[m and rad] Residuals that iteration of an arm and of a hybrid arm comes below."""
+ACCEPTED = 1e-11
+"""[m and rad] Residuals that will do where rounding stops the iteration earlier."""
+NEARLY = 0.01
+"""Share of the reach, and angle [rad]: a pose that the geometric arm misses by less the hybrid one may take."""
+_ITERATIONS = 100
+_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 0.1, 1e-6, 1e12
+_CLOSE, _LAST, _SETTLED = 0.05, 1e-15, 3e-12
+"""Squared errors [reach or rad]: from _CLOSE**2 on quick steps are tried; below _LAST one more step is exact.
+_SETTLED: joint values [rad or m] move less after a step that is the last one."""
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _within(error: Array, position: float, rotation: float) -> bool:
+    linear = error[0] * error[0] + error[1] * error[1] + error[2] * error[2]
+    angular = error[3] * error[3] + error[4] * error[4] + error[5] * error[5]
+    return linear < position * position and angular < rotation * rotation
+
+
+@njit(error_model="numpy")
+@no_type_check
+def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, tolerance: float) -> None:
+    """Bring q to a pose, as `kinematics.numeric.solve_numeric` does; the error left stands in `memory.best`.
+
+    Args:
+        description: the calibrated arm.
+        memory: to work in.
+        arm: which arm.
+        T: wanted T_base_tool.
+        q: joint values to begin with [rad or m]; the best found are written there.
+        tolerance: residuals to come below [m and rad].
+    """
+    arms, dof = description.arms, description.arms.dof
+    reach = arms.reach[HYBRID if arm == BLENDED else arm]
+    share = move(description, memory, arm, q)
+    _steepen(description, memory, arm, share)
+    pose_error(T, memory.T, memory.R, memory.best)
+    copy_rows(memory.J, memory.J_best)
+    old, damping = scaled_square(reach, memory.best), _FIRST_DAMPING
+    for _ in range(_ITERATIONS):
+        if _within(memory.best, tolerance, tolerance) or damping > _MOST_DAMPING:
+            break
+        possible = damped_step(arms, reach, memory.J_best, memory.best, damping, memory)
+        new = math.inf
+        if possible:
+            for j in range(dof):
+                memory.trial[j] = q[j] + memory.step[j]
+            share = move(description, memory, arm, memory.trial)
+            _steepen(description, memory, arm, share)
+            pose_error(T, memory.T, memory.R, memory.error)
+            new = scaled_square(reach, memory.error)
+        if new < old:
+            old = new
+            copy(memory.trial, q)
+            copy(memory.error, memory.best)
+            copy_rows(memory.J, memory.J_best)
+            damping = max(damping * 0.2, _LEAST_DAMPING)
+        else:
+            damping *= 8.0
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _steepen(description: Record, memory: Record, arm: int, share: float) -> None:
+    """Take the slope of the correction's series into the Jacobian of a blended arm."""
+    dof = description.arms.dof
+    if arm != BLENDED or share == 0.0 or dof > 6:
+        return  # with joints to spare it would lead to another of the many solutions than the torch route's
+    series_slope(description.correction, dof, memory.turning, memory.slope)
+    for j in range(dof):
+        for i in range(6):
+            memory.J[i, j] *= 1 + share * memory.slope[j]
+
+
+@njit(error_model="numpy")
+@no_type_check
+def search(description: Record, memory: Record, T: Array, q: Array) -> bool:
+    """Bring q to a pose of the calibrated arm, and say whether that succeeded.
+
+    First the geometric arm, then from there the hybrid one, which may reach a little farther; where the start is
+    near already, a shorter way to the same place.
+    """
+    arms = description.arms
+    fill(memory.checked, math.nan)
+    if arms.dof <= 6:
+        copy(q, memory.start)
+        if _quick(description, memory, T, q):
+            return True
+        copy(memory.start, q)
+    newton(description, memory, GEOMETRIC, T, q, TOLERANCE)
+    if not arms.hybrid:
+        return _within(memory.best, ACCEPTED, ACCEPTED)
+    if not _within(memory.best, NEARLY * arms.reach[GEOMETRIC], NEARLY):
+        return False
+    newton(description, memory, BLENDED, T, q, HYBRID_TOLERANCE)
+    return _within(memory.best, ACCEPTED, ACCEPTED)
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
+    """Solve for `q + Δ(q)` by Newton steps, then for q by fixed-point steps; checked on the arm itself.
+
+    Only where joint values lead to the pose that are near the start and all within the measured ones: there the
+    correction need not be in the Newton steps at all.
+    """
+    arms, dof = description.arms, description.arms.dof
+    arm = HYBRID if arms.hybrid else GEOMETRIC
+    if not _converge(description, memory, arm, T, q):
+        return False
+    if not arms.hybrid:
+        move(description, memory, GEOMETRIC, q)
+        pose_error(T, memory.T, memory.R, memory.error)
+        return _checked(memory, q, 1.0, TOLERANCE * 4)
+    copy(q, memory.trial)
+    before = 1.0
+    for attempt in range(20):
+        correct(description, memory, q)
+        if attempt == 0:
+            series_slope(description.correction, dof, memory.turning, memory.slope)
+        moved = 0.0
+        for j in range(dof):
+            step = (memory.trial[j] - memory.theta[j]) / (1 + memory.slope[j])
+            moved = max(moved, abs(step))
+            q[j] += step
+        ratio = moved / before
+        if moved * ratio < _SETTLED or ratio > 0.5:
+            break
+        before = moved
+    share = move(description, memory, BLENDED, q)
+    if share < 1.0:
+        return False
+    pose_error(T, memory.T, memory.R, memory.error)
+    return _checked(memory, q, share, ACCEPTED)
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _checked(memory: Record, q: Array, share: float, tolerance: float) -> bool:
+    """Whether the pose is reached; if so, keep that the pose, Jacobian and error in memory are those of q."""
+    if not _within(memory.error, tolerance, tolerance):
+        return False
+    copy(q, memory.checked)
+    memory.share = share
+    return True
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _converge(description: Record, memory: Record, arm: int, T: Array, q: Array) -> bool:
+    """Newton steps as long as each is far better than the one before."""
+    arms, dof = description.arms, description.arms.dof
+    reach, before = arms.reach[arm], _CLOSE * _CLOSE
+    for _ in range(8):
+        move(description, memory, arm, q)
+        pose_error(T, memory.T, memory.R, memory.error)
+        square = scaled_square(reach, memory.error)
+        if not square < before:
+            return square < 1e-26
+        if square < 1e-30:
+            return True
+        if not damped_step(arms, reach, memory.J, memory.error, _FIRST_DAMPING, memory):
+            return False
+        for j in range(dof):
+            q[j] += memory.step[j]
+        if square < _LAST:
+            return True
+        before = square * 0.25
+    return False

@@ -1,0 +1,124 @@
+"""Poses that the calibrated arm reaches and the nominal one does not, on plain numbers."""
+
+import math
+from typing import Any, no_type_check
+
+from numba import njit
+
+from pisigma.kernels.arrays import GEOMETRIC, NOMINAL
+from pisigma.kernels.chain import walk
+from pisigma.kernels.closed_form import all_branches
+from pisigma.kernels.newton import search
+from pisigma.kernels.rotations import wrap
+from pisigma.kernels.rows import copy, fill
+
+Array = Any
+Record = Any
+
+ATTEMPTS, MORE_ATTEMPTS = 4, 128
+"""Stored starts that are tried, nearest first; the latter number on arms without closed form."""
+PULL = 0.02
+"""Share of the reach by which a pose beyond the nominal workspace is drawn towards a stored one."""
+
+
+@njit(error_model="numpy")
+@no_type_check
+def within_reach(description: Record, T: Array) -> bool:
+    """Whether a pose is not farther away than the robot is long, whatever its joints do."""
+    base, reach = description.arms.ends[GEOMETRIC, 0], description.arms.reach[GEOMETRIC]
+    x, y, z = T[0, 3] - base[0, 3], T[1, 3] - base[1, 3], T[2, 3] - base[2, 3]
+    return math.sqrt(x * x + y * y + z * z) <= reach * (1 + 1e-9)
+
+
+@njit(error_model="numpy")
+@no_type_check
+def nearest_starts(description: Record, memory: Record, T: Array, most: int) -> int:
+    """Write the indices of the starts whose poses are nearest into `memory.nearest`, nearest first; their number."""
+    starts, near = description.starts, memory.nearest
+    count = min(most, starts.count)
+    best = memory.distance  # squared
+    fill(best, math.inf)
+    for s in range(starts.count):
+        point, distance = starts.points[s], 0.0
+        for i in range(3):
+            distance += (T[i, 3] - point[i]) ** 2
+            for k in range(3):
+                distance += (starts.lever * T[i, k] - point[3 + 3 * i + k]) ** 2
+        if distance >= best[count - 1]:
+            continue
+        place = count - 1
+        while place > 0 and best[place - 1] > distance:
+            best[place], near[place] = best[place - 1], near[place - 1]
+            place -= 1
+        best[place], near[place] = distance, s
+    return count
+
+
+@njit(error_model="numpy")
+@no_type_check
+def recover(description: Record, memory: Record, branch: int, any_branch: bool) -> int:
+    """Look for joint values from other starts; see `correction.identified_arm.IdentifiedArm.recover`.
+
+    Args:
+        description: the calibrated arm.
+        memory: to work in, with the pose; the joint values found are written into `memory.solution`.
+        branch: index of the branch wanted.
+        any_branch: whether another will do.
+
+    Returns:
+        Index of the branch on which they lie, -1 where nothing was found.
+    """
+    form, starts, arms, drawn = description.closed_form, description.starts, description.arms, memory.others
+    if starts.count == 0:
+        return -1
+    count = nearest_starts(description, memory, memory.pose, ATTEMPTS)
+    _draw(description, memory.pose, memory.nearest[0], memory.drawn)
+    all_branches(arms, form, memory.drawn, -1, memory.wanted, drawn)
+    for attempt in range(1 + form.branches + count if any_branch else 1):
+        place = branch if attempt == 0 else attempt - 1
+        if attempt > form.branches:
+            copy(starts.q[memory.nearest[attempt - 1 - form.branches]], memory.q)
+        elif math.isnan(drawn[place, 0]):
+            continue
+        else:
+            copy(drawn[place], memory.q)
+        if search(description, memory, memory.pose, memory.q):
+            copy(memory.q, memory.solution)
+            lies = branch_of(description, memory, memory.q)
+            fill(memory.checked, math.nan)
+            return lies if any_branch or lies == branch else -1
+    return -1
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _draw(description: Record, T: Array, start: int, drawn: Array) -> None:
+    """Write the pose, moved by `PULL` of the reach but no farther than to the position of a start."""
+    point = description.starts.points[start]
+    x, y, z = point[0] - T[0, 3], point[1] - T[1, 3], point[2] - T[2, 3]
+    way = max(math.sqrt(x * x + y * y + z * z), 1e-12)
+    share = min(PULL * description.arms.reach[NOMINAL] / way, 1.0)
+    for i in range(3):
+        for k in range(4):
+            drawn[i, k] = T[i, k]
+    drawn[0, 3] += share * x
+    drawn[1, 3] += share * y
+    drawn[2, 3] += share * z
+
+
+@njit(error_model="numpy")
+@no_type_check
+def branch_of(description: Record, memory: Record, q: Array) -> int:
+    """Index of the nominal arm's branch that is nearest to joint values."""
+    walk(description.arms, NOMINAL, q, memory.axes, memory.T)
+    every = memory.others
+    all_branches(description.arms, description.closed_form, memory.T, -1, memory.wanted, every)
+    nearest, least = 0, math.inf
+    for branch in range(description.closed_form.branches):
+        total = 0.0
+        for j in range(description.arms.dof):
+            off = every[branch, j] - q[j]
+            total += (wrap(off) if description.arms.revolute[j] else off) ** 2
+        if total < least:
+            nearest, least = branch, total
+    return nearest

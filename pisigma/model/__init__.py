@@ -1,0 +1,1 @@
+"""The calibrated model, its domain and its predicted accuracy."""

@@ -1,0 +1,74 @@
+"""How well a model knows the positions that it predicts."""
+
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from pisigma.identification.problem.user_coordinates import IdentifiedGeometry
+from pisigma.measurement.conditions import CONDITIONS
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.hybrid_motion import corrected_joints
+from pisigma.model.row_poses import Frames, known_names
+from pisigma.robot.description import Robot
+
+
+def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch"]:
+    """Standard deviation of the tool's predicted position [m], `sqrt(σx² + σy² + σz²)`.
+
+    Args:
+        model: the model; its tool is that of the first target, in the first frame.
+        q: commanded joint values [rad or m].
+
+    Returns:
+        NaN where a joint value is NaN, and everywhere where the model holds no uncertainty.
+    """
+    flat = q.detach().to("cpu", torch.float64).reshape(-1, q.shape[-1])
+    found = torch.full((len(flat),), torch.nan, dtype=torch.float64)
+    rows = torch.isfinite(flat).all(-1).nonzero()[:, 0]
+    if model.uncertainty is not None and len(rows):
+        frame, target = (next(iter(known), "") for known in (model.bases, model.tools))
+        payload, temperature = (
+            torch.full((len(rows),), model.conditions.get(name, torch.nan), dtype=torch.float64)
+            for name in CONDITIONS
+        )
+        at = Measurements(
+            q=flat[rows],
+            frame=(frame,) * len(rows),
+            target=(target,) * len(rows),
+            payload=payload,
+            temperature=temperature,
+        )
+        found[rows] = deviation_of_rows(model, at).norm(dim=-1)
+    return found.reshape(q.shape[:-1])
+
+
+def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
+    """Standard deviation of the position of every row's target along the axes of its frame [m], without noise.
+
+    Beyond the measured joint values it goes over into what the geometric calibration does not explain.
+
+    Returns:
+        NaN where the model holds no uncertainty.
+
+    Raises:
+        MeasurementError: the model does not know a frame or target of the rows.
+    """
+    if model.uncertainty is None:
+        return torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
+    frame = known_names(model.bases, measurements.frame, "frame", measurements)
+    target = known_names(model.tools, measurements.target, "target", measurements)
+    at, arm = replace(measurements, frame=frame, target=target), model.hybrid
+    if arm is None:
+        return model.uncertainty.deviation(at, at.q)
+    inside = model.uncertainty.deviation(at, corrected_joints(arm, at))
+    share = arm.coverage.share(at.q)[:, None]
+    deviation: Tensor = ((share * inside).square() + ((1 - share) * model.unexplained) ** 2).sqrt()
+    return deviation
+
+
+def geometry_of(robot: Robot, bases: Frames, tools: Frames) -> IdentifiedGeometry:
+    """A geometry as an uncertainty needs it: without sockets, anchors, and how it was solved for."""
+    return IdentifiedGeometry(robot, bases, tools, {}, {}, {}, torch.zeros(0, 0, dtype=torch.float64))

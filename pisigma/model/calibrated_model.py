@@ -1,0 +1,151 @@
+"""A calibrated robot: geometry, learned joint corrections and where both hold."""
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.uncertainty import PositionUncertainty
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.model.domain import Domain
+from pisigma.model.hybrid_motion import hybrid_poses
+from pisigma.network.correction_network import CorrectionNetwork
+from pisigma.robot.description import Robot
+
+FORWARD_ITERATIONS = 100
+FORWARD_TOLERANCE = 1e-12
+"""[rad or m] Joint values have settled when none moves more than this in an iteration."""
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """Where a model comes from.
+
+    Attributes:
+        recipe: the recipe's name.
+        recipe_sha256: hash of the recipe file.
+        data_source: the measured file, or "simulation".
+        data_sha256: hash of the training measurements.
+        rows: training rows used.
+        rows_left_out: training rows left out, with the rule in `rule`.
+        rule: why rows were left out.
+        seed: of the training.
+        versions: of pisigma, torch and python.
+    """
+
+    recipe: str = ""
+    recipe_sha256: str = ""
+    data_source: str = ""
+    data_sha256: str = ""
+    rows: int = 0
+    rows_left_out: int = 0
+    rule: str = ""
+    seed: int = 0
+    versions: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class CalibratedModel:
+    """Everything that `pisigma.load` needs.
+
+    Attributes:
+        name: of the model.
+        kind: how it was made, such as "inverse_calibration".
+        robot: its kinematics give the nominal joint values; base and tool as fitted.
+        network: joint corrections, or None.
+        domain: where the corrections hold, or None.
+        branches: branches of the closed-form inverse that the training rows lie on, most frequent first;
+            empty where there is no closed form.
+        starts: commanded joint values [rad or m] of training rows: on the turns that the network knows, and
+            where there is no closed form the starts of the numeric inverse.
+        calibrated: the robot with its geometry as identified, base and tool those of `robot`; None where the
+            geometry is the nominal one.
+        bases: per frame of the measurements ("" where it had no name) x, y, z [m], roll, pitch, yaw [rad] of
+            the base in it; the first is that of `robot`. Empty where frames were not told apart.
+        tools: the same per target for the tool.
+        hybrid: the arm with a joint correction that was fitted through the kinematics, its geometric part being
+            `calibrated`; None where there is none.
+        hybrid_bases: the bases that go with the hybrid's geometry, by the names of `bases`.
+        hybrid_tools: the same for the tools.
+        uncertainty: of predicted positions, or None.
+        unexplained: standard deviation of what the geometric calibration does not explain [m]: noise and all
+            that it cannot express.
+        conditions: payload [kg] and temperature [deg C] that it was put under, by name; empty for the usual ones of
+            the rows. See `pisigma.model.stated_conditions`.
+        provenance: recipe, data, versions.
+        metrics: figures for the card, by name.
+    """
+
+    name: str
+    kind: str
+    robot: Robot
+    network: CorrectionNetwork | None
+    domain: Domain | None
+    branches: tuple[str, ...]
+    starts: Float64[Tensor, "starts dof"]
+    calibrated: Robot | None = None
+    bases: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
+    tools: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
+    hybrid: HybridArm | None = None
+    hybrid_bases: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
+    hybrid_tools: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
+    uncertainty: PositionUncertainty | None = None
+    unexplained: float = 0.0
+    conditions: dict[str, float] = field(default_factory=dict)
+    provenance: Provenance = field(default_factory=Provenance)
+    metrics: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def drawn(self) -> Robot | None:
+        """The robot as drawn, with its own base and tool, where a hybrid calibration knows it."""
+        if self.hybrid is not None:
+            return self.hybrid.correction.robot
+        return None if self.uncertainty is None else self.uncertainty.space.robot
+
+    def correction(
+        self, T: Float64[Tensor, "*batch 4 4"], q_nominal: Float64[Tensor, "*batch dof"]
+    ) -> Float64[Tensor, "*batch dof"]:
+        """Correction [rad or m] that `network` adds to the nominal joint values of poses T; 0 without one."""
+        if self.network is None:
+            return torch.zeros_like(q_nominal)
+        with torch.no_grad():
+            result: Tensor = self.network(T, q_nominal)
+        return result
+
+    def forward(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch 4 4"]:
+        """Pose T_base_tool that the robot takes when commanded to q [rad or m], as far as the model knows.
+
+        With an identified geometry it is its forward kinematics, with the joint correction of a hybrid. Else
+        it is the pose whose corrected joint values are q, see `nominal_joints`.
+
+        Returns:
+            The poses; NaN where the iteration does not settle because the correction is steeper than the
+            joints, as it may be far outside the domain, and where a joint value is NaN.
+        """
+        if self.hybrid is not None:
+            return hybrid_poses(self.hybrid, q)
+        if self.calibrated is not None:
+            return forward_kinematics(self.calibrated, q)
+        q_nominal = self.nominal_joints(q)
+        settled = torch.isfinite(q_nominal).all(-1, keepdim=True)
+        T = forward_kinematics(self.robot, torch.where(settled, q_nominal, q))
+        return torch.where(settled[..., None], T, torch.nan)
+
+    def nominal_joints(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
+        """Joint values `q_nominal = q - Δ(FK(q_nominal), q_nominal)` [rad or m] that `network` corrects to q.
+
+        Returns:
+            NaN where the iteration does not settle; q itself without a network.
+        """
+        q_nominal, moved = q, torch.zeros_like(q)
+        for _ in range(FORWARD_ITERATIONS if self.network is not None else 0):
+            following = q - self.correction(forward_kinematics(self.robot, q_nominal), q_nominal)
+            moved, q_nominal = (following - q_nominal).abs(), following
+            if bool((moved <= FORWARD_TOLERANCE).all()):
+                break
+        settled = (moved <= 1e-9).all(-1, keepdim=True)
+        return torch.where(settled, q_nominal, torch.nan)

@@ -1,0 +1,1 @@
+"""Models as folders on disk: written whole or not at all, checked when read."""

@@ -1,0 +1,238 @@
+"""What a model folder holds of a hybrid calibration: sections of `model.yaml`, and tensors.
+
+Geometry stands in `model.yaml` in mm and deg, for people, and once more in the weights file in SI units, so that
+predictions are the same to the last bit after reading. The root of the covariance is in float32.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.coverage import JointCoverage
+from pisigma.hybrid.held_products import HeldProducts
+from pisigma.hybrid.uncertainty import PositionUncertainty
+from pisigma.identification.problem.parameters import ParameterSpace
+from pisigma.joint_correction.feature_description import features_from
+from pisigma.joint_correction.features import AbstractFeatures, turning_rate
+from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.model.accuracy import geometry_of
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_document import LearnedSection, ModelDocument, UncertaintySection
+from pisigma.model.row_poses import Frames
+from pisigma.robot.description import Robot
+
+Shape = tuple[int | None, ...]
+"""Wanted shape of a tensor; None is any length."""
+
+ROUNDING = 1e-9
+"""The geometry in `model.yaml` and in the weights file may differ by so much [m or rad]."""
+
+DTYPES = {"uncertainty.root": torch.float32, "coverage.joint": torch.int64}
+"""Tensors that are not in float64."""
+
+_GEOMETRY = ("dh", "base", "tool")
+
+
+def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
+    """Sections of `model.yaml` that only models of a hybrid calibration have."""
+    found: dict[str, Any] = {}
+    if (arm := model.hybrid) is not None:
+        found["learned"] = {
+            "features": [chosen.describe() for chosen in arm.correction.features],
+            "orders": list(arm.correction.orders),
+            "fade_rad": arm.coverage.fade,
+            "bases": {name: frame.tolist() for name, frame in model.hybrid_bases.items()},
+            "tools": {name: frame.tolist() for name, frame in model.hybrid_tools.items()},
+        }
+    if (known := model.uncertainty) is not None:
+        found["uncertainty"] = {
+            "sockets": list(known.space.sockets),
+            "anchors": list(known.space.anchors),
+            "free": _free_rows(known),
+            "turns": [chosen.turn for chosen in known.features if isinstance(chosen, HeldProducts)],
+            "widening": known.widening,
+            "unexplained_m": model.unexplained,
+        }
+    return found
+
+
+def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
+    """Tensors of the weights file that only models of a hybrid calibration have."""
+    found: dict[str, Tensor] = {}
+    if (drawn := model.drawn) is not None:
+        found |= _geometry("drawn", drawn)
+        found["drawn.limits"] = torch.from_numpy(drawn.limits[_limited(drawn)])
+        assert model.calibrated is not None
+        found |= _geometry("calibrated", model.calibrated)
+    if (arm := model.hybrid) is not None:
+        found |= _geometry("learned", arm.hybrid)
+        found |= {f"correction.{key}": value for key, value in arm.correction.state_dict().items()}
+        found |= {f"coverage.{name}": getattr(arm.coverage, name) for name in ("joint", "middle", "half")}
+    if (known := model.uncertainty) is not None:
+        weights = range(len(known.space.parameters), known.root.shape[0])
+        found["uncertainty.root"] = known.root[[*_free_rows(known), *weights]].float()
+    return found
+
+
+def hybrid_shapes(document: ModelDocument, robot: Robot) -> dict[str, Shape]:
+    """Shapes of the tensors that a description calls for.
+
+    Raises:
+        ValueError: features cannot be made as described, or the uncertainty is of parameters that do not exist.
+    """
+    learned, known = document.learned, document.uncertainty
+    if learned is None and known is None:
+        return {}
+    rows = len(robot.rows)
+    found: dict[str, Shape] = {"drawn.limits": (int(_limited(robot).sum()), 2)}
+    for name in ("drawn", "calibrated", *(["learned"] if learned else [])):
+        found |= {f"{name}.dh": (rows, 5), f"{name}.base": (6,), f"{name}.tool": (6,)}
+    weights = 0
+    if learned is not None:
+        empty = _empty_correction(learned, robot)
+        found |= {f"correction.{key}": tuple(value.shape) for key, value in empty.state_dict().items()}
+        found |= {f"coverage.{name}": (None,) for name in ("joint", "middle", "half")}
+        weights = sum(int(chosen.used.sum()) for chosen in empty.features)
+        turns = 0 if known is None else len(known.turns)
+        weights += turns * robot.dof * len(empty.orders) * (empty.weight.shape[2] + 1)
+    if known is not None:
+        found["uncertainty.root"] = (len(known.free) + weights, None)
+    return found
+
+
+def with_hybrid(
+    model: CalibratedModel, document: ModelDocument, tensors: Mapping[str, Tensor]
+) -> CalibratedModel:
+    """Add what belongs to a hybrid calibration, and the geometry to the last bit; other models stay as they are.
+
+    Args:
+        model: made from the description and all other tensors.
+        document: the description.
+        tensors: of the shapes of `hybrid_shapes`.
+
+    Raises:
+        ValueError: parts do not fit together.
+    """
+    learned, known = document.learned, document.uncertainty
+    if learned is None and known is None:
+        return model
+    if model.calibrated is None:
+        raise ValueError("a hybrid calibration needs the calibrated robot")
+    drawn = _with_limits(_exact("drawn", model.robot, tensors, ("dh",)), tensors["drawn.limits"])
+    calibrated = _exact("calibrated", replace(model.calibrated, rows=drawn.rows), tensors, _GEOMETRY)
+    robot = drawn.with_geometry(base=calibrated.base, tool=calibrated.tool)
+    model = replace(model, robot=robot, calibrated=calibrated)
+    place = (calibrated, model.bases, model.tools)
+    if learned is not None:
+        if (list(learned.bases), list(learned.tools)) != (list(model.bases), list(model.tools)):
+            raise ValueError("the learned part has other frames or targets than the geometric one")
+        place = (_exact("learned", drawn, tensors, ()), _frames(learned.bases), _frames(learned.tools))
+        parts = _correction(learned, drawn, tensors), _coverage(learned, drawn, tensors)
+        arm = HybridArm(calibrated, place[0], *parts)
+        model = replace(model, hybrid=arm, hybrid_bases=place[1], hybrid_tools=place[2])
+    if known is None:
+        return model
+    uncertainty = _uncertainty(known, model.hybrid, drawn, tensors["uncertainty.root"], place)
+    return replace(model, uncertainty=uncertainty, unexplained=known.unexplained_m)
+
+
+def _free_rows(known: PositionUncertainty) -> list[int]:
+    """Parameters that were free: those whose row of the root is not 0."""
+    found: list[int] = known.root[: len(known.space.parameters)].any(1).nonzero()[:, 0].tolist()
+    return found
+
+
+def _limited(robot: Robot) -> np.ndarray:
+    """Which joints have limits, which a file holds both or none of."""
+    found: np.ndarray = np.isfinite(robot.limits).all(1)
+    return found
+
+
+def _geometry(name: str, robot: Robot) -> dict[str, Tensor]:
+    return {f"{name}.{part}": torch.from_numpy(getattr(robot, part).copy()) for part in _GEOMETRY}
+
+
+def _exact(name: str, robot: Robot, tensors: Mapping[str, Tensor], same: Sequence[str]) -> Robot:
+    """The robot with the geometry of the weights file; some parts must be those it had, but for rounding."""
+    values = {part: tensors[f"{name}.{part}"].numpy() for part in _GEOMETRY}
+    for part in same:
+        if np.abs(values[part] - getattr(robot, part)).max() > ROUNDING:
+            raise ValueError(f"the tensor '{name}.{part}' is not the geometry in the description")
+    return robot.with_geometry(**values)
+
+
+def _with_limits(robot: Robot, limits: Tensor) -> Robot:
+    """The robot with its joints' limits to the last bit."""
+    limited = _limited(robot)
+    if len(limits) and np.abs(limits.numpy() - robot.limits[limited]).max() > ROUNDING:
+        raise ValueError("the tensor 'drawn.limits' are not the limits in the description")
+    rows = list(robot.rows)
+    places = [row for row, bounded in zip(robot.joint_rows, limited, strict=True) if bounded]
+    for place, (lower, upper) in zip(places, limits.tolist(), strict=True):
+        rows[place] = replace(rows[place], lower=lower, upper=upper)
+    return replace(robot, rows=tuple(rows))
+
+
+def _frames(sections: Mapping[str, tuple[float, ...]]) -> Frames:
+    return {name: np.array(frame) for name, frame in sections.items()}
+
+
+def _empty_correction(learned: LearnedSection, robot: Robot) -> JointCorrection:
+    features = [features_from(robot, section.model_dump()) for section in learned.features]
+    return JointCorrection(robot, features, learned.orders)
+
+
+def _correction(learned: LearnedSection, robot: Robot, tensors: Mapping[str, Tensor]) -> JointCorrection:
+    correction, prefix = _empty_correction(learned, robot), "correction."
+    own = {key.removeprefix(prefix): value for key, value in tensors.items() if key.startswith(prefix)}
+    correction.load_state_dict(own)
+    correction.requires_grad_(False)
+    return correction
+
+
+def _coverage(learned: LearnedSection, robot: Robot, tensors: Mapping[str, Tensor]) -> JointCoverage:
+    joint, middle, half = (tensors[f"coverage.{name}"] for name in ("joint", "middle", "half"))
+    if not len(joint) == len(middle) == len(half):
+        raise ValueError("the coverage has stretches of which joint, middle or half is missing")
+    if set(joint.tolist()) != set(range(robot.dof)) or bool((half < 0).any()):
+        raise ValueError("the coverage needs a stretch of at least no length for every joint, and no other")
+    rate = torch.from_numpy(turning_rate(robot))
+    turning = tuple(bool(turns) for turns in robot.revolute)
+    return JointCoverage(joint, middle, half, rate, turning, learned.fade_rad)
+
+
+def _uncertainty(
+    known: UncertaintySection,
+    hybrid: HybridArm | None,
+    drawn: Robot,
+    root: Tensor,
+    place: tuple[Robot, Frames, Frames],
+) -> PositionUncertainty:
+    """The uncertainty, its root with the rows of the parameters that were not free."""
+    robot, bases, tools = place
+    space = ParameterSpace(drawn, tuple(bases), tuple(tools), known.sockets, known.anchors)
+    count, free = len(space.parameters), list(known.free)
+    products = 0 if hybrid is None else len(hybrid.correction.orders)
+    if bool(products) != bool(known.turns):
+        raise ValueError(f"turns of product units do not fit: {products} units and turns {list(known.turns)}")
+    if sorted(set(free)) != free or (free and free[-1] >= count):
+        raise ValueError(f"the free parameters are rising numbers below {count}, got {free}")
+    full = torch.zeros(count + len(root) - len(free), root.shape[1], dtype=torch.float64)
+    full[[*free, *range(count, len(full))]] = root.double()
+    geometry = geometry_of(robot, bases, tools)
+    return PositionUncertainty(space, geometry, _weighted(known, hybrid), full, known.widening)
+
+
+def _weighted(known: UncertaintySection, hybrid: HybridArm | None) -> tuple[AbstractFeatures, ...]:
+    """What the weights in the root belong to: the features, and factors of product units with the others held."""
+    if hybrid is None:
+        return ()
+    correction = hybrid.correction
+    factors = torch.cat([correction.bias[..., None], correction.weight], -1).detach()
+    held = [HeldProducts(correction.robot, correction.orders, factors, turn) for turn in known.turns]
+    return (*correction.features, *held)

@@ -1,0 +1,175 @@
+"""`model.yaml`: what it holds, and the checksum by which a truncated or edited one is told."""
+
+import hashlib
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import ConfigDict, Field, PositiveInt
+
+from pisigma.errors import ModelError
+from pisigma.robot.robot_file import RobotDocument
+from pisigma.yaml_file import Section, parse_yaml
+
+FORMAT = 2
+"""Newest format; folders without anything of a hybrid calibration are written in format 1, which had none."""
+_CHECKSUM = re.compile(r"(.*^)sha256: ([0-9a-f]{64})\n", re.DOTALL | re.MULTILINE)
+
+_Vector = tuple[float, float, float]
+_Frame = tuple[float, float, float, float, float, float]
+"""x, y, z [m], roll, pitch, yaw [rad]."""
+
+
+class GroupSection(Section):
+    """One joint group of the network: see `pisigma.network.correction_network.JointGroup`."""
+
+    joints: Annotated[tuple[str, ...], Field(min_length=1)]
+    inputs: Annotated[tuple[str, ...], Field(min_length=1)]
+    orders: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
+    reference: tuple[_Vector, _Vector, _Vector]
+
+
+class SeriesSection(Section):
+    """See `pisigma.joint_correction.features.FourierSeries`."""
+
+    name: Literal["series"]
+    harmonics: Annotated[int, Field(ge=1, le=100_000)]
+
+
+class GravitySection(Section):
+    """See `pisigma.joint_correction.features.GravityTorques`."""
+
+    name: Literal["gravity"]
+    gravity: _Vector
+
+
+class ConditionSection(Section):
+    """See `pisigma.joint_correction.features.ConditionFeatures`."""
+
+    name: Literal["conditions"]
+    names: Annotated[tuple[Literal["payload_kg", "temperature_c"], ...], Field(min_length=1)]
+    mean: tuple[float, ...]
+    spread: tuple[float, ...]
+    gravity: _Vector
+
+
+class SharedSection(Section):
+    """See `pisigma.joint_correction.features.SharedFeatures`."""
+
+    name: Literal["joints", "sin_cos", "pose"]
+
+
+_Features = Annotated[
+    SeriesSection | GravitySection | ConditionSection | SharedSection, Field(discriminator="name")
+]
+
+
+class LearnedSection(Section):
+    """The joint correction of a hybrid calibration and the geometry that goes with it.
+
+    Attributes:
+        features: of the unit of order 1.
+        orders: number of factors of every product unit.
+        fade_rad: angle beyond the measured joint values over which the correction fades.
+        bases: per frame, of the hybrid's geometry.
+        tools: per target.
+    """
+
+    features: tuple[_Features, ...]
+    orders: tuple[Annotated[int, Field(ge=2, le=100)], ...]
+    fade_rad: Annotated[float, Field(gt=0)]
+    bases: dict[str, _Frame]
+    tools: dict[str, _Frame]
+
+
+class UncertaintySection(Section):
+    """What the root of the covariance, which stands in the weights file, belongs to.
+
+    Attributes:
+        sockets: names of the fixed points of the calibration.
+        anchors: the same of the ends of distances.
+        free: which parameters have a row in the root; the others' rows are 0. Behind them come all weights.
+        turns: whose turn it is, for every stretch of weights of product units that stands behind the others: see
+            `pisigma.hybrid.held_products.HeldProducts`.
+        widening: see `pisigma.hybrid.uncertainty.PositionUncertainty`.
+        unexplained_m: see `pisigma.model.calibrated_model.CalibratedModel`.
+    """
+
+    sockets: tuple[str, ...]
+    anchors: tuple[str, ...]
+    free: tuple[Annotated[int, Field(ge=0)], ...]
+    turns: tuple[Annotated[int, Field(ge=0)], ...]
+    widening: Annotated[float, Field(gt=0)]
+    unexplained_m: Annotated[float, Field(ge=0)]
+
+
+class ProvenanceSection(Section):
+    """See `pisigma.model.calibrated_model.Provenance`."""
+
+    recipe: str
+    recipe_sha256: str
+    data_source: str
+    data_sha256: str
+    rows: int
+    rows_left_out: int
+    rule: str
+    seed: int
+    versions: dict[str, str]
+
+
+class ModelDocument(Section):
+    """The whole of `model.yaml`, but for the checksum in its last line."""
+
+    model_config = ConfigDict(protected_namespaces=())
+
+    format: Literal[1, 2]
+    name: str
+    kind: str
+    branches: tuple[str, ...]
+    weights_sha256: str
+    robot: RobotDocument
+    calibrated: RobotDocument | None
+    bases: dict[str, _Frame]
+    tools: dict[str, _Frame]
+    network: tuple[GroupSection, ...]
+    learned: LearnedSection | None = None
+    uncertainty: UncertaintySection | None = None
+    provenance: ProvenanceSection
+    metrics: dict[str, Any]
+
+
+def write_document(document: dict[str, Any], path: Path) -> None:
+    """Write the document, and as its last line the checksum of all before it."""
+    stated = FORMAT if {"learned", "uncertainty"} & set(document) else 1
+    text = yaml.safe_dump({"format": stated, **document}, sort_keys=False, allow_unicode=True)
+    path.write_text(f"{text}sha256: {_digest(text)}\n", encoding="utf-8", newline="\n")
+
+
+def read_document(path: Path) -> ModelDocument:
+    """Read the document and check it.
+
+    Raises:
+        ModelError: the file cannot be read, is of a newer format, truncated, edited, or no model's.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as problem:
+        reason = problem.strerror if isinstance(problem, OSError) else "it is no UTF-8 text"
+        raise ModelError(f"{path}: cannot be read ({reason}); train or copy the model again.") from None
+    stated = re.match(r"format: ([0-9]{1,9})\n", text)
+    if stated and int(stated[1]) > FORMAT:
+        raise ModelError(
+            f"{path}: format {stated[1]} is newer than this pisigma reads ({FORMAT}); upgrade pisigma."
+        )
+    signed = _CHECKSUM.fullmatch(text)
+    if not signed or _digest(signed[1]) != signed[2]:
+        raise ModelError(
+            f"{path}: is truncated, was edited, or is no model of pisigma (its last line is not the "
+            "checksum of the lines before it); train or copy the model again."
+        )
+    return parse_yaml(signed[1], ModelDocument, ModelError, source=str(path))
+
+
+def _digest(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()

@@ -1,0 +1,239 @@
+"""Models as folders: `model.yaml` and `model.safetensors`, checked when read."""
+
+import hashlib
+import os
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import torch
+import yaml
+from safetensors import SafetensorError
+from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
+from torch import Tensor
+
+from pisigma.errors import ModelError, PisigmaError, nearest_choice
+from pisigma.kinematics.closed_form import closed_form_solver
+from pisigma.model.calibrated_model import CalibratedModel, Provenance
+from pisigma.model.compiled_model import save_compiled
+from pisigma.model.domain import Domain
+from pisigma.model.folder.folder_files import COMPILED, DESCRIPTION, WEIGHTS, folder_hash
+from pisigma.model.folder.hybrid_folder import (
+    DTYPES,
+    Shape,
+    hybrid_sections,
+    hybrid_shapes,
+    hybrid_tensors,
+    with_hybrid,
+)
+from pisigma.model.folder.model_document import ModelDocument, read_document, write_document
+from pisigma.network.correction_network import CorrectionNetwork, JointGroup
+from pisigma.network.inputs import Inputs
+from pisigma.network.pi_sigma import PiSigma
+from pisigma.robot.description import Robot
+from pisigma.robot.robot_file import robot_to_yaml
+
+_PREFIX = "network."
+
+
+def save_model(model: CalibratedModel, folder: Path) -> None:
+    """Write the files of a model into a folder, such as `staged_folder` gives.
+
+    Next to `model.yaml` and `model.safetensors` it gets what the compiled kernels read, where they know the model's
+    kind of correction.
+
+    Raises:
+        ModelError: the model is under given conditions.
+    """
+    if model.conditions:
+        raise ModelError(
+            f"model '{model.name}' is under given conditions, which a folder does not keep; save it as calibrated."
+        )
+    weights = save_tensors(_tensors(model))
+    groups = [
+        {
+            "joints": [model.robot.joints[index].name for index in group.joints],
+            "inputs": list(group.inputs.names),
+            "orders": list(network.orders),
+            "reference": group.inputs.reference.tolist(),
+        }
+        for group, network in (model.network.members() if model.network else ())
+    ]
+    document = {
+        "name": model.name,
+        "kind": model.kind,
+        "branches": list(model.branches),
+        "weights_sha256": hashlib.sha256(weights).hexdigest(),
+        "robot": yaml.safe_load(robot_to_yaml(model.robot)),
+        "calibrated": yaml.safe_load(robot_to_yaml(model.calibrated)) if model.calibrated else None,
+        "bases": {name: frame.tolist() for name, frame in model.bases.items()},
+        "tools": {name: frame.tolist() for name, frame in model.tools.items()},
+        "network": groups,
+        **hybrid_sections(model),
+        "provenance": asdict(model.provenance),
+        "metrics": model.metrics,
+    }
+    (folder / WEIGHTS).write_bytes(weights)
+    write_document(document, folder / DESCRIPTION)
+    with suppress(ModelError):
+        save_compiled(model, folder / COMPILED, folder_hash(folder) or "")
+
+
+def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:
+    """Read a model folder and check all of it.
+
+    Raises:
+        ModelError: a file is missing, truncated, foreign, changed or of a newer format; nothing is half
+            loaded.
+    """
+    path = Path(folder)
+    if not path.is_dir():
+        raise ModelError(
+            f"{path}: there is no such model folder; give a folder that `pisigma calibrate` or `pisigma train` wrote."
+        )
+    for name in (DESCRIPTION, WEIGHTS):
+        if not (path / name).is_file():
+            raise ModelError(
+                f"{path}: {name} is missing, so this is no whole model folder; train or copy it again."
+            )
+    document = read_document(path / DESCRIPTION)
+    tensors = _read_weights(path / WEIGHTS, document.weights_sha256)
+    try:
+        return _build_model(document, tensors)
+    except (PisigmaError, ValueError) as problem:
+        reason = " ".join(str(problem).rstrip(".").split())
+        raise ModelError(
+            f"{path}: {WEIGHTS} and {DESCRIPTION} do not fit ({reason}); train the model again."
+        ) from None
+
+
+def _tensors(model: CalibratedModel) -> dict[str, Tensor]:
+    tensors = {"starts": model.starts, **hybrid_tensors(model)}
+    for prefix, module in (("network", model.network), ("domain", model.domain)):
+        if module is not None:
+            tensors |= {f"{prefix}.{key}": value for key, value in module.state_dict().items()}
+    return {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
+
+
+def _read_weights(path: Path, sha256: str) -> dict[str, Tensor]:
+    try:
+        content = path.read_bytes()
+    except OSError as problem:
+        raise ModelError(
+            f"{path}: cannot be read ({problem.strerror}); train or copy the model again."
+        ) from None
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise ModelError(
+            f"{path}: is truncated, changed or of another model (its hash is not the one in {DESCRIPTION}); "
+            "train or copy the model again."
+        )
+    try:
+        tensors: dict[str, Tensor] = load_tensors(content)
+    except SafetensorError as problem:
+        raise ModelError(
+            f"{path}: is no safetensors file ({problem}); train or copy the model again."
+        ) from None
+    for name, value in tensors.items():
+        if not torch.isfinite(value).all():
+            raise ModelError(
+                f"{path}: the tensor '{name}' has entries that are not finite; train the model again."
+            )
+    return tensors
+
+
+def _build_model(document: ModelDocument, tensors: dict[str, Tensor]) -> CalibratedModel:
+    """Put the model together from parts that fit.
+
+    Raises:
+        ValueError: a tensor is missing, too many or of another shape or type; or a name or count is wrong.
+    """
+    robot = document.robot.to_robot()
+    _check_branches(robot, document.branches)
+    network = _empty_network(document, robot)
+    samples = "domain.samples" in tensors
+    expected: dict[str, Shape] = {"starts": (None, robot.dof), **hybrid_shapes(document, robot)}
+    if network is not None:
+        expected |= {_PREFIX + key: tuple(value.shape) for key, value in network.state_dict().items()}
+        inputs = sum(len(group.inputs.names) for group in network.groups)
+        expected |= {"domain.samples": (None, inputs), "domain.radius": ()} if samples else {}
+    _check_tensors(tensors, expected)
+    if network is not None:
+        network.load_state_dict(
+            {k.removeprefix(_PREFIX): v for k, v in tensors.items() if k.startswith(_PREFIX)}
+        )
+        network.requires_grad_(False)
+    bases, tools = (
+        {name: np.array(frame) for name, frame in frames.items()}
+        for frames in (document.bases, document.tools)
+    )
+    model = CalibratedModel(
+        name=document.name,
+        kind=document.kind,
+        robot=robot,
+        network=network,
+        domain=Domain(tensors["domain.samples"], tensors["domain.radius"]) if samples else None,
+        branches=document.branches,
+        starts=tensors["starts"],
+        calibrated=_calibrated_robot(document, robot),
+        bases=bases,
+        tools=tools,
+        provenance=Provenance(**document.provenance.model_dump()),
+        metrics=document.metrics,
+    )
+    return with_hybrid(model, document, tensors)
+
+
+def _calibrated_robot(document: ModelDocument, robot: Robot) -> Robot | None:
+    if document.calibrated is None:
+        return None
+    calibrated = document.calibrated.to_robot()
+    if [(row.name, row.type) for row in calibrated.rows] != [(row.name, row.type) for row in robot.rows]:
+        raise ValueError("the calibrated robot has other rows than the nominal one")
+    if not (np.array_equal(calibrated.base, robot.base) and np.array_equal(calibrated.tool, robot.tool)):
+        raise ValueError("the calibrated robot has another base or tool than the nominal one")
+    return calibrated
+
+
+def _check_branches(robot: Robot, branches: tuple[str, ...]) -> None:
+    solver = closed_form_solver(robot)
+    for name in branches:
+        if solver is None:
+            raise ValueError(f"branch '{name}' is named, but robot '{robot.name}' has no closed-form inverse")
+        if name not in solver.branches:
+            raise ValueError(
+                f"robot '{robot.name}' has no branch '{name}'; {nearest_choice(name, solver.branches)}"
+            )
+
+
+def _empty_network(document: ModelDocument, robot: Robot) -> CorrectionNetwork | None:
+    """The network as described, its weights still to be filled in."""
+    names = [joint.name for joint in robot.joints]
+    groups, networks = [], []
+    for section in document.network:
+        for name in section.joints:
+            if name not in names:
+                raise ValueError(f"the network corrects joint '{name}'; {nearest_choice(name, names)}")
+        inputs = Inputs.of(robot, section.inputs, np.array(section.reference))
+        groups.append(JointGroup(tuple(names.index(name) for name in section.joints), inputs))
+        networks.append(PiSigma(len(section.inputs), len(section.joints), section.orders))
+    return CorrectionNetwork(robot.dof, groups, networks) if groups else None
+
+
+def _check_tensors(tensors: dict[str, Tensor], expected: dict[str, Shape]) -> None:
+    """Refuse tensors that are not exactly the expected ones; None in a shape is any length."""
+    for name in sorted(set(tensors) ^ set(expected)):
+        raise ValueError(f"the tensor '{name}' is {'unknown' if name in tensors else 'missing'}")
+    for name, shape in expected.items():
+        value = tensors[name]
+        fits = len(shape) == value.ndim and all(
+            want in (None, got) for want, got in zip(shape, value.shape, strict=True)
+        )
+        if not fits:
+            wanted = str(tuple("any" if length is None else length for length in shape)).replace("'", "")
+            raise ValueError(f"the tensor '{name}' of shape {wanted} was wanted, got {tuple(value.shape)}")
+        dtype = DTYPES.get(name, torch.float64)
+        if value.dtype != dtype:
+            kind = str(dtype).removeprefix("torch.")
+            raise ValueError(f"the tensor '{name}' in {kind} was wanted, got {value.dtype}")

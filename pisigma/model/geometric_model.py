@@ -1,0 +1,116 @@
+"""A geometric or hybrid calibration as a model that corrected inverse kinematics can be made from."""
+
+import platform
+from dataclasses import replace
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.hybrid.result import HybridResult, unexplained_length
+from pisigma.hybrid.uncertainty import PositionUncertainty
+from pisigma.identification.result import CalibrationResult
+from pisigma.inverse.identified_arm import IdentifiedArm
+from pisigma.kinematics.closed_form import closed_form_solver
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.accuracy import geometry_of
+from pisigma.model.calibrated_model import CalibratedModel, Provenance
+from pisigma.model.row_poses import Frames
+from pisigma.model.stored_starts import StoredStarts, spread_rows
+from pisigma.robot.description import Robot
+
+
+def model_of_calibration(
+    name: str,
+    nominal: Robot,
+    result: CalibrationResult,
+    measurements: Measurements,
+    recipe: tuple[str, str] = ("", ""),
+) -> CalibratedModel:
+    """Make the model of a geometric calibration.
+
+    Its poses are those of the first target in the first frame of the measurements. Nominal joint values are
+    those of the nominal arm on the base and with the tool that were identified.
+
+    Args:
+        name: of the model.
+        nominal: the robot as drawn.
+        result: its calibration.
+        measurements: the rows it was calibrated with.
+        recipe: name and SHA-256 of the recipe, where there was one.
+    """
+    robot = nominal.with_geometry(base=result.robot.base, tool=result.robot.tool)
+    starts = spread_rows(torch.unique(measurements.q.cpu(), dim=0))
+    return CalibratedModel(
+        name=name,
+        kind="geometric_calibration",
+        robot=robot,
+        network=None,
+        domain=None,
+        branches=_branches(robot, result.robot, starts),
+        starts=starts,
+        calibrated=result.robot,
+        bases=dict(result.bases),
+        tools=dict(result.tools),
+        provenance=Provenance(
+            recipe=recipe[0],
+            recipe_sha256=recipe[1],
+            data_source=Path(measurements.source).name,
+            data_sha256=measurements.content_hash(),
+            rows=measurements.rows,
+            rows_left_out=len(measurements.left_out),
+            versions={name: version(name) for name in ("pisigma", "torch")}
+            | {"python": platform.python_version()},
+        ),
+    )
+
+
+def model_of_hybrid(
+    name: str,
+    nominal: Robot,
+    result: HybridResult,
+    measurements: Measurements,
+    recipe: tuple[str, str] = ("", ""),
+) -> CalibratedModel:
+    """Make the model of a hybrid calibration; without a joint correction that of its geometric calibration.
+
+    For the arguments see `model_of_calibration`. The uncertainty is kept in float32, so that the model is the
+    same before it is written and after it is read.
+    """
+    known, learned = result.geometric, result.learned
+    model = model_of_calibration(name, nominal, known, measurements, recipe)
+    model = replace(model, unexplained=unexplained_length(known))
+    if learned is None:
+        kept = _kept(result.uncertainty, known.robot, model.bases, model.tools)
+        return replace(model, uncertainty=kept)
+    found = learned.geometry
+    bases, tools = dict(found.bases), dict(found.tools)
+    return replace(
+        model,
+        kind="hybrid_calibration",
+        hybrid=result.arm(),
+        hybrid_bases=bases,
+        hybrid_tools=tools,
+        uncertainty=_kept(result.uncertainty, found.robot, bases, tools),
+    )
+
+
+def _kept(
+    uncertainty: PositionUncertainty, robot: Robot, bases: Frames, tools: Frames
+) -> PositionUncertainty:
+    """An uncertainty at the geometry of a model, with a root that float32 holds."""
+    geometry = geometry_of(robot, bases, tools)
+    return replace(uncertainty, geometry=geometry, root=uncertainty.root.float().double())
+
+
+def _branches(nominal: Robot, calibrated: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:
+    """Branches of the nominal arm that joint values lie on, most frequent first; empty without closed form."""
+    solver = closed_form_solver(nominal)
+    if solver is None:
+        return ()
+    index = IdentifiedArm(nominal, calibrated, solver, StoredStarts(calibrated, q)).branch_of(q)
+    counts = torch.bincount(index, minlength=len(solver.branches))
+    order = counts.argsort(descending=True, stable=True).tolist()
+    return tuple(solver.branches[i] for i in order if counts[i] > 0)

@@ -1,0 +1,113 @@
+"""Where the tool of a hybrid arm is and how it moves, a chunk of poses at a time."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from pisigma.hybrid.arms import HybridArm, blend
+from pisigma.joint_correction.batched_correction import BatchedCorrection
+from pisigma.kinematics.jacobian import joint_jacobian
+from pisigma.measurement.conditions import with_conditions
+from pisigma.measurement.dataset import Measurements
+from pisigma.se3 import rotation_vector
+
+Correct = Callable[[Tensor], Tensor]
+"""Corrections `(*batch, dof)` of joint values `(*batch, dof)` [rad or m]."""
+
+CHUNK = 4_096
+"""Poses whose features are in memory at a time: a few hundred columns a joint."""
+
+STEP = 1e-5
+"""[rad or m] Of differences: with 100 cycles a turn their error is a millionth of a slope."""
+
+
+def hybrid_poses(arm: HybridArm, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch 4 4"]:
+    """Poses T_base_tool of an arm at commanded joint values [rad or m], of any number of rows.
+
+    Raises:
+        PoseError: q has another number of columns than the robot has joints.
+    """
+    arm.geometric.check_joint_count(q.shape[-1])
+    flat = q.reshape(-1, q.shape[-1])
+    return torch.cat([arm.forward(part) for part in torch.split(flat, CHUNK)]).reshape(*q.shape[:-1], 4, 4)
+
+
+def corrected_joints(arm: HybridArm, measurements: Measurements) -> Float64[Tensor, "rows dof"]:
+    """Joint values of measured rows with the correction of the network in full, `q + Δ(q)` [rad or m]."""
+    state, dof = with_conditions(measurements, arm.correction.conditions), measurements.dof
+    with torch.no_grad():
+        return torch.cat([part[:, :dof] + arm.correction(part) for part in torch.split(state, CHUNK)])
+
+
+def hybrid_motion(
+    arm: HybridArm, q: Float[Tensor, "poses dof"], exact: bool = True, correct: Correct | None = None
+) -> tuple[Float[Tensor, "poses 4 4"], Float[Tensor, "poses 6 dof"]]:
+    """Poses and joint Jacobian of a hybrid arm.
+
+    With share s of the hybrid arm and e from the geometric to the hybrid pose, the Jacobian is
+    `s J_hybrid(q + Δ) (1 + dΔ/dq) + (1 - s) J_geometric(q) + e ds/dq`, up to the share of the curvature in e.
+
+    Args:
+        arm: the arm.
+        q: commanded joint values [rad or m].
+        exact: whether dΔ/dq is computed, which costs some times as much as Δ. Without it Newton steps contract by
+            |dΔ/dq|, of the order of 1e-2.
+        correct: Δ, where something gives it faster than the arm's correction itself.
+    """
+    chunk = CHUNK // (2 * q.shape[1]) if exact else CHUNK
+    with torch.no_grad():
+        parts = [_motion(arm, part, exact, correct or arm.correction) for part in torch.split(q, chunk)]
+    T, J = zip(*parts, strict=True)
+    return torch.cat(T), torch.cat(J)
+
+
+class HybridMotion:
+    """`hybrid_motion` of one arm, with what its correction needs prepared.
+
+    Attributes:
+        arm: the arm.
+    """
+
+    def __init__(self, arm: HybridArm) -> None:
+        """Prepare for an arm whose weights stay."""
+        self.arm = arm
+        self._batched = BatchedCorrection(arm.correction)
+
+    def __call__(
+        self, q: Float[Tensor, "poses dof"], exact: bool = True
+    ) -> tuple[Float[Tensor, "poses 4 4"], Float[Tensor, "poses 6 dof"]]:
+        """See `hybrid_motion`."""
+        return hybrid_motion(self.arm, q, exact, self._correct)
+
+    def _correct(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+        delta, _ = self._batched(q.reshape(-1, q.shape[-1]).T.contiguous())
+        return delta.T.reshape(q.shape)
+
+
+def _motion(arm: HybridArm, q: Tensor, exact: bool, correct: Correct) -> tuple[Tensor, Tensor]:
+    T_hybrid, J_hybrid = joint_jacobian(arm.hybrid, q + correct(q))
+    if exact:
+        J_hybrid = J_hybrid + J_hybrid @ _slope(correct, q)
+    share = arm.coverage.share(q)
+    if bool((share == 1).all()):
+        return T_hybrid, J_hybrid
+    T_geometric, J_geometric = joint_jacobian(arm.geometric, q)
+    shift = T_hybrid[:, :3, 3] - T_geometric[:, :3, 3]
+    turn = rotation_vector(T_hybrid[:, :3, :3] @ T_geometric[:, :3, :3].mT)
+    fading = _slope(lambda moving: arm.coverage.share(moving)[..., None], q)
+    between = torch.cat([shift, turn], -1)[..., None] @ fading
+    way = share[:, None, None]
+    return blend(T_geometric, T_hybrid, share), way * J_hybrid + (1 - way) * J_geometric + between
+
+
+def _slope(
+    function: Callable[[Tensor], Tensor], q: Float[Tensor, "poses dof"]
+) -> Float[Tensor, "poses values dof"]:
+    """Derivatives of a function of every pose's joint values, by central differences in one call."""
+    step = STEP * torch.eye(q.shape[1], dtype=q.dtype, device=q.device)
+    values = function(q[:, None] + torch.cat([step, -step]))
+    above, below = torch.chunk(values, 2, 1)
+    slope: Tensor = (above - below).mT / (2 * STEP)
+    return slope

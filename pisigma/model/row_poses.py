@@ -1,0 +1,110 @@
+"""Poses that a model predicts for measured rows, each of the row's target in the row's frame."""
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.hybrid.arms import blend
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.hybrid_motion import corrected_joints
+from pisigma.robot.description import Robot
+from pisigma.se3 import invert, transform_from_xyzrpy
+
+Frames = dict[str, Float64[np.ndarray, " 6"]]
+"""Bases per frame or tools per target: x, y, z [m], roll, pitch, yaw [rad]."""
+
+
+def poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
+    """Where a model of any kind says that the targets were, each in the frame of its row.
+
+    NaN where the model predicts nothing; see `CalibratedModel.forward`. Under the conditions (payload, temperature)
+    of the rows, where a hybrid knows of them; `CalibratedModel.forward` is under the usual ones.
+
+    Raises:
+        MeasurementError: the model does not know a frame or target of the rows.
+        PoseError: the joint values do not fit the robot.
+    """
+    arm, q = model.hybrid, measurements.q
+    if arm is None:
+        return _seen(model.forward(q), model.robot, model.bases, model.tools, measurements)
+    model.robot.check_joint_count(q.shape[-1])
+    T_geometric = _seen(
+        forward_kinematics(arm.geometric, q), arm.geometric, model.bases, model.tools, measurements
+    )
+    T_hybrid = forward_kinematics(arm.hybrid, corrected_joints(arm, measurements))
+    T_hybrid = _seen(T_hybrid, arm.hybrid, model.hybrid_bases, model.hybrid_tools, measurements)
+    return blend(T_geometric, T_hybrid, arm.coverage.share(q))
+
+
+def nominal_poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
+    """The same for the model's robot without any correction, its bases and tools as fitted.
+
+    For errors see `poses_of_rows`.
+    """
+    T = forward_kinematics(model.robot, measurements.q)
+    return _seen(T, model.robot, model.bases, model.tools, measurements)
+
+
+def known_names(
+    known: Frames, names: tuple[str, ...], what: str, measurements: Measurements
+) -> tuple[str, ...]:
+    """The frame or target of every row as the model calls it.
+
+    A model that was fitted to rows without names takes rows of any one name, and one that was fitted to a
+    single name takes rows without.
+
+    Args:
+        known: what the model knows.
+        names: of the rows.
+        what: "frame" or "target".
+        measurements: the rows, for messages.
+
+    Raises:
+        MeasurementError: the model does not know a name.
+    """
+    if not set(known) - {""}:
+        other = next((row for row, name in enumerate(names) if name != names[0]), None)
+        if other is not None:
+            raise MeasurementError(
+                f"{measurements.place(other)}: {what} '{names[other]}' stands there, but "
+                f"{measurements.place(0)} has '{names[0]}', and the model knows one {what} only; give a file for each."
+            )
+        return ("",) * len(names)
+    if len(known) == 1 and not any(names):
+        return tuple(known) * len(names)
+    for row, name in enumerate(names):
+        if name not in known:
+            raise MeasurementError(
+                f"{measurements.place(row)}: the model was not fitted to {what} '{name}'; "
+                f"{nearest_choice(name, known)}"
+            )
+    return names
+
+
+def _seen(
+    T: Float64[Tensor, "rows 4 4"], robot: Robot, bases: Frames, tools: Frames, measurements: Measurements
+) -> Float64[Tensor, "rows 4 4"]:
+    """Poses T_base_tool as poses of the rows' targets in the rows' frames."""
+    before = _of_rows(bases, measurements.frame, "frame", measurements)
+    behind = _of_rows(tools, measurements.target, "target", measurements)
+    if before is not None:
+        T = before @ invert(transform_from_xyzrpy(torch.from_numpy(robot.base.copy()))) @ T
+    if behind is not None:
+        T = T @ invert(transform_from_xyzrpy(torch.from_numpy(robot.tool.copy()))) @ behind
+    return T
+
+
+def _of_rows(
+    known: Frames, names: tuple[str, ...], what: str, measurements: Measurements
+) -> Float64[Tensor, "rows 4 4"] | None:
+    """The base or tool of every row; None where there is one only, which the robot has already."""
+    names = known_names(known, names, what, measurements)
+    if len(known) < 2:
+        return None
+    order = list(known)
+    frames = transform_from_xyzrpy(torch.from_numpy(np.stack([known[name] for name in order])))
+    return frames[torch.tensor([order.index(name) for name in names], dtype=torch.int64)]

@@ -1,0 +1,227 @@
+"""Which touches to make: those after which the robot's position is known best over its workspace."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError
+from pisigma.identification.problem.parameters import USUAL_ANGLE, USUAL_LENGTH, ParameterSpace, Prior
+from pisigma.kinematics.parameter_jacobian import identification_jacobian
+from pisigma.robot.description import Robot
+from pisigma.simulation.touch_candidates import TouchCandidates
+
+VAGUE = 300.0
+"""Standard deviation of what nothing is known about, in mm and mrad: so wide that it does not matter."""
+LEAST_GAIN = 1e-4
+"""Share of the criterion that an exchange must gain; below it the search ends."""
+DROPPED = 0.02
+"""Share of the touches that is dropped at a time while there are too many."""
+MOST_EXCHANGES = 500
+"""Exchanges after which the search ends in any case."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanningProblem:
+    """What touches tell of the parameters, and what the parameters do to the tool over the workspace.
+
+    Parameters are in millimetres and milliradians: the free ones of the arm, the tool's x, y and z, then six
+    of every placement's base.
+
+    Attributes:
+        rows: derivative of every candidate's coordinate over the standard deviation of a touch.
+        weight: mean over the workspace of J^T J, J the derivative of the tool's position in the robot's frame
+            [mm].
+        precision: 1 / variance of every parameter before anything is touched.
+    """
+
+    rows: Float64[Tensor, "candidates parameters"]
+    weight: Float64[Tensor, "parameters parameters"]
+    precision: Float64[Tensor, " parameters"]
+
+    def covariance(self, chosen: Int64[Tensor, " chosen"]) -> Float64[Tensor, "parameters parameters"]:
+        """Covariance of the parameters after these touches: `(P + Σ a aᵀ)⁻¹`."""
+        rows = self.rows[chosen]
+        return torch.cholesky_inverse(torch.linalg.cholesky(torch.diag(self.precision) + rows.mT @ rows))
+
+    def criterion(self, chosen: Int64[Tensor, " chosen"]) -> float:
+        """Mean over the workspace of the predicted squared position error, `tr(C W)` [mm²]."""
+        return float((self.covariance(chosen) * self.weight).sum())
+
+    def predicted_error(self, chosen: Int64[Tensor, " chosen"]) -> float:
+        """Predicted RMS position error over the workspace after these touches [m]."""
+        return math.sqrt(self.criterion(chosen)) / 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class TouchPlan:
+    """The touches that were chosen.
+
+    Attributes:
+        chosen: index of every chosen candidate, ascending.
+        predicted_error: RMS position error over the workspace that is predicted for them [m].
+        path: the same after dropping and after every exchange [m].
+    """
+
+    chosen: Int64[Tensor, " chosen"]
+    predicted_error: float
+    path: tuple[float, ...]
+
+
+def build_planning_problem(
+    robot: Robot,
+    candidates: TouchCandidates,
+    Ts_jig_base: Float64[Tensor, "placements 4 4"],
+    workspace: Float64[Tensor, "poses dof"],
+    free: Sequence[str],
+    prior: Prior | None = None,
+    sigma: float = 2e-4,
+) -> PlanningProblem:
+    """Linearise touches and workspace at the nominal robot.
+
+    The row of a touch is `e_axis · R_jig_base · ∂p/∂x` (Lim et al., eqs 35 to 37), next to the derivative by
+    the base of its own placement (eq. 34).
+
+    Args:
+        robot: the nominal robot.
+        candidates: what could be touched.
+        Ts_jig_base: where the jigs are believed to stand [m], in the order of `candidates.placements`.
+        workspace: joint values [rad or m] where the robot shall be accurate.
+        free: names of the arm's parameters that the calibration will estimate, such as "theta_2".
+        prior: standard deviations of their errors; None for none.
+        sigma: standard deviation of a touch [m].
+
+    Raises:
+        IdentificationError: a name is no parameter of the arm, or there is no workspace.
+        PoseError: the workspace's joint values do not fit the robot.
+    """
+    if not len(workspace):
+        raise IdentificationError("joint values over the workspace were wanted, got none; state some poses.")
+    space = ParameterSpace(robot)
+    arm = [space.index(name) for name in free]
+    if wrong := [name for name, index in zip(free, arm, strict=True) if index >= space.arm_size]:
+        raise IdentificationError(
+            f"'{wrong[0]}' is no parameter of the arm; the tool's position and every base are planned for anyway, "
+            "so leave it out."
+        )
+    tool = space.arm_size + 6
+    columns = [*arm, tool, tool + 1, tool + 2]
+    usual = torch.from_numpy(space.usual_errors)[columns]
+    own = torch.tensor([USUAL_LENGTH] * 3 + [USUAL_ANGLE] * 3, dtype=torch.float64)
+    size = len(columns) + 6 * len(Ts_jig_base)
+    rows = torch.zeros(candidates.count, size, dtype=torch.float64)
+    free_of_base = robot.with_geometry(base=np.zeros(6))
+    for number, T_jig_base in enumerate(Ts_jig_base):
+        chosen = (candidates.placement == number).nonzero()[:, 0]
+        T, J = identification_jacobian(free_of_base, candidates.q[chosen])
+        along = T_jig_base[candidates.axis[chosen], :3]
+        start = len(columns) + 6 * number
+        rows[chosen, : len(columns)] = torch.einsum("ni,nip->np", along, J[:, :3, columns]) * usual
+        rows[chosen, start : start + 6] = _base_rows(along, T[:, :3, 3]) * own
+    _, J = identification_jacobian(free_of_base, workspace)
+    J = J[:, :3, columns] * usual * 1e3
+    weight = torch.zeros(size, size, dtype=torch.float64)
+    weight[: len(columns), : len(columns)] = torch.einsum("nip,niq->pq", J, J) / len(workspace)
+    known = torch.from_numpy(space.precision(prior))[columns] * usual**2
+    precision = torch.full((size,), VAGUE**-2, dtype=torch.float64)
+    precision[: len(columns)] = torch.where(known > 0, known, VAGUE**-2)
+    return PlanningProblem(rows / sigma, weight, precision)
+
+
+def plan_touches(problem: PlanningProblem, count: int) -> TouchPlan:
+    """Choose touches that lower the predicted error over the workspace.
+
+    The criterion is `tr(C W)`, the mean variance of the tool's position over the workspace (V- or
+    I-optimality), which says how far off the robot will be; a condition number does not. Starting with all
+    candidates, those that are missed least are dropped, and then touches are exchanged, each time the pair that
+    gains most. The changes for all candidates and all pairs come at once from rank-one updates of the covariance
+    (Sherman and Morrison 1950). No candidate is chosen twice, and the same problem gives the same touches.
+
+    Source: exchange of Fedorov 1972, "Theory of Optimal Experiments", section 3.3; dropping of
+    Mitchell 1974, "An algorithm for the construction of D-optimal experimental designs" (DETMAX). For robots Borm
+    and Menq 1991 and Daney, Papegay and Madeline 2005 choose poses, by observability instead.
+
+    Args:
+        problem: from `build_planning_problem`.
+        count: touches to choose.
+
+    Raises:
+        IdentificationError: there are not as many candidates.
+    """
+    total = len(problem.rows)
+    if not 1 <= count <= total:
+        raise IdentificationError(
+            f"1 to {total} touches can be planned from {total} candidates, {count} were wanted; "
+            "ask for fewer or draw more candidates."
+        )
+    chosen = _thinned(problem, count)
+    best = problem.criterion(chosen)
+    path = [best]
+    for _ in range(MOST_EXCHANGES if count < total else 0):
+        gain, out, into = _best_exchange(problem, chosen)
+        if gain < LEAST_GAIN * best:
+            break
+        trial = chosen.clone()
+        trial[out] = into
+        value = problem.criterion(trial)
+        if value >= best:
+            break
+        chosen, best = trial, value
+        path.append(best)
+    lengths = tuple(math.sqrt(value) / 1e3 for value in path)
+    return TouchPlan(chosen.sort().values, lengths[-1], lengths)
+
+
+def _base_rows(
+    along: Float64[Tensor, "touches 3"], position: Float64[Tensor, "touches 3"]
+) -> Float64[Tensor, "touches 6"]:
+    """Derivative of the coordinates by a small shift and turn of the robot's base, both in the robot's frame.
+
+    They span what x, y, z, roll, pitch and yaw span, so the predicted error is the same.
+    """
+    return torch.cat([along, torch.linalg.cross(position, along)], -1)
+
+
+def _thinned(problem: PlanningProblem, count: int) -> Int64[Tensor, " chosen"]:
+    """Start with all candidates and drop those that are missed least, some percent at a time.
+
+    Adding from nothing would never leave the first jig, as the first touches of another one only tell where it
+    stands. Without the row a the covariance becomes `C + C a aᵀ C / (1 - aᵀ C a)`, so the criterion rises by
+    `aᵀ C W C a / (1 - aᵀ C a)`.
+    """
+    chosen = torch.arange(len(problem.rows))
+    while (surplus := len(chosen) - count) > 0:
+        A, C = problem.rows[chosen], problem.covariance(chosen)
+        AC = A @ C
+        loss = ((AC @ problem.weight) * AC).sum(-1) / (1 - (AC * A).sum(-1)).clamp(min=1e-12)
+        dropped = max(1, min(surplus, round(DROPPED * len(chosen))))
+        chosen = chosen[loss.argsort(stable=True)[dropped:].sort().values]
+    return chosen
+
+
+def _best_exchange(problem: PlanningProblem, chosen: Int64[Tensor, " chosen"]) -> tuple[float, int, int]:
+    """The exchange that gains most: its gain [mm²], the place in `chosen`, the candidate that comes there.
+
+    Adding j and then dropping i are two rank-one updates. With `d_ij = a_iᵀ C a_j` and `e_ij = a_iᵀ C W C
+    a_j`, and d', e' those of i after j was added, the criterion falls by
+    `e_jj / (1 + d_jj) - e'_ii / (1 - d'_ii)`.
+    """
+    A, C = problem.rows, problem.covariance(chosen)
+    AC = A @ C
+    ACW = AC @ problem.weight
+    d_j, e_j = (AC * A).sum(-1), (ACW * AC).sum(-1)
+    d_i, e_i = d_j[chosen, None], e_j[chosen, None]
+    d = AC[chosen] @ A.mT
+    e = ACW[chosen] @ AC.mT
+    share = d / (1 + d_j)
+    after = e_i - 2 * share * e + share * share * e_j
+    left = (1 - d_i + share * d).clamp(min=1e-12)
+    gain = e_j / (1 + d_j) - after / left
+    gain[:, chosen] = -torch.inf
+    best = int(gain.argmax())
+    out, into = divmod(best, gain.shape[1])
+    return float(gain[out, into]), out, into

@@ -1,0 +1,1 @@
+"""Recipe files: what to train, on what."""

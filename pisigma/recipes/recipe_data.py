@@ -1,0 +1,117 @@
+"""The rows of a recipe: simulated, or read from a file and parted by its column `set`."""
+
+from pathlib import Path
+
+import torch
+
+from pisigma.errors import MeasurementError, RecipeError
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joining import join
+from pisigma.measurement.splits import TrainTest
+from pisigma.recipes.geometric_recipe import GeometricRecipe
+from pisigma.recipes.hybrid_recipe import HybridRecipe, repeated
+from pisigma.recipes.jig_recipe import JigRecipe
+from pisigma.recipes.recipe import Recipe, SimulatedData
+from pisigma.robot.description import Robot
+from pisigma.simulation.true_robot import TrueRobot
+
+
+def part_sets(measurements: Measurements) -> tuple[Measurements, Measurements | None]:
+    """Part rows by the column `set`: those to train on, and those that are kept aside for a test.
+
+    Args:
+        measurements: rows, with or without the column.
+
+    Returns:
+        The rows to train on, and the others; None where there are none.
+
+    Raises:
+        MeasurementError: all rows are kept aside, or the two rows of a pair are in different sets.
+    """
+    test = torch.tensor([name == "test" for name in measurements.split or ()], dtype=torch.bool)
+    if not test.any():
+        return measurements, None
+    if test.all():
+        raise MeasurementError(
+            f"{measurements.source}: column 'set' marks all {measurements.rows} rows as 'test', so nothing is "
+            "left to train on; mark some as 'train' or remove the column."
+        )
+    return measurements.select(~test), measurements.select(test)
+
+
+def load_measurements(recipe: Recipe | HybridRecipe, data: Path | None) -> Measurements:
+    """Give the rows of a recipe: the simulated training rows, or all of a file; see `part_sets`.
+
+    Raises:
+        RecipeError: a simulated recipe was given a file, or a measured one none.
+        MeasurementError: the file cannot be used.
+    """
+    robot = Robot.load(recipe.robot)
+    if isinstance(recipe.data, SimulatedData):
+        if data is not None:
+            raise RecipeError(f"recipe '{recipe.name}' simulates its data and takes no --data; leave it out.")
+        return simulate_training(recipe)
+    if data is None:
+        raise RecipeError(f"recipe '{recipe.name}' is for measured data; give the file with --data FILE.csv.")
+    return Measurements.read_csv(data, robot)
+
+
+def simulate_training(recipe: Recipe | GeometricRecipe | HybridRecipe | JigRecipe) -> Measurements:
+    """Measure the training rows of a recipe on its true robot; with jigs, the touches of the first seed.
+
+    Raises:
+        RecipeError: the recipe is for measured data.
+    """
+    if isinstance(recipe, JigRecipe):
+        return recipe.measure(recipe.draw_touches(0), 0)
+    section = recipe.measurements if isinstance(recipe, GeometricRecipe) else simulated_data(recipe).training
+    return section.measure(_true_robot(recipe))
+
+
+def simulate_held_out(recipe: Recipe | GeometricRecipe | HybridRecipe | JigRecipe) -> Measurements:
+    """Measure the held-out rows of a recipe on its true robot.
+
+    Raises:
+        RecipeError: the recipe is for measured data, or has no held-out rows.
+    """
+    if isinstance(recipe, JigRecipe):
+        raise RecipeError(f"recipe '{recipe.name}' has no held-out rows; leave --held-out out.")
+    section = recipe.held_out if isinstance(recipe, GeometricRecipe) else simulated_data(recipe).held_out
+    return section.measure(_true_robot(recipe))
+
+
+def simulate_repeats(recipe: HybridRecipe) -> tuple[Measurements, tuple[TrainTest, ...]]:
+    """Measure training and held-out rows of every repeat of a simulation.
+
+    Returns:
+        All rows together, and per repeat which of them are its training and its held-out rows.
+
+    Raises:
+        RecipeError: the recipe is for measured data.
+    """
+    robot, rows, parts, start = Robot.load(recipe.robot), [], [], 0
+    for repeat in range(recipe.repeats):
+        data = repeated(simulated_data(recipe), repeat)
+        true = TrueRobot(robot, data.errors)
+        train, test = data.training.measure(true), data.held_out.measure(true)
+        middle, end = start + train.rows, start + train.rows + test.rows
+        parts.append((torch.arange(start, middle), torch.arange(middle, end)))
+        rows += [train, test]
+        start = end
+    return join(rows), tuple(parts)
+
+
+def simulated_data(recipe: Recipe | HybridRecipe) -> SimulatedData:
+    """The section of a recipe that simulates its data.
+
+    Raises:
+        RecipeError: the recipe is for measured data.
+    """
+    if not isinstance(recipe.data, SimulatedData):
+        raise RecipeError(f"recipe '{recipe.name}' is for measured data and simulates nothing; use another.")
+    return recipe.data
+
+
+def _true_robot(recipe: Recipe | GeometricRecipe | HybridRecipe) -> TrueRobot:
+    errors = recipe.errors if isinstance(recipe, GeometricRecipe) else simulated_data(recipe).errors
+    return TrueRobot(Robot.load(recipe.robot), errors)

@@ -1,0 +1,79 @@
+"""The same calibration with different parameters left out, and the correlations that tell which may be."""
+
+import math
+from typing import Any
+
+import numpy as np
+
+from pisigma.identification.identifiability.pairwise import CorrelationTable
+from pisigma.identification.problem.parameters import ParameterSpace
+from pisigma.identification.result import CalibrationResult
+from pisigma.judging.calibration_validation import errors_under
+from pisigma.measurement.dataset import Measurements
+from pisigma.recipes.geometric_recipe import GeometricRecipe
+from pisigma.robot.description import Robot
+from pisigma.simulation.true_robot import TrueRobot
+
+_DECIMALS = 6
+
+
+def report_eliminations(
+    recipe: GeometricRecipe, result: CalibrationResult, rows: Measurements, held_out: Measurements
+) -> dict[str, Any]:
+    """Calibrate without the parameters of every case of the recipe, and with all (Park et al. 2022, Tables 7 to 10).
+
+    Args:
+        recipe: names the cases.
+        result: the recipe's own calibration, for its redundant sets.
+        rows: what to calibrate on.
+        held_out: what to judge on.
+
+    Returns:
+        ``{"elimination_cases": [...], "true_values": {...}}``: per case what was left out, how many parameters
+        were estimated, the RMS error after every iteration, that of held-out rows, and the values of all members
+        of redundant sets [mm, deg]. Empty where the recipe names no case.
+    """
+    if not recipe.elimination_cases:
+        return {}
+    names = [name.removeprefix("-") for members in result.pairwise.sets for name in members]
+    space = ParameterSpace(result.robot, (recipe.measurements.frame,), ("",))
+    cases = []
+    for removed in (*recipe.elimination_cases, ()):
+        found = recipe.calibrate_without(removed, rows)
+        errors = errors_under(found, held_out).in_file_units()
+        cases.append(
+            {
+                "removed": list(removed),
+                "parameters": len(found.free),
+                "status": found.status.value,
+                "rmse_mm": [value * 1e3 for value in found.rms_path],
+                "held_out_rms_mm": errors["rms_mm"],
+                "values": _values(found.robot, names, space),
+            }
+        )
+    truth = TrueRobot(Robot.load(recipe.robot), recipe.errors).geometry
+    return {"elimination_cases": cases, "true_values": _values(truth, names, space)}
+
+
+def report_correlations(result: CalibrationResult) -> dict[str, Any]:
+    """Pearson correlations of lengths and of angles (Park et al. 2022, Tables 3 to 6); None where there is none."""
+    pairwise = result.pairwise
+    return {"correlations": {"lengths": _table(pairwise.lengths), "angles": _table(pairwise.angles)}}
+
+
+def _table(table: CorrelationTable) -> dict[str, Any]:
+    values = [
+        [None if np.isnan(value) else round(float(value), _DECIMALS) for value in row] for row in table.values
+    ]
+    return {"names": list(table.names), "values": values}
+
+
+def _values(robot: Robot, names: list[str], space: ParameterSpace) -> dict[str, float]:
+    """Parameters of the arm by name [mm, deg]."""
+    values = robot.dh.reshape(-1)
+    found = {}
+    for name in names:
+        place = space.index(name)
+        length = space.parameters[place].unit == "m"
+        found[name] = float(values[place]) * 1e3 if length else math.degrees(float(values[place]))
+    return found

@@ -1,0 +1,247 @@
+"""What to measure next, as sentences with figures."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.hybrid.coverage import JointCoverage
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.reporting.page.accuracy import Accuracy
+from pisigma.reporting.page.judged_rows import JudgedRows
+from pisigma.reporting.page.limits import MOSTLY, Limit
+from pisigma.reporting.tables import figure_text
+
+Stretch = tuple[float, float]
+"""Lowest and highest joint value [rad or m]."""
+
+COVERED = 0.98
+"""Of a joint's range; less is a gap worth a sentence."""
+NOT_MOVED = 1e-3
+"""A joint that was measured over less of its range stood still."""
+STILL_FALLING = 0.05
+"""Relative gain of the last doubling of rows from which more rows are worth while."""
+SURE = 2.0
+"""A change of less than so many standard errors may be none."""
+LITTLE_KG, LITTLE_C = 0.5, 3.0
+"""Payload or temperature that differ by less say nothing of others."""
+COVERAGE_OFF = 0.03
+"""By how much the share within the 95 % intervals may be off."""
+
+
+def advice_for(
+    model: CalibratedModel, rows: JudgedRows | None, accuracies: tuple[Accuracy, ...], limit: Limit
+) -> tuple[str, ...]:
+    """Sentences, the most useful first.
+
+    Args:
+        model: the model.
+        rows: judged rows, or None.
+        accuracies: what is known of the accuracy.
+        limit: what limits it.
+    """
+    metrics = model.metrics
+    return (
+        *(f"{line[:1].upper()}{line[1:].rstrip('.')}." for line in metrics.get("warnings", ())),
+        *_independent(model, accuracies),
+        *_joint_gaps(model, rows),
+        *_outside(rows),
+        *_weak_parameters(metrics),
+        *_more_rows(model, limit),
+        *_trust(metrics),
+        *_orientations(model),
+        *_conditions(rows),
+        *_outliers(metrics),
+    )
+
+
+def measured_stretches(
+    model: CalibratedModel, q: Float64[Tensor, "rows dof"]
+) -> list[tuple[list[Stretch], Stretch]]:
+    """Per joint the stretches of its range that were measured, and the range [rad or m].
+
+    Joints that go all the way round have a range of one turn, and stretches that are the same a turn further.
+
+    Args:
+        model: a hybrid knows its own stretches.
+        q: measured joint values, for others.
+    """
+    coverage = model.hybrid.coverage if model.hybrid else JointCoverage.of(model.robot, q)
+    found = []
+    for j, (low, high) in enumerate(model.robot.limits.tolist()):
+        own, rate = coverage.joint == j, float(coverage.rate[j])
+        middle, half = coverage.middle[own].tolist(), coverage.half[own].tolist()
+        ends = [((m - h) / rate, (m + h) / rate) for m, h in zip(middle, half, strict=True)]
+        found.append(_in_range(ends, (low, high), 2 * math.pi / rate if coverage.turning[j] else None))
+    return found
+
+
+def _in_range(ends: list[Stretch], limits: Stretch, turn: float | None) -> tuple[list[Stretch], Stretch]:
+    """Stretches in one turn of a joint that goes all the way round, or within the limits of another."""
+    low, high = limits
+    if turn is not None and not high - low < turn - 1e-9:
+        if any(b - a >= turn - 1e-9 for a, b in ends):
+            return [(-turn / 2, turn / 2)], (-turn / 2, turn / 2)
+        back = [turn * round((a + b) / (2 * turn)) for a, b in ends]
+        return [(a - k, b - k) for (a, b), k in zip(ends, back, strict=True)], (-turn / 2, turn / 2)
+    shifts = [0.0] if turn is None else [turn * k for k in range(-2, 3)]
+    clipped = [(max(a + shift, low), min(b + shift, high)) for a, b in ends for shift in shifts]
+    return sorted((a, b) for a, b in clipped if b > a), limits
+
+
+def _joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> list[str]:
+    """Joints whose range was measured in part only."""
+    q = model.starts if rows is None or rows.origin == "unseen" else rows.measurements.q
+    if not len(q):
+        return []
+    parts = []
+    for j, (stretches, (low, high)) in enumerate(measured_stretches(model, q)):
+        name, turns = model.robot.joints[j].name, model.robot.revolute[j]
+        share = sum(b - a for a, b in stretches) / (high - low) if high > low else 1.0
+        if not math.isfinite(high - low) or share >= COVERED:
+            continue
+        factor, unit = (math.degrees(1.0), "deg") if turns else (1e3, "mm")
+        told = " and ".join(f"{a * factor:.0f} to {b * factor:.0f}" for a, b in stretches)
+        if share < NOT_MOVED:
+            parts.append(f"{name} at {float(q[0, j]) * factor:.0f} {unit} only")
+        elif turns and high - low > 2 * math.pi - 1e-6:
+            parts.append(f"{name} {told} {unit} ({100 * share:.0f} % of a turn)")
+        else:
+            whole = f"{100 * share:.0f} % of {low * factor:.0f} to {high * factor:.0f}"
+            parts.append(f"{name} {told} {unit} ({whole})")
+    if not parts:
+        return []
+    fades = "the learned correction fades out" if model.hybrid else "nothing was measured"
+    return [
+        f"Joints were measured in part only: {'; '.join(parts)}. Beyond that {fades}: measure there if programs "
+        "go there."
+    ]
+
+
+def _independent(model: CalibratedModel, accuracies: tuple[Accuracy, ...]) -> list[str]:
+    if model.provenance.data_source == "simulation":
+        return [
+            "The model was made of simulated rows: measure poses on a real robot and give them to this report."
+        ]
+    held_out = [accuracy for accuracy in accuracies if accuracy.held_out]
+    if not held_out:
+        return [
+            "No rows were held out: measure rows on another day and give them to this report, or calibrate with folds."
+        ]
+    if held_out[0].title == "rows of the file":
+        return []
+    return [
+        "All figures are from the measurement that the model was made of: measure some 50 other poses on another day, "
+        "with the load of the programs, and give them to this report."
+    ]
+
+
+def _outside(rows: JudgedRows | None) -> list[str]:
+    if rows is None or bool(rows.inside.all()):
+        return []
+    count, after = int((~rows.inside).sum()), rows.after.position.numpy() * 1e3
+    apart = [after[mask & np.isfinite(after)] for mask in (~rows.inside.numpy(), rows.inside.numpy())]
+    text = f"{count} of {rows.measurements.rows} rows have joint values outside those that the model was made with"
+    if all(len(part) for part in apart):
+        out, own = (figure_text(float(np.sqrt((part**2).mean()))) for part in apart)
+        text += f"; errors there are {out} mm RMS, inside {own} mm"
+    return [f"{text}: calibrate with such rows too."]
+
+
+def _weak_parameters(metrics: Mapping[str, Any]) -> list[str]:
+    lines = [
+        f"Hardly identified: {line.rstrip('.')}. Choose poses that move more of what it depends on."
+        for line in metrics.get("unseen", ())
+    ]
+    unsure = [
+        row["name"]
+        for row in metrics.get("parameters", ())
+        if row["standard_error"] and abs(row["change"]) < SURE * row["standard_error"]
+    ]
+    if unsure:
+        named = ", ".join(unsure[:8]) + (f" and {len(unsure) - 8} others" if len(unsure) > 8 else "")
+        lines.append(
+            f"{named}: the change from nominal is less than {SURE:.0f} standard errors, so it may be none; more rows "
+            "make the standard errors smaller with the root of their number."
+        )
+    return lines
+
+
+def _more_rows(model: CalibratedModel, limit: Limit) -> list[str]:
+    points = model.metrics.get("learning_curve") or []
+    name = "hybrid" if points and "hybrid" in points[-1] else "geometric"
+    if len(points) > 1 and name in points[-1]:
+        before, last = points[-2], points[-1]
+        gain = 1 - last[name]["rms_mm"] / before[name]["rms_mm"]
+        doublings = math.log2(last["rows"] / before["rows"])
+        each = 1 - (1 - gain) ** (1 / doublings) if doublings > 0 and gain < 1 else 0.0
+        first, second = (figure_text(point[name]["rms_mm"]) for point in (before, last))
+        told = f"from {before['rows']} to {last['rows']} rows the error went from {first} to {second} mm RMS"
+        if each >= STILL_FALLING:
+            return [f"More rows help: {told}, {100 * each:.0f} % per doubling."]
+        return [f"More rows of the same kind help little: {told}, {100 * max(each, 0.0):.0f} % per doubling."]
+    if limit.share is None or limit.share >= MOSTLY:
+        return []
+    return [
+        f"Scatter of the measurements is {100 * limit.share:.0f} % of the squared error only: more than the present "
+        f"{model.provenance.rows} rows would bring the rest down where it comes of too few of them."
+    ]
+
+
+def _trust(metrics: Mapping[str, Any]) -> list[str]:
+    figures = next(
+        (metrics[k] for k in ("cross_validation", "held_out", "test") if "coverage" in metrics.get(k, ())),
+        None,
+    )
+    if figures is None or abs(figures["coverage"] - 0.95) < COVERAGE_OFF:
+        return []
+    share = 100 * figures["coverage"]
+    kind = "too good: take it with a factor" if share < 95 else "cautious: errors are smaller than it says"
+    return [
+        f"{share:.1f} % of held-out coordinates are within the predicted 95 % intervals: the predicted accuracy is "
+        f"{kind}."
+    ]
+
+
+def _orientations(model: CalibratedModel) -> list[str]:
+    sensors = [noise["sensor"] for noise in model.metrics.get("noise", ())]
+    if not sensors or "rotation" in sensors or len(model.tools) > 2:
+        return []
+    return [
+        "Orientations were not measured: what turns the tool without moving the target stays unknown. Measure poses, "
+        "or three targets or more on the tool, where orientation counts."
+    ]
+
+
+def _conditions(rows: JudgedRows | None) -> list[str]:
+    """Payload and temperature, where a file could have told them."""
+    if rows is None or (rows.origin == "held_out" and rows.measurements.position is None):
+        return []
+    lines = []
+    for values, name, unit, little in (
+        (rows.measurements.payload, "payload", "kg", LITTLE_KG),
+        (rows.measurements.temperature, "temperature", "°C", LITTLE_C),
+    ):
+        known = torch.zeros(0) if values is None else values[torch.isfinite(values)]
+        if not len(known):
+            lines.append(f"The file states no {name}: the figures hold for the one of the measurement.")
+            continue
+        low, high = float(known.min()), float(known.max())
+        if high - low < little:
+            told = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
+            lines.append(f"The {name} was {told} {unit} throughout: nothing is known of others.")
+    return lines
+
+
+def _outliers(metrics: Mapping[str, Any]) -> list[str]:
+    outliers = metrics.get("outliers", ())
+    if not outliers:
+        return []
+    worst = ", ".join(str(outlier["place"]) for outlier in outliers[:3])
+    return [
+        f"{len(outliers)} rows counted for less than half as outliers: measure them again, the worst first ({worst})."
+    ]

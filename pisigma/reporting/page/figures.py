@@ -1,0 +1,222 @@
+"""Figures of a report: errors over what they may depend on, correlations, corrections, learning curve."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
+
+from pisigma.reporting.page.corrections import CorrectionCurve
+from pisigma.reporting.page.dependence import Dependence
+from pisigma.reporting.page.drawing import (
+    AFTER,
+    BEFORE,
+    MANY_DOTS,
+    OTHER,
+    SIZE,
+    Drawing,
+    drawing_style,
+)
+from pisigma.reporting.page.error_map import ErrorMap
+from pisigma.reporting.page.regions import binned
+
+MOST_MAP_DOTS = 1_500
+"""Of the flat map: the largest errors all, of the others every fourth and as many at most."""
+_MARKS = {"nominal": ("s", ":"), "geometric": ("o", "--"), "hybrid": ("^", "-")}
+
+
+def draw_dependence(found: Dependence) -> Drawing:
+    """Errors over one quantity: every row a dot, and the RMS error of its parts."""
+    with drawing_style():
+        figure, axes = _panel()
+        if "before" in found.errors:
+            _lengths(axes, found)
+        else:
+            _signed(axes, found)
+        unit = f" [{found.unit}]" if found.unit else ""
+        axes.set_xlabel(f"{found.title}{unit}")
+    return Drawing(f"residual_{found.key}", found.title, found.sentence, figure)
+
+
+def draw_correction(curve: CorrectionCurve) -> Drawing:
+    """What a joint is corrected by over its own value, measured values shaded."""
+    with drawing_style():
+        figure, axes = _panel()
+        for low, high in _stretches(curve.values, curve.measured):
+            axes.axvspan(low, high, color="0.92", linewidth=0)
+        dots = axes.plot(curve.dot_values, curve.dots, ".", color=OTHER, alpha=0.5, markersize=3)
+        dots[0].set_rasterized(len(curve.dots) > MANY_DOTS)
+        axes.plot(
+            curve.values, np.where(curve.measured, curve.correction, np.nan), "-", color=AFTER, linewidth=1.3
+        )
+        axes.plot(
+            curve.values, np.where(curve.measured, np.nan, curve.correction), "--", color=AFTER, linewidth=1.3
+        )
+        axes.axhline(0.0, color="black", linewidth=0.6)
+        axes.set(xlabel=f"{curve.joint} [{curve.unit}]", ylabel=f"correction [{curve.small_unit}]")
+    return Drawing(f"correction_{curve.joint}", curve.joint, curve.sentence, figure)
+
+
+def draw_correlations(
+    tables: Sequence[tuple[tuple[str, ...], Float64[np.ndarray, "_names _names"]]],
+) -> tuple[Drawing, ...]:
+    """Correlations of lengths and of angles; pairs that act alike bear their sign."""
+    found = []
+    for (names, values), title in zip(tables, ("lengths", "angles"), strict=False):
+        if not names:
+            continue
+        with drawing_style():
+            side = float(np.clip(0.25 * len(names) + 1.3, 3.4, 9.0))
+            figure = Figure(figsize=(side + 0.9, side), layout="constrained")
+            axes = figure.add_subplot()
+            axes.grid(False)
+            axes.set_facecolor("0.85")
+            shown = axes.imshow(values, cmap="RdBu", vmin=-1, vmax=1, interpolation="nearest")
+            labels = list(names)
+            axes.set_xticks(range(len(names)), labels, rotation=90, fontsize=8)
+            axes.set_yticks(range(len(names)), labels, fontsize=8)
+            for (i, k), value in np.ndenumerate(np.nan_to_num(values)):
+                if i != k and abs(value) >= 0.5:
+                    mark = "+" if value > 0 else "−"
+                    text = mark if abs(value) > 1 - 1e-6 else f"{10 * abs(value):.0f}"
+                    axes.text(
+                        k,
+                        i,
+                        text,
+                        ha="center",
+                        va="center",
+                        fontsize=6.5,
+                        color="white" if abs(value) > 0.7 else "black",
+                    )
+            figure.colorbar(shown, ax=axes, shrink=0.8).set_label("Pearson correlation")
+        alt = f"Correlations of the columns of {len(names)} {title}; the strongest pairs stand in the text."
+        found.append(Drawing(f"correlation_{title}", title, alt, figure))
+    return tuple(found)
+
+
+def draw_learning_curve(points: Sequence[Mapping[str, Any]]) -> Drawing:
+    """Error of held-out rows over the number of rows to calibrate with, both logarithmic."""
+    with drawing_style():
+        figure, axes = _panel()
+        rows = [point["rows"] for point in points]
+        for name, (mark, line) in _MARKS.items():
+            if name in points[0]:
+                errors = [point[name]["rms_mm"] for point in points]
+                axes.plot(
+                    rows,
+                    errors,
+                    line,
+                    marker=mark,
+                    label=name,
+                    color=BEFORE if name == "nominal" else AFTER if name == "hybrid" else OTHER,
+                )
+        axes.set(xscale="log", yscale="log", xlabel="rows to calibrate with", ylabel="RMS error [mm]")
+        axes.set_xticks(rows, [str(count) for count in rows])
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        _plain_log(axes)
+        axes.legend()
+    return Drawing(
+        "learning_curve", "learning curve", "RMS error of held-out rows over the number of rows.", figure
+    )
+
+
+def draw_map(found: ErrorMap) -> Drawing:
+    """The map from above and from the side, for paper and for pages without scripts."""
+    layers = found.layers[:3]
+    with drawing_style():
+        figure = Figure(figsize=(3.9 * len(layers), 5.8), layout="constrained")
+        grid = figure.subplots(2, len(layers), squeeze=False)
+        for column, layer in enumerate(layers):
+            known = np.isfinite(layer.values)
+            order = np.argsort(layer.values[known], kind="stable")
+            order = np.concatenate([order[:-MOST_MAP_DOTS:4], order[-MOST_MAP_DOTS:]])[-2 * MOST_MAP_DOTS :]
+            values, place = layer.values[known][order], found.place[known][order]
+            top = max(float(values.max(initial=0.0)), 1e-12)
+            for axes, (a, b) in zip(grid[:, column], ((0, 1), (0, 2)), strict=True):
+                dots = axes.scatter(
+                    place[:, a], place[:, b], c=values, s=2 + 16 * values / top, cmap="cividis", vmin=0.0, vmax=top,
+                    linewidths=0, rasterized=len(values) > MANY_DOTS,
+                )  # fmt: skip
+                axes.set_aspect("equal", "datalim")
+                axes.set(xlabel=f"{'xyz'[a]} [mm]", ylabel=f"{'xyz'[b]} [mm]")
+            grid[0, column].set_title(f"{layer.label}, largest {top:.3g} {layer.unit}")
+            figure.colorbar(
+                dots, ax=list(grid[:, column]), orientation="horizontal", format="%.2g"
+            ).set_label(layer.unit)
+    return Drawing("error_map", "map", "Errors over the workspace from above and from the side.", figure)
+
+
+def _panel() -> tuple[Figure, Axes]:
+    """A panel with fixed margins: working them out would take as long as drawing it."""
+    figure = Figure(figsize=SIZE)
+    figure.subplots_adjust(left=0.155, right=0.985, bottom=0.165, top=0.9)
+    axes = figure.add_subplot()
+    axes.xaxis.set_major_locator(MaxNLocator(6))
+    return figure, axes
+
+
+def _lengths(axes: Axes, found: Dependence) -> None:
+    """Lengths on a logarithmic axis: dots after, and root mean squares before and after."""
+    after = found.errors["after"]
+    floor = max(float(np.quantile(after, 0.01)) / 2, 1e-9) if len(after) else 1e-9
+    _dots(axes, found.values, np.maximum(after, floor), AFTER)
+    for name, color, line in (("before", BEFORE, "--"), ("after", AFTER, "-")):
+        lengths = found.errors[name]
+        known = np.isfinite(lengths)
+        if known.sum() < 3:
+            continue
+        parts = binned(found.values[known], lengths[known])
+        axes.stairs(
+            parts.rms,
+            parts.edges,
+            baseline=None,
+            color=color,
+            linestyle=line,
+            linewidth=2,
+            label=f"RMS {name}",
+        )
+    axes.set(yscale="log", ylabel=f"error [{found.error_unit}]")
+    _plain_log(axes)
+    if axes.get_legend_handles_labels()[0]:  # too few rows for parts have no lines
+        axes.legend(ncols=2, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
+
+
+def _signed(axes: Axes, found: Dependence) -> None:
+    """Signed errors, with the mean of parts of the rows."""
+    styles = {"x": (AFTER, "-", "o"), "y": (BEFORE, "--", "s"), "z": (OTHER, ":", "^")}
+    for name, (color, line, mark) in styles.items():
+        values = found.errors[name]
+        _dots(axes, found.values, values, color)
+        parts = np.array_split(np.arange(len(values)), min(20, max(len(values) // 8, 1)))
+        middle = [found.values[part].mean() for part in parts]
+        mean = [values[part].mean() for part in parts]
+        axes.plot(
+            middle, mean, line, marker=mark, markersize=3.5, color=color, label=f"mean {name}", linewidth=1.8
+        )
+    largest = max(float(np.quantile(np.abs(found.errors[name]), 0.995)) for name in styles)
+    axes.set(ylabel=f"error [{found.error_unit}]", ylim=(-1.15 * largest - 1e-12, 1.15 * largest + 1e-12))
+    axes.axhline(0.0, color="black", linewidth=0.6)
+    axes.legend(ncols=3, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
+
+
+def _dots(axes: Axes, x: np.ndarray, y: np.ndarray, color: str) -> None:
+    opacity = float(np.clip(800 / max(len(x), 1), 0.15, 0.6))
+    size = 3.6 if len(x) < 3_000 else 2.0
+    drawn = axes.plot(x, y, ".", color=color, alpha=opacity, markersize=size, markeredgewidth=0)
+    drawn[0].set_rasterized(len(x) > MANY_DOTS)
+
+
+def _plain_log(axes: Axes) -> None:
+    """Numbers such as 0.02 up a logarithmic axis; every tick costs a millisecond, so there are few."""
+    low, high = axes.get_ylim()
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if low > 0 and high < 300 * low else (1,)))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_locator(NullLocator())
+
+
+def _stretches(values: np.ndarray, inside: np.ndarray) -> list[tuple[float, float]]:
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], inside, [False]]).astype(int)))
+    return [(float(values[a]), float(values[b - 1])) for a, b in zip(edges[::2], edges[1::2], strict=True)]

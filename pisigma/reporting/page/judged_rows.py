@@ -1,0 +1,256 @@
+"""What a report knows of every row: where it is, and how far off before and after the calibration."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from pisigma.errors import MeasurementError, ModelError
+from pisigma.judging.held_out_rows import HeldOutRows
+from pisigma.judging.pose_statistics import PoseErrors
+from pisigma.judging.reference_models import nominal_model
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.accuracy import deviation_of_rows
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
+from pisigma.se3 import invert, transform_from_xyzrpy
+
+MOST_PREDICTED = 4_000
+"""The accuracy is predicted at so many rows at most, evenly over them: each costs a millisecond."""
+ROUNDING = 1e-9
+"""[rad] A joint value that is beyond the measured ones by less is not."""
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedRows:
+    """Rows and their errors, in SI units.
+
+    Attributes:
+        origin: "held_out": errors under calibrations that never saw the row; "training": of the rows that the model
+            was made of; "unseen": of other rows.
+        measurements: the rows; of a model's own held-out rows joint values and names only.
+        place: position of the tool in the robot's own base [m].
+        models: by name, "nominal" first and the model last, errors of every row.
+        residual: measured minus predicted position in the row's frame under the model [m]; NaN where there is none.
+        residual_origin: the same for the residuals as `origin` for the lengths.
+        predicted: standard deviation of the predicted position [m]; NaN where it is not known or not computed.
+        inside: whether every joint value was measured when the model was made.
+        remarks: what has to be said of these rows.
+    """
+
+    origin: str
+    measurements: Measurements
+    place: Float64[Tensor, "rows 3"]
+    models: Mapping[str, PoseErrors]
+    residual: Float64[Tensor, "rows 3"]
+    residual_origin: str
+    predicted: Float64[Tensor, " rows"]
+    inside: Bool[Tensor, " rows"]
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def before(self) -> PoseErrors:
+        """Errors of the robot as drawn."""
+        return self.models["nominal"]
+
+    @property
+    def after(self) -> PoseErrors:
+        """Errors of the model."""
+        return list(self.models.values())[-1]
+
+
+def name_of(model: CalibratedModel) -> str:
+    """What a model is called beside "nominal" in tables."""
+    if model.hybrid is not None:
+        return "hybrid"
+    return "geometric" if model.calibrated is not None else "corrected"
+
+
+def rows_of_file(
+    model: CalibratedModel, measurements: Measurements, held_out: HeldOutRows | None
+) -> JudgedRows:
+    """Judge the rows of a file; those marked as test alone, where some are.
+
+    Args:
+        model: the model.
+        measurements: the file.
+        held_out: what the model folder keeps of its held-out rows, or None.
+
+    Raises:
+        MeasurementError: no row can be judged.
+    """
+    rows, remarks = _unseen(measurements)
+    digest = rows.content_hash()
+    if held_out is not None and digest == held_out.data_sha256:
+        residual = held_out.residual
+        kept = bool(torch.isfinite(residual).any())
+        known = residual if kept else _model_errors(model, rows)[1]
+        origins = ("held_out", "held_out" if kept else "training")
+        return _judged(model, rows, held_out.models, known, origins, [*remarks, *_dealt(model)])
+    origin = "training" if digest == model.provenance.data_sha256 else "unseen"
+    remarks += _seen_before(model, rows) if origin == "unseen" else []
+    errors, residual = _model_errors(model, rows)
+    if not (torch.isfinite(errors.position).any() or errors.rotation is not None):
+        raise MeasurementError(
+            f"{rows.source}: no row holds a position, an orientation or a socket that was touched twice, so the model "
+            "cannot be judged on this file; give poses or positions, or leave the file out."
+        )
+    models = {"nominal": _nominal_errors(model, rows, remarks)}
+    if model.hybrid is not None:
+        models["geometric"] = _model_errors(replace(model, hybrid=None), rows)[0]
+    models[name_of(model)] = errors
+    if rows.socket is not None:
+        remarks.append(
+            "Rows in sockets are judged from where the model puts the ball of the socket on average: an error that all "
+            "rows of a socket share is not seen."
+        )
+    there = torch.isfinite(errors.position)
+    if not bool(there.all()) and bool(there.any()):
+        remarks.append(f"{int((~there).sum())} of {rows.rows} rows have no position error that can be known.")
+    return _judged(model, rows, models, residual, (origin, origin), remarks)
+
+
+def rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
+    """The held-out rows that a model folder keeps."""
+    rows = Measurements(
+        q=held_out.q, frame=held_out.frame, target=held_out.target, source=model.provenance.data_source
+    )
+    return _judged(model, rows, held_out.models, held_out.residual, ("held_out", "held_out"), _dealt(model))
+
+
+def _dealt(model: CalibratedModel) -> list[str]:
+    """A sentence where the errors that are kept of every row are those of one dealing among several."""
+    times = model.metrics.get("cross_validation", {}).get("dealings", 1)
+    if times == 1:
+        return []
+    return [
+        f"The rows were dealt to the folds {times} times; errors of single rows are those of the first time."
+    ]
+
+
+def place_of(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows 3"]:
+    """Position of the tool in the robot's own base [m]."""
+    T = model.forward(q)
+    T = torch.where(torch.isfinite(T), T, forward_kinematics(model.robot, q))
+    base = transform_from_xyzrpy(torch.from_numpy(model.robot.base.copy()))
+    return (invert(base) @ T)[:, :3, 3]
+
+
+def predicted_at(model: CalibratedModel, rows: Measurements) -> Float64[Tensor, " rows"]:
+    """Standard deviation of predicted positions [m]; NaN where it is not known, and past `MOST_PREDICTED` rows."""
+    found = torch.full((rows.rows,), torch.nan, dtype=torch.float64)
+    chosen = torch.linspace(0, rows.rows - 1, min(rows.rows, MOST_PREDICTED)).round().long()
+    if model.uncertainty is not None and len(chosen):
+        known = rows.select(chosen)
+        try:
+            found[chosen] = deviation_of_rows(model, known).norm(dim=-1)
+        except MeasurementError:  # a frame or target that was left out of the model
+            return found
+    return found
+
+
+def inside(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Bool[Tensor, " rows"]:
+    """Whether every joint value was measured; everywhere where the model does not keep that."""
+    if model.hybrid is None:
+        return torch.ones(len(q), dtype=torch.bool)
+    return model.hybrid.coverage.beyond(q).amax(-1) <= ROUNDING
+
+
+def _judged(
+    model: CalibratedModel,
+    rows: Measurements,
+    models: Mapping[str, PoseErrors],
+    residual: Float64[Tensor, "rows 3"],
+    origins: tuple[str, str],
+    remarks: list[str],
+) -> JudgedRows:
+    return JudgedRows(
+        origin=origins[0],
+        measurements=replace(rows, source=Path(rows.source).name),
+        place=place_of(model, rows.q),
+        models=models,
+        residual=residual,
+        residual_origin=origins[1],
+        predicted=predicted_at(model, rows),
+        inside=inside(model, rows.q),
+        remarks=tuple(remarks),
+    )
+
+
+def _unseen(measurements: Measurements) -> tuple[Measurements, list[str]]:
+    """The rows marked as test, or all where none is."""
+    test = torch.tensor([name == "test" for name in measurements.split or ()], dtype=torch.bool)
+    if not test.any():
+        return measurements, []
+    remark = f"The {int((~test).sum())} rows that the file marks as 'train' are left out."
+    return measurements.select(test), [remark] if not bool(test.all()) else []
+
+
+def _seen_before(model: CalibratedModel, rows: Measurements) -> list[str]:
+    """A remark where joint values are among those that the model keeps of its training rows."""
+    kept = {tuple(row) for row in model.starts.tolist()}
+    count = sum(tuple(row) in kept for row in rows.q.tolist())
+    if not count:
+        return []
+    return [
+        f"At least {count} of these {rows.rows} rows have joint values that the model was made with (it keeps "
+        f"{len(kept)} of {model.provenance.rows}): as far as they are the same measurements, they are no test of it."
+    ]
+
+
+def _model_errors(model: CalibratedModel, rows: Measurements) -> tuple[PoseErrors, Float64[Tensor, "rows 3"]]:
+    """Errors of rows, and the signed ones of their positions; of balls in sockets from where these are on average."""
+    T = poses_of_rows(model, rows)
+    none = torch.full((rows.rows,), torch.nan, dtype=torch.float64)
+    residual = none[:, None].repeat(1, 3) if rows.position is None else rows.position - T[:, :3, 3]
+    if rows.socket is not None:
+        residual = torch.where(rows.seen("socket")[:, None], _from_socket(rows, T[:, :3, 3]), residual)
+    return PoseErrors(residual.norm(dim=-1), _turned(rows, T)), residual
+
+
+def _turned(rows: Measurements, T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, " rows"] | None:
+    """Angles of the orientation errors of rows [rad]; None where none was measured."""
+    if rows.rotation is None:
+        return None
+    alone = Measurements(q=rows.q, position=T[:, :3, 3].nan_to_num(), rotation=rows.rotation)
+    return PoseErrors.between(alone, T).rotation
+
+
+def _from_socket(rows: Measurements, ball: Float64[Tensor, "rows 3"]) -> Float64[Tensor, "rows 3"]:
+    """Mean place of every row's socket minus where the row puts the ball; NaN in sockets of a single row."""
+    names = list(zip(rows.frame, rows.socket or (), strict=True))
+    order = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    number = torch.tensor([order[name] for name in names])
+    counts = torch.bincount(number, minlength=len(order)).double()
+    sums = torch.zeros(len(order), 3, dtype=torch.float64).index_add_(0, number, ball)
+    apart = (sums / counts[:, None])[number] - ball
+    return torch.where((counts[number] > 1)[:, None], apart, torch.nan)
+
+
+def _nominal_errors(model: CalibratedModel, rows: Measurements, remarks: list[str]) -> PoseErrors:
+    """Errors of the robot as drawn, with the base and tool that `nominal_model` gives it."""
+    try:
+        nominal = nominal_model(model, rows.rotation is not None)
+    except ModelError:
+        remarks.append(
+            "Nominal is the robot as drawn with the model's base and tool, as the model keeps too few joint values to "
+            "fit its own; it looks worse than it is."
+        )
+        return _errors_at(nominal_poses_of_rows(model, rows), rows)
+    remarks.append(
+        "Nominal is the robot as drawn with the base and tool that the model was given."
+        if model.calibrated is None
+        else "Nominal is the robot as drawn, base and tool fitted to the model's own poses where it was measured."
+    )
+    return _model_errors(nominal, rows)[0]
+
+
+def _errors_at(T: Float64[Tensor, "rows 4 4"], rows: Measurements) -> PoseErrors:
+    if rows.position is not None:
+        return PoseErrors.between(rows, T)
+    apart = _from_socket(rows, T[:, :3, 3]) if rows.socket else torch.full_like(T[:, :3, 3], torch.nan)
+    return PoseErrors(apart.norm(dim=-1), _turned(rows, T))

@@ -1,0 +1,195 @@
+"""The report as one page that loads nothing from elsewhere."""
+
+import base64
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+import jinja2
+import numpy as np
+from markupsafe import Markup
+
+from pisigma.reporting.page.accuracy import LABELS, STATISTICS, Accuracy
+from pisigma.reporting.page.content import ReportContent
+from pisigma.reporting.page.drawing import Drawing
+from pisigma.reporting.page.error_map import ErrorMap
+from pisigma.reporting.page.figures import (
+    draw_correction,
+    draw_correlations,
+    draw_dependence,
+    draw_learning_curve,
+    draw_map,
+)
+from pisigma.reporting.tables import figure_text
+
+_ESCAPED = {ord(mark): f"\\u{ord(mark):04x}" for mark in "<>&\u2028\u2029"}
+_PACKAGE = "pisigma.reporting.page"
+
+
+@dataclass(frozen=True, eq=False)
+class ReportFigures:
+    """Drawings of a report.
+
+    Attributes:
+        map: from above and from the side.
+        dependences: over joint values, order, payload and temperature.
+        correlations: of lengths and of angles.
+        corrections: of every joint.
+        learning_curve: none or one.
+    """
+
+    map: Drawing
+    dependences: tuple[Drawing, ...]
+    correlations: tuple[Drawing, ...]
+    corrections: tuple[Drawing, ...]
+    learning_curve: tuple[Drawing, ...]
+
+    @property
+    def all(self) -> tuple[Drawing, ...]:
+        """Every one of them."""
+        return (self.map, *self.dependences, *self.correlations, *self.corrections, *self.learning_curve)
+
+
+def draw_figures(content: ReportContent) -> ReportFigures:
+    """Draw what a report shows."""
+    points = content.learning_curve
+    return ReportFigures(
+        map=draw_map(content.map),
+        dependences=tuple(draw_dependence(found) for found in content.dependences),
+        correlations=draw_correlations(content.parameters.correlations),
+        corrections=tuple(draw_correction(curve) for curve in content.curves),
+        learning_curve=(draw_learning_curve(points),) if len(points) > 1 else (),
+    )
+
+
+def render_page(content: ReportContent, figures: ReportFigures) -> str:
+    """Lay the report out as HTML.
+
+    Every text of the content is shown as it is, whatever it holds.
+    """
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    environment.filters |= {"image": _image, "png": _png, "figure": figure_text, "signed": _signed}
+    template = environment.from_string(_resource("template.html.j2"))
+    return template.render(
+        c=content,
+        figures=figures,
+        tables=[_table(accuracy) for accuracy in content.accuracies],
+        joint_table=_joint_table(content.joints),
+        map_data=script_json(
+            map_data(
+                content.map,
+                [joint.name for joint in content.model.robot.joints],
+                content.model.robot.revolute,
+            )
+        ),
+        style=Markup(_resource("style.css")),  # ours
+        script=Markup(_resource("viewer.js")),
+    )
+
+
+def script_json(value: Any) -> Markup:
+    """JSON that can stand inside a script element: nothing in it ends the element or a line."""
+    return Markup(json.dumps(value, allow_nan=False, ensure_ascii=True).translate(_ESCAPED))
+
+
+def map_data(found: ErrorMap, joints: Sequence[str], revolute: Sequence[bool]) -> dict[str, Any]:
+    """What the viewer reads; arrays as base64 of little-endian float32."""
+    frames, frame = _numbered(found.frame)
+    targets, target = _numbered(found.target)
+    return {
+        "place": _packed(found.place),
+        "layers": [
+            {
+                "key": layer.key,
+                "label": layer.label,
+                "unit": layer.unit,
+                "says": layer.says,
+                "values": _packed(layer.values),
+            }
+            for layer in found.layers
+        ],
+        "row": _packed(found.row),
+        "q": _packed(found.q),
+        "joints": [
+            {"name": name, "unit": "°" if turns else "mm"}
+            for name, turns in zip(joints, revolute, strict=True)
+        ],
+        "frames": frames,
+        "frame": _packed(frame),
+        "targets": targets,
+        "target": _packed(target),
+        "inside": _packed(found.inside),
+    }
+
+
+def _resource(name: str) -> str:
+    return files(_PACKAGE).joinpath(name).read_text(encoding="utf-8")
+
+
+def _packed(values: Any) -> str:
+    return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()
+
+
+def _numbered(names: Sequence[str]) -> tuple[list[str], list[int]]:
+    order = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    return list(order), [order[name] for name in names]
+
+
+def _image(drawing: Drawing) -> str:
+    """A figure as the address of an image that holds it."""
+    return f"data:image/svg+xml;base64,{base64.b64encode(drawing.svg().encode()).decode()}"
+
+
+def _png(content: bytes) -> str:
+    return f"data:image/png;base64,{base64.b64encode(content).decode()}"
+
+
+def _signed(value: float) -> str:
+    return f"{value:+.4f}"
+
+
+def _table(accuracy: Accuracy) -> dict[str, Any]:
+    """A table of errors: names of the models, and per statistic a line."""
+    rows = []
+    for unit, quantity in (("mm", "position"), ("deg", "orientation")):
+        for key, label in STATISTICS:
+            cells = [figures.get(f"{key}_{unit}") for figures in accuracy.models.values()]
+            if any(cell is not None for cell in cells):
+                texts = ["" if cell is None else figure_text(cell) for cell in cells]
+                better = _better(cells)
+                rows.append((f"{quantity}, {label}", unit, texts, better))
+    names = [LABELS[name] for name in accuracy.models]
+    return {
+        "title": accuracy.title,
+        "how": accuracy.how,
+        "held_out": accuracy.held_out,
+        "rows": accuracy.rows,
+        "names": names,
+        "lines": rows,
+    }
+
+
+def _better(cells: Sequence[float | None]) -> str:
+    """How much smaller the last figure is than the first."""
+    first, last = cells[0], cells[-1]
+    return f"{first / last:.1f} ×" if len(cells) > 1 and first is not None and last else ""
+
+
+def _joint_table(joints: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
+    """Errors of joints: name, rows, unit, and average, deviation and maximum before and after."""
+    lines = []
+    for joint in joints:
+        for part in ("held_out", "training"):
+            if part in joint:
+                unit = next(iter(joint[part]["before"])).rsplit("_", 1)[1]
+                figures = [
+                    figure_text(joint[part][when][f"{name}_{unit}"])
+                    for when in ("before", "after")
+                    for name in ("average", "deviation", "maximum")
+                ]
+                lines.append((joint["name"], part.replace("_", "-"), unit, *figures))
+    return lines

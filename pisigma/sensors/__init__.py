@@ -1,0 +1,1 @@
+"""What sensors measure: residuals and their derivatives, one file a sensor."""

@@ -1,0 +1,144 @@
+"""How far off a robot is that was calibrated on jigs: at test points and over the workspace."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.recipes.jig_recipe import JigCalibration, JigRecipe
+from pisigma.robot.description import Robot
+from pisigma.se3 import transform_from_xyzrpy
+from pisigma.simulation.true_robot import TrueRobot
+from pisigma.studies.straight_lines import Controller
+
+DEFINITIONS = (
+    "absolute error, robot frame: the controller solves the inverse kinematics of a test point with its "
+    "parameters; the error is where the true tool then is minus the test point, in the robot's frame",
+    "absolute error, seen from a jig: the same tool position measured in the frame of the jig as it really "
+    "stands, minus where the test point should be in it by the parameters; so it holds the error of the "
+    "jig's base too",
+    "RMS: over the x, y and z errors of all test points; deviation: the mean over x, y and z of the errors' "
+    "standard deviation over the test points (both give the paper's figures from its Tables 3 to 7)",
+    "Move-L: both ends are taught with the true robot, so they are met; the deviation is where the true tool is "
+    "minus where it should be on the straight line between them, per axis the largest of the line",
+    "I-Move: only the start is taught, direction and distance are commanded; dL is the distance of the true ends "
+    "minus the distance commanded",
+    "nominal, one jig, both: the paper's parameters by plain least squares; default: all that the touches on both "
+    "jigs can tell, with pisigma's prior; planned and random: the paper's parameters from touches that were chosen "
+    "from many candidates, and from as many drawn from them",
+    "workspace: distance of the true tool from where the parameters put it at the same joint values, over "
+    "poses of the workspace, in the robot's frame",
+)
+"""What the figures mean, in sentences."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """The true robot and where it is looked at; the same for all calibrations of a recipe.
+
+    Attributes:
+        recipe: what is simulated.
+        true_robot: the robot as it really is.
+        workspace: joint values over the workspace [rad or m].
+    """
+
+    recipe: JigRecipe
+    true_robot: TrueRobot
+    workspace: Float64[Tensor, "poses dof"]
+
+    @staticmethod
+    def of(recipe: JigRecipe) -> "Bench":
+        """The bench of a recipe.
+
+        Raises:
+            RecipeError: the recipe names a robot, joint or branch that does not exist.
+        """
+        return Bench(recipe, recipe.true_robot(), recipe.workspace_joints())
+
+    @cached_property
+    def true_positions(self) -> Float64[Tensor, "poses 3"]:
+        """Where the true tool is over the workspace [m]."""
+        return self.true_robot.forward(self.workspace)[:, :3, 3]
+
+    @cached_property
+    def T_test_points(self) -> Float64[Tensor, "points 4 4"]:
+        """The test points [m]."""
+        return torch.stack([point.T_base_tool for point in self.recipe.test_points])
+
+    def controller(self, arm: Robot) -> Controller:
+        """A controller with these parameters."""
+        return Controller(self.true_robot.nominal, arm, self.recipe.branch)
+
+
+@dataclass(frozen=True, eq=False)
+class Accuracy:
+    """Errors of one calibration, see `DEFINITIONS`.
+
+    Attributes:
+        points: at the test points, in the robot's frame [m].
+        seen_from: the same as seen from every jig whose base the calibration knows [m].
+        workspace: distances over the workspace [m].
+    """
+
+    points: Float64[Tensor, "points 3"]
+    seen_from: dict[str, Float64[Tensor, "points 3"]]
+    workspace: Float64[Tensor, " poses"]
+
+
+def measure_accuracy(bench: Bench, calibration: JigCalibration) -> Accuracy:
+    """Drive to the test points with a calibration's parameters, and compare positions over the workspace.
+
+    Raises:
+        UnreachablePoseError: a test point cannot be reached.
+    """
+    wanted = bench.T_test_points[:, :3, 3]
+    q = bench.controller(calibration.arm).joints(bench.T_test_points)
+    reached = bench.true_robot.forward(q)[:, :3, 3]
+    seen_from = {}
+    for placement in bench.recipe.placements:
+        if placement.name in calibration.bases:
+            believed = transform_from_xyzrpy(torch.from_numpy(calibration.bases[placement.name]))
+            seen_from[placement.name] = _moved(placement.true_T_jig_base, reached) - _moved(believed, wanted)
+    predicted = forward_kinematics(calibration.arm, bench.workspace)[:, :3, 3]
+    distance = (bench.true_positions - predicted).norm(dim=-1)
+    return Accuracy(reached - wanted, seen_from, distance)
+
+
+def rms(errors: Float64[Tensor, "points 3"]) -> float:
+    """Root mean square over all coordinates, as the paper has it [m]."""
+    return float(errors.square().mean().sqrt())
+
+
+def deviation(errors: Float64[Tensor, "points 3"]) -> float:
+    """Mean over the axes of the standard deviation over the points, as the paper has it [m]."""
+    return float(errors.std(0, correction=0).mean())
+
+
+def accuracy_figures(accuracy: Accuracy) -> dict[str, object]:
+    """The figures in millimetres."""
+    return {
+        "robot_frame": _figures(accuracy.points),
+        "seen_from": {name: _figures(errors) for name, errors in accuracy.seen_from.items()},
+        "workspace": {
+            "median_mm": float(accuracy.workspace.median()) * 1e3,
+            "rms_mm": float(accuracy.workspace.square().mean().sqrt()) * 1e3,
+            "p95_mm": float(accuracy.workspace.quantile(0.95)) * 1e3,
+            "max_mm": float(accuracy.workspace.max()) * 1e3,
+        },
+    }
+
+
+def _figures(errors: Float64[Tensor, "points 3"]) -> dict[str, object]:
+    return {
+        "rms_mm": rms(errors) * 1e3,
+        "deviation_mm": deviation(errors) * 1e3,
+        "mean_mm": float(errors.norm(dim=-1).mean()) * 1e3,
+        "points_mm": (errors * 1e3).tolist(),
+    }
+
+
+def _moved(T: Float64[Tensor, "4 4"], points: Float64[Tensor, "points 3"]) -> Float64[Tensor, "points 3"]:
+    return points @ T[:3, :3].mT + T[:3, 3]

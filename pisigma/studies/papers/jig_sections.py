@@ -1,0 +1,129 @@
+"""A robot that touches jigs beside Lim et al., Tables 1 to 10."""
+
+from pisigma.recipes.jig_recipe import JigRecipe
+from pisigma.reporting.markdown import markdown_table
+from pisigma.robot.description import Robot
+from pisigma.studies.jig_tables import (
+    Table,
+    component_table,
+    error_table,
+    line_table,
+    parameter_table,
+    seed_table,
+)
+from pisigma.studies.papers.markdown_text import command_block, folded, picture, plain
+from pisigma.studies.papers.published import Published
+from pisigma.studies.papers.redundancy_sections import dh_lines
+from pisigma.studies.papers.stored_results import Result, StoredResults
+
+JIG_COMPARISON = "jigs.png"
+
+SET_UPS = {
+    "nominal": "nominal",
+    "jig_1": "paper's {jig_1}, jig 1 alone",
+    "jig_2": "paper's {jig_2}, jig 2 alone",
+    "both": "paper's {both}, both jigs",
+    "default": "default: all that can be identified, both jigs",
+    "planned": "paper's {both}, {touches} planned of {candidates} candidates",
+    "random": "paper's {both}, {touches} random ones",
+}
+"""What the set-ups are called; numbers are filled in."""
+
+
+def jig_sections(published: Published, results: StoredResults, recipe: JigRecipe) -> list[str]:
+    """The sections of the recipe."""
+    result = results["jigs"]
+    return [
+        command_block("jigs"),
+        published.notes["jigs"],
+        picture(JIG_COMPARISON, "RMS error and deviation at the test points, ours and the paper's"),
+        "RMS error and deviation at the test points: ours are averages over the seeds with one standard deviation, the "
+        "paper's those of Tables 3 to 7 (both jigs: the mean of Tables 6 and 7, as in Table 8).",
+        _averages(result),
+        "What the figures mean:",
+        "\n".join(f"- {sentence}." for sentence in result["definitions"]),
+        "### Nominal parameters of the welding robot",
+        *dh_lines("welding", "welding robot", published.dh_tables["welding"]),
+        _frames(published, recipe),
+        "### Estimated parameters",
+        "Table 2. The column `true` is what our robot is made with: the paper's result with both jigs.",
+        _rendered(parameter_table(result)),
+        "### Errors at the test points",
+        "Tables 3 to 7, first seed. Of Tables 3 to 5 the paper does not say in which frame they are seen.",
+        _rendered(error_table(result)),
+        folded("The same error by error", _rendered(component_table(result))),
+        "### One jig against both",
+        "Table 8. Its ratio is both jigs over the mean of the single ones.",
+        _rendered(seed_table(result)),
+        _said(result),
+        "### Straight lines",
+        "Tables 9 and 10, first seed.",
+        _rendered(line_table(result)),
+    ]
+
+
+def _rendered(table: Table) -> str:
+    return f"{table.title}:\n\n{markdown_table(table.columns, table.rows)}"
+
+
+def _averages(result: Result) -> str:
+    planning = result["planning"]
+    numbers = {**result["parameters_estimated"], **planning}
+    seeds = result["seeds"]
+    rows = []
+    for name, label in SET_UPS.items():
+        figures, spreads = seeds["averages"][name], seeds["spreads"][name]
+        cells = (
+            f"{figures[key]:.3f} ± {spreads[key]:.3f}"
+            for key in ("rms_mm", "deviation_mm", "workspace_median_mm")
+        )
+        rows.append((label.format(**numbers), *cells))
+    head = [
+        f"parameters (from 2 x {result['touches_per_jig']} touches, {seeds['count']} seeds: mean ± standard deviation)",
+        "RMS at P1 to P4 [mm]",
+        "deviation [mm]",
+        "workspace median [mm]",
+    ]
+    return markdown_table(head, rows)
+
+
+def _frames(published: Published, recipe: JigRecipe) -> str:
+    tool = Robot.load(recipe.robot).tool
+    columns = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
+    ours = {f"base_{placement.name}": placement.base.to_si() for placement in recipe.placements} | {
+        "tool": tool
+    }
+    rows = []
+    for name, paper in published.nominal_frames.items():
+        units = [
+            value * (1e3 if c.endswith("_mm") else 57.29577951308232)
+            for c, value in zip(columns, ours[name], strict=True)
+        ]
+        cells = []
+        for column, value in zip(columns, units, strict=True):
+            stated, own = paper.get(column), plain(round(float(value), 6) + 0.0)
+            cells.append(
+                f"lost / {own}"
+                if stated is None
+                else own
+                if plain(stated) == own
+                else f"{plain(stated)} / {own}"
+            )
+        rows.append((name, *cells))
+    head = ["frame", *(column.replace("_mm", " [mm]").replace("_deg", " [deg]") for column in columns)]
+    return "Table 1, frames; paper / ours where they differ:\n\n" + markdown_table(head, rows)
+
+
+def _said(result: Result) -> str:
+    seeds = result["seeds"]
+    ratios, table = seeds["ratios"], result["paper"]["table_8_mm"]
+    both = ratios["both_over_single"]
+    paper = {key: table["both"][key] / table["one_jig"][key] for key in ("mean", "deviation")}
+    change = 100 * (ratios["default_over_paper"]["rms"] - 1)
+    return (
+        f"Both jigs against the mean of the single ones: {both['rms']:.2f} of the error, {both['deviation']:.2f} of "
+        f"the deviation (paper: {paper['mean']:.2f} and {paper['deviation']:.2f}); both jigs win with "
+        f"{100 * seeds['share_of_seeds_won_by_both']:.0f} % of the seeds. The default against the paper's parameters: "
+        f"{change:+.1f} % of the error at the test points. Planned touches against random ones: "
+        f"{ratios['planned_over_random']['rms']:.2f} of the error."
+    )

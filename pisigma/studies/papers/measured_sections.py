@@ -1,0 +1,73 @@
+"""Recipes that stand beside no paper: measured robots, and the hybrid."""
+
+from pisigma.reporting.markdown import markdown_table
+from pisigma.reporting.tables import pose_table
+from pisigma.studies.papers.markdown_text import command_block, picture
+from pisigma.studies.papers.published import Published
+from pisigma.studies.papers.stored_results import Result, StoredResults
+
+LEARNING_CURVES = "learning_curves.png"
+
+HYBRIDS = {
+    "rb5_hybrid": "RB5 with every source of errors, hybrid",
+    "ur10_hybrid": "UR10, measured, hybrid",
+    "ur5_hybrid": "UR5, measured, hybrid",
+}
+OTHERS = ("ur10_inverse", *HYBRIDS)
+"""Recipes of this part."""
+
+
+def measured_sections(published: Published, results: StoredResults) -> list[str]:
+    """The sections of the four recipes."""
+    found = results["ur10_inverse"]
+    rows, figures = found["rows"], found["cross_validation"]
+    text = [
+        "### UR10, measured, inverse calibration",
+        command_block("ur10_inverse"),
+        f"Errors of held-out rows, {figures['folds']}-fold cross-validated; {rows['left_out']} of "
+        f"{rows['used'] + rows['left_out']} rows are left out of the training.",
+        pose_table({name: figures[name] for name in ("nominal", "corrected")}),
+        published.notes["ur10_inverse"],
+        picture(
+            LEARNING_CURVES, "position error of held-out rows by the number of training rows, three robots"
+        ),
+    ]
+    for name, heading in HYBRIDS.items():
+        result = results[name]
+        text += [
+            f"### {heading}",
+            command_block(name),
+            _learning_curve(result),
+            f"{published.notes[name]} {_said(result)}",
+        ]
+    return text
+
+
+def _learning_curve(result: Result) -> str:
+    models = ("nominal", "geometric", "hybrid")
+    head = [
+        "training rows",
+        *(f"{name}, RMS [mm]" for name in models),
+        "hybrid, 95 % [mm]",
+        "hybrid, largest [mm]",
+    ]
+    rows = [
+        (
+            str(point["rows"]),
+            *(f"{point[name]['rms_mm']:.4f}" for name in models),
+            *(f"{point['hybrid'][key]:.4f}" for key in ("p95_mm", "max_mm")),
+            f"{100 * point['coverage']:.1f}",
+        )
+        for point in result["learning_curve"]
+    ]
+    return markdown_table([*head, "coverage [%]"], rows)
+
+
+def _said(result: Result) -> str:
+    whole, fit = result["seconds"], result["fit_seconds"]
+    seconds = f"{whole:.0f} s in all, {fit:.0f} s for the model itself, at the load of that run."
+    if "held_out" not in result:
+        return seconds
+    means = result["held_out"]["mean_rms_mm"]
+    of = ", ".join(f"{name} {value:.4f}" for name, value in means.items())
+    return f"Mean of the RMS errors of the simulations with all rows: {of} mm. {seconds}"

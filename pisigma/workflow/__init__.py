@@ -1,0 +1,1 @@
+"""The steps of a calibration as functions: typed settings in, typed results out."""

@@ -1,0 +1,145 @@
+"""Sizes of the network that a calibrated model is distilled into, and fitting one of them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError
+from pisigma.joint_correction.features import FourierSeries
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.network.correction_network import CorrectionNetwork, JointGroup
+from pisigma.network.pi_sigma import PiSigma
+from pisigma.recipes.recipe import NetworkSection
+from pisigma.robot.description import Robot
+from pisigma.training.fit_sections import LevenbergMarquardtSection
+from pisigma.training.fitting import fit_networks
+from pisigma.training.pairs import TrainingPairs
+from pisigma.training.patterns import build_network, build_patterns
+
+VALIDATION_SHARE = 0.1
+
+OVERTONE_SCALE = 1e4
+"""Overtones are scaled down by so much after the fit, and their weights up: they do not say where a joint is, and the
+domain is measured in scaled inputs."""
+
+ROWS_PER_UNKNOWN = 4
+"""A size is tried where there are so many poses for each of its unknowns."""
+
+_STILL = 1e-6
+"""[rad or m] A joint that moves less over the region is no input."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """A network: the same for every joint.
+
+    Attributes:
+        orders: number of summing units of every product unit.
+        harmonics: sines and cosines of up to so many times the corrected joint's own value are inputs, besides those of
+            all joints' own values.
+    """
+
+    orders: tuple[int, ...]
+    harmonics: int = 1
+
+    def unknowns(self, robot: Robot) -> int:
+        """Number of weights and biases per joint."""
+        inputs = sum(2 if turns else 1 for turns in robot.revolute) + 2 * (self.harmonics - 1)
+        return sum(self.orders) * (inputs + 1)
+
+
+SMOOTH = (Size((1, 2)), Size((1, 2, 3)), Size((1, 2, 3, 4)))
+"""Sizes for what varies slowly with the joints: geometry, and arms that sag."""
+RIPPLED = (Size((1, 2)), Size((1, 2, 3)), Size((1, 2, 3), 8), Size((1, 2, 3), 24))
+"""Sizes where gears and encoders run out of true as well."""
+
+
+def sizes_for(model: CalibratedModel, poses: int) -> tuple[Size, ...]:
+    """Sizes to try for a model with so many poses to fit, small ones first."""
+    learned = () if model.hybrid is None else model.hybrid.correction.features
+    rippled = any(isinstance(features, FourierSeries) and features.harmonics > 1 for features in learned)
+    return tuple(
+        size
+        for size in (RIPPLED if rippled else SMOOTH)
+        if size.unknowns(model.robot) * ROWS_PER_UNKNOWN <= poses
+    )
+
+
+def fit_size(
+    robot: Robot,
+    size: Size,
+    pairs: TrainingPairs,
+    seed: int,
+    epochs: int,
+    tell: Callable[[str], None] = lambda what: None,
+) -> CorrectionNetwork:
+    """Fit a network of a size to corrections by Levenberg-Marquardt.
+
+    Args:
+        robot: the nominal robot.
+        size: of the network.
+        pairs: nominal joint values and their corrections.
+        seed: of start and validation rows.
+        epochs: largest number of iterations for a joint.
+        tell: is called with the state of the work.
+
+    Raises:
+        IdentificationError: no joint moves in the region, or there are too few poses.
+        TrainingError: the fit diverged.
+    """
+    section = LevenbergMarquardtSection(
+        method="levenberg_marquardt", epochs=epochs, starts=1, validation_share=VALIDATION_SHARE, seed=seed
+    )
+    sections = _sections(robot, size, pairs.q_nominal)
+    groups: list[JointGroup] = []
+    networks: list[PiSigma] = []
+    rows = torch.arange(len(pairs.target))
+    for part in sections:
+        tell(", ".join(part.joints))
+        network = build_network(robot, [part], pairs)
+        generator = torch.Generator().manual_seed(seed)
+        patterns = build_patterns(network, pairs, VALIDATION_SHARE, rows, generator)
+        ((group, net),) = network.members()
+        fit_networks([net], patterns, [part.joints], section)
+        _shrink_overtones(net, [_multiple(name) > 1 for name in part.inputs])
+        groups.append(group)
+        networks.append(net)
+    return CorrectionNetwork(robot.dof, groups, networks).requires_grad_(False)
+
+
+def _sections(robot: Robot, size: Size, q: Float64[Tensor, "poses dof"]) -> list[NetworkSection]:
+    """One group of all joints, or one of each joint where it sees its own overtones."""
+    names = [joint.name for joint in robot.joints]
+    moves = ((q.amax(0) - q.amin(0)) > _STILL).tolist()
+    shared: list[str] = []
+    for name, turns, moving in zip(names, robot.revolute, moves, strict=True):
+        if moving:
+            shared += [f"sin({name})", f"cos({name})"] if turns else [name]
+    if not shared:
+        raise IdentificationError(
+            "no joint moves among the poses to distil from; give a larger region, or joint values that differ."
+        )
+    if size.harmonics == 1:
+        return [NetworkSection(joints=tuple(names), inputs=tuple(shared), orders=size.orders)]
+    sections = []
+    for name, turns, moving in zip(names, robot.revolute, moves, strict=True):
+        multiples = range(2, size.harmonics + 1) if turns and moving else ()
+        own = [f"{function}({k}*{name})" for k in multiples for function in ("sin", "cos")]
+        sections.append(NetworkSection(joints=(name,), inputs=(*shared, *own), orders=size.orders))
+    return sections
+
+
+def _multiple(name: str) -> int:
+    """The whole number in an input that `_sections` named."""
+    return int(name.split("(")[1].split("*")[0]) if "*" in name else 1
+
+
+@torch.no_grad()
+def _shrink_overtones(network: PiSigma, overtone: Sequence[bool]) -> None:
+    """Scale inputs down and their weights up, which changes no output."""
+    factor = torch.where(torch.tensor(overtone), OVERTONE_SCALE, 1.0).double()
+    network.input_scale.mul_(factor)
+    network.weight.mul_(factor)

@@ -1,0 +1,177 @@
+"""Poses drawn in a region and solved by a calibrated model: what its distilled form learns from."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError
+from pisigma.inverse.torch_ik import TorchIK
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.joint_limits import LIMIT_TOLERANCE
+from pisigma.kinematics.singularity import singularity_measure
+from pisigma.kinematics.status import Status
+from pisigma.robot.description import Robot
+from pisigma.se3 import wrap_to_pi
+
+SINGULAR_BELOW = 0.05
+"""Poses whose nominal `singularity_measure` is below this are not drawn: corrections are steep there."""
+
+CHUNK = 2_000
+"""Poses solved between two reports of progress."""
+
+TRIES = 20
+"""So many poses are drawn for one that the robot takes; a region where that is not enough is refused."""
+
+_MOVED = 0.05
+"""[rad or m] The nominal solution of a drawn pose lies this near to the joint values drawn, or on another branch."""
+
+Box = tuple[float, float, float, float, float, float]
+"""x_min, x_max, y_min, y_max, z_min, z_max [m] in the base frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class Region:
+    """Where poses are drawn.
+
+    Attributes:
+        q: joint values [rad or m] around which they are drawn: between a row and its neighbours.
+        box: bounds of the tool's position, orientations still being those at joint values around `q`; None where the
+            joint values alone say it.
+    """
+
+    q: Float64[Tensor, "rows dof"]
+    box: Box | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedPoses:
+    """Poses with the full solution of a model.
+
+    Attributes:
+        T: poses T_base_tool.
+        q_nominal: joint values of the nominal robot [rad or m].
+        correction: what the full solution adds to them [rad or m].
+        branch: index of the branch of every pose.
+        status: of the full solution: REACHED, or OUTSIDE_DOMAIN beyond the joint values that were measured.
+        drawn: how many poses were drawn for them.
+        refused: why the other ones were not taken, and how many for each reason.
+    """
+
+    T: Float64[Tensor, "poses 4 4"]
+    q_nominal: Float64[Tensor, "poses dof"]
+    correction: Float64[Tensor, "poses dof"]
+    branch: Int64[Tensor, " poses"]
+    status: Int64[Tensor, " poses"]
+    drawn: int
+    refused: dict[str, int]
+
+
+def draw_solved_poses(
+    ik: TorchIK,
+    region: Region,
+    count: int,
+    generator: torch.Generator,
+    tell: Callable[[str], None] = lambda what: None,
+) -> SolvedPoses:
+    """Draw poses until as many as wanted could be solved.
+
+    Args:
+        ik: of the model.
+        region: where.
+        count: how many are wanted.
+        generator: draws them.
+        tell: is called with the state of the work.
+
+    Raises:
+        IdentificationError: the robot takes too few of the poses of the region; the message says why not.
+    """
+    kept: list[tuple[Tensor, ...]] = []
+    refused: dict[str, int] = {}
+    drawn = have = 0
+    while have < count:
+        some = min(CHUNK, 2 * count)
+        parts, reasons = _solve(ik, region, some, generator)
+        kept.append(parts)
+        drawn, have = drawn + some, have + len(parts[0])
+        refused = {name: refused.get(name, 0) + number for name, number in reasons.items()}
+        if TRIES * have < drawn:
+            raise IdentificationError(_complaint(ik, region, have, drawn, refused))
+        tell(f"{min(have, count)} of {count} poses solved")
+    T, q_nominal, correction, branch, status = (torch.cat(part)[:count] for part in zip(*kept, strict=True))
+    return SolvedPoses(T, q_nominal, correction, branch, status, drawn, refused)
+
+
+def draw_between(
+    robot: Robot, q: Float64[Tensor, "rows dof"], count: int, generator: torch.Generator
+) -> Float64[Tensor, "drawn dof"]:
+    """Joint values between a row of q and rows near it: their mean with random weights.
+
+    Neighbours are as many of the nearest as the robot has joints, drawn from twice as many; a joint that turns is
+    compared, and followed, the short way round.
+    """
+    first = torch.randint(len(q), (count,), generator=generator)
+    nearby = min(2 * robot.dof, len(q) - 1)
+    if not nearby:
+        return q[first]
+    turning = torch.tensor(robot.revolute)
+    neighbours = []
+    for part in torch.split(q, 256):
+        way = q - part[:, None]
+        way = torch.where(turning, wrap_to_pi(way), way / (robot.reach or 1.0))
+        neighbours.append(way.norm(dim=-1).topk(nearby + 1, largest=False).indices[:, 1:])
+    order = torch.rand(count, nearby, generator=generator).argsort(-1)[:, : robot.dof]
+    others = torch.cat(neighbours)[first].gather(1, order)
+    way = q[others] - q[first][:, None]
+    way = torch.where(turning, wrap_to_pi(way), way)
+    weight = torch.rand(count, way.shape[1] + 1, generator=generator, dtype=torch.float64).log().square()
+    weight = weight / weight.sum(-1, keepdim=True)
+    return q[first] + (weight[:, 1:, None] * way).sum(1)
+
+
+def _solve(
+    ik: TorchIK, region: Region, count: int, generator: torch.Generator
+) -> tuple[tuple[Tensor, ...], dict[str, int]]:
+    """Some poses with their solutions, and why others were refused."""
+    robot = ik.model.robot
+    q = draw_between(robot, region.q, count, generator)
+    T = forward_kinematics(robot, q)
+    if region.box is None:
+        found = ik(T, near=q)
+    else:
+        low, high = T.new_tensor(region.box[::2]), T.new_tensor(region.box[1::2])
+        T[:, :3, 3] = low + (high - low) * torch.rand(count, 3, generator=generator, dtype=T.dtype)
+        found = ik(T)
+    nominal = found.q_nominal
+    lost = (found.status == Status.UNREACHABLE) | ~torch.isfinite(nominal).all(-1)
+    safe = torch.where(lost[:, None], q, nominal)
+    limits = torch.from_numpy(robot.limits)
+    outside = (safe < limits[:, 0] - LIMIT_TOLERANCE) | (safe > limits[:, 1] + LIMIT_TOLERANCE)
+    away = (safe - q).abs().amax(-1) > _MOVED if region.box is None else torch.zeros_like(lost)
+    reasons = {
+        "unreachable": lost,
+        "outside the joint limits": outside.any(-1) | (found.status == Status.OUTSIDE_JOINT_LIMITS),
+        "singular": (singularity_measure(robot, safe) < SINGULAR_BELOW) | (found.status == Status.SINGULAR),
+        "on another branch": away,
+    }
+    counts, good = {}, torch.ones_like(lost)
+    for name, bad in reasons.items():
+        counts[name] = int((good & bad).sum())
+        good = good & ~bad
+    parts = (T, nominal, found.q - nominal, found.branch, found.status)
+    return tuple(part[good] for part in parts), counts
+
+
+def _complaint(ik: TorchIK, region: Region, have: int, drawn: int, refused: dict[str, int]) -> str:
+    """Say that the region is not one for the robot."""
+    reasons = ", ".join(f"{number} {name}" for name, number in refused.items() if number)
+    where = "around the joint values given"
+    if region.box is not None:
+        low, high = (", ".join(f"{value * 1e3:g}" for value in region.box[i::2]) for i in (0, 1))
+        where = f"between ({low}) and ({high}) mm"
+    return (
+        f"of {drawn} poses drawn {where} robot '{ik.model.robot.name}' takes only {have} ({reasons}); choose a region "
+        "that it reaches, in the base frame of the model, with the orientations of the measured poses."
+    )

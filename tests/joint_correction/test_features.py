@@ -1,0 +1,258 @@
+"""Features of joint corrections: values against formulas and peers, and descriptions that make them again."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+
+from pisigma.joint_correction.feature_description import features_from
+from pisigma.joint_correction.features import (
+    BAND_STARTS,
+    ConditionFeatures,
+    FourierSeries,
+    GravityTorques,
+    SharedFeatures,
+    scaled_joints,
+    turning_rate,
+    unit_inputs,
+)
+from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.robot import Robot, Row
+from pisigma.se3 import rpy_from_rotation
+from pisigma.simulation.joint_compliance import LinkMass, gravity_load
+
+GRAVITY = (1.0, -2.0, -9.0)
+CONDITIONS = ("payload_kg", "temperature_c")
+ROBOTS = ("kiro3", "rb5", "panda")
+
+
+def arm() -> Robot:
+    """Rows of every kind, two counted backwards, one joint without limits."""
+    rows = (
+        Row("j1", "revolute", 1, -2.0, 1.0),
+        Row("j2", "revolute", direction=-1),
+        Row("bracket", "fixed"),
+        Row("slide", "prismatic", -1, 0.1, 0.5),
+        Row("j5", "revolute"),
+    )
+    rng = np.random.default_rng(3)
+    return Robot("arm", "", "", rows, rng.normal(size=(5, 5)), rng.normal(size=6), rng.normal(size=6))
+
+
+def joints(robot: Robot, *batch: int, seed: int = 0) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return 2 * torch.rand(*batch, robot.dof, generator=generator, dtype=torch.float64) - 1
+
+
+def every_kind(robot: Robot) -> list:
+    return [
+        FourierSeries(robot, 5),
+        GravityTorques(robot, GRAVITY),
+        ConditionFeatures(robot, CONDITIONS, (3.0, 20.0), (1.5, 4.0), GRAVITY),
+        *(SharedFeatures(robot, name) for name in SharedFeatures.CHOICES),
+    ]
+
+
+def test_the_series_is_sines_and_cosines_of_the_joints_own_value():
+    robot = arm()
+    q = joints(robot, 7)
+    columns = FourierSeries(robot, 3).columns(q)
+    assert columns.shape == (7, 4, 6)
+    for joint in (0, 1, 3):
+        for k in (1, 2, 3):
+            assert_close(columns[:, joint, k - 1], torch.sin(k * q[:, joint]), atol=1e-14)
+            assert_close(columns[:, joint, 2 + k], torch.cos(k * q[:, joint]), atol=1e-14)
+    assert_close(columns[:, 2, 0], torch.sin(torch.pi / 0.4 * q[:, 2]), atol=1e-13)  # travel of 0.4 m
+
+
+def test_a_slide_without_limits_turns_with_the_reach():
+    rows = (Row("slide", "prismatic"), Row("turn", "revolute"))
+    robot = Robot("r", "", "", rows, np.array([[0, 0.3, 0.4, 0, 0], [0, 0, 1.5, 0, 0]]))
+    assert_close(
+        torch.from_numpy(turning_rate(robot)), torch.tensor([math.pi / 2.0, 1.0], dtype=torch.float64)
+    )
+
+
+@pytest.mark.parametrize("harmonics", [1, 2, 5, 30])
+def test_harmonics_share_prior_sizes_in_bands(harmonics):
+    series = FourierSeries(Robot.load("rb5"), harmonics)
+    assert series.count == 2 * harmonics
+    assert bool(series.used.all())
+    assert len(series.group_names) == int(series.group.max()) + 1
+    bands = series.group[0, :harmonics]
+    assert torch.equal(bands, series.group[3, harmonics:])
+    for k in range(1, harmonics + 1):
+        band = max(i for i, start in enumerate(BAND_STARTS) if start <= k)
+        assert int(bands[k - 1]) == band
+        first, last = (int(word) for word in series.group_names[band].split()[1::2])
+        assert first <= k <= last <= harmonics
+
+
+def test_gravity_columns_make_up_the_load_of_any_masses():
+    robot = arm()
+    features = GravityTorques(robot, GRAVITY)
+    masses = {
+        0: LinkMass(mass_kg=4, centre_mm=(100, -50, 30)),
+        1: LinkMass(mass_kg=0.5, centre_mm=(10, 20, -30)),
+        3: LinkMass(mass_kg=2, centre_mm=(-70, 0, 200)),
+        4: LinkMass(mass_kg=1, centre_mm=(0, 300, 10)),
+    }
+    q = joints(robot, 3, 5)
+    load = gravity_load(robot, q, masses, LinkMass(mass_kg=0), GRAVITY)
+    weights = torch.zeros(4, 4, dtype=torch.float64)
+    for place, row in enumerate(robot.joint_rows):
+        centre = torch.tensor(masses[row].centre_mm, dtype=torch.float64) / 1e3
+        weights[place] = masses[row].mass_kg * torch.cat(
+            [torch.tensor([robot.reach], dtype=torch.float64), centre / features.ARM]
+        )
+    scale = float(np.linalg.norm(GRAVITY))
+    columns = features.columns(q)
+    turning = torch.tensor(robot.revolute)
+    found = scale * (columns * weights.flatten()).sum(-1)
+    assert_close(found[..., turning], load[..., turning], atol=1e-10)
+    forces = torch.tensor([masses[row].mass_kg for row in robot.joint_rows]).double()
+    found = scale * (columns[..., 2, ::4] * forces).sum(-1)
+    assert_close(found, load[..., 2], atol=1e-10)
+    assert float(load.abs().amax((0, 1)).min()) > 1.0
+
+
+def test_masses_before_a_joint_have_no_weight():
+    robot = arm()
+    features = GravityTorques(robot, GRAVITY)
+    columns = features.columns(joints(robot, 6))
+    assert_close(columns[:, ~features.used], 0.0)
+    assert features.used[0].all()
+    assert int(features.used[3].sum()) == 4
+
+
+def test_base_and_tool_do_not_turn_gravity():
+    robot = arm()
+    bare = robot.with_geometry(base=np.zeros(6))
+    q = joints(robot, 4)
+    assert_close(GravityTorques(robot, GRAVITY).columns(q), GravityTorques(bare, GRAVITY).columns(q))
+
+
+@pytest.mark.parametrize("name", ROBOTS)
+def test_shared_features_are_the_same_for_every_joint(name):
+    robot = Robot.load(name)
+    q = joints(robot, 6)
+    for choice in SharedFeatures.CHOICES:
+        columns = SharedFeatures(robot, choice).columns(q)
+        assert_close(columns, columns[:, :1].expand_as(columns))
+    assert_close(SharedFeatures(robot, "joints").columns(q)[:, 0], scaled_joints(robot, q))
+    assert_close(SharedFeatures(robot, "sin_cos").columns(q)[:, 0], unit_inputs(robot, q))
+    T = forward_kinematics(robot, q)
+    pose = torch.cat([T[:, :3, 3] / robot.reach, rpy_from_rotation(T[:, :3, :3])], -1)
+    assert_close(SharedFeatures(robot, "pose").columns(q)[:, 0], pose, atol=1e-14)
+
+
+def test_unit_inputs_are_sines_cosines_and_then_slides():
+    robot = arm()
+    q = joints(robot, 5)
+    turning = q[:, [0, 1, 3]]
+    slide = (q[:, 2:3] - 0.3) / 0.2
+    assert_close(unit_inputs(robot, q), torch.cat([turning.sin(), turning.cos(), slide], -1), atol=1e-14)
+
+
+def test_joints_are_scaled_to_their_limits():
+    robot = arm()
+    limits = torch.tensor([[-2.0, 0.0, 0.1, 0.0], [1.0, math.pi, 0.5, -math.pi]], dtype=torch.float64)
+    ends = torch.tensor([[-1.0, 0.0, -1.0, 0.0], [1.0, 1.0, 1.0, -1.0]]).double()
+    assert_close(scaled_joints(robot, limits), ends, atol=1e-14)
+
+
+@pytest.mark.parametrize("batch", [(), (0,), (1,), (3, 1, 2)], ids=str)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_batches_and_types(batch, dtype):
+    robot = arm()
+    q = joints(robot, *batch).to(dtype)
+    for features in every_kind(robot):
+        columns = features.columns(q)
+        assert columns.shape == (*batch, 4, features.count)
+        assert columns.dtype == dtype
+        flat = q.reshape(-1, 4)
+        looped = [features.columns(one) for one in flat]
+        if looped:
+            assert_close(columns.reshape(-1, 4, features.count), torch.stack(looped), atol=1e-5)
+
+
+@pytest.mark.parametrize("name", [None, *ROBOTS])
+def test_a_description_makes_the_same_features_again(name):
+    robot = arm() if name is None else Robot.load(name)
+    q = torch.cat([joints(robot, 9), torch.randn(9, 2, dtype=torch.float64)], -1)
+    for features in every_kind(robot):
+        again = features_from(robot, features.describe())
+        assert type(again) is type(features)
+        assert torch.equal(again.columns(q), features.columns(q))
+        assert torch.equal(again.used, features.used)
+        assert torch.equal(again.group, features.group)
+        assert again.describe() == features.describe()
+
+
+def test_only_scaled_joints_change_with_full_turns():
+    robot = arm()
+    q = joints(robot, 5)
+    turned = q + 2 * torch.pi * torch.tensor([1.0, -1.0, 0.0, 2.0]).double()
+    for features in every_kind(robot):
+        change = float((features.columns(turned) - features.columns(q)).abs().max())
+        assert (change < 1e-12) == features.periodic
+
+
+@pytest.mark.parametrize(
+    ("description", "complaint"),
+    [
+        ({"name": "seris", "harmonics": 3}, "no features 'seris'; did you mean 'series'"),
+        ({}, "no features 'None'"),
+        ({"name": "series"}, "'harmonics'"),
+        ({"name": "gravity", "harmonics": 3}, "'gravity'"),
+        ({"name": "pose", "gravity": (0, 0, -1)}, "a name only"),
+        (
+            {"name": "conditions", "names": (), "mean": (), "spread": (), "gravity": (0.0, 0.0, 1.0)},
+            "need names",
+        ),
+        ({"name": "series", "harmonics": 0}, "at least one harmonic"),
+        ({"name": "gravity", "gravity": (0.0, 0.0, 0.0)}, "needs a direction"),
+        ({"name": "gravity", "gravity": (0.0, math.nan, 0.0)}, "needs a direction"),
+    ],
+)
+def test_descriptions_of_nothing_are_refused(description, complaint):
+    with pytest.raises(ValueError, match=complaint):
+        features_from(Robot.load("rb5"), description)
+
+
+def test_unknown_shared_features_are_refused():
+    with pytest.raises(ValueError, match="joints, sin_cos, pose"):
+        SharedFeatures(Robot.load("rb5"), "sines")
+
+
+@pytest.mark.parametrize("orders", [(), (2,), (2, 3)])
+def test_the_correction_is_what_its_formula_says(orders):
+    robot = arm()
+    features = (FourierSeries(robot, 2), GravityTorques(robot))
+    correction = JointCorrection(robot, features, orders)
+    q = joints(robot, 6)
+    assert_close(correction(q), 0.0)
+    generator = torch.Generator().manual_seed(5)
+    with torch.no_grad():
+        for parameter in correction.parameters():
+            parameter.copy_(torch.randn(parameter.shape, generator=generator, dtype=torch.float64))
+    phi = unit_inputs(robot, q)
+    for j in range(robot.dof):
+        expected = torch.zeros(6, dtype=torch.float64)
+        for chosen, weight in zip(features, correction.linear, strict=True):
+            expected = expected + chosen.columns(q)[:, j] @ weight[j]
+        start = 0
+        for order in orders:
+            product = torch.ones(6, dtype=torch.float64)
+            for s in range(start, start + order):
+                product = product * (correction.bias[j, s] + phi @ correction.weight[j, s])
+            expected, start = expected + product, start + order
+        assert_close(correction(q)[:, j], expected, atol=1e-12)
+
+
+def test_units_of_one_factor_are_refused():
+    with pytest.raises(ValueError, match="two factors or more"):
+        JointCorrection(arm(), (), (2, 1))

@@ -1,0 +1,144 @@
+"""Geometric calibration on rows that it never saw: whole placements of sockets and of jigs held out."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.sensors import ARM, TRUE_BASES, socket_data, touch_data, true_robot
+from testing.simulated_arm import simulate
+
+from pisigma.errors import IdentificationError
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.problem.loss import SquaredLoss
+from pisigma.judging.calibration_validation import validate
+from pisigma.judging.held_out_frames import with_frames
+from pisigma.measurement import Measurements, k_folds
+from pisigma.measurement.joining import join
+from pisigma.reporting.held_out_sentences import held_out_lines
+
+KNOWN = {(f"{plate}/0", f"{plate}/1"): 0.05 for plate in ("plate", "low", "high")}
+
+
+def exact(**options: object) -> GeometricCalibrator:
+    """The calibrator that gives the true arm back from exact data."""
+    return GeometricCalibrator(
+        true_robot().nominal,
+        free=ARM,
+        tool="position",
+        prior=None,
+        loss=SquaredLoss(),
+        **options,  # type: ignore[arg-type]
+    )
+
+
+def test_sockets_of_exact_data_are_met_where_they_were_held_out() -> None:
+    data = socket_data()
+    found = validate(exact(socket_distances=KNOWN), data, k_folds(data, None, 0, "placement"))
+    assert (found.folds, found.sockets_held_out, found.frames_fitted) == (3, 6, 0)
+    assert_close(found.models["geometric"].position, torch.zeros(data.rows, dtype=torch.float64), atol=1e-8)
+    assert_close(found.distances["geometric"], torch.zeros(3, dtype=torch.float64), atol=1e-8)
+    figures = found.in_file_units()
+    distance = figures["socket_distance"]
+    assert distance["count"] == 3  # type: ignore[index]
+    nominal = found.distances["nominal"].abs() * 1e3
+    assert_close(distance["nominal"]["mean_mm"], float(nominal.mean()), atol=1e-12)  # type: ignore[index]
+    assert_close(distance["nominal"]["max_mm"], float(nominal.max()), atol=1e-12)  # type: ignore[index]
+    assert float(nominal.mean()) > 0.1
+    lines = held_out_lines(figures)
+    assert lines[0].startswith("6 sockets were held out whole")
+    assert lines[1].startswith("The known distance of held-out sockets (3 of them) is met to")
+
+
+def test_rows_of_a_target_that_is_seen_once_are_not_judged() -> None:
+    arm = simulate("ur5", rows=80, noise=5e-5)
+    rows = replace(arm.measurements, target=("A",) * 79 + ("B",))
+    found = validate(GeometricCalibrator(arm.nominal), rows, k_folds(rows, 4, seed=0))
+    assert int(torch.isnan(found.models["geometric"].position).sum()) == 1
+    figures = found.in_file_units()
+    assert (figures["rows"], figures["rows_not_judged"]) == (79, 1)
+    assert held_out_lines(figures) == [
+        "1 rows could not be judged: no row that was calibrated with had their target or anchor."
+    ]
+    alone = replace(rows, target=tuple(f"target {row}" for row in range(80)))
+    with pytest.raises(
+        IdentificationError, match=r"measure more poses with each, or leave out the cross-validation"
+    ):
+        validate(GeometricCalibrator(arm.nominal), alone, k_folds(alone, 4, seed=0))
+
+
+def test_too_few_training_rows_name_their_fold() -> None:
+    arm = simulate("ur5", rows=12, noise=5e-5)
+    with pytest.raises(
+        IdentificationError, match=r"fold 1 of 4, calibrated with 9 of the 12 rows: .* 9 different"
+    ):
+        validate(GeometricCalibrator(arm.nominal), arm.measurements, k_folds(arm.measurements, 4, seed=0))
+
+
+def test_an_error_of_a_held_out_socket_is_the_distance_to_where_its_rows_meet() -> None:
+    data = socket_data()
+    rows = torch.tensor([name.startswith("low/") for name in data.socket or ()])
+    part = (~rows).nonzero()[:, 0], rows.nonzero()[:, 0]
+    found = validate(exact(socket_distances=KNOWN), data, [part])
+    assert bool(torch.isnan(found.models["nominal"].position[~rows]).all())
+    arm = replace(exact(socket_distances={k: v for k, v in KNOWN.items() if "low" not in k[0]}), free=())
+    errors = arm.fit(data.select(part[0])).errors_of(data.select(part[1]))["socket"]
+    assert_close(found.models["nominal"].position[rows], errors.norm(dim=-1), atol=1e-12)
+    for name in ("low/0", "low/1"):
+        own = torch.tensor([other == name for other in data.socket or ()])[rows]
+        assert_close(errors[own].mean(0), torch.zeros(3, dtype=torch.float64), atol=1e-12)
+
+
+def test_known_distances_that_were_calibrated_with_are_not_judged() -> None:
+    data = socket_data()
+    found = validate(exact(socket_distances=KNOWN), data, k_folds(data, 3, 0))
+    assert found.sockets_held_out == 0
+    assert "socket_distance" not in found.in_file_units()
+    assert held_out_lines(found.in_file_units()) == []
+
+
+def test_distances_of_sockets_that_no_row_has_are_still_refused() -> None:
+    data = socket_data()
+    wrong = exact(socket_distances=KNOWN | {("low/0", "low/7"): 0.05})
+    with pytest.raises(IdentificationError, match="no row has it"):
+        validate(wrong, data, k_folds(data, None, 0, "placement"))
+
+
+def test_frames_of_exact_touches_are_met_where_they_were_held_out() -> None:
+    data = touch_data(("right", "left", "back"))
+    frames = {name: tuple(base + 0.01) for name, base in TRUE_BASES.items()}
+    found = validate(exact(frames=frames), data, k_folds(data, None, 0, "placement"))
+    assert (found.folds, found.sockets_held_out, found.frames_fitted) == (3, 0, 3)
+    assert_close(found.models["geometric"].position, torch.zeros(data.rows, dtype=torch.float64), atol=1e-8)
+    assert float(found.models["nominal"].position.square().mean().sqrt()) > 5e-4
+    assert held_out_lines(found.in_file_units())[0].startswith("3 frames were held out whole")
+
+
+def test_a_frame_that_is_fitted_afterwards_leaves_the_arm_as_it_was() -> None:
+    data = touch_data(("right", "left"))
+    right = torch.tensor([name == "right" for name in data.frame])
+    arm = exact()
+    result = arm.fit(data.select(right.nonzero()[:, 0]))
+    both = with_frames(arm, result, data.select((~right).nonzero()[:, 0]))
+    assert both.robot is result.robot
+    assert sorted(both.bases) == ["left", "right"]
+    assert_close(both.bases["left"][:3], TRUE_BASES["left"][:3], atol=1e-7)
+    assert sorted(result.bases) == ["right"]
+
+
+def test_a_held_out_frame_with_several_targets_is_refused() -> None:
+    data = touch_data(("right", "left"), count=120)
+    two = replace(data, target=("A", "B") * (data.rows // 2))
+    frames = {name: tuple(TRUE_BASES[name]) for name in ("right", "left")}
+    with pytest.raises(
+        IdentificationError, match="held out, which needs a single target, but there are A, B"
+    ):
+        validate(exact(frames=frames), two, k_folds(two, None, 0, "placement"))
+
+
+def test_rows_without_a_socket_are_in_no_test() -> None:
+    sockets = socket_data()
+    free = Measurements(q=sockets.q[:4] + 0.01, position=torch.zeros(4, 3, dtype=torch.float64))
+    data = join([free, sockets])
+    tested = torch.cat([test for _, test in k_folds(data, None, 0, "placement")])
+    assert sorted(tested.tolist()) == list(range(4, data.rows))

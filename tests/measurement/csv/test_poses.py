@@ -1,0 +1,142 @@
+"""Files of wanted poses: units from the names, every complaint with file, line and column."""
+
+import pytest
+import torch
+from testing.closeness import assert_close
+
+from pisigma.errors import MeasurementError
+from pisigma.measurement.csv.poses import read_pose_chunks, read_poses
+from pisigma.se3 import transform_from_xyzrpy
+
+RPY = "x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg"
+QUATERNION = "x_m,y_m,z_m,qx,qy,qz,qw"
+
+
+def read(tmp_path, *lines: str):
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join(lines) + "\n")
+    return read_poses(path)
+
+
+def test_roll_pitch_yaw_in_degrees_and_millimetres(tmp_path):
+    found = read(tmp_path, "# wanted", RPY, "100,-200,300,10,20,30", "", " 1e2 ,0,+5,0,0,-90")
+    values = torch.tensor([[0.1, -0.2, 0.3, 10, 20, 30], [0.1, 0, 0.005, 0, 0, -90]], dtype=torch.float64)
+    values[:, 3:] = torch.deg2rad(values[:, 3:])
+    assert_close(found.T, transform_from_xyzrpy(values), atol=1e-15)
+    assert found.line == (3, 5)
+
+
+def test_quaternions_metres_and_any_order_of_columns(tmp_path):
+    half = 0.5**0.5
+    found = read(tmp_path, QUATERNION, f"0.1,0.2,0.3,0,0,{half},{half}")
+    quarter = transform_from_xyzrpy(torch.tensor([[0.1, 0.2, 0.3, torch.pi / 2, 0, 0]], dtype=torch.float64))
+    assert_close(found.T, quarter, atol=1e-15)
+    mixed = read(tmp_path, "yaw_deg,z_mm,x_mm,roll_deg,y_mm,pitch_deg", "0,300,100,90,200,0")
+    assert_close(mixed.T, quarter, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("lines", "complaint"),
+    [
+        (["x_mm,y_mm,z_mm,roll_deg,pitch_deg", "1,2,3,4,5"], "line 1: the column of 'yaw' is missing"),
+        (["x_mm,y_mm,z_mm", "1,2,3"], "line 1: the column of 'roll' is missing; a pose has x_mm"),
+        (["x_mm,y_mm,z_mm,qx,qy,qz", "1,2,3,0,0,0"], "'qw' is missing; a pose has x_mm, y_mm, z_mm, qx"),
+        ([f"{RPY},colour", "1,2,3,4,5,6,7"], "line 1, column 'colour': no column of a wanted pose; Valid:"),
+        (
+            [RPY.replace(",", ";"), "1;2;3;4;5;6"],
+            "fields are separated by semicolons or tabs; save the file with",
+        ),
+        ([f"{RPY},q1_deg", "1,2,3,4,5,6,7"], "column 'q1_deg': no column of a wanted pose"),
+        ([RPY.replace("roll_deg", "rol_deg"), "1,2,3,4,5,6"], "did you mean 'roll_deg'"),
+        ([f"{RPY},x_m", "1,2,3,4,5,6,7"], "column 'x_m': 'x' stands twice"),
+        ([f"{RPY},qx,qy,qz,qw", "1,2,3,4,5,6,0,0,0,1"], "both given; keep one"),
+        ([RPY.replace("y_mm", "y_m"), "1,2,3,4,5,6"], "columns 'x_mm', 'y_m', 'z_mm': mixed units"),
+        ([RPY, "1,2,3,4,5,6", "1,2,3,4,5"], "line 3: 6 fields were wanted, got 5"),
+        ([RPY, "1,5,2,3,4,5,6"], "decimal point, not a comma"),
+        ([RPY, '1,2,3,4,5,"6'], "line 2: is no valid CSV"),
+        ([RPY, "1,2,three,4,5,6"], "line 2, column 'z_mm': 'three' is no finite number"),
+        ([RPY, "1,2,nan,4,5,6"], "'nan' is no finite number"),
+        ([RPY, "1,2,3,4,5,inf"], "'inf' is no finite number"),
+        ([RPY, "1,2,,4,5,6"], "column 'z_mm': '' is no finite number"),
+        ([RPY, "1,2,1_000,4,5,6"], "'1_000' is no finite number"),
+        (
+            [QUATERNION, "0,0,0,0,0,0,1", "0,0,0,0,0,0,2"],
+            "line 3, columns 'qx' to 'qw': a quaternion of length 1",
+        ),
+        ([QUATERNION, "0,0,0,0,0,0,0"], "got 0; normalise it"),
+        ([RPY], "ends after its header"),
+        ([], "is empty"),
+    ],
+)
+def test_faults_are_named(tmp_path, lines, complaint):
+    with pytest.raises(MeasurementError) as caught:
+        read(tmp_path, *lines)
+    assert str(caught.value).startswith(str(tmp_path / "poses.csv"))
+    assert complaint in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_files_that_cannot_be_read(tmp_path):
+    with pytest.raises(MeasurementError, match="cannot be read"):
+        read_poses(tmp_path / "nothing.csv")
+    (tmp_path / "poses.csv").write_bytes(b"\xff\xfe\x00x")
+    with pytest.raises(MeasurementError, match="not UTF-8"):
+        read_poses(tmp_path / "poses.csv")
+
+
+HALF = 0.5**0.5
+ROWS = [
+    "0.1,0.2,0.3,0,0,0,1",
+    "",
+    f"0.4,0.5,0.6,0,0,{HALF},{HALF}",
+    "0.1,0.2,0.3,0,0,0,2",
+    "# a remark",
+    "0.1,0.2,0.3,0,0,0",
+    "0.7,0.8,0.9,1,0,0,0",
+    "0.1,two,0.3,0,0,0,1",
+    "0.2,0.3,0.4,0,1,0,0",
+]
+SOUND, BAD = (2, 4, 8, 10), (5, 7, 9)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 100])
+def test_chunks_hold_every_row_once_and_in_order(tmp_path, rows):
+    path = tmp_path / "poses.csv"
+    path.write_text("\n".join([QUATERNION, *ROWS]) + "\n")
+    chunks = list(read_pose_chunks(path, rows))
+    assert all(len(chunk.line) + len(chunk.bad) <= rows for chunk in chunks)
+    assert [line for chunk in chunks for line in chunk.line] == list(SOUND)
+    assert [bad.line for chunk in chunks for bad in chunk.bad] == list(BAD)
+    only_sound = read(tmp_path, QUATERNION, *(ROWS[line - 2] for line in SOUND))
+    assert_close(torch.cat([chunk.T for chunk in chunks]), only_sound.T, atol=0.0)
+    shares = [chunk.share for chunk in chunks]
+    assert shares == sorted(shares)
+    assert shares[-1] == 1
+
+
+def test_chunks_say_what_is_wrong_with_a_row(tmp_path):
+    path = tmp_path / "poses.csv"
+    path.write_bytes("\n".join([QUATERNION, *ROWS, "0,0,0,0,0,0,ü", ""]).encode("latin-1"))
+    (chunk,) = read_pose_chunks(path)
+    reasons = [bad.reason for bad in chunk.bad]
+    assert "a quaternion of length 1 was wanted, got 2" in reasons[0]
+    assert "7 fields were wanted, got 6" in reasons[1]
+    assert "column 'y_m': 'two' is no finite number" in reasons[2]
+    assert "is not UTF-8 text" in reasons[3]
+    assert chunk.bad[3].line == 11
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_ends_of_lines_and_byte_order_marks(tmp_path, end):
+    path = tmp_path / "poses.csv"
+    path.write_bytes(("\ufeff" + end.join([QUATERNION, *ROWS[:3]])).encode())
+    (chunk,) = read_pose_chunks(path)
+    assert chunk.line == (2, 4)
+    assert not chunk.bad
+
+
+def test_a_long_cell_is_cut(tmp_path):
+    path = tmp_path / "poses.csv"
+    path.write_text(f"{QUATERNION}\n{'x' * 100_000},0,0,0,0,0,1\n")
+    (chunk,) = read_pose_chunks(path)
+    assert len(chunk.bad[0].reason) < 200

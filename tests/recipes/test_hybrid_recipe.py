@@ -1,0 +1,97 @@
+"""Recipes of the hybrid calibrator: mistakes are refused, repeats draw everything anew."""
+
+import pytest
+import torch
+from testing.closeness import assert_close
+
+from pisigma.errors import RecipeError
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.recipes.hybrid_recipe import HybridRecipe, repeated
+from pisigma.recipes.recipe import MeasuredData, SimulatedData
+from pisigma.recipes.recipe_data import (
+    load_measurements,
+    simulate_held_out,
+    simulate_repeats,
+    simulate_training,
+)
+from pisigma.recipes.recipe_kinds import read_any_recipe, read_hybrid_recipe
+
+RB5 = "rb5_hybrid"
+SMALL = (("count: 5000", "count: 40"), ("repeats: 5", "repeats: 2"))
+HYBRID = "repeats: 5\n"
+
+
+@pytest.mark.parametrize("name", ["ur5_hybrid", "ur10_hybrid", RB5])
+def test_shipped_recipes_parse_and_say_what_they_are(repository, name):
+    recipe = read_any_recipe(repository / "training" / f"{name}.yaml")
+    assert isinstance(recipe, HybridRecipe)
+    assert recipe.name == name
+    assert recipe.description
+    assert recipe.not_validated
+    assert recipe.learning_curve is not None
+    calibrator = recipe.calibrator()
+    assert calibrator == HybridCalibrator(calibrator.geometric)  # the defaults
+
+
+def test_every_error_source_is_on(repository):
+    data = read_hybrid_recipe(repository / "training" / f"{RB5}.yaml").data
+    assert isinstance(data, SimulatedData)
+    kinds = {source.kind for source in data.errors}
+    assert kinds == {"geometric", "geometric_random", "transmission", "joint_compliance", "encoder"}
+    assert (data.training.poses.count, data.held_out.poses.count) == (150, 5000)  # type: ignore[union-attr]
+    assert data.training.noise is not None
+    assert data.training.noise.position_mm == 0.03
+    assert data.held_out.noise is None
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "complaint"),
+    [
+        (HYBRID, "hybrid: {features: [gravty]}\n", "'hybrid': features: 'gravty' is no choice; did you mean 'gravity'"),
+        (HYBRID, "hybrid: {harmonics: []}\n", "'hybrid': harmonics"),
+        (HYBRID, "hybrid: {orders: [[1]]}\n", "'hybrid': orders"),
+        (HYBRID, "hybrid: {order: [[2]]}\n", "unknown key 'order' in 'hybrid'; did you mean 'orders'"),
+        (HYBRID, "repeats: 0\n", "'repeats'"),
+        ("rows: [30, 50, 75, 100]", "rows: []", "'learning_curve.rows'"),
+        ("rows: [30, 50, 75, 100]", "rows: [0]", "'learning_curve.rows"),
+        ("joint: theta_1", "joint: theta_9", "'data.errors': .*theta_9"),
+        ("count: 150, seed: 100", "count: 150, seed: 100, range_deg: {q: [0, 1]}", "'data.training.poses'"),
+        ("kind: hybrid_calibration", "kind: hybrid_calibratio", "did you mean 'hybrid_calibration'"),
+        ("kind: simulated", "kind: simulatd", "'data.kind'.*did you mean 'simulated'"),
+    ],
+)  # fmt: skip
+def test_mistakes_are_refused_with_place(write_recipe, old, new, complaint):
+    path = write_recipe(RB5, (old, new))
+    with pytest.raises(RecipeError, match=complaint) as caught:
+        read_any_recipe(path)
+    assert str(caught.value).startswith(f"{path}, line ")
+    assert "\n" not in str(caught.value)
+
+
+def test_repeats_are_other_robots_other_poses_and_other_noise(write_recipe):
+    recipe = read_hybrid_recipe(write_recipe(RB5, *SMALL))
+    rows, parts = simulate_repeats(recipe)
+    assert rows.rows == 2 * (150 + 40)
+    assert [(len(train), len(test)) for train, test in parts] == [(150, 40)] * 2
+    assert sorted(torch.cat([part for both in parts for part in both]).tolist()) == list(range(rows.rows))
+    first, held_out = simulate_training(recipe), simulate_held_out(recipe)
+    (train, test), (other, _) = parts
+    assert_close(rows.q[train], first.q, atol=0.0)
+    assert_close(rows.position[train], first.position, atol=0.0)
+    assert_close(rows.position[test], held_out.position, atol=0.0)
+    assert float((rows.q[other] - first.q).abs().min()) > 0
+    again = repeated(recipe.data, 0)
+    assert again == recipe.data
+    seeds = [source.seed for source in repeated(recipe.data, 3).errors if hasattr(source, "seed")]
+    assert seeds == [3]
+
+
+def test_measured_recipes_want_a_file_and_simulated_ones_none(write_recipe, tmp_path):
+    recipe = read_hybrid_recipe(write_recipe("ur5_hybrid"))
+    assert isinstance(recipe.data, MeasuredData)
+    with pytest.raises(RecipeError, match="is for measured data; give the file with --data"):
+        load_measurements(recipe, None)
+    with pytest.raises(RecipeError, match="is for measured data and simulates nothing"):
+        simulate_repeats(recipe)
+    with pytest.raises(RecipeError, match="simulates its data and takes no --data"):
+        load_measurements(read_hybrid_recipe(write_recipe(RB5)), tmp_path / "rows.csv")

@@ -1,0 +1,295 @@
+"""What a report says: figures against numpy, and whose figures they are said to be."""
+
+import json
+import math
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.models import hand_made_model, joints_around
+from testing.report import folder_with_held_out, geometric_under_test, hybrid_under_test, measured
+
+from pisigma.errors import MeasurementError
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.row_poses import poses_of_rows
+from pisigma.reporting.calibration_card import parameter_table
+from pisigma.reporting.page.advice import measured_stretches
+from pisigma.reporting.page.content import report_content
+from pisigma.reporting.page.corrections import correction_curves
+from pisigma.reporting.page.judged_rows import MOST_PREDICTED, predicted_at
+from pisigma.reporting.page.limits import limit_of
+from pisigma.reporting.page.summary import summary_of
+
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+
+
+@pytest.fixture(scope="module")
+def hybrid():
+    return hybrid_under_test()
+
+
+def test_figures_of_unseen_rows_are_numpys(hybrid, tmp_path):
+    arm, model = hybrid
+    rows = measured(arm, 150, seed=9)
+    content = report_content(model, tmp_path, rows)
+    assert content.rows.origin == "unseen"
+    first = content.accuracies[0]
+    assert (first.held_out, first.rows, list(first.models)) == (True, 150, ["nominal", "geometric", "hybrid"])
+    error = np.linalg.norm((rows.position - poses_of_rows(model, rows)[:, :3, 3]).numpy(), axis=1) * 1e3
+    for name, value in (
+        ("mean_mm", error.mean()),
+        ("rms_mm", np.sqrt((error**2).mean())),
+        ("p95_mm", np.quantile(error, 0.95)),
+        ("max_mm", error.max()),
+    ):
+        assert_close(first.models["hybrid"][name], value, rtol=1e-12)
+    after = next(layer for layer in content.map.layers if layer.key == "after")
+    assert_close(after.values, error, rtol=1e-12)
+    assert_close(
+        first.factor, first.models["nominal"]["rms_mm"] / first.models["hybrid"]["rms_mm"], rtol=0, atol=0
+    )
+    assert "150 rows that it never saw" in content.verdict.sentence
+    assert first.models["nominal"]["rms_mm"] > 2 * first.models["hybrid"]["rms_mm"]
+
+
+def test_rows_of_the_calibration_are_known_by_their_hash(hybrid, tmp_path):
+    arm, model = hybrid
+    content = report_content(model, tmp_path, arm.measurements)
+    assert content.rows.origin == "training"
+    own = content.accuracies[-1]
+    assert not own.held_out
+    assert "very rows that the model was made of" in own.how
+    assert content.accuracies[0].held_out  # the model's own held-out figures lead
+    assert content.accuracies[0].models == {
+        name: model.metrics["cross_validation"][name] for name in ("nominal", "geometric", "hybrid")
+    }
+
+
+def test_training_rows_alone_are_no_held_out_figures(hybrid, tmp_path):
+    arm, model = hybrid
+    bare = replace(model, metrics={})
+    verdict = report_content(bare, tmp_path, arm.measurements).verdict
+    assert not verdict.held_out
+    assert "200 rows that it was made of" in verdict.sentence
+
+
+def test_joint_values_of_the_calibration_measured_again_are_said(hybrid, tmp_path):
+    arm, model = hybrid
+    again = replace(arm.measurements, position=arm.measurements.position + 1e-5)
+    content = report_content(model, tmp_path, again)
+    assert content.rows.origin == "unseen"
+    assert any("200 of these 200 rows have joint values" in line for line in content.rows.remarks)
+
+
+def test_a_folder_that_keeps_held_out_rows_shows_them(hybrid, tmp_path):
+    arm, model = hybrid
+    kept = folder_with_held_out(arm, model, tmp_path / "arm")
+    training = report_content(model, tmp_path, arm.measurements).rows
+    for rows in (arm.measurements, None):
+        content = report_content(kept, tmp_path / "arm", rows)
+        assert content.rows.origin == "held_out"
+        assert_close(content.rows.after.position, 1.1 * training.after.position, rtol=1e-5)
+        assert content.parameters.correlations
+    other = report_content(kept, tmp_path / "arm", measured(arm, 40, seed=9))
+    assert other.rows.origin == "unseen"
+
+
+def test_a_model_in_another_frame_is_called_worse(hybrid, tmp_path):
+    rows = measured(hybrid[0], 60, seed=9)
+    moved = replace(rows, position=rows.position + 0.05)
+    sentence = report_content(hybrid[1], tmp_path, moved).verdict.sentence
+    assert "times worse than the nominal robot" in sentence
+    assert "check that the rows are in the frame" in sentence
+
+
+def test_rows_marked_as_train_are_left_out(hybrid, tmp_path):
+    arm, model = hybrid
+    rows = replace(measured(arm, 40, seed=9), split=("train",) * 10 + ("test",) * 30)
+    content = report_content(model, tmp_path, rows)
+    assert content.rows.measurements.rows == 30
+    assert any("10 rows that the file marks as 'train'" in line for line in content.rows.remarks)
+
+
+def test_frames_and_targets_are_told_apart(tmp_path):
+    arm, model = hybrid_under_test(frames=True)
+    content = report_content(model, tmp_path, arm.measurements)
+    names, sentence = content.frames
+    assert [one.name for one in names] == ["wall", "floor"]
+    assert sum(one.rows for one in names) == 200
+    error = content.rows.residual.norm(dim=-1).numpy() * 1e3
+    wall = np.array([name == "wall" for name in arm.measurements.frame])
+    assert_close(names[0].after, np.sqrt((error[wall] ** 2).mean()), rtol=1e-12)
+    assert_close(names[0].bias, content.rows.residual.numpy()[wall].mean(0) * 1e3, rtol=1e-9)
+    assert sentence
+    assert len(content.targets[0]) == 2
+
+
+def test_sockets_are_judged_from_where_they_are_on_average(hybrid, tmp_path):
+    arm, model = hybrid
+    q = arm.measurements.q[:9]
+    rows = Measurements(q=q, socket=("A",) * 4 + ("B",) * 4 + ("alone",))
+    content = report_content(model, tmp_path, rows)
+    ball = poses_of_rows(model, rows)[:, :3, 3]
+    expected = torch.cat([ball[:4].mean(0) - ball[:4], ball[4:8].mean(0) - ball[4:8]])
+    assert_close(content.rows.residual[:8], expected, atol=1e-12)
+    assert bool(torch.isnan(content.rows.residual[8]).all())
+    said = " ".join(content.rows.remarks)
+    assert "1 of 9 rows have no position error" in said
+    assert "that all rows of a socket share is not seen" in said
+
+
+def test_rows_that_cannot_be_judged_are_refused(hybrid, tmp_path):
+    q = hybrid[0].measurements.q[:5]
+    rows = Measurements(q=q, frame=("jig",) * 5, touch_axis=("x",) * 5, touch=torch.zeros(5).double())
+    with pytest.raises(MeasurementError, match="cannot be judged on this file"):
+        report_content(hybrid[1], tmp_path, rows)
+
+
+def test_without_rows_the_workspace_is_shown(hybrid, tmp_path):
+    content = report_content(hybrid[1], tmp_path)
+    assert content.rows is None
+    assert [layer.key for layer in content.map.layers] == ["correction", "predicted"]
+    assert len(content.map.place) == 3000
+    assert any("No measured rows" in line for line in content.missing)
+    assert content.dependences == ()
+
+
+def test_a_geometric_model_says_what_it_lacks(tmp_path):
+    arm, model = geometric_under_test()
+    content = report_content(model, tmp_path, measured(arm, 80, seed=9))
+    assert list(content.accuracies[0].models) == ["nominal", "geometric"]
+    assert content.curves == ()
+    assert any("no uncertainty" in line for line in content.missing)
+    assert content.limit.share is None
+    assert "cannot tell which" in content.verdict.sentence
+    expected = [(*row[:-1], row[-1].replace("below", "above")) for row in parameter_table(model.metrics)]
+    assert list(content.parameters.table) == expected
+
+
+@pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur10"])
+def test_a_network_alone_is_reported(name, tmp_path):
+    model = hand_made_model(name)
+    alone = report_content(model, tmp_path)
+    assert "holds no figures" in alone.verdict.sentence
+    assert alone.parameters.table == ()
+    q = joints_around(name, 50, seed=4)
+    T = model.forward(q)
+    rows = Measurements(q=q, position=T[:, :3, 3], rotation=T[:, :3, :3])
+    content = report_content(model, tmp_path, rows)
+    assert list(content.accuracies[0].models) == ["nominal", "corrected"]
+    assert content.accuracies[0].last["max_mm"] < 1e-6 < content.accuracies[0].models["nominal"]["rms_mm"]
+    assert {layer.key for layer in content.map.layers} >= {"before", "after", "before_deg", "after_deg"}
+
+
+def test_orientations_alone_are_reported(hybrid, tmp_path):
+    model = hybrid[1]
+    q = hybrid[0].measurements.q[:40]
+    rows = Measurements(q=q, rotation=poses_of_rows(model, Measurements(q=q))[:, :3, :3])
+    content = report_content(model, tmp_path, rows)
+    assert content.accuracies[0].quantity == ("deg", "orientation")
+    assert content.accuracies[0].last["max_deg"] < 1e-6
+
+
+def test_repeated_rows_tell_the_scatter(hybrid, tmp_path):
+    arm, model = hybrid
+    q = arm.measurements.q[:60].repeat(4, 1)
+    rng = np.random.default_rng(0)
+    position = arm.true.forward(q)[:, :3, 3] + torch.from_numpy(rng.normal(0, 1e-4, (240, 3)))
+    content = report_content(model, tmp_path, Measurements(q=q, position=position))
+    limit = content.limit
+    assert "more than once" in limit.source
+    values = content.rows.residual.numpy().reshape(4, 60, 3)
+    pooled = ((values - values.mean(0)) ** 2).sum() / (240 - 60)
+    assert_close(limit.noise, math.sqrt(pooled) * 1e3, rtol=1e-12)
+    assert_close(limit.noise, math.sqrt(3) * 0.1, rtol=0.1)
+
+
+def test_the_noise_that_a_hybrid_found_is_the_limit(hybrid, tmp_path):
+    model = hybrid[1]
+    sigma = model.metrics["hybrid"]["learned"]["noise"][0]["sigma_mm"]
+    accuracy = report_content(model, tmp_path).accuracies[0]
+    limit = limit_of(model, accuracy, None)
+    assert_close(limit.noise, math.sqrt(3) * sigma, rtol=1e-12)
+    assert_close(limit.share, min((limit.noise / accuracy.last["rms_mm"]) ** 2, 1.0), rtol=1e-12)
+
+
+def test_accuracy_is_predicted_at_many_rows_at_most(hybrid, monkeypatch):
+    arm, model = hybrid
+    monkeypatch.setattr("pisigma.reporting.page.judged_rows.MOST_PREDICTED", 20)
+    found = predicted_at(model, arm.measurements)
+    assert int(torch.isfinite(found).sum()) == 20
+    assert MOST_PREDICTED > 20
+    assert bool(torch.isfinite(found[[0, -1]]).all())
+
+
+def test_curves_are_the_correction_at_the_middle_row(hybrid):
+    model = hybrid[1]
+    curves = correction_curves(model)
+    assert [curve.joint for curve in curves] == [joint.name for joint in model.robot.joints]
+    q, curve = model.starts, curves[2]
+    with torch.no_grad():
+        seen = model.hybrid.correction(q)[:, 2].numpy() * math.degrees(1e3)
+    assert_close(curve.dots, seen, rtol=1e-12)
+    assert curve.measured.any()
+
+
+def test_measured_values_are_in_the_stretches_up_to_turns(hybrid):
+    model = hybrid[1]
+    for j, (stretches, (low, high)) in enumerate(measured_stretches(model, model.starts)):
+        assert all(low - math.pi - 1e-9 <= a < b <= high + math.pi + 1e-9 for a, b in stretches)
+        turns = model.starts[:, j].numpy()[:, None] + 2 * math.pi * np.arange(-2, 3)
+        inside = [(turns >= a - 1e-9) & (turns <= b + 1e-9) for a, b in stretches]
+        assert np.any(inside, axis=(0, 2)).all()
+
+
+@pytest.mark.parametrize("name", ["kiro3", "ur10"])
+def test_gaps_are_said_of_joints_that_were_measured_in_part(name, tmp_path):
+    advice = " ".join(report_content(hand_made_model(name), tmp_path).advice)
+    assert "Joints were measured in part only" in advice
+    found = re.search(r"theta_1 (-?[0-9]+) to (-?[0-9]+) deg", advice)
+    own = np.degrees(hand_made_model(name).starts[:, 0].numpy())
+    assert_close([float(part) for part in found.groups()], [own.min(), own.max()], atol=0.51)
+
+
+def test_a_dependence_on_temperature_is_said(hybrid, tmp_path):
+    arm, model = hybrid
+    rows = measured(arm, 300, seed=9)
+    warm = torch.linspace(18, 30, 300, dtype=torch.float64)
+    off = torch.linspace(0, 2e-3, 300, dtype=torch.float64)[:, None] * torch.tensor([0.0, 1.0, 0.0])
+    content = report_content(model, tmp_path, replace(rows, temperature=warm, position=rows.position + off))
+    said = {found.key: found.sentence for found in content.dependences}
+    assert "grows with temperature" in said["temperature"]
+    assert "Component y of the error changes with the order" in said["order"]
+    calm = report_content(model, tmp_path, replace(rows, temperature=warm))
+    assert "No dependence on temperature" in {f.key: f.sentence for f in calm.dependences}["temperature"]
+
+
+def test_the_summary_is_json(hybrid, tmp_path):
+    content = report_content(hybrid[1], tmp_path, measured(hybrid[0], 40, seed=9))
+    text = json.dumps(summary_of(content), allow_nan=False)
+    assert (
+        json.loads(text)["accuracy"][0]["models"]["hybrid"]["rms_mm"] == content.accuracies[0].last["rms_mm"]
+    )
+
+
+def test_a_distilled_model_is_judged_by_its_parent(tmp_path):
+    figures = [
+        {f"{name}_mm": size * k for k, name in enumerate(("mean", "rms", "p95", "max"), 1)}
+        for size in (1, 0.01)
+    ]
+    metrics = {
+        "parent": {"name": "whole", "kind": "hybrid_calibration"},
+        "poses": {"held_out": 77},
+        "held_out": {"nominal": figures[0], "distilled": figures[1], "full": figures[1]},
+        "joints": [{"name": "theta_1", "unit": "deg", "error_rms_deg": 0.1}],
+        "gives_up": ["Reach: less."],
+    }
+    content = report_content(replace(hand_made_model("ur10"), kind="distilled", metrics=metrics), tmp_path)
+    assert list(content.accuracies[0].models) == ["nominal", "full", "distilled"]
+    assert "On 77 poses that it never saw" in content.verdict.sentence
+    assert "the full model whole, whose own errors come on top" in content.verdict.sentence
+    assert content.limit.sentence == "Reach: less."
+    assert content.joints == ()

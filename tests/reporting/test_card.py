@@ -1,0 +1,53 @@
+"""The card of a model: all its sections, and the figures that were measured."""
+
+import pytest
+from testing.models import trained_run
+
+from pisigma.reporting.card import write_card
+from pisigma.reporting.markdown import CARD
+from pisigma.reporting.tables import joint_table
+from pisigma.reporting.training_report import report_training
+
+SECTIONS = ("Data", "Joint errors", "Figures", "Domain", "Not validated", "Use", "Provenance")
+
+
+@pytest.fixture(scope="module", params=["kiro3", "kiro4"])
+def card(request, tmp_path_factory):
+    """Recipe, run, report, folder and text of a card."""
+    recipe, run = trained_run(request.param)
+    report = report_training(recipe, run, None)
+    folder = tmp_path_factory.mktemp("card")
+    write_card(recipe, f"pisigma train training/{request.param}.yaml", run, report, folder)
+    return recipe, run, report, folder, (folder / CARD).read_text()
+
+
+def test_sections_and_pictures_are_there(card):
+    recipe, _, _, folder, text = card
+    assert text.startswith(f"# {recipe.name}\n\n{recipe.description.strip()}\n")
+    assert [line[3:] for line in text.splitlines() if line.startswith("## ")] == list(SECTIONS)
+    for name in ("energy.csv", "energy.png", "errors_over_workspace.png"):
+        assert f"]({name})" in text
+        assert (folder / name).stat().st_size > 0
+    assert recipe.not_validated.strip() in text
+
+
+def test_the_table_is_that_of_the_report(card):
+    _, run, report, _, text = card
+    assert joint_table(report["joints"]) in text
+    assert len(report["joints"]) == len(run.history.joints)
+    assert f"Trained on {run.model.provenance.rows} simulated rows, none left out." in text
+    assert "Judged on 200 other simulated rows (held-out)." in text
+
+
+def test_domain_names_inputs_and_branches(card):
+    _, run, _, _, text = card
+    for name in (*run.model.branches, *run.model.network.groups[0].inputs.names):
+        assert f"`{name}`" in text
+
+
+def test_provenance_is_complete(card):
+    _, run, _, _, text = card
+    provenance = run.model.provenance
+    assert provenance.data_sha256 in text
+    for name, version in provenance.versions.items():
+        assert f"{name} {version}" in text

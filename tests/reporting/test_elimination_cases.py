@@ -1,0 +1,65 @@
+"""Leaving out other members of redundant sets: the same predictions, other values."""
+
+import json
+
+import pytest
+from testing.closeness import assert_close
+
+from pisigma.errors import RecipeError
+from pisigma.recipes.recipe_data import simulate_held_out, simulate_training
+from pisigma.recipes.recipe_kinds import read_geometric_recipe
+from pisigma.reporting.elimination_cases import report_correlations, report_eliminations
+
+
+@pytest.fixture(scope="module")
+def recipe(repository):
+    return read_geometric_recipe(repository / "training" / "rb5_redundancy.yaml")
+
+
+@pytest.fixture(scope="module")
+def calibrated(recipe):
+    rows = simulate_training(recipe)
+    return recipe.calibrate(rows), rows
+
+
+def test_every_case_predicts_the_same_and_keeps_the_sums(recipe, calibrated):
+    result, rows = calibrated
+    two = recipe.model_copy(update={"elimination_cases": recipe.elimination_cases[:2]})
+    report = report_eliminations(two, result, rows, simulate_held_out(recipe))
+    json.dumps(report, allow_nan=False)
+    first, second, none = report["elimination_cases"]
+    assert [case["parameters"] for case in (first, second, none)] == [28, 28, 35]
+    assert [case["removed"] for case in (first, second, none)] == [*map(list, two.elimination_cases), []]
+    for case in (first, second, none):
+        assert case["held_out_rms_mm"] < 1e-9
+        assert_close(case["rmse_mm"][0], result.rms_path[0] * 1e3, rtol=1e-12)
+        total = sum(case["values"][name] for name in ("d_2", "d_3", "d_4"))
+        assert_close(total, sum(report["true_values"][name] for name in ("d_2", "d_3", "d_4")), atol=0.01)
+    assert first["values"]["d_3"] == 0
+    assert second["values"]["d_4"] == pytest.approx(110.7)
+    assert_close(report["true_values"]["d_6"] - 94.7, 0.0, atol=1.0)
+
+
+def test_a_recipe_without_cases_reports_none(recipe, calibrated):
+    result, rows = calibrated
+    without = recipe.model_copy(update={"elimination_cases": ()})
+    assert report_eliminations(without, result, rows, rows) == {}
+
+
+def test_correlations_are_json_with_none_where_there_is_no_effect(recipe, calibrated):
+    angles = report_correlations(calibrated[0])["correlations"]["angles"]
+    json.dumps(angles, allow_nan=False)
+    place = {name: index for index, name in enumerate(angles["names"])}
+    assert angles["values"][place["theta_4"]][place["beta_4"]] == -1
+    assert angles["values"][place["theta_1"]][place["beta_1"]] == 1
+    for name in recipe.paper["no_effect"]:
+        assert set(angles["values"][place[name]]) == {None}
+
+
+def test_a_case_that_names_no_parameter_is_refused(repository, tmp_path):
+    text = (repository / "training" / "rb5_redundancy.yaml").read_text(encoding="utf-8")
+    (tmp_path / "r.yaml").write_text(text.replace("[a_6, d_2, d_3,", "[a_6, d_2, d_33,", 1))
+    with pytest.raises(
+        RecipeError, match=r"line 2\d.*there is no parameter 'd_33' of the arm.*did you mean 'd_3'"
+    ):
+        read_geometric_recipe(tmp_path / "r.yaml")

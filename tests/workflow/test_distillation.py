@@ -1,0 +1,248 @@
+"""A distilled model follows the full solution in its region, and says how well."""
+
+import functools
+import math
+import re
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.identified import geometric_model, hybrid_model
+from testing.models import HOMES, hand_made_model, no_type_checker
+
+import pisigma
+from pisigma.errors import IdentificationError, ModelError
+from pisigma.inverse.torch_ik import TorchIK
+from pisigma.joint_correction.features import FourierSeries, GravityTorques
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.status import Status
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import save_model
+from pisigma.reporting.distilled_card import write_distilled_card
+from pisigma.reporting.distilled_report import report_distillation
+from pisigma.robot import Robot
+from pisigma.workflow.distillation import DistillationSettings, distill
+from pisigma.workflow.distilled_sizes import Size, sizes_for
+from pisigma.workflow.solved_poses import Region, draw_between, draw_solved_poses
+
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+
+HOME = torch.tensor(HOMES["kiro3"], dtype=torch.float64)
+BOX = tuple(
+    float(value) + side
+    for value, width in zip(
+        forward_kinematics(Robot.load("kiro3"), HOME)[:3, 3], (0.04, 0.04, 0.01), strict=True
+    )
+    for side in (-width, width)
+)
+"""[m] A box around the place that kiro3 is at home."""
+
+
+@pytest.fixture(scope="module")
+def without_type_checker():
+    with no_type_checker():
+        yield
+
+
+def rippled(name: str) -> CalibratedModel:
+    """With a series for every joint that turns: one that slides has no overtones that a network could see."""
+    robot = Robot.load(name)
+    model = hybrid_model(name, [FourierSeries(robot, 24), GravityTorques(robot)])
+    model.hybrid.correction.linear[0][~torch.tensor(robot.revolute)] = 0.0
+    return model
+
+
+@functools.cache
+def distilled(kind: str, name: str, size: Size | None, poses: int = 600):
+    parent = geometric_model(name) if kind == "geometric" else rippled(name)
+    return distill("small", parent, settings=DistillationSettings(poses, size, epochs=30))
+
+
+def tool_errors(found, q: torch.Tensor) -> torch.Tensor:
+    """How far the tool is from where it was wanted [m]."""
+    return (found.parent.forward(q)[:, :3, 3] - found.held_out.T[:, :3, 3]).norm(dim=-1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "share"),
+    [
+        ("geometric", "kiro3", 0.01),
+        ("geometric", "kiro4", 0.05),
+        ("geometric", "ur10", 0.05),
+        ("hybrid", "kiro3", 0.2),
+    ],
+)
+def test_the_tool_comes_near_where_the_full_solution_brings_it(kind, name, share):
+    """On poses that were not fitted to, for every kind of arm; the share is that of the nominal robot's error."""
+    found = distilled(kind, name, Size((1, 2, 3)))
+    poses = found.held_out
+    assert_close(tool_errors(found, poses.q_nominal + poses.correction), 0.0, atol=1e-9)
+    nominal = tool_errors(found, poses.q_nominal).square().mean().sqrt()
+    rms = tool_errors(found, poses.q_nominal + found.predicted).square().mean().sqrt()
+    assert float(nominal) > 4e-4
+    assert float(rms) < share * float(nominal)
+
+
+def test_overtones_follow_what_sines_and_cosines_cannot():
+    plain, rich = (distilled("hybrid", "kiro3", Size((1, 2), harmonics)) for harmonics in (1, 24))
+    errors = [
+        float(tool_errors(f, f.held_out.q_nominal + f.predicted).square().mean().sqrt())
+        for f in (plain, rich)
+    ]
+    assert errors[1] < 0.3 * errors[0]
+
+
+def test_poses_are_those_of_the_nominal_joint_values():
+    poses = distilled("geometric", "ur10", Size((1, 2, 3))).held_out
+    robot = Robot.load("ur10")
+    assert_close(forward_kinematics(robot, poses.q_nominal), poses.T, atol=1e-9)
+    assert len(poses.T) == 240
+    assert set(poses.status.tolist()) <= {Status.REACHED, Status.OUTSIDE_DOMAIN}
+
+
+@pytest.mark.parametrize("size", [Size((1, 2, 3)), Size((1, 2), 24)])
+def test_a_folder_gives_the_same_corrections(size, tmp_path):
+    found = distilled("hybrid", "kiro3", size)
+    save_model(replace(found.model, metrics=report_distillation(found)), tmp_path)
+    ik = pisigma.load(tmp_path)
+    poses = found.held_out
+    solution = ik(poses.T)
+    assert ik.model.kind == "distilled"
+    assert_close(solution.q_nominal, poses.q_nominal, atol=1e-9)
+    assert_close(solution.q, poses.q_nominal + found.predicted, atol=1e-9)
+    assert float((solution.status == Status.REACHED).double().mean()) > 0.95
+    if size.harmonics > 1:
+        arrays = ik(poses.T.numpy())
+        assert_close(arrays.q, solution.q, atol=1e-9)
+        assert_close(arrays.status, solution.status)
+
+
+@pytest.mark.parametrize("size", [Size((1, 2, 3)), Size((1, 2), 24)])
+def test_poses_away_from_the_region_are_outside_the_domain(size):
+    """Overtones, which look alike everywhere, do not hide that a joint is elsewhere."""
+    found = distilled("hybrid", "kiro3", size)
+    robot, q = found.model.robot, found.held_out.q_nominal.clone()
+    q[:, 0] += 1.5
+    scaled = found.model.network.scaled_inputs(forward_kinematics(robot, q), q)
+    assert not found.model.domain.contains(scaled).any()
+
+
+def test_a_region_of_positions_holds_all_poses():
+    parent = geometric_model("kiro3")
+    region = Region(parent.starts, BOX)
+    found = distill("boxed", parent, region, DistillationSettings(300, Size((1, 2)), epochs=20))
+    place = found.held_out.T[:, :3, 3]
+    for axis in range(3):
+        assert float(place[:, axis].min()) >= BOX[2 * axis]
+        assert float(place[:, axis].max()) <= BOX[2 * axis + 1]
+    assert float(tool_errors(found, found.held_out.q_nominal + found.predicted).max()) < 2e-4
+
+
+def test_a_given_seed_gives_the_same_model():
+    settings = DistillationSettings(200, Size((1, 2)), seed=4, epochs=5)
+    first, second = (distill("again", geometric_model("kiro3"), settings=settings) for _ in range(2))
+    assert_close(first.predicted, second.predicted)
+    other = distill("again", geometric_model("kiro3"), settings=replace(settings, seed=5))
+    assert not torch.equal(first.held_out.T, other.held_out.T)
+
+
+def test_the_smallest_size_that_is_good_is_kept():
+    found = distilled("hybrid", "kiro3", None, 800)
+    assert [trial.size for trial in found.trials][:2] == [Size((1, 2)), Size((1, 2, 3))]
+    (kept,) = (trial for trial in found.trials if trial.kept)
+    assert kept.error <= max(1.1 * min(trial.error for trial in found.trials), 5e-6)
+    assert kept.size.harmonics == found.trials[-1].size.harmonics > 1
+
+
+def test_sizes_fit_the_number_of_poses_and_the_parent():
+    plain, rich = geometric_model("kiro3"), rippled("kiro3")
+    assert {size.harmonics for size in sizes_for(plain, 10_000)} == {1}
+    assert max(size.harmonics for size in sizes_for(rich, 10_000)) == 24
+    assert sizes_for(rich, 150) == (Size((1, 2)),)
+    robot, size = Robot.load("kiro3"), Size((1, 2), 24)
+    network = distilled("hybrid", "kiro3", size).model.network
+    assert network.networks[0].weight[0].numel() + network.networks[0].bias[0].numel() == size.unknowns(robot)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 60])
+def test_joint_values_lie_between_the_rows(rows):
+    robot, q = Robot.load("kiro3"), geometric_model("kiro3").starts[:rows]
+    drawn = draw_between(robot, q, 500, torch.Generator().manual_seed(0))
+    assert drawn.shape == (500, 4)
+    assert bool(((drawn >= q.amin(0) - 1e-12) & (drawn <= q.amax(0) + 1e-12)).all())
+    assert rows == 1 or float(drawn.std(0).min()) > 0.1 * float(q.std(0).min())
+
+
+def test_between_goes_the_short_way_round():
+    robot = Robot.load("ur10")
+    q = torch.full((2, 6), 3.1, dtype=torch.float64)
+    q[1] = -3.1
+    drawn = draw_between(robot, q, 100, torch.Generator().manual_seed(0))
+    assert float(drawn.abs().min()) >= 3.1 - 1e-12
+    assert float(drawn.abs().max()) <= 2 * math.pi - 3.1 + 1e-12
+
+
+def test_figures_and_card_are_those_of_the_held_out_poses(tmp_path):
+    found = distilled("hybrid", "kiro3", Size((1, 2, 3)))
+    report = report_distillation(found)
+    errors = tool_errors(found, found.held_out.q_nominal + found.predicted) * 1e3
+    assert_close(report["held_out"]["distilled"]["rms_mm"], errors.square().mean().sqrt(), rtol=1e-9)
+    assert_close(report["held_out"]["distilled"]["max_mm"], errors.max(), rtol=1e-9)
+    off = (found.predicted - found.held_out.correction)[:, 0].abs().rad2deg()
+    assert_close(report["joints"][0]["error_max_deg"], off.max(), rtol=1e-9)
+    assert_close(
+        report["joints"][2]["correction_mean_mm"],
+        found.held_out.correction[:, 2].abs().mean() * 1e3,
+        rtol=1e-9,
+    )
+    write_distilled_card(found, "pisigma distill it", report, tmp_path)
+    card = (tmp_path / "README.md").read_text()
+    assert f"{report['held_out']['distilled']['rms_mm']:.4f} mm RMS" in card
+    assert "up to 24 cycles a turn" in card
+    assert "`hybrid_kiro3`" in card
+    assert not re.search(r"\bnan\b", card)
+
+
+def test_a_region_out_of_reach_is_refused():
+    parent = geometric_model("kiro3")
+    region = Region(parent.starts, (3.0, 3.1, 0.0, 0.1, 0.0, 0.1))
+    with pytest.raises(
+        IdentificationError, match=r"between \(3000, 0, 0\) and .* takes only 0 \(640 unreachable\)"
+    ):
+        distill("far", parent, region, DistillationSettings(200, Size((1,))))
+
+
+def test_poses_near_a_singularity_are_not_drawn():
+    parent = geometric_model("kiro4")
+    straight = parent.starts.clone()
+    straight[:, 4] = 0.02
+    with pytest.raises(IdentificationError, match="20 singular"):
+        draw_solved_poses(TorchIK(parent), Region(straight), 10, torch.Generator().manual_seed(0))
+
+
+@pytest.mark.parametrize(
+    ("parent", "complaint"),
+    [
+        (lambda: hand_made_model("kiro3"), "by a network already, so there is nothing to distil"),
+        (lambda: replace(geometric_model("kiro3"), calibrated=None), "has no identified geometry"),
+    ],
+)
+def test_models_without_anything_to_distil_are_refused(parent, complaint):
+    with pytest.raises(ModelError, match=complaint):
+        distill("nothing", parent())
+
+
+@pytest.mark.parametrize(
+    ("name", "settings", "rows", "complaint"),
+    [
+        ("kiro3", DistillationSettings(50), 60, "50 poses are too few"),
+        ("ur10", DistillationSettings(120), 60, "120 poses are too few for any size"),
+        ("kiro3", DistillationSettings(120, Size((3, 3), 8)), 60, "rows are there to fit"),
+        ("kiro3", DistillationSettings(200, Size((1,))), 1, "no joint moves"),
+    ],
+)
+def test_too_little_is_refused(name, settings, rows, complaint):
+    parent = geometric_model(name)
+    with pytest.raises(IdentificationError, match=complaint):
+        distill("little", parent, Region(parent.starts[:rows]), settings)
