@@ -48,7 +48,7 @@ def calibrate(
         str,
         typer.Option(help="How rows are parted: joints (at random), interleaved, time, space or placement."),
     ] = "joints",
-    dealings: Annotated[
+    repeats: Annotated[
         int | None,
         typer.Option(
             min=1,
@@ -98,20 +98,20 @@ def calibrate(
     from pisigma.model.folder.model_folder import save_model
     from pisigma.model.folder.staging import check_replaceable, staged_folder
     from pisigma.recipes.geometric_recipe import calibration_section, known_socket_distances
-    from pisigma.recipes.recipe_data import part_sets
+    from pisigma.recipes.recipe_data import split_sets
     from pisigma.reporting.calibration_card import write_calibration_card
     from pisigma.reporting.calibration_report import report_calibration
     from pisigma.robot.description import Robot
 
     check_replaceable(out)
     nominal = Robot.load(robot, base, tip)
-    measurements, test = part_sets(Measurements.read_csv(data, nominal))
+    measurements, test = split_sets(Measurements.read_csv(data, nominal))
     geometric = replace(
         calibration_section(free, prior_mm, prior_mrad, robust).calibrator(nominal),
         socket_distances=known_socket_distances(socket_distance, measurements.socket or ()),
     )
     calibrator = _calibrator(model, geometric)
-    parts = _parts(measurements, folds, hold_out, seed, split, dealings)
+    parts = _parts(measurements, folds, hold_out, seed, split, repeats)
     rows, parts = _drawn(measurements, parts, train_rows, seed)
     with progress_of("calibration") as tell:
         result = fit(calibrator, rows, tell)
@@ -125,7 +125,7 @@ def calibrate(
     found = replace(_model(out.resolve().name, nominal, result, rows), metrics=report)
     options = {"model": model, "folds": folds, "hold-out": hold_out, "split": split, "seed": seed}
     options |= {
-        "dealings": dealings,
+        "repeats": repeats,
         "train-rows": train_rows,
         "free": free,
         "prior-mm": prior_mm,
@@ -214,16 +214,16 @@ def _parts(
     split: str,
     times: int | None,
 ) -> "Sequence[Sequence[TrainTest]]":
-    """Per dealing its parts; one part for rows that are held out once."""
+    """Per repeat its parts; one part for rows that are held out once."""
     from pisigma.errors import MeasurementError, nearest_choice
-    from pisigma.measurement.splits import SplitBy, dealings, holdout
+    from pisigma.measurement.splits import SplitBy, holdout, repeats
 
     choices: tuple[str, ...] = get_args(SplitBy)
     if split not in choices:
         raise MeasurementError(f"--split '{split}' is unknown; {nearest_choice(split, choices)}")
     if times is not None and times > 1 and (hold_out is not None or folds == 0):
         raise MeasurementError(
-            f"--dealings {times}: rows are dealt to folds; leave out --hold-out and --folds 0."
+            f"--repeats {times}: rows are dealt to folds; leave out --hold-out and --folds 0."
         )
     if hold_out is not None and folds is not None:
         raise MeasurementError(
@@ -234,7 +234,7 @@ def _parts(
         return [[holdout(measurements, hold_out, seed, by)]]
     if folds is None and split != "placement":
         folds = FOLDS
-    return [] if folds == 0 else dealings(measurements, folds, seed, by, times)
+    return [] if folds == 0 else repeats(measurements, folds, seed, by, times)
 
 
 def _drawn(

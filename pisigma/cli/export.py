@@ -112,9 +112,9 @@ def export(
         return
     loaded, as_csv = load_model(model), out.suffix.lower() == ".csv"
     if conditions:
-        from pisigma.model.stated_conditions import under_conditions
+        from pisigma.model.stated_conditions import under_stated_conditions
 
-        loaded = under_conditions(loaded, **conditions)
+        loaded = under_stated_conditions(loaded, **conditions)
     content: str | bytes
     if form == "onnx":
         content, result = _onnx(loaded, model)

@@ -50,7 +50,7 @@ def train(
     from pisigma.model.folder.model_folder import save_model
     from pisigma.model.folder.staging import check_replaceable, staged_folder
     from pisigma.recipes.recipe import recipe_hash
-    from pisigma.recipes.recipe_data import load_measurements, part_sets
+    from pisigma.recipes.recipe_data import load_measurements, split_sets
     from pisigma.reporting.card import write_card
     from pisigma.reporting.training_course import report_course
     from pisigma.reporting.training_report import report_training
@@ -59,7 +59,7 @@ def train(
 
     folder = out or Path("runs") / stated.name
     check_replaceable(folder)
-    measurements, test = part_sets(load_measurements(stated, data))
+    measurements, test = split_sets(load_measurements(stated, data))
     checkpoints = checkpoint_folder(folder)
     run = train_recipe(stated, measurements, RunOptions(checkpoints, resume, True, recipe_hash(recipe)))
     report = report_training(stated, run, _cross_validate(stated, measurements), test)

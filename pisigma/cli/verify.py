@@ -19,7 +19,7 @@ def verify(
 ) -> None:
     """Tell whether new measurements are explained better by the corrected model than by the nominal robot.
 
-    Where errors are large, the usual mix-ups that explain them are named: another frame or tool, units, order,
+    Where errors are large, the usual setup faults that explain them are named: another frame or tool, units, order,
     signs or zeros of the joints, a correction that was applied twice or not at all. Rows of the set "train" are
     left out. Exit status 3 where the corrected model does not explain the measurements better.
     """
@@ -45,7 +45,7 @@ def verify(
         "ratio": found.ratio if found.ratio == found.ratio else None,
         "better_share": found.better_share,
         **found.comparison,
-        "mix_ups": [mix_up.in_file_units() for mix_up in found.mix_ups],
+        "setup_faults": [setup_fault.in_file_units() for setup_fault in found.setup_faults],
         "remarks": list(found.remarks),
     }
     if as_json:
@@ -64,8 +64,8 @@ def _print(result: dict[str, Any]) -> None:
     rows = f"{result['rows_compared']} rows ({result['configurations']} configurations) of {result['data']}"
     print_table(f"errors of {rows}; in brackets {confidence} confidence", *comparison_table(result))
     print_table("difference to nominal on the same rows, below 0 is better", *difference_table(result))
-    for mix_up in result["mix_ups"]:
-        typer.echo(mix_up["sentence"])
+    for setup_fault in result["setup_faults"]:
+        typer.echo(setup_fault["sentence"])
     for remark in result["remarks"]:
         typer.echo(remark)
     if result["explained_better"]:

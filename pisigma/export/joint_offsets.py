@@ -52,14 +52,14 @@ class JointOffsets:
         robot: as drawn but for theta of turning and d of sliding joints, base and tool.
         values: per joint [rad or m], as the controller counts: the real robot commanded to q stands where the
             drawn one stands at q + offset.
-        unseen: joints whose offset is 0 because base or tool take the same in.
+        unobservable: joints whose offset is 0 because base or tool take the same in.
         lost: what is given up: departure from the whole model.
         nominal: the departure of the robot as drawn, with the model's base and tool, for comparison.
     """
 
     robot: Robot
     values: Float64[np.ndarray, " dof"]
-    unseen: tuple[str, ...]
+    unobservable: tuple[str, ...]
     lost: Departure
     nominal: Departure
 
@@ -85,7 +85,7 @@ def fit_joint_offsets(model: CalibratedModel, seed: int = 0) -> JointOffsets:
     return JointOffsets(
         robot=fitted,
         values=_offsets(model.robot, fitted),
-        unseen=tuple(j.name for j, known in zip(model.robot.joints, seen, strict=True) if not known),
+        unobservable=tuple(j.name for j, known in zip(model.robot.joints, seen, strict=True) if not known),
         lost=_departure(forward_kinematics(fitted, q), T),
         nominal=_departure(forward_kinematics(model.robot, q), T),
     )

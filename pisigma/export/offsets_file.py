@@ -27,8 +27,8 @@ def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
         f"{nominal['mean_mm']:.4g}, {nominal['p95_mm']:.4g}, {nominal['max_mm']:.4g} mm and "
         f"{nominal['mean_mrad']:.4g} mrad).",
     ]
-    if offsets.unseen:
-        said.append(f"Base or tool take in the offset of {', '.join(offsets.unseen)}, which is 0 here.")
+    if offsets.unobservable:
+        said.append(f"Base or tool take in the offset of {', '.join(offsets.unobservable)}, which is 0 here.")
     return tuple(said)
 
 

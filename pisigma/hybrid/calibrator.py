@@ -6,13 +6,13 @@ from dataclasses import dataclass
 from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.hybrid.common_frames import with_frames_of
 from pisigma.hybrid.coverage import JointCoverage
-from pisigma.hybrid.evidence import told_share
+from pisigma.hybrid.evidence import effective_share
 from pisigma.hybrid.extrapolation import fade_angle
 from pisigma.hybrid.product_search import best_products
 from pisigma.hybrid.refinement import Refinement, refine, with_held_factors
 from pisigma.hybrid.result import HybridResult, LearnedPart
 from pisigma.hybrid.rows import Rows
-from pisigma.hybrid.search import MOST_TOLD, Additive, Search, described
+from pisigma.hybrid.search import LARGEST_EFFECTIVE_SHARE, Additive, Search, described
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
@@ -28,7 +28,7 @@ from pisigma.joint_correction.features import (
     GravityTorques,
     SharedFeatures,
 )
-from pisigma.measurement.conditions import told_conditions
+from pisigma.measurement.conditions import stated_conditions
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints
 
@@ -104,7 +104,7 @@ class HybridCalibrator:
             return _geometric_alone(solved, search, verdict)
         progress("solving for everything")
         refined = refinement(solved, additive, orders, self.geometric.loss)
-        if told_share(refined.sums, refined.posterior) > MOST_TOLD:
+        if effective_share(refined.sums, refined.posterior) > LARGEST_EFFECTIVE_SHARE:
             verdict = (
                 "A joint correction would take up nearly all that the few rows tell, so the geometric calibration "
                 "stands; measure more poses."
@@ -158,7 +158,7 @@ class HybridCalibrator:
         )
         series, others = self._features(solved, rows.configurations)
         largest = [*others, *series[-1:]]
-        search = Search(rows, view.noise, view.widening, largest, progress)
+        search = Search(rows, view.noise, view.prior_scale, largest, progress)
         additive = search.best_additive(series, others)
         additive, orders = best_products(search, additive, self.orders)
         return search, additive, orders
@@ -177,7 +177,7 @@ class HybridCalibrator:
             elif name == "gravity":
                 others.append(GravityTorques(robot, self.gravity))
             elif name == "conditions":
-                values, names = solved.problem.conditions, told_conditions(solved.setup.measurements)
+                values, names = solved.problem.conditions, stated_conditions(solved.setup.measurements)
                 if values is not None:
                     mean, spread = values.mean(0).tolist(), values.std(0).tolist()
                     others.append(ConditionFeatures(robot, names, mean, spread, self.gravity))

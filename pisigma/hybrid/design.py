@@ -50,15 +50,15 @@ class Design:
         blocks += [values.feature_columns(chosen, state, rows) for chosen in self.features]
         return torch.cat(blocks, -1)
 
-    def prior(self, widening: Sequence[float]) -> GaussianPrior:
+    def prior(self, prior_scale: Sequence[float]) -> GaussianPrior:
         """Prior of all unknowns, the classes' factors as the geometric calibration left them.
 
         A prismatic joint's weights are lengths; their sizes count in radians times the reach.
         """
         problem, robot = self.problem, self.problem.space.robot
         base, group = [problem.precision[problem.active]], [problem.prior_group]
-        sizes = [problem.q.new_tensor(list(widening))]
-        classes = len(widening)
+        sizes = [problem.q.new_tensor(list(prior_scale))]
+        classes = len(prior_scale)
         unit = torch.where(torch.tensor(robot.revolute), 1.0, robot.reach**-2).to(problem.q)
         following = classes
         for chosen in self.features:

@@ -8,7 +8,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
-from pisigma.identification.problem.noise import LEAST_TOLD, SMALLEST_NOISE, SMALLEST_PRIOR
+from pisigma.identification.problem.noise import LEAST_EFFECTIVE, SMALLEST_NOISE, SMALLEST_PRIOR
 
 SMALLEST_SIZE = 1e-9
 """Prior size [rad] below which a group of weights is off."""
@@ -90,7 +90,7 @@ class GaussianPrior:
         count = torch.zeros_like(self.sizes).index_add(0, self.group, told)
         square = torch.zeros_like(self.sizes).index_add(0, self.group, x.square() * self.base)
         is_class = torch.arange(len(self.sizes), device=x.device) < self.classes
-        least = torch.where(is_class, LEAST_TOLD, 1e-9)
+        least = torch.where(is_class, LEAST_EFFECTIVE, 1e-9)
         floor = torch.where(is_class, SMALLEST_PRIOR, SMALLEST_SIZE)
         sizes = torch.maximum((square / count.clamp(min=1e-12)).sqrt(), floor)
         stands = (count <= least) | (is_class & self.fixed)
@@ -119,7 +119,7 @@ class Posterior:
     iterations: int
 
 
-def told_share(sums: Sums, found: Posterior) -> float:
+def effective_share(sums: Sums, found: Posterior) -> float:
     """Share of the values that the unknowns use up; near 1 nothing is left that tells noise from error."""
     held = found.prior.precision * found.covariance.diagonal()
     values = sum(count for count, exact in zip(sums.count, sums.exact, strict=True) if not exact)

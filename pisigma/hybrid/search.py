@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from pisigma.hybrid.design import Design, sum_up
-from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence, told_share
+from pisigma.hybrid.evidence import Posterior, Sums, effective_share, maximise_evidence
 from pisigma.hybrid.left_out import left_out
 from pisigma.hybrid.rows import Rows
 from pisigma.joint_correction.features import AbstractFeatures, FourierSeries
@@ -14,7 +14,7 @@ LEVEL = 1.03
 """Features that the evidence is for are kept unless the left-out RMS rises above so many times what it was."""
 CLEARLY = 5.0
 """The log evidence has to rise by so much (a Bayes factor of 150: very strong, Kass and Raftery 1995)."""
-MOST_TOLD = 0.75
+LARGEST_EFFECTIVE_SHARE = 0.75
 """Unknowns may use up so much of the values, or the noise cannot be told from them."""
 ROUGHLY = 0.1
 """While features are chosen, a log evidence that rises by less has settled."""
@@ -77,7 +77,7 @@ class Search:
         self,
         rows: Rows,
         noise: tuple[float, ...],
-        widening: Sequence[float],
+        prior_scale: Sequence[float],
         largest: Sequence[AbstractFeatures],
         progress: Progress,
     ) -> None:
@@ -86,11 +86,11 @@ class Search:
         Args:
             rows: to fit to.
             noise: of the geometric calibration, per sensor.
-            widening: prior sizes of the geometric calibration.
+            prior_scale: prior sizes of the geometric calibration.
             largest: all features that may be tried, series with all its harmonics.
             progress: called with what is being tried.
         """
-        self.rows, self.noise, self.widening = rows, noise, widening
+        self.rows, self.noise, self.prior_scale = rows, noise, prior_scale
         self.trials: list[Trial] = []
         self.progress = progress
         self._largest = Design(rows.problem, tuple(largest))
@@ -104,7 +104,7 @@ class Search:
         places = self._largest.places(features)
         design = Design(self.rows.problem, tuple(features))
         sums = self._sums.select(places)
-        noise, prior = self.noise, design.prior(self.widening)
+        noise, prior = self.noise, design.prior(self.prior_scale)
         if near is not None:
             noise, prior = near.posterior.noise, design.prior_like(near.design, near.posterior.prior)
         posterior = maximise_evidence(sums, prior, noise, tolerance=ROUGHLY)
@@ -172,7 +172,11 @@ class Search:
         found = self.additive(features, best)
         own = self.left_out_rms(found.design, found.posterior)
         gain = found.posterior.log_evidence - best.posterior.log_evidence
-        better = gain > CLEARLY and own < rms * LEVEL and told_share(found.sums, found.posterior) < MOST_TOLD
+        better = (
+            gain > CLEARLY
+            and own < rms * LEVEL
+            and effective_share(found.sums, found.posterior) < LARGEST_EFFECTIVE_SHARE
+        )
         self.note(found.name, found.design, found.posterior, own, began, better)
         return (found, own, True) if better else (best, rms, False)
 

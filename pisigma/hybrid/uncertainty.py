@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.hybrid.design import Design
-from pisigma.hybrid.evidence import Posterior, Sums, told_share
+from pisigma.hybrid.evidence import Posterior, Sums, effective_share
 from pisigma.hybrid.left_out import LeftOut, folds_left_out, left_out
 from pisigma.hybrid.rows import Rows
 from pisigma.hybrid.sensor_values import joint_columns
@@ -26,7 +26,7 @@ MOST_CONFIGURATIONS = 2_000
 """Left-out rows are looked at on so many configurations at most."""
 FEW_CONFIGURATIONS = 600
 """Up to so many, whole parts are left out instead of single configurations."""
-LEAST_TOLD = 0.5
+LEAST_EFFECTIVE = 0.5
 """Prior sizes of groups of which the data tell less than so many unknowns do not matter."""
 MOST_WIDENING = 1e4
 """Largest factor on variances."""
@@ -42,14 +42,14 @@ class PositionUncertainty:
         features: what the weights belong to.
         root: `R` with `C = R R^T`, of all parameters of the space (0 for those that were not free) and then all
             weights, widened so that left-out rows are missed by as much as it says.
-        widening: factor on the variances that this took.
+        prior_scale: factor on the variances that this took.
     """
 
     space: ParameterSpace
     geometry: IdentifiedGeometry
     features: tuple[AbstractFeatures, ...]
     root: Float64[Tensor, "unknowns directions"]
-    widening: float
+    prior_scale: float
 
     def deviation(
         self, measurements: Measurements, q_moved: Float64[Tensor, "rows dof"]
@@ -125,7 +125,7 @@ def covariance_of_sizes(posterior: Posterior) -> Float64[Tensor, "unknowns unkno
     groups[torch.arange(len(x)), prior.group] = 1.0
     told = (groups * ((1 - held) * (prior.base > 0))[:, None]).sum(0)
     moved = 2 * posterior.covariance @ (groups * (prior.precision * x)[:, None])
-    moved = moved[:, told > LEAST_TOLD] * (2 * told[told > LEAST_TOLD]).rsqrt()
+    moved = moved[:, told > LEAST_EFFECTIVE] * (2 * told[told > LEAST_EFFECTIVE]).rsqrt()
     return moved @ moved.t()
 
 
@@ -154,7 +154,7 @@ def degrees_of_freedom_factor(posterior: Posterior, sums: Sums) -> float:
     Features, prior sizes and noise are chosen on the same rows, which makes the posterior a little too sure; new rows
     err by about so much more (as in generalised cross-validation, Craven and Wahba 1979).
     """
-    return 1 / max(1 - told_share(sums, posterior), 0.2)
+    return 1 / max(1 - effective_share(sums, posterior), 0.2)
 
 
 def position_uncertainty(
@@ -173,9 +173,9 @@ def position_uncertainty(
         missed = folds_left_out(rows, design, posterior, sums)
     else:
         missed = left_out(rows.sample(MOST_CONFIGURATIONS), design, posterior)
-    widening = max(left_out_widening(missed), degrees_of_freedom_factor(posterior, sums))
+    prior_scale = max(left_out_widening(missed), degrees_of_freedom_factor(posterior, sums))
     space = design.problem.space
     active = design.problem.active.cpu()
     covariance = posterior.covariance + covariance_of_sizes(posterior)
-    root = covariance_root(widening * covariance.cpu(), geometry.change[:, active])
-    return PositionUncertainty(space, geometry, design.features, root, widening)
+    root = covariance_root(prior_scale * covariance.cpu(), geometry.change[:, active])
+    return PositionUncertainty(space, geometry, design.features, root, prior_scale)

@@ -12,7 +12,7 @@ from torch import Tensor
 from pisigma.errors import IdentificationError
 from pisigma.identification.identifiability.pairwise import find_pairwise_redundancy
 from pisigma.identification.identifiability.plausibility import refuse_implausible
-from pisigma.identification.identifiability.rank_extension import told_besides
+from pisigma.identification.identifiability.rank_extension import rank_extension
 from pisigma.identification.identifiability.redundancy import Redundancy, find_redundancy
 from pisigma.identification.identifiability.sufficiency import check_sufficiency
 from pisigma.identification.identifiability.unobservable import tells_scale, untold
@@ -242,7 +242,7 @@ class GeometricCalibrator:
         kept = [candidates.index(i) for i in problem.active.tolist()]
         if self.elimination == "exact" and len(kept) < len(candidates):
             now = information(few, here.point, candidates, view_of(here))
-            extended = [candidates[i] for i in told_besides(now, kept)]
+            extended = [candidates[i] for i in rank_extension(now, kept)]
             problem = problem.with_active(problem.active.tolist() + extended)
         if extended or few.q is not problem.q:
             here = problem.linearise(here.point, here)

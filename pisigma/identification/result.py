@@ -102,7 +102,7 @@ class CalibrationResult:
         information: what `redundancy` was found from.
         sizes: nominal values behind `information`.
         extended: parameters that were added because at the solution the data do tell them.
-        unseen: directions that the data hardly see, in words; there the nominal value stands.
+        weak_directions: directions that the data hardly see, in words; there the nominal value stands.
         observability: indices O1 to O5 of the free parameters at the solution.
         iterations: steps tried.
         cost: sum of squared residuals over variances, with loss and prior.
@@ -126,7 +126,7 @@ class CalibrationResult:
     information: Information
     sizes: Float64[np.ndarray, " candidates"]
     extended: tuple[str, ...]
-    unseen: tuple[str, ...]
+    weak_directions: tuple[str, ...]
     observability: Observability
     iterations: int
     cost: float

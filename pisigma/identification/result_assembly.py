@@ -10,7 +10,7 @@ from torch import Tensor
 from pisigma.identification.identifiability.mixed_frames import frames_mixed_up
 from pisigma.identification.identifiability.observability import observability_of
 from pisigma.identification.identifiability.redundancy import Redundancy
-from pisigma.identification.identifiability.weak_directions import unseen_directions
+from pisigma.identification.identifiability.weak_directions import find_weak_directions
 from pisigma.identification.problem.covariance import covariance_of
 from pisigma.identification.problem.information import Information
 from pisigma.identification.problem.least_squares import Linearisation, Solution
@@ -108,7 +108,7 @@ def assemble_result(
         information=findings.information,
         sizes=findings.sizes,
         extended=tuple(space.names[i] for i in findings.extended),
-        unseen=unseen_directions(problem, here),
+        weak_directions=find_weak_directions(problem, here),
         observability=observability_of(gram * usual * usual[:, None], poses),
         iterations=solution.iterations,
         cost=here.cost,
@@ -135,7 +135,7 @@ def _warnings(
     found = []
     if not solution.status.good:
         found.append(f"the search {solution.status.value}.")
-    sizes = view_of(here).widening
+    sizes = view_of(here).prior_scale
     active = problem.active.tolist()
     groups = [
         (problem.space.parameters[i].unit, group)

@@ -171,9 +171,9 @@ class CorrectedIK:
         Raises:
             ModelError: the model did not learn what a given condition does, or not near the given value.
         """
-        from pisigma.model.stated_conditions import under_conditions
+        from pisigma.model.stated_conditions import under_stated_conditions
 
-        return CorrectedIK(under_conditions(self.model, payload_kg, temperature_c))
+        return CorrectedIK(under_stated_conditions(self.model, payload_kg, temperature_c))
 
     def accuracy(self, q: Any) -> Any:
         """Predicted standard deviation [m] of the tool's position at joint values `(*batch, dof)`, as an array."""

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pisigma.inverse.fast_model import FastModel, as_frame, follow
 from pisigma.inverse.fast_rows import FastRows
-from pisigma.inverse.nearest_turn import turn_near
+from pisigma.inverse.nearest_turn import nearest_turn
 from pisigma.inverse.reference import AWAY
 from pisigma.kinematics.components import Frame
 from pisigma.kinematics.status import Status
@@ -94,7 +94,7 @@ class ChunkOfPoses:
         frame, values, distances = self._frame(slice(None)), [], []
         for branch in range(len(self._model.solver.branches)):
             q, reached = self._model.solver.solve_branch(frame, branch)
-            beside = turn_near(self._model.robot, q, self._near, within_limits=True)
+            beside = nearest_turn(self._model.robot, q, self._near, within_limits=True)
             distances.append(torch.where(reached, (beside - self._near).norm(dim=-1), torch.inf))
             values.append(q)
         return torch.stack(values), torch.stack(distances)

@@ -10,10 +10,10 @@ from torch import Tensor
 from pisigma.inverse.fast_arm import FastArm
 from pisigma.inverse.fast_rows import FastRows
 from pisigma.inverse.identified_arm import IdentifiedArm
-from pisigma.inverse.nearest_turn import turn_near
+from pisigma.inverse.nearest_turn import nearest_turn
 from pisigma.kinematics.closed_form import AbstractClosedForm
 from pisigma.kinematics.components import Frame
-from pisigma.kinematics.joint_limits import turn_into_limits
+from pisigma.kinematics.joint_limits import wrap_into_limits
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
 from pisigma.se3 import wrap_to_pi
@@ -78,9 +78,9 @@ def follow(
     robot, columns = model.robot, start.T.contiguous()
     followed = model.arm.follow(T_base_tool, columns, patient)
     q = (columns + wrap_to_pi(followed.q - columns)).T
-    commanded, inside = turn_into_limits(robot, q)
+    commanded, inside = wrap_into_limits(robot, q)
     if near is not None:
-        commanded = turn_near(robot, commanded, near, within_limits=True)
+        commanded = nearest_turn(robot, commanded, near, within_limits=True)
     done = followed.good if model.periodic else followed.good & (commanded == q).all(-1)
     status = torch.where(followed.share < 1, int(Status.OUTSIDE_DOMAIN), int(Status.REACHED))
     status = torch.where(followed.singular, int(Status.SINGULAR), status)
@@ -89,7 +89,7 @@ def follow(
         done=done,
         lost=followed.lost,
         q=commanded,
-        q_nominal=turn_near(robot, start, commanded, within_limits=False),
+        q_nominal=nearest_turn(robot, start, commanded, within_limits=False),
         branch=torch.as_tensor(branch).expand(len(done)),
         status=torch.where(inside, status, int(Status.OUTSIDE_JOINT_LIMITS)),
         measure=2 - followed.share if learned else torch.full_like(followed.share, torch.nan),

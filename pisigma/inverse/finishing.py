@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from pisigma.inverse.identified_arm import search
-from pisigma.inverse.nearest_turn import turn_near
+from pisigma.inverse.nearest_turn import nearest_turn
 from pisigma.inverse.solution import Solution
-from pisigma.kinematics.joint_limits import turn_into_limits
+from pisigma.kinematics.joint_limits import wrap_into_limits
 from pisigma.kinematics.numeric import SINGULAR_TOLERANCE
 from pisigma.kinematics.singularity import singularity_measure
 from pisigma.kinematics.status import Status
@@ -75,7 +75,7 @@ class Finishing:
             status[(status == Status.REACHED) & (share < 1)] = int(Status.OUTSIDE_DOMAIN)
         status[~inside & found] = int(Status.OUTSIDE_JOINT_LIMITS)
         q_nominal = torch.where(found[..., None], q_nominal, torch.nan)
-        q_nominal = turn_near(self._model.robot, q_nominal, commanded, within_limits=False)
+        q_nominal = nearest_turn(self._model.robot, q_nominal, commanded, within_limits=False)
         correction = commanded - q_nominal
         return Solution(commanded, q_nominal, correction, branch, self._branches, status, measure)
 
@@ -88,14 +88,14 @@ class Finishing:
         flat = q.reshape(-1, 1, q.shape[-1])
         found, status = search(self._geometric, T.reshape(-1, 4, 4), flat, self._motion)
         settled = torch.where((status == Status.UNREACHABLE)[:, None], flat[:, 0], found).reshape(q.shape)
-        turned, within = turn_into_limits(self._model.robot, settled)
+        turned, within = wrap_into_limits(self._model.robot, settled)
         return settled, within & (turned == settled).all(-1)
 
     def _turned(self, q: Tensor, near: Tensor | None) -> tuple[Tensor, Tensor]:
         """Joint values on the turn to command, and whether they are inside the limits."""
-        commanded, inside = turn_into_limits(self._model.robot, q)
+        commanded, inside = wrap_into_limits(self._model.robot, q)
         if near is not None:
-            commanded = turn_near(self._model.robot, commanded, near, within_limits=True)
+            commanded = nearest_turn(self._model.robot, commanded, near, within_limits=True)
         return commanded, inside
 
     def _without_limits(self, q: Tensor, status: Tensor) -> Tensor:
@@ -114,4 +114,4 @@ def as_trained(model: CalibratedModel, q: Tensor) -> Tensor:
     if not len(model.starts):
         return q
     lower, upper = model.starts.aminmax(dim=0)
-    return turn_near(model.robot, q, (lower + upper).double() / 2, within_limits=False)
+    return nearest_turn(model.robot, q, (lower + upper).double() / 2, within_limits=False)

@@ -8,7 +8,7 @@ from pisigma.kinematics.joint_limits import LIMIT_TOLERANCE
 from pisigma.robot.description import Robot
 
 
-def turn_near(
+def nearest_turn(
     robot: Robot, q: Float[Tensor, "*batch dof"], near: Float[Tensor, "... dof"], within_limits: bool
 ) -> Float[Tensor, "*batch dof"]:
     """Move revolute joints by full turns as near to given values as they can come.

@@ -10,7 +10,7 @@ from torch import Tensor
 from pisigma.inverse.fast_model import FastModel, as_frame, entries_of, follow
 from pisigma.inverse.fast_rows import FastRows
 from pisigma.inverse.identified_arm import ATTEMPTS
-from pisigma.inverse.nearest_turn import turn_near
+from pisigma.inverse.nearest_turn import nearest_turn
 from pisigma.inverse.reference import AWAY
 from pisigma.kinematics.status import Status
 
@@ -81,7 +81,7 @@ class PatientPoses:
         return least
 
     def _continue(self, rows: Tensor) -> None:
-        """Look from `near` itself where nothing was found close to it; see `CarefulIK`."""
+        """Look from `near` itself where nothing was found close to it; see `ReferenceIK`."""
         assert self._near is not None
         off = (self.found.q - self._near).norm(dim=-1).nan_to_num(torch.inf)
         rows = rows[off[rows] > AWAY]
@@ -92,7 +92,7 @@ class PatientPoses:
         nominal = self._model.nominal.follow(
             as_frame(self._entries[:, rows]), followed.q.T.contiguous(), patient=True
         )
-        q_nominal = turn_near(self._model.robot, nominal.q.T, followed.q, within_limits=False)
+        q_nominal = nearest_turn(self._model.robot, nominal.q.T, followed.q, within_limits=False)
         self._take(rows, followed, torch.where(nominal.good[:, None], q_nominal, torch.nan))
 
     def _recover(self, rows: Tensor, order: Sequence[int]) -> None:

@@ -21,7 +21,7 @@ MORE_ATTEMPTS = 128
 """Starts that are tried in all where there is no closed form."""
 
 
-class CarefulIK:
+class ReferenceIK:
     """The ways to solutions of one model.
 
     Attributes:

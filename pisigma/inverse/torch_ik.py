@@ -12,7 +12,7 @@ from pisigma.inverse.fast_rows import FastRows
 from pisigma.inverse.fast_solver import FastSolver
 from pisigma.inverse.pose_gradients import differentiable
 from pisigma.inverse.pose_input import JointLike, PoseLike, as_numbers, as_poses
-from pisigma.inverse.reference import CarefulIK
+from pisigma.inverse.reference import ReferenceIK
 from pisigma.inverse.solution import Solution
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.model.calibrated_model import CalibratedModel
@@ -51,10 +51,10 @@ class TorchIK:
             )
         trained = [self.branches.index(name) for name in model.branches] or list(range(len(self.branches)))
         self.order = (*trained, *(index for index in range(len(self.branches)) if index not in trained))
-        self._careful = CarefulIK(model, solver, self.branches, trained)
+        self._reference = ReferenceIK(model, solver, self.branches, trained)
         self._fast: FastSolver | None = None
-        if self._careful.arm is not None and FastArm.suits(model.robot):
-            self._fast = FastSolver(self._careful.arm)
+        if self._reference.arm is not None and FastArm.suits(model.robot):
+            self._fast = FastSolver(self._reference.arm)
 
     def __call__(
         self, T_base_tool: PoseLike, *, near: JointLike | None = None, branch: str | None = None
@@ -87,7 +87,7 @@ class TorchIK:
         start = None if near is None else self._as_near(near, T.shape[:-2])
         order = self.order if branch is None else (self.branches.index(branch),)
         if self._fast is None:
-            return self._given(self._careful.solve(T, given, start, order), T, given)
+            return self._given(self._reference.solve(T, given, start, order), T, given)
         flat, beside = T.reshape(-1, 4, 4), None if start is None else start.reshape(-1, start.shape[-1])
         rows = self._fast.solve(flat, beside, order)
         found = self._of_rows(rows)
@@ -95,13 +95,13 @@ class TorchIK:
         if len(left):
             part = given.detach().reshape(-1, 4, 4)[left.to(given.device)]
             beside = None if beside is None else beside[left]
-            found = found.with_rows(left, self._careful.solve(flat[left], part, beside, order))
+            found = found.with_rows(left, self._reference.solve(flat[left], part, beside, order))
         return self._given(found.reshaped(T.shape[:-2]), T, given)
 
     def all_branches(self, T_base_tool: PoseLike) -> Solution:
         """Solutions on every branch, as `(*batch, branches)`; one for a robot without closed-form inverse."""
         T, given = as_poses(T_base_tool)
-        every = self._careful.all_branches(T, given)
+        every = self._reference.all_branches(T, given)
         shape = (*every.status.shape, 4, 4)
         return self._given(every, T.unsqueeze(-3).expand(shape), given.unsqueeze(-3).expand(shape))
 

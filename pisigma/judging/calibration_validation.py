@@ -51,46 +51,45 @@ class CalibrationValidation:
     again: tuple["CalibrationValidation", ...] = ()
 
     @property
-    def dealings(self) -> tuple["CalibrationValidation", ...]:
+    def repeats(self) -> tuple["CalibrationValidation", ...]:
         """One validation for every time that the rows were dealt to the folds."""
         return (replace(self, again=()), *self.again)
 
     @property
     def all_errors(self) -> dict[str, PoseErrors]:
-        """By model, errors of all rows in all dealings, one dealing after the other."""
+        """By model, errors of all rows in all repeats, one repeat after the other."""
         return {
-            name: PoseErrors.joined([dealing.models[name] for dealing in self.dealings])
-            for name in self.models
+            name: PoseErrors.joined([repeat.models[name] for repeat in self.repeats]) for name in self.models
         }
 
     @property
     def all_spread(self) -> PredictedSpread | None:
         """What a hybrid predicts of these errors."""
-        spreads = [dealing.spread for dealing in self.dealings if dealing.spread is not None]
+        spreads = [repeat.spread for repeat in self.repeats if repeat.spread is not None]
         return PredictedSpread.joined(spreads) if spreads else None
 
     def in_file_units(self) -> dict[str, object]:
-        """The figures in mm and deg of all dealings; `rows` counts the held-out ones with a length, once each."""
+        """The figures in mm and deg of all repeats; `rows` counts the held-out ones with a length, once each."""
         last = list(self.models.values())[-1]
         figures: dict[str, object] = {"folds": self.folds, "rows": int(torch.isfinite(last.position).sum())}
         if self.again:
-            figures["dealings"] = len(self.dealings)
-            figures["rms_mm_of_dealings"] = {
-                name: [error_statistics(one.models[name].position)["rms"] * 1e3 for one in self.dealings]
+            figures["repeats"] = len(self.repeats)
+            figures["rms_mm_of_repeats"] = {
+                name: [error_statistics(one.models[name].position)["rms"] * 1e3 for one in self.repeats]
                 for name in self.models
             }
         figures |= {name: errors.in_file_units() for name, errors in self.all_errors.items()}
         if self.all_spread is not None:
             figures |= self.all_spread.in_file_units()
         distances = {
-            name: torch.cat([one.distances[name] for one in self.dealings]) for name in self.distances
+            name: torch.cat([one.distances[name] for one in self.repeats]) for name in self.distances
         }
         count = max((len(errors) for errors in self.distances.values()), default=0)
         if count:
             sizes = {name: _sizes(errors) for name, errors in distances.items()}
             figures["socket_distance"] = {"count": count, **sizes}
         counts = {"frames_fitted": self.frames_fitted, "sockets_held_out": self.sockets_held_out}
-        counts["rows_not_judged"] = max(dealing.not_judged for dealing in self.dealings)
+        counts["rows_not_judged"] = max(repeat.not_judged for repeat in self.repeats)
         return figures | {name: count for name, count in counts.items() if count}
 
     def means(self, parts: Sequence[TrainTest]) -> dict[str, object]:
@@ -166,9 +165,9 @@ def validate(
         seen, held_out = measurements.select(train), len(test)
         test = test[judgeable(measurements, test, seen)]
         left_out += held_out - len(test)
-        unseen = measurements.select(test)
-        frames += len(set(unseen.frame) - set(seen.frame))
-        sockets += len(_sockets(unseen) - _sockets(seen))
+        held_out_rows = measurements.select(test)
+        frames += len(set(held_out_rows.frame) - set(seen.frame))
+        sockets += len(_sockets(held_out_rows) - _sockets(seen))
         chosen = without_missing(calibrator, seen, measurements)
         try:
             results = trained(chosen, seen, lambda what, fold=fold: progress(f"{fold}: {what}"))  # type: ignore[misc]
@@ -177,27 +176,27 @@ def validate(
                 f"{fold}, calibrated with {seen.rows} of the {measurements.rows} rows: {problem} All rows at once may "
                 "do: leave out the cross-validation, or ask for more folds."
             ) from None
-        _judge(judged, geometric_of(calibrator), results, seen, (unseen, test))
+        _judge(judged, geometric_of(calibrator), results, seen, (held_out_rows, test))
     return judged.validation(len(parts), frames, sockets, left_out)
 
 
 def validate_repeatedly(
     calibrator: Calibrator,
     measurements: Measurements,
-    dealings: Sequence[Sequence[TrainTest]],
+    repeats: Sequence[Sequence[TrainTest]],
     progress: Progress = lambda what: None,
 ) -> CalibrationValidation:
-    """The same for rows that were dealt to folds several times over; see `pisigma.measurement.splits.dealings`."""
-    if len(dealings) == 1:
-        return validate(calibrator, measurements, dealings[0], progress)
+    """The same for rows that were dealt to folds several times over; see `pisigma.measurement.splits.repeats`."""
+    if len(repeats) == 1:
+        return validate(calibrator, measurements, repeats[0], progress)
     first, *again = (
         validate(
             calibrator,
             measurements,
             parts,
-            lambda what, done=done: progress(f"dealing {done + 1} of {len(dealings)}, {what}"),  # type: ignore[misc]
+            lambda what, done=done: progress(f"repeat {done + 1} of {len(repeats)}, {what}"),  # type: ignore[misc]
         )
-        for done, parts in enumerate(dealings)
+        for done, parts in enumerate(repeats)
     )
     return replace(first, again=tuple(again))
 

@@ -53,7 +53,7 @@ def held_out_csv(validation: CalibrationValidation, measurements: Measurements, 
     """The rows as CSV text: joint values, frame and target, and per model the errors in mm and deg.
 
     Args:
-        validation: of the measurements; the errors are those of its first dealing.
+        validation: of the measurements; the errors are those of its first repeat.
         measurements: the rows that were held out in turn.
         robot: says which joints turn (degrees) and which slide (millimetres).
     """

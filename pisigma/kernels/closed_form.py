@@ -48,12 +48,12 @@ def all_branches(arms: Record, form: Record, T: Array, only: int, P: Array, q: A
         for j in range(arms.dof):
             value = form.direction[j] * (form.sign[j] * q[branch, j] - form.offset[j])
             q[branch, j] = wrap(value) if arms.revolute[j] else value
-        turn_into_limits(arms, q[branch])
+        wrap_into_limits(arms, q[branch])
 
 
 @njit(error_model="numpy")
 @no_type_check
-def turn_into_limits(arms: Record, q: Array) -> bool:
+def wrap_into_limits(arms: Record, q: Array) -> bool:
     """Move joints by full turns into their limits where that is possible; whether all are inside."""
     all_inside = True
     for j in range(arms.dof):
@@ -74,7 +74,7 @@ def turn_into_limits(arms: Record, q: Array) -> bool:
 
 @njit(error_model="numpy")
 @no_type_check
-def turn_near(arms: Record, q: Array, near: Array, within_limits: bool) -> None:
+def nearest_turn(arms: Record, q: Array, near: Array, within_limits: bool) -> None:
     """Move revolute joints by full turns as near to given values as they can come."""
     for j in range(arms.dof):
         if not arms.revolute[j]:

@@ -7,7 +7,7 @@ from numba import njit
 
 from pisigma.kernels.arrays import NO_CLOSED_FORM, NOMINAL
 from pisigma.kernels.chain import walk
-from pisigma.kernels.closed_form import all_branches, turn_into_limits, turn_near
+from pisigma.kernels.closed_form import all_branches, nearest_turn, wrap_into_limits
 from pisigma.kernels.codes import (
     OUTSIDE_DOMAIN,
     OUTSIDE_LIMITS,
@@ -75,14 +75,14 @@ def add_correction(description: Record, memory: Record, has_near: bool) -> bool:
     """Correct `memory.nominal` to `memory.solution`, both on the turns to command; whether inside the limits."""
     arms, q = description.arms, memory.q
     copy(memory.nominal, q)
-    turn_near(arms, q, description.network.centre, False)  # as the training rows were turned
+    nearest_turn(arms, q, description.network.centre, False)  # as the training rows were turned
     network_correction(description, memory, memory.pose, q)
     for j in range(arms.dof):
         q[j] = memory.nominal[j] + memory.delta[j]
     copy(q, memory.solution)
-    inside = turn_into_limits(arms, memory.solution)
+    inside = wrap_into_limits(arms, memory.solution)
     if has_near:
-        turn_near(arms, memory.solution, memory.near, True)
+        nearest_turn(arms, memory.solution, memory.near, True)
     for j in range(arms.dof):
         memory.nominal[j] += memory.solution[j] - q[j]
     return inside

@@ -6,7 +6,7 @@ from typing import Any, no_type_check
 from numba import njit
 
 from pisigma.kernels.arrays import BLENDED, GEOMETRIC, HYBRID
-from pisigma.kernels.closed_form import turn_into_limits, turn_near
+from pisigma.kernels.closed_form import nearest_turn, wrap_into_limits
 from pisigma.kernels.codes import (
     OUTSIDE_DOMAIN,
     OUTSIDE_LIMITS,
@@ -50,7 +50,7 @@ def finish(
     found[place] = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
     found[place + 1] = math.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
     found[place + 2] = 2 - share if arms.hybrid else math.nan
-    turn_near(arms, memory.nominal, q, False)
+    nearest_turn(arms, memory.nominal, q, False)
     if not inside:
         return True, OUTSIDE_LIMITS
     reach = arms.reach[HYBRID if arms.hybrid else GEOMETRIC]
@@ -65,9 +65,9 @@ def _choose_turns(description: Record, memory: Record, has_near: bool) -> tuple[
     """Bring joints into their limits and near to given values; whether they are inside, and still reach the pose."""
     arms, q = description.arms, memory.solution
     copy(q, memory.q)
-    inside = turn_into_limits(arms, q)
+    inside = wrap_into_limits(arms, q)
     if has_near:
-        turn_near(arms, q, memory.near, True)
+        nearest_turn(arms, q, memory.near, True)
     turned = False
     for j in range(arms.dof):
         turned = turned or memory.q[j] != q[j]
@@ -76,7 +76,7 @@ def _choose_turns(description: Record, memory: Record, has_near: bool) -> tuple[
     copy(q, memory.q)
     if not search(description, memory, memory.pose, memory.q):
         return inside, False
-    turn_near(arms, memory.q, q, False)
+    nearest_turn(arms, memory.q, q, False)
     copy(memory.q, q)
     for j in range(arms.dof):
         inside = inside and arms.limits[j, 0] - _LIMIT <= q[j] <= arms.limits[j, 1] + _LIMIT

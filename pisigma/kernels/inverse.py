@@ -6,7 +6,7 @@ from typing import Any, no_type_check
 from numba import njit
 
 from pisigma.kernels.arrays import NO_CLOSED_FORM, NOMINAL
-from pisigma.kernels.closed_form import all_branches, turn_into_limits, turn_near
+from pisigma.kernels.closed_form import all_branches, nearest_turn, wrap_into_limits
 from pisigma.kernels.codes import UNREACHABLE
 from pisigma.kernels.corrected import add_correction, choose_corrected, finish_corrected
 from pisigma.kernels.finishing import finish
@@ -108,7 +108,7 @@ def _solve_in_order(description: Record, memory: Record, wanted: int) -> int:
         if math.isnan(memory.branches[branch, 0]) or not _follow(description, memory, branch):
             continue
         copy(memory.q, memory.trial)
-        if wanted >= 0 or turn_into_limits(arms, memory.trial):
+        if wanted >= 0 or wrap_into_limits(arms, memory.trial):
             copy(memory.q, memory.solution)
             return branch
         if outside < 0:
@@ -153,8 +153,8 @@ def _solve_nearest(description: Record, memory: Record) -> int:
         if not _follow(description, memory, branch):
             continue
         copy(memory.q, memory.trial)
-        rank = 0 if turn_into_limits(arms, memory.trial) else 1
-        turn_near(arms, memory.trial, memory.near, True)
+        rank = 0 if wrap_into_limits(arms, memory.trial) else 1
+        nearest_turn(arms, memory.trial, memory.near, True)
         distance = _distance(arms, memory.trial, memory.near)
         if rank < best_rank or (rank == best_rank and distance < best_distance):
             best, best_rank, best_distance = branch, rank, distance
@@ -169,8 +169,8 @@ def _continue(description: Record, memory: Record, chosen: int) -> int:
     arms, off = description.arms, math.inf
     if chosen >= 0:
         copy(memory.solution, memory.trial)
-        turn_into_limits(arms, memory.trial)
-        turn_near(arms, memory.trial, memory.near, True)
+        wrap_into_limits(arms, memory.trial)
+        nearest_turn(arms, memory.trial, memory.near, True)
         off = math.sqrt(_distance(arms, memory.trial, memory.near))
     if off <= AWAY:
         return chosen
@@ -178,8 +178,8 @@ def _continue(description: Record, memory: Record, chosen: int) -> int:
     if not search(description, memory, memory.pose, memory.q):
         return chosen
     copy(memory.q, memory.trial)
-    inside = turn_into_limits(arms, memory.trial)
-    turn_near(arms, memory.trial, memory.near, True)
+    inside = wrap_into_limits(arms, memory.trial)
+    nearest_turn(arms, memory.trial, memory.near, True)
     if not inside or not math.sqrt(_distance(arms, memory.trial, memory.near)) < off:
         return chosen
     copy(memory.q, memory.solution)
@@ -211,7 +211,7 @@ def _nearest(description: Record, memory: Record) -> tuple[int, float]:
         if math.isnan(memory.others[branch, 0]):
             continue
         copy(memory.others[branch], memory.q)
-        turn_near(arms, memory.q, memory.near, True)
+        nearest_turn(arms, memory.q, memory.near, True)
         distance = _distance(arms, memory.q, memory.near)
         if distance < least:
             nearest, least = branch, distance
@@ -243,7 +243,7 @@ def _solve_without_branches(description: Record, memory: Record, has_near: bool)
         if not search(description, memory, memory.pose, memory.q):
             continue
         copy(memory.q, memory.trial)
-        inside = turn_into_limits(description.arms, memory.trial)
+        inside = wrap_into_limits(description.arms, memory.trial)
         if inside or not reached:
             copy(memory.q, memory.kept)
         reached = True

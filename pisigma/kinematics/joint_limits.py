@@ -10,7 +10,7 @@ LIMIT_TOLERANCE = 1e-9
 """How far [rad or m] a value may lie beyond a limit and still count as on it; it is not moved."""
 
 
-def turn_into_limits(
+def wrap_into_limits(
     robot: Robot, q: Float[Tensor, "*batch dof"]
 ) -> tuple[Float[Tensor, "*batch dof"], Bool[Tensor, "*batch"]]:
     """Move revolute joints that are outside their limits by full turns where that brings them inside.

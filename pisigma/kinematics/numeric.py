@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pisigma.errors import PoseError
 from pisigma.kinematics.jacobian import joint_jacobian
-from pisigma.kinematics.joint_limits import turn_into_limits
+from pisigma.kinematics.joint_limits import wrap_into_limits
 from pisigma.kinematics.singularity import (
     characteristic_length,
     dimensionless_jacobian,
@@ -214,7 +214,7 @@ def damped_step(
 
 
 def _finish(robot: Robot, state: _Iterate, tolerance: float, batch: tuple[int, ...]) -> NumericSolution:
-    q, inside = turn_into_limits(robot, state.q)
+    q, inside = wrap_into_limits(robot, state.q)
     singular_tolerance = SINGULAR_TOLERANCE if q.dtype == torch.float64 else 3e-3
     singular = smallest_singular_value(robot, state.J) < singular_tolerance
     status = torch.where(singular, int(Status.SINGULAR), int(Status.REACHED))

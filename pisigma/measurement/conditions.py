@@ -14,7 +14,7 @@ SMALLEST_SPREAD = 1e-9
 """A condition that varies less tells nothing."""
 
 
-def told_conditions(measurements: Measurements) -> tuple[str, ...]:
+def stated_conditions(measurements: Measurements) -> tuple[str, ...]:
     """Names of the conditions that every row states and that are not always the same."""
     found = []
     for name, values in zip(CONDITIONS, conditions_of(measurements, CONDITIONS).t(), strict=True):

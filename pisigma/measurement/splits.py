@@ -17,9 +17,9 @@ SplitBy = Literal["joints", "interleaved", "time", "space", "placement"]
 the measured positions; by placement: all sockets of a placement together, or all rows of a frame."""
 
 AT_RANDOM: tuple[SplitBy, ...] = ("joints", "placement")
-"""Ways that deal groups at random, so that dealing again gives other folds."""
+"""Ways that deal groups at random, so that repeat again gives other folds."""
 JUDGED_GROUPS, MOST_DEALINGS = 200, 10
-"""Groups held out, counted anew in every dealing, after which the luck of the dealing hardly shows."""
+"""Groups held out, counted anew in every repeat, after which the luck of the repeat hardly shows."""
 
 TrainTest = tuple[Int64[Tensor, " _train"], Int64[Tensor, " _test"]]
 """Rows to train on and rows to test on, each in the order of the measurements."""
@@ -66,7 +66,7 @@ def k_folds(
     return tuple(_train_test(measurements, (fold[group] == number) & (group >= 0)) for number in range(folds))
 
 
-def dealings(
+def repeats(
     measurements: Measurements,
     folds: int | None,
     seed: int,
@@ -75,22 +75,22 @@ def dealings(
 ) -> tuple[tuple[TrainTest, ...], ...]:
     """Part the measurements into folds several times over, differently each time.
 
-    With few groups the error of held-out rows depends on which of them came together; over several dealings that
+    With few groups the error of held-out rows depends on which of them came together; over several repeats that
     averages out (Burman 1989, Biometrika 76(3), 503-514).
 
     Args:
         measurements: what to part.
         folds: how many, 2 or more; None for as many as there are groups.
-        seed: of the first dealing; the others follow from it.
+        seed: of the first repeat; the others follow from it.
         by: see `k_folds`.
-        times: how many dealings; None for as many as it takes to hold out `JUDGED_GROUPS` groups, `MOST_DEALINGS` at
+        times: how many repeats; None for as many as it takes to hold out `JUDGED_GROUPS` groups, `MOST_DEALINGS` at
             most, and one where groups are not dealt at random, by placement, or one by one.
 
     Returns:
-        Per dealing its folds, as from `k_folds`; the first one as with `k_folds`.
+        Per repeat its folds, as from `k_folds`; the first one as with `k_folds`.
 
     Raises:
-        MeasurementError: several dealings were wanted where they do not differ; see `k_folds` too.
+        MeasurementError: several repeats were wanted where they do not differ; see `k_folds` too.
     """
     generator = torch.Generator().manual_seed(seed)
     first = k_folds(measurements, folds, generator, by)
@@ -102,8 +102,8 @@ def dealings(
     if times > 1 and not differ:
         what = f"{groups} folds of {groups} {_kind(by)}" if by in AT_RANDOM else f"folds by {by}"
         raise MeasurementError(
-            f"{measurements.source}: {times} dealings were wanted, but {what} are the same every time; ask for one "
-            "dealing, or for fewer folds by joints or placement."
+            f"{measurements.source}: {times} repeats were wanted, but {what} are the same every time; ask for one "
+            "repeat, or for fewer folds by joints or placement."
         )
     return first, *(k_folds(measurements, folds, generator, by) for _ in range(times - 1))
 

@@ -24,7 +24,7 @@ MOST_SPREADS = 3.0
 """Conditions farther from the mean of the measured rows, in their standard deviations, were not measured."""
 
 
-def under_conditions(
+def under_stated_conditions(
     model: CalibratedModel, payload_kg: float | None = None, temperature_c: float | None = None
 ) -> CalibratedModel:
     """The same model as a function of the joint values alone, under conditions that were learned.

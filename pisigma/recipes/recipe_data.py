@@ -16,7 +16,7 @@ from pisigma.robot.description import Robot
 from pisigma.simulation.true_robot import TrueRobot
 
 
-def part_sets(measurements: Measurements) -> tuple[Measurements, Measurements | None]:
+def split_sets(measurements: Measurements) -> tuple[Measurements, Measurements | None]:
     """Part rows by the column `set`: those to train on, and those that are kept aside for a test.
 
     Args:
@@ -40,7 +40,7 @@ def part_sets(measurements: Measurements) -> tuple[Measurements, Measurements | 
 
 
 def load_measurements(recipe: Recipe | HybridRecipe, data: Path | None) -> Measurements:
-    """Give the rows of a recipe: the simulated training rows, or all of a file; see `part_sets`.
+    """Give the rows of a recipe: the simulated training rows, or all of a file; see `split_sets`.
 
     Raises:
         RecipeError: a simulated recipe was given a file, or a measured one none.

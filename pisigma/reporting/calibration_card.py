@@ -96,7 +96,7 @@ def not_identified_lines(report: Mapping[str, Any]) -> list[str]:
     lines = list(redundancy["dependencies"])
     if redundancy["no_effect"]:
         lines.append(f"{', '.join(redundancy['no_effect'])} change no measured value")
-    lines += [*report["unseen"], *report["warnings"]]
+    lines += [*report["weak_directions"], *report["warnings"]]
     return [f"{line.rstrip('.')}." for line in lines] or ["Nothing: every parameter is identified."]
 
 

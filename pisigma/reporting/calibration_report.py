@@ -39,7 +39,7 @@ def report_calibration(
         "noise": [_noise(item) for item in result.noise],
         "parameters": parameter_rows(result),
         "redundancy": report_redundancy(result),
-        "unseen": list(result.unseen),
+        "weak_directions": list(result.weak_directions),
         "outliers": [
             {
                 "row": o.row,

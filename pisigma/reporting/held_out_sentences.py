@@ -21,19 +21,19 @@ def cross_validation_text(found: Mapping[str, Any]) -> str:
 
 
 def _dealt(found: Mapping[str, Any]) -> str:
-    return f", dealt {found['dealings']} times" if "dealings" in found else ""
+    return f", dealt {found['repeats']} times" if "repeats" in found else ""
 
 
 def held_out_lines(found: Mapping[str, Any]) -> list[str]:
-    """What else a cross-validation says, in sentences: of its dealings, of sockets and frames held out whole."""
+    """What else a cross-validation says, in sentences: of its repeats, of sockets and frames held out whole."""
     lines = []
-    if "rms_mm_of_dealings" in found:
+    if "rms_mm_of_repeats" in found:
         ranges = ", ".join(
             f"{name} {figure_text(min(rms))} to {figure_text(max(rms))} mm"
-            for name, rms in found["rms_mm_of_dealings"].items()
+            for name, rms in found["rms_mm_of_repeats"].items()
         )
         lines.append(
-            f"RMS position errors of the {found['dealings']} dealings by themselves: {ranges}: so much depends on "
+            f"RMS position errors of the {found['repeats']} repeats by themselves: {ranges}: so much depends on "
             "which joint values are held out together."
         )
     if "sockets_held_out" in found:

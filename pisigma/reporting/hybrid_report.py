@@ -33,10 +33,10 @@ def _learned(result: HybridResult, learned: LearnedPart) -> dict[str, Any]:
         "features": [chosen.describe() for chosen in learned.correction.features],
         "orders": list(learned.correction.orders),
         "unknowns": learned.unknowns,
-        "told_by_the_data": learned.effective,
+        "effective_parameters": learned.effective,
         "linearisations": learned.rounds,
         "noise": [_noise(sensor, sigma, units[sensor]) for sensor, sigma in learned.noise.items()],
-        "variance_widening": result.uncertainty.widening,
+        "variance_widening": result.uncertainty.prior_scale,
         "fades_over_deg": math.degrees(learned.coverage.fade),
     }
 
@@ -79,7 +79,7 @@ def learned_lines(report: Mapping[str, Any]) -> list[str]:
     if learned is not None:
         lines.append(
             f"Geometry and correction have {learned['unknowns']} unknowns, of which the data tell "
-            f"{learned['told_by_the_data']:.0f}; beyond the measured joint values the correction fades to nothing "
+            f"{learned['effective_parameters']:.0f}; beyond the measured joint values the correction fades to nothing "
             f"over {learned['fades_over_deg']:.0f} deg."
         )
     return lines

@@ -7,7 +7,7 @@ from pydantic import model_validator
 from torch import Tensor
 
 from pisigma.errors import RecipeError
-from pisigma.kinematics.joint_limits import turn_into_limits
+from pisigma.kinematics.joint_limits import wrap_into_limits
 from pisigma.simulation.branch import BranchSection
 from pisigma.simulation.poses import WhereToMeasure
 from pisigma.simulation.random_joints import JointsRandom
@@ -65,7 +65,7 @@ def joints_for_poses(
         UnreachablePoseError: the true robot does not reach a pose near its start.
         RecipeError: joint values would have to leave the limits of the robot.
     """
-    q, inside = turn_into_limits(robot.nominal, robot.without_encoder().inverse(T, start))
+    q, inside = wrap_into_limits(robot.nominal, robot.without_encoder().inverse(T, start))
     if not inside.all():
         outside = (~inside).nonzero()
         raise RecipeError(

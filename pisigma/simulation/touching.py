@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pisigma.errors import UnreachablePoseError
-from pisigma.kinematics.joint_limits import turn_into_limits
+from pisigma.kinematics.joint_limits import wrap_into_limits
 from pisigma.kinematics.numeric import solve_numeric
 from pisigma.kinematics.status import Status
 from pisigma.measurement.dataset import LeftOut, Measurements
@@ -88,7 +88,7 @@ def simulate_touches(
     draws = draw_noise(noise, candidates.count)
     contact = _approach(robot.without_encoder(), placements, candidates, draws, travel)
     met = contact.met & _on_faces(placements, candidates, contact.tip)
-    _, inside = turn_into_limits(robot.nominal, contact.q)
+    _, inside = wrap_into_limits(robot.nominal, contact.q)
     met = met & inside
     source = f"simulation of {robot.nominal.name}"
     left_out = tuple(LeftOut(0, _miss(candidates, row, contact)) for row in (~met).nonzero()[:, 0].tolist())

@@ -143,7 +143,7 @@ def report_jigs(run: JigRun) -> dict[str, Any]:
             sentence
             for calibration in (run.calibrations[DEFAULT],)
             if calibration.result is not None
-            for sentence in calibration.result.unseen
+            for sentence in calibration.result.weak_directions
         ],
         "paper": recipe.paper,
     }

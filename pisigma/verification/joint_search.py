@@ -1,4 +1,4 @@
-"""Which mix-ups of joint columns may explain measured positions: thousands of them tried on a few rows."""
+"""Which setup faults of joint columns may explain measured positions: thousands of them tried on a few rows."""
 
 from collections import Counter
 from dataclasses import dataclass, replace

@@ -1,4 +1,4 @@
-"""The usual mix-ups behind large errors, recognised by trying each on the data."""
+"""The usual setup faults behind large errors, recognised by trying each on the data."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
@@ -19,7 +19,7 @@ from pisigma.verification.joint_search import NOTICED, likely_maps
 SMALL_SHARE = 2e-4
 """Share of the reach below which errors come from no mixed-up joint column."""
 COLLAPSED = 0.25
-"""What is left of the errors, at most, where a mix-up explains them."""
+"""What is left of the errors, at most, where a setup fault explains them."""
 PLAUSIBLE_SHARE = 0.01
 """Share of the reach that the errors which are left may have, at most."""
 AS_GOOD = 1.5
@@ -31,7 +31,7 @@ FEWEST_SPARE = 6
 
 
 @dataclass(frozen=True)
-class MixUp:
+class SetupFault:
     """An explanation under which the errors collapse.
 
     Attributes:
@@ -111,13 +111,13 @@ class _Explained:
 
 def find_mix_ups(
     model: CalibratedModel, nominal: CalibratedModel, measurements: Measurements
-) -> tuple[MixUp, ...]:
+) -> tuple[SetupFault, ...]:
     """Look for what makes the errors of a model collapse to a quarter or less, the simplest first.
 
     Tried are: another frame and another tool (rigid transforms that fit best), positions off by 1000 either way,
     degrees for radians, millimetres for metres and the reverse in joint columns, all orders and all signs of the
     joints, zeros moved by quarter turns or one zero moved by anything, and a correction that was applied once more
-    or once less than logged; the joints' mix-ups also together with another frame and tool, which a new set-up of
+    or once less than logged; the joints' setup faults also together with another frame and tool, which a new set-up of
     the sensor has. Several are given where they explain equally well.
 
     Args:
@@ -267,7 +267,7 @@ def _nominal_error(nominal: CalibratedModel, some: Measurements, found: _Explain
     return next(other.rms()[0] for other in tried if {part.kind for part in other.parts} == wanted)
 
 
-def _mix_up(here: _Explained, found: _Explained, after_nominal: float) -> MixUp:
+def _mix_up(here: _Explained, found: _Explained, after_nominal: float) -> SetupFault:
     (before, before_turn), (after, after_turn) = here.rms(), found.rms()
     what = " and ".join(part.what for part in found.parts)
     advice = "; ".join(part.advice for part in found.parts)
@@ -278,7 +278,7 @@ def _mix_up(here: _Explained, found: _Explained, after_nominal: float) -> MixUp:
         fall += f" (those of the nominal robot to {length_text(after_nominal)})"
     kinds = tuple(part.kind for part in found.parts)
     sentence = f"With {what}, the errors fall {fall}; {advice}."
-    return MixUp(kinds, sentence, before, after, after_nominal, before_turn, after_turn)
+    return SetupFault(kinds, sentence, before, after, after_nominal, before_turn, after_turn)
 
 
 def length_text(length: float) -> str:

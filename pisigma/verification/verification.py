@@ -17,7 +17,7 @@ from pisigma.measurement.csv.rows import LIMIT_TOLERANCE
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.comparison_report import report_comparison
-from pisigma.verification.setup_faults import PLAUSIBLE_SHARE, MixUp, find_mix_ups, length_text
+from pisigma.verification.setup_faults import PLAUSIBLE_SHARE, SetupFault, find_mix_ups, length_text
 
 FEWEST_CONFIGURATIONS = 6
 """With fewer different joint values nothing is concluded."""
@@ -28,7 +28,7 @@ RESAMPLES = (200, 2000)
 NOMINAL, GEOMETRIC, CORRECTED = "nominal", "geometric", "corrected"
 
 HALVED = 0.5
-"""Where a mix-up is found, errors must at least be halved for the corrected model to count as better."""
+"""Where a setup fault is found, errors must at least be halved for the corrected model to count as better."""
 
 Verdict = Literal["better", "not_better", "undecided", "mixed_up"]
 
@@ -40,13 +40,13 @@ class Verification:
     Attributes:
         verdict: "better" where the corrected model explains them better than the nominal robot, which the confidence
             interval of the mean difference has to show; "undecided" where it shows nothing; "mixed_up" where a
-            mix-up explains the errors, or where they are too large for a calibration, so that neither counts.
+            setup fault explains the errors, or where they are too large for a calibration, so that neither counts.
         sentence: the verdict with figures.
         ratio: mean position error of the corrected model over that of the nominal robot.
         better_share: share of the configurations in which the corrected model is nearer.
         comparison: figures of "nominal", "geometric" (of a hybrid) and "corrected"; see
             `pisigma.reporting.comparison_report.report_comparison`.
-        mix_ups: what explains large errors.
+        setup_faults: what explains large errors.
         remarks: what else should be known, each a sentence.
     """
 
@@ -55,7 +55,7 @@ class Verification:
     ratio: float
     better_share: float
     comparison: Mapping[str, Any]
-    mix_ups: tuple[MixUp, ...]
+    setup_faults: tuple[SetupFault, ...]
     remarks: tuple[str, ...]
 
 
@@ -106,24 +106,24 @@ def verify(
         report = report_comparison(compared)
         if fit_frame:
             measurements = replace(measurements, frame=(next(iter(model.bases), ""),) * measurements.rows)
-        mix_ups = find_mix_ups(model, models[NOMINAL], measurements)
-        mix_ups = tuple(found for found in mix_ups if not (fit_frame and found.kinds == ("frame",)))
+        setup_faults = find_mix_ups(model, models[NOMINAL], measurements)
+        setup_faults = tuple(found for found in setup_faults if not (fit_frame and found.kinds == ("frame",)))
     nominal, corrected = report["models"][0], report["models"][-1]
     paired = corrected["difference_to_first"]["position"]
     ratio = corrected["mean_mm"] / nominal["mean_mm"] if nominal["mean_mm"] > 0 else float("nan")
     smaller = min(nominal["rms_mm"], corrected["rms_mm"]) * 1e-3
     too_large = smaller > PLAUSIBLE_SHARE * model.robot.reach > 0
     verdict = _verdict(paired, report["configurations"])
-    if too_large or (mix_ups and verdict != "not_better" and not ratio <= HALVED):
+    if too_large or (setup_faults and verdict != "not_better" and not ratio <= HALVED):
         verdict = "mixed_up"
     return Verification(
         verdict=verdict,
-        sentence=_sentence(verdict, report, ratio, mix_ups),
+        sentence=_sentence(verdict, report, ratio, setup_faults),
         ratio=ratio,
         better_share=paired["better_share"],
         comparison=report,
-        mix_ups=mix_ups,
-        remarks=(*_remarks(model, measurements, report, mix_ups), *([FITTED] if fit_frame else [])),
+        setup_faults=setup_faults,
+        remarks=(*_remarks(model, measurements, report, setup_faults), *([FITTED] if fit_frame else [])),
     )
 
 
@@ -136,7 +136,9 @@ def _verdict(paired: Mapping[str, Any], configurations: int) -> Verdict:
     return "not_better" if low > 0 or low == high == 0 else "undecided"
 
 
-def _sentence(verdict: Verdict, report: Mapping[str, Any], ratio: float, mix_ups: tuple[MixUp, ...]) -> str:
+def _sentence(
+    verdict: Verdict, report: Mapping[str, Any], ratio: float, setup_faults: tuple[SetupFault, ...]
+) -> str:
     nominal, corrected = report["models"][0], report["models"][-1]
     paired, count = corrected["difference_to_first"]["position"], report["configurations"]
     begin = {
@@ -144,14 +146,16 @@ def _sentence(verdict: Verdict, report: Mapping[str, Any], ratio: float, mix_ups
         "not_better": "The nominal robot explains these measurements at least as well as the corrected model",
         "undecided": "These measurements do not tell whether the corrected model or the nominal robot is nearer",
         "mixed_up": "These measurements do not show whether the correction is right, as "
-        + ("something was mixed up" if mix_ups else "their errors are no calibration errors"),
+        + ("something was mixed up" if setup_faults else "their errors are no calibration errors"),
     }[verdict]
     means = [length_text(model["mean_mm"] / 1e3) for model in (corrected, nominal)]
     figures = f"the mean error is {means[0]} instead of {means[1]}"
     if np.isfinite(ratio):
         figures += f" (ratio {ratio:.3g})"
     if verdict == "mixed_up":
-        known = next((mix_up for mix_up in mix_ups if np.isfinite(mix_up.after_nominal)), None)
+        known = next(
+            (setup_fault for setup_fault in setup_faults if np.isfinite(setup_fault.after_nominal)), None
+        )
         if known is not None:
             set_right = [length_text(length) for length in (known.after, known.after_nominal)]
             figures += f"; set right, the errors are {set_right[0]} RMS instead of {set_right[1]}"
@@ -167,7 +171,10 @@ def _sentence(verdict: Verdict, report: Mapping[str, Any], ratio: float, mix_ups
 
 
 def _remarks(
-    model: CalibratedModel, measurements: Measurements, report: Mapping[str, Any], mix_ups: tuple[MixUp, ...]
+    model: CalibratedModel,
+    measurements: Measurements,
+    report: Mapping[str, Any],
+    setup_faults: tuple[SetupFault, ...],
 ) -> list[str]:
     remarks = []
     lower, upper = torch.from_numpy(model.robot.limits).unbind(1)
@@ -187,10 +194,10 @@ def _remarks(
             f"{count} rows lie so far outside the domain that nothing is predicted; they do not count."
         )
     limit = PLAUSIBLE_SHARE * model.robot.reach
-    if not mix_ups and report["models"][-1]["rms_mm"] * 1e-3 > limit:
+    if not setup_faults and report["models"][-1]["rms_mm"] * 1e-3 > limit:
         remarks.append(
-            f"Errors of more than {limit * 1e3:.3g} mm are no calibration errors, but no usual mix-up (frame, tool, "
-            "units, order, signs and zeros of the joints, correction applied twice or not at all) explains them; "
+            f"Errors of more than {limit * 1e3:.3g} mm are no calibration errors, but no usual setup fault (frame, "
+            "tool, units, order, signs and zeros of the joints, correction applied twice or not at all) explains them; "
             "check whether this robot was measured, and whether the rows belong together."
         )
     return remarks

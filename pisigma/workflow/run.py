@@ -17,7 +17,7 @@ from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.domain import Domain
 from pisigma.model.stored_starts import spread_rows
 from pisigma.recipes.recipe import MeasuredData, Recipe, SimulatedData
-from pisigma.recipes.recipe_data import part_sets, simulate_held_out
+from pisigma.recipes.recipe_data import simulate_held_out, split_sets
 from pisigma.robot.description import Robot
 from pisigma.training.fit_sections import LevenbergMarquardtSection
 from pisigma.training.fitting import TrainingHistory, fit_networks
@@ -91,7 +91,7 @@ def train_recipe(
     Raises:
         PisigmaError: the data or the recipe do not allow it; the message says what to do.
     """
-    measurements, _ = part_sets(measurements)
+    measurements, _ = split_sets(measurements)
     robot = Robot.load(recipe.robot)
     if isinstance(recipe.data, MeasuredData):
         check_one_pose(measurements)
@@ -126,8 +126,8 @@ def train_recipe(
         starts=spread_rows(measurements.q[used]),
         provenance=_provenance(recipe, measurements, pairs, options),
     )
-    unseen = joint_errors(model, held_out) if held_out else None
-    return TrainingRun(model, history, pairs, joint_errors(model, pairs), unseen, measurements)
+    other = joint_errors(model, held_out) if held_out else None
+    return TrainingRun(model, history, pairs, joint_errors(model, pairs), other, measurements)
 
 
 def check_one_pose(measurements: Measurements) -> None:

@@ -65,8 +65,8 @@ def test_json_has_the_agreed_shape(calibrated):
     assert (validation["folds"], validation["rows"]) == (3, 60)
     assert set(validation["nominal"]) == set(validation["geometric"]) == POSE
     assert validation["geometric"]["rms_mm"] < validation["nominal"]["rms_mm"] / 3
-    assert validation["dealings"] == 3  # 200 held-out poses at most
-    for name, rms in validation["rms_mm_of_dealings"].items():
+    assert validation["repeats"] == 3  # 200 held-out poses at most
+    for name, rms in validation["rms_mm_of_repeats"].items():
         assert_close(np.sqrt(np.square(rms).mean()), validation[name]["rms_mm"], rtol=1e-12)
         assert len(set(rms)) == 3
     assert "test" not in printed
@@ -254,12 +254,12 @@ def test_inverse_calibration_wants_one_frame_and_target(refuses, repository, tar
         ),
         (("--folds", "1"), "1 folds were wanted"),
         (("--hold-out", "2"), "between 0 and 1 was wanted, got 2."),
-        (("--hold-out", "0.2", "--dealings", "2"), "leave out --hold-out and --folds 0."),
+        (("--hold-out", "0.2", "--repeats", "2"), "leave out --hold-out and --folds 0."),
         (
             ("--hold-out", "0.2", "--folds", "5"),
             "--folds 5 and --hold-out 0.2 exclude each other; leave one out.",
         ),
-        (("--split", "time", "--dealings", "2"), "2 dealings were wanted, but folds by time are the same"),
+        (("--split", "time", "--repeats", "2"), "2 repeats were wanted, but folds by time are the same"),
         (("--free", "a_9"), "a_9"),
         (("--prior-mm", "0"), "or both 0 for none, got 0 mm and 1 mrad."),
         (("--prior-mm", "nan"), "got nan mm"),

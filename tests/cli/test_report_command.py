@@ -40,7 +40,7 @@ def test_json_is_one_object_with_the_figures(run, arm, tmp_path):
     assert result.stdout.count("\n") == 1
     found = json.loads(result.stdout)
     assert found["report"] == str(page)
-    assert found["rows"] == {"count": 50, "origin": "unseen", "remarks": found["rows"]["remarks"]}
+    assert found["rows"] == {"count": 50, "origin": "other", "remarks": found["rows"]["remarks"]}
     assert set(found["figures"]) == {str(path) for path in figures.iterdir()}
     assert found["accuracy"][0]["models"]["hybrid"]["rms_mm"] > 0
     evaluated = json.loads(run("evaluate", arm / "arm", arm / "rows.csv", "--json").stdout)

@@ -34,7 +34,7 @@ def test_measurements_that_are_explained_better(run, models, files):
     printed = json.loads(result.stdout)
     assert printed["explained_better"] is True
     assert printed["verdict"] == "better"
-    assert printed["mix_ups"] == []
+    assert printed["setup_faults"] == []
     assert [model["name"] for model in printed["models"]] == ["nominal", "corrected"]
     assert printed["models"][1]["mean_mm"] < printed["models"][0]["mean_mm"]
     assert printed["ratio"] < 0.1
@@ -56,7 +56,7 @@ def test_the_nominal_robot_ends_with_status_3(run, models, files):
     assert result.exit_code == 3
     printed = json.loads(result.stdout)
     assert printed["explained_better"] is False
-    assert printed["mix_ups"][0]["kinds"] == ["correction"]
+    assert printed["setup_faults"][0]["kinds"] == ["correction"]
     assert result.stderr == f"pisigma: {printed['sentence']}\n"
     assert "at least as well" in printed["sentence"]
 

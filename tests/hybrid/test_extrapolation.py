@@ -38,7 +38,7 @@ def wild(arm: LinearisedArm, harmonics: int, size: float) -> tuple[Design, Poste
     """A series whose weights are hardly held, and the angle over which it is to fade."""
     design = Design(arm.rows.problem, (FourierSeries(arm.rows.problem.space.robot, harmonics),))
     sums = sum_up(design, arm.rows.values, arm.rows.start(design))
-    prior = design.prior(arm.widening)
+    prior = design.prior(arm.prior_scale)
     sizes = torch.where(torch.arange(len(prior.sizes)) < prior.classes, prior.sizes, size)
     posterior = solve_posterior(sums, replace(prior, sizes=sizes), arm.noise)
     return design, posterior, fade_angle(arm.rows, design, posterior, sums)

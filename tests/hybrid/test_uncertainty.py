@@ -13,7 +13,7 @@ from torch import Tensor
 from pisigma.hybrid.evidence import GaussianPrior, Posterior, Sums, solve_mean, solve_posterior
 from pisigma.hybrid.left_out import LeftOut
 from pisigma.hybrid.uncertainty import (
-    LEAST_TOLD,
+    LEAST_EFFECTIVE,
     MOST_WIDENING,
     PositionUncertainty,
     covariance_of_sizes,
@@ -67,8 +67,8 @@ def test_uncertain_sizes_add_what_the_unknowns_move_with_them() -> None:
             ends.append(solve_mean(sums, replace(prior, sizes=sizes), (0.4,)))
         slope = (ends[0] - ends[1]) / (2 * step)
         told = float((1 - prior.precision * posterior.covariance.diagonal())[prior.group == g].sum())
-        told_at_all.append(told > LEAST_TOLD)
-        if told > LEAST_TOLD:
+        told_at_all.append(told > LEAST_EFFECTIVE)
+        if told > LEAST_EFFECTIVE:
             expected += slope[:, None] * slope / (2 * told)
     assert told_at_all == [True, True, False]
     assert_close(covariance_of_sizes(posterior), expected, atol=1e-7 * float(expected.abs().max()))
@@ -194,7 +194,7 @@ def test_deviation_is_that_of_drawn_calibrations(arm: LinearisedArm) -> None:
     values = arm.rows.values[0].select(torch.arange(10))
     X = fitted.design.columns(values, slice(None))
     draws = torch.linalg.cholesky(C) @ normal(len(C), 4000, seed=8)
-    drawn = (X @ draws).std(-1) * found.widening**0.5
+    drawn = (X @ draws).std(-1) * found.prior_scale**0.5
     of_rows = arm.setup.measurements.select(values.row)
     got = found.deviation(of_rows, of_rows.q + correction(of_rows.q))
     # Drawn along the axes of the problem, told along those of the frame: the length is the same.
@@ -209,16 +209,16 @@ def test_more_rows_make_it_surer_and_the_widening_is_one_or_more() -> None:
         found, _, correction = uncertainty(own)
         test = tracker_data(robot, drawn_joints(robot, 200, 3))
         deviations.append(float(found.deviation(test, test.q + correction(test.q)).mean()))
-        assert 1.0 <= found.widening < 3.0
+        assert 1.0 <= found.prior_scale < 3.0
     assert 0.3 < deviations[1] / deviations[0] < 0.75
 
 
 def test_many_configurations_are_left_out_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Robot.load("rb5")
     own = linearised(robot, tracker_data(robot, drawn_joints(robot, 80, 2), noise=3e-5))
-    folds = uncertainty(own)[0].widening
+    folds = uncertainty(own)[0].prior_scale
     monkeypatch.setattr("pisigma.hybrid.uncertainty.FEW_CONFIGURATIONS", 10)
-    single = uncertainty(own)[0].widening
+    single = uncertainty(own)[0].prior_scale
     assert 1.0 <= single < 1.5 * folds
     monkeypatch.setattr("pisigma.hybrid.uncertainty.CHUNK", 3)
     test = tracker_data(robot, drawn_joints(robot, 10, 3))

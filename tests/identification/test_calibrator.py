@@ -210,8 +210,8 @@ def test_what_the_data_do_not_see_stays_at_nominal_and_is_said() -> None:
     spread = turn @ turn[0].mT  # the tool's own turn is not seen by positions
     angle = torch.arccos(((spread.diagonal(dim1=-1, dim2=-2).sum(-1) - 1) / 2).clamp(-1, 1))
     assert float(angle.max()) < np.deg2rad(0.5)
-    assert len(result.unseen) == 2
-    assert all("theta_5" in sentence or "alpha_5" in sentence for sentence in result.unseen)
+    assert len(result.weak_directions) == 2
+    assert all("theta_5" in sentence or "alpha_5" in sentence for sentence in result.weak_directions)
     assert any("from the axis of joint theta_6" in warning for warning in result.warnings)
     assert "the prior holds it" in result.parameter("alpha_5").remark
     assert result.redundancy.group("d_2") == "d_2 + d_3 + d_4 is identified, the single values are not"

@@ -40,7 +40,7 @@ def test_the_fast_way_gives_what_the_careful_one_does(kind, way):
     q, T, ik = solved(kind, 120)
     near = q + 0.02 * torch.sin(17 * q) if way == "near" else None
     order = ik.order[1:2] if way == "branch" else ik.order
-    fast, slow = ik._fast.solve(T, near, order), ik._careful.solve(T, T, near, order)
+    fast, slow = ik._fast.solve(T, near, order), ik._reference.solve(T, T, near, order)
     done = fast.done
     assert float(done.double().mean()) > (0.85 if way != "branch" else 0.5)
     same = done & (fast.status != Status.SINGULAR) & (slow.status != Status.SINGULAR)

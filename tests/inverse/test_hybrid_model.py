@@ -275,7 +275,7 @@ def _known(**values):
         (lambda document: document["uncertainty"]["free"].__setitem__(-1, 9999), "rising numbers"),
         (_known(turns=[0]), "of shape"),
         (_known(sockets=["A", 3]), "sockets"),
-        (_known(widening=-1.0), "widening"),
+        (_known(prior_scale=-1.0), "prior_scale"),
         (
             lambda document: document["robot"]["rows"][0].update(d_mm=1.0),
             "not the geometry in the description",

@@ -45,7 +45,7 @@ def test_a_moved_tracker_is_no_mix_up(arm, turned):
     here = verify(model, rows if turned else replace(rows, rotation=None))
     there = verify(model, from_elsewhere(rows, turned), fit_frame=True)
     assert there.verdict == "better"
-    assert there.mix_ups == ()
+    assert there.setup_faults == ()
     assert [remark for remark in there.remarks if "fitted anew" in remark]
     for before, after in zip(here.comparison["models"], there.comparison["models"], strict=True):
         assert after["rms_mm"] < 1.3 * before["rms_mm"]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement import Measurements, groups_of_equal_joints, holdout, k_folds, placements
-from pisigma.measurement.splits import SplitBy, dealings
+from pisigma.measurement.splits import SplitBy, repeats
 
 WAYS = ("joints", "interleaved", "time", "space")
 
@@ -223,7 +223,7 @@ def test_refuses_more_folds_than_placements():
 
 def test_dealings_differ_and_start_with_the_folds_of_the_seed():
     measurements = repeated([row // 3 for row in range(72)])
-    found = dealings(measurements, 6, seed=4)
+    found = repeats(measurements, 6, seed=4)
     assert len(found) == 8  # 200 of 24 groups
     first = [test.tolist() for _, test in k_folds(measurements, 6, seed=4)]
     assert [test.tolist() for _, test in found[0]] == first
@@ -245,12 +245,12 @@ def test_dealings_differ_and_start_with_the_folds_of_the_seed():
     ],
 )
 def test_as_many_dealings_as_there_are_few_poses(groups: int, folds: int | None, by: SplitBy, times: int):
-    assert len(dealings(repeated(list(range(groups))), folds, seed=0, by=by)) == times
+    assert len(repeats(repeated(list(range(groups))), folds, seed=0, by=by)) == times
 
 
 @pytest.mark.parametrize(("folds", "by"), [(4, "time"), (4, "interleaved"), (12, "joints")])
 def test_refuses_to_deal_what_cannot_be_dealt_anew(folds: int, by: SplitBy):
     measurements = repeated(list(range(12)))
-    assert len(dealings(measurements, folds, seed=0, by=by, times=1)) == 1
-    with pytest.raises(MeasurementError, match=r"3 dealings were wanted, but .* are the same every time"):
-        dealings(measurements, folds, seed=0, by=by, times=3)
+    assert len(repeats(measurements, folds, seed=0, by=by, times=1)) == 1
+    with pytest.raises(MeasurementError, match=r"3 repeats were wanted, but .* are the same every time"):
+        repeats(measurements, folds, seed=0, by=by, times=3)

@@ -7,7 +7,7 @@ import torch
 from testing.closeness import assert_close
 from testing.models import HOMES, hand_made_model, joints_around
 
-from pisigma.inverse.nearest_turn import turn_near
+from pisigma.inverse.nearest_turn import nearest_turn
 from pisigma.kinematics.forward import forward_kinematics
 
 
@@ -50,9 +50,9 @@ def test_turns_stay_inside_the_limits_and_on_the_pose():
     robot = hand_made_model("kiro3").robot  # theta_4 may turn by ±360 deg, d_3 slides
     q = torch.tensor([3.0, 1.0, -0.2, 0.5], dtype=torch.float64)
     near = torch.tensor([-3.0, 40.0, 9.0, -7.0], dtype=torch.float64)
-    inside = turn_near(robot, q, near, within_limits=True)
+    inside = nearest_turn(robot, q, near, within_limits=True)
     assert_close(inside, torch.tensor([3.0, 1.0, -0.2, 0.5 - 2 * torch.pi], dtype=torch.float64), atol=1e-12)
-    free = turn_near(robot, q, near, within_limits=False)
+    free = nearest_turn(robot, q, near, within_limits=False)
     assert_close(forward_kinematics(robot, free), forward_kinematics(robot, q), atol=1e-12)
     assert bool(((free - near).abs()[[0, 1, 3]] <= torch.pi).all())
     assert float(free[2]) == float(q[2])

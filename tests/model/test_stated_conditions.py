@@ -20,7 +20,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.row_poses import poses_of_rows
-from pisigma.model.stated_conditions import under_conditions
+from pisigma.model.stated_conditions import under_stated_conditions
 from pisigma.robot.description import Robot
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
@@ -53,7 +53,7 @@ def test_poses_are_those_of_rows_that_state_the_conditions(
     name: str, beside: str, payload: float, temperature: float
 ) -> None:
     model = model_with(name, beside, orders=(2,) if beside == "all" else ())
-    under = under_conditions(model, payload, temperature)
+    under = under_stated_conditions(model, payload, temperature)
     q = joints_around(name, 50, seed=3, spread=0.8)
     expected = poses_of_rows(model, rows_under(q, payload, temperature))
     assert_close(under.forward(q), expected, atol=1e-14)
@@ -64,10 +64,10 @@ def test_poses_are_those_of_rows_that_state_the_conditions(
 def test_what_is_not_given_is_as_usual() -> None:
     model = model_with("kiro4", "all")
     q = joints_around("kiro4", 20, seed=3)
-    under = under_conditions(model, temperature_c=31.0)
+    under = under_stated_conditions(model, temperature_c=31.0)
     assert_close(under.forward(q), poses_of_rows(model, rows_under(q, 2.0, 31.0)), atol=1e-14)
     assert under.conditions == {"payload_kg": 2.0, "temperature_c": 31.0}
-    assert under_conditions(model) is model
+    assert under_stated_conditions(model) is model
 
 
 @pytest.mark.parametrize("name", ["kiro4", "kiro3"])
@@ -124,7 +124,7 @@ def test_what_was_not_learned_is_refused(tmp_path) -> None:
         (hybrid_model("kiro4", [FourierSeries(robot, 2)]), "joint values only"),
     ):
         with pytest.raises(ModelError, match=f"did not learn what payload_kg does; it knows {knows}"):
-            under_conditions(model, payload_kg=1.0)
+            under_stated_conditions(model, payload_kg=1.0)
     with pytest.raises(ModelError, match="which a folder does not keep"):
-        save_model(under_conditions(warm, temperature_c=20.0), tmp_path)
+        save_model(under_stated_conditions(warm, temperature_c=20.0), tmp_path)
     assert not list(tmp_path.iterdir())

@@ -9,7 +9,7 @@ from testing.models import no_type_checker, trained_run
 from pisigma.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 from pisigma.recipes.recipe import MeasuredData
-from pisigma.recipes.recipe_data import part_sets
+from pisigma.recipes.recipe_data import split_sets
 from pisigma.reporting.training_report import report_training
 from pisigma.workflow.run import train_recipe
 
@@ -21,7 +21,7 @@ def rows(*split: str) -> Measurements:
 
 
 def test_rows_are_parted_by_the_column():
-    train, test = part_sets(rows("train", "test", "train", "train", "test", "train"))
+    train, test = split_sets(rows("train", "test", "train", "train", "test", "train"))
     assert train.q[:, 0].tolist() == [0, 4, 6, 10]
     assert test.q[:, 0].tolist() == [2, 8]
     assert set(train.split) == {"train"}
@@ -31,12 +31,12 @@ def test_rows_are_parted_by_the_column():
 @pytest.mark.parametrize("split", [(), ("train",) * 6])
 def test_without_test_rows_all_are_trained_on(split):
     measurements = rows(*split)
-    assert part_sets(measurements) == (measurements, None)
+    assert split_sets(measurements) == (measurements, None)
 
 
 def test_test_rows_alone_are_refused():
     with pytest.raises(MeasurementError, match=r"rows\.csv: column 'set' marks all 6 rows as 'test'"):
-        part_sets(rows(*["test"] * 6))
+        split_sets(rows(*["test"] * 6))
 
 
 def test_rows_of_the_test_set_change_nothing_that_is_learned():
@@ -47,7 +47,7 @@ def test_rows_of_the_test_set_change_nothing_that_is_learned():
     position = everything.position.clone()
     position[::4] += 0.5
     marked = replace(everything, split=split)
-    train, test = part_sets(marked)
+    train, test = split_sets(marked)
     with no_type_checker():
         models = [
             train_recipe(measured, data).model for data in (marked, replace(marked, position=position), train)

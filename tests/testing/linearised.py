@@ -83,14 +83,14 @@ class LinearisedArm:
     setup: CalibrationSetup
     rows: Rows
     noise: tuple[float, ...]
-    widening: tuple[float, ...]
+    prior_scale: tuple[float, ...]
 
     def fitted(self, features: Sequence[AbstractFeatures], iterations: int = 40) -> "Fitted":
         """Geometry and a unit of order 1, prior sizes and noise by the evidence."""
         design = Design(self.rows.problem, tuple(features))
         sums = sum_up(design, self.rows.values, self.rows.start(design))
         return Fitted(
-            design, sums, maximise_evidence(sums, design.prior(self.widening), self.noise, iterations)
+            design, sums, maximise_evidence(sums, design.prior(self.prior_scale), self.noise, iterations)
         )
 
 
@@ -114,7 +114,7 @@ def linearised(robot: Robot, measurements: Measurements, **options: object) -> L
         (here.point - problem.nominal)[problem.active],
         groups_of_equal_joints(problem.q),
     )
-    return LinearisedArm(solved.setup, rows, view.noise, view.widening)
+    return LinearisedArm(solved.setup, rows, view.noise, view.prior_scale)
 
 
 def with_directions(robot: Robot, directions: Sequence[int]) -> Robot:

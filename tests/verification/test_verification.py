@@ -1,4 +1,4 @@
-"""Verification: the verdict on new measurements, and mix-ups recognised by name and never on good data."""
+"""Verification: the verdict on new measurements, and setup faults recognised by name and never on good data."""
 
 from dataclasses import replace
 
@@ -135,12 +135,12 @@ def test_mix_ups_are_recognised(geometric, name):
     model, rows, _ = geometric
     spoil, kinds, words = MIX_UPS[name]
     found = verify(model, spoil(rows, poses_of_rows(model, rows)))
-    assert [mix_up.kinds for mix_up in found.mix_ups] == [kinds]
-    (mix_up,) = found.mix_ups
-    assert words in mix_up.sentence
-    assert mix_up.before > 20 * mix_up.after
-    assert_close(mix_up.after, NOISE * 3**0.5, rtol=0.3)
-    assert mix_up.after_nominal > 3 * mix_up.after
+    assert [setup_fault.kinds for setup_fault in found.setup_faults] == [kinds]
+    (setup_fault,) = found.setup_faults
+    assert words in setup_fault.sentence
+    assert setup_fault.before > 20 * setup_fault.after
+    assert_close(setup_fault.after, NOISE * 3**0.5, rtol=0.3)
+    assert setup_fault.after_nominal > 3 * setup_fault.after
     assert found.verdict == "mixed_up"
     assert "something was mixed up" in found.sentence
 
@@ -149,18 +149,18 @@ def test_mix_ups_are_recognised(geometric, name):
 def test_mix_ups_are_recognised_in_poses(geometric, name):
     model, _, rows = geometric
     spoil, kinds, words = MIX_UPS[name]
-    (mix_up,) = find_mix_ups(model, model, spoil(rows, poses_of_rows(model, rows)))
-    assert mix_up.kinds == kinds
-    assert words in mix_up.sentence
-    assert mix_up.after_rotation < 1e-3 < mix_up.before_rotation
-    assert {"before_rms_deg", "after_rms_deg"} <= set(mix_up.in_file_units())
+    (setup_fault,) = find_mix_ups(model, model, spoil(rows, poses_of_rows(model, rows)))
+    assert setup_fault.kinds == kinds
+    assert words in setup_fault.sentence
+    assert setup_fault.after_rotation < 1e-3 < setup_fault.before_rotation
+    assert {"before_rms_deg", "after_rms_deg"} <= set(setup_fault.in_file_units())
 
 
 def test_a_zero_that_only_orientations_tell(geometric):
     model, _, rows = geometric
-    (mix_up,) = find_mix_ups(model, model, joints(rows, offset=[0, 0, 0, 0, 0, torch.pi]))
-    assert mix_up.kinds == ("joint_zero",)
-    assert "180 deg added to q6" in mix_up.sentence
+    (setup_fault,) = find_mix_ups(model, model, joints(rows, offset=[0, 0, 0, 0, 0, torch.pi]))
+    assert setup_fault.kinds == ("joint_zero",)
+    assert "180 deg added to q6" in setup_fault.sentence
 
 
 @pytest.mark.parametrize("name", ["tool", "mm named m", "a sign", "a quarter turn", "a sign, from elsewhere"])
@@ -168,7 +168,7 @@ def test_mix_ups_are_recognised_by_a_hybrid(hybrid, name):
     model, rows = hybrid
     spoil, kinds, _ = MIX_UPS[name]
     found = verify(model, spoil(rows, poses_of_rows(model, rows)))
-    assert kinds in [mix_up.kinds for mix_up in found.mix_ups]
+    assert kinds in [setup_fault.kinds for setup_fault in found.setup_faults]
     assert found.verdict == "mixed_up"
 
 
@@ -177,7 +177,7 @@ def test_good_data_are_explained_better_and_nothing_is_claimed(geometric, turned
     model, *rows = geometric
     found = verify(model, rows[turned])
     assert found.verdict == "better"
-    assert found.mix_ups == ()
+    assert found.setup_faults == ()
     assert found.remarks == ()
     assert found.ratio < 0.3
     assert found.better_share > 0.9
@@ -188,19 +188,19 @@ def test_good_data_of_a_hybrid(hybrid):
     found = verify(*hybrid)
     assert [model["name"] for model in found.comparison["models"]] == ["nominal", "geometric", "corrected"]
     assert found.verdict == "better"
-    assert found.mix_ups == ()
+    assert found.setup_faults == ()
 
 
 def test_few_or_random_rows_are_no_evidence(geometric):
     model, rows, _ = geometric
     few = verify(model, rows.select(torch.arange(3)))
     assert few.verdict == "undecided"
-    assert few.mix_ups == ()
+    assert few.setup_faults == ()
     order = torch.randperm(ROWS, generator=torch.Generator().manual_seed(2))
     random = verify(model, replace(rows, q=rows.q[order]))
-    assert random.mix_ups == ()
+    assert random.setup_faults == ()
     assert random.verdict == "mixed_up"
-    assert "no usual mix-up" in random.remarks[-1]
+    assert "no usual setup fault" in random.remarks[-1]
 
 
 @pytest.mark.parametrize("fixture", ["geometric", "hybrid"])
@@ -208,10 +208,10 @@ def test_the_nominal_robot_is_recognised(request, fixture):
     model, rows = request.getfixturevalue(fixture)[:2]
     found = verify(model, measured(rows.q, nominal_poses_of_rows(model, rows), False))
     assert found.verdict != "better"
-    (mix_up,) = found.mix_ups
-    assert mix_up.kinds == ("correction",)
-    assert "the nominal robot at the joint values of the file" in mix_up.sentence
-    assert "after_nominal_rms_mm" not in mix_up.in_file_units()
+    (setup_fault,) = found.setup_faults
+    assert setup_fault.kinds == ("correction",)
+    assert "the nominal robot at the joint values of the file" in setup_fault.sentence
+    assert "after_nominal_rms_mm" not in setup_fault.in_file_units()
 
 
 def test_corrected_values_in_the_log_of_uncorrected_moves(geometric):
@@ -228,9 +228,9 @@ def test_corrected_values_in_the_log_of_uncorrected_moves(geometric):
     )  # near singular poses corrections are large
     assert int(regular.sum()) > ROWS / 2
     T = poses_of_rows(model, rows)
-    (mix_up,) = find_mix_ups(model, model, measured(logged[regular], T[regular], False))
-    assert mix_up.kinds == ("correction",)
-    assert "the correction taken off" in mix_up.sentence
+    (setup_fault,) = find_mix_ups(model, model, measured(logged[regular], T[regular], False))
+    assert setup_fault.kinds == ("correction",)
+    assert "the correction taken off" in setup_fault.sentence
 
 
 def pose_steps(model, rows, q, T, T_wanted):
@@ -251,10 +251,10 @@ def test_a_model_of_joint_errors():
     rows = measured(q, model.forward(q), False)
     found = verify(model, rows)
     assert found.verdict == "better"
-    assert found.mix_ups == ()
+    assert found.setup_faults == ()
     nominal = verify(model, measured(q, forward_kinematics(model.robot, q), False))
     assert nominal.verdict == "not_better"
-    assert [mix_up.kinds for mix_up in nominal.mix_ups] == [("correction",)]
+    assert [setup_fault.kinds for setup_fault in nominal.setup_faults] == [("correction",)]
 
 
 def test_reading_minds_no_limits_but_says_so(geometric, tmp_path):
@@ -289,9 +289,9 @@ def test_measured_ur5(shared_data):
     model = model_of_calibration("ur5", model_robot, GeometricCalibrator(model_robot).fit(trained), trained)
     good = verify(model, rows)
     assert good.verdict == "better"
-    assert good.mix_ups == ()
+    assert good.setup_faults == ()
     assert good.ratio < 0.25
-    (mix_up,) = verify(model, joints(rows, [1, 1, 1, 1, -1.0, 1])).mix_ups
-    assert mix_up.kinds == ("joint_sign",)
-    assert "q5" in mix_up.sentence
-    assert mix_up.after < 2e-4
+    (setup_fault,) = verify(model, joints(rows, [1, 1, 1, 1, -1.0, 1])).setup_faults
+    assert setup_fault.kinds == ("joint_sign",)
+    assert "q5" in setup_fault.sentence
+    assert setup_fault.after < 2e-4

@@ -14,7 +14,7 @@ VISIBLE = 1e-7
 """Columns with less than this share of their length beside the kept ones count as dependent."""
 
 
-def told_besides(information: Information, kept: list[int]) -> list[int]:
+def rank_extension(information: Information, kept: list[int]) -> list[int]:
     """Find columns that the data tell besides those kept.
 
     Nominal axes are parallel or meet exactly; real ones do not, so that dependencies of the nominal robot

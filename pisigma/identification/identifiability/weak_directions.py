@@ -15,7 +15,7 @@ SHOWN = 0.25
 """Parameters with at least this share of a direction are named."""
 
 
-def unseen_directions(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[str, ...]:
+def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[str, ...]:
     """Find directions of the free arm parameters that the data tell less well than the prior does.
 
     Base and tool are marginalised: what they can mimic does not count as seen. The directions are
@@ -30,7 +30,7 @@ def unseen_directions(problem: CalibrationProblem, here: Linearisation[Tensor]) 
     precision = view.widened(stated, problem.prior_group)
     held = bool((precision > 0).any())
     data = here.normal - torch.diag(precision)
-    wide = replace(view, widening=tuple(max(factor, 1.0) for factor in view.widening))
+    wide = replace(view, prior_scale=tuple(max(factor, 1.0) for factor in view.prior_scale))
     precision = wide.widened(stated, problem.prior_group)
     usual = torch.where(precision > 0, precision.clamp(min=1e-30).rsqrt(), problem.step_scale)
     data = data * usual * usual[:, None]

@@ -36,7 +36,7 @@ class PriorGroup(IntEnum):
     """alpha and beta: how square and parallel axes are."""
 
 
-LEAST_TOLD = 0.1
+LEAST_EFFECTIVE = 0.1
 """A prior of which the data tell less than so many parameters stays as it is."""
 SMALLEST_PRIOR = 0.03
 """An estimated prior is not narrower than this share of the stated one."""
@@ -76,13 +76,13 @@ class SensorView:
             their own.
         repetition: per sensor, 1 or more: by how much repeats of a pose, and several targets in it, tell less than
             so many poses, because what the model gets wrong there is the same in all of them.
-        widening: of the prior's standard deviations, per group of parameters.
+        prior_scale: of the prior's standard deviations, per group of parameters.
     """
 
     sums: tuple[SensorSums, ...]
     noise: tuple[float, ...]
     repetition: tuple[float, ...]
-    widening: tuple[float, ...] = (1.0,) * len(PriorGroup)
+    prior_scale: tuple[float, ...] = (1.0,) * len(PriorGroup)
 
     def scale(self, sensor: int) -> float:
         """What distances are divided by for the loss."""
@@ -94,7 +94,7 @@ class SensorView:
 
     def widened(self, precision: Float64[Tensor, " active"], group: Tensor) -> Float64[Tensor, " active"]:
         """1 / variance of parameters by the prior, as far as it was widened."""
-        return precision / precision.new_tensor(self.widening).square()[group]
+        return precision / precision.new_tensor(self.prior_scale).square()[group]
 
 
 def view_of(linearisation: Linearisation[Tensor]) -> SensorView:
@@ -234,9 +234,9 @@ def prior_widening(
     """
     told = (1 - view.widened(precision, group) * covariance.diagonal()) * (precision > 0)
     square = off.square() * precision
-    sums = off.new_zeros((2, len(view.widening))).index_add(1, group, torch.stack([told, square]))
-    least = 1.0 if floor == 1.0 else LEAST_TOLD
+    sums = off.new_zeros((2, len(view.prior_scale))).index_add(1, group, torch.stack([told, square]))
+    least = 1.0 if floor == 1.0 else LEAST_EFFECTIVE
     return tuple(
         max(off_square / total, floor**2) ** 0.5 if total > least else now
-        for total, off_square, now in zip(*sums.tolist(), view.widening, strict=True)
+        for total, off_square, now in zip(*sums.tolist(), view.prior_scale, strict=True)
     )

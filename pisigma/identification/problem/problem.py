@@ -161,13 +161,15 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
                 self.sensors, self.loss, seen, used, self.pose, self.configuration
             )
         off = (linearisation.point - self.nominal)[self.active]
-        widening = view.widening
+        prior_scale = view.prior_scale
         if self.prior_sizes != "stated":
             floor = 1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR
-            widening = prior_widening(off, self._prior, self.prior_group, view, covariance, floor)
-        old, new = (*view.noise, *view.repetition, *view.widening), (*noise, *repetition, *widening)
+            prior_scale = prior_widening(off, self._prior, self.prior_group, view, covariance, floor)
+        old, new = (*view.noise, *view.repetition, *view.prior_scale), (*noise, *repetition, *prior_scale)
         settled = all(abs(b / a - 1) < 1e-2 for a, b in zip(old, new, strict=True))
-        return self.combined(linearisation.point, SensorView(view.sums, noise, repetition, widening)), settled
+        return self.combined(
+            linearisation.point, SensorView(view.sums, noise, repetition, prior_scale)
+        ), settled
 
     def row_weights(self, view: SensorView, sensor: int, rows: slice) -> Float64[Tensor, " poses"]:
         """1 / standard deviation of each row for a sensor, 0 where it saw nothing [1/m or 1/rad]."""

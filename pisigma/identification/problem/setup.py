@@ -16,7 +16,7 @@ from pisigma.identification.problem.loss import AbstractLoss
 from pisigma.identification.problem.noise import renumbered
 from pisigma.identification.problem.parameters import ParameterSpace, Prior, PriorSizes
 from pisigma.identification.problem.problem import CalibrationProblem
-from pisigma.measurement.conditions import conditions_of, told_conditions, with_conditions
+from pisigma.measurement.conditions import conditions_of, stated_conditions, with_conditions
 from pisigma.measurement.dataset import Kind, Measurements
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert, rotation_from_rpy, transform_from_xyzrpy
@@ -135,7 +135,7 @@ def build_setup(
     start = start.to(device)
     known = build_socket_distances(measurements, options.socket_distances, options.socket_sigma)
     sensors = build_sensors(measurements, anchors.bases, anchors.tools, frame, target)
-    told = told_conditions(measurements)
+    told = stated_conditions(measurements)
     carried = with_conditions(measurements, tuple(name for name in told if name == "payload_kg"))
     problem = CalibrationProblem(
         space=space,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from pisigma.kinematics.closed_form.canonical import CanonicalRows
 from pisigma.kinematics.components import Frame, Scalar, compose, constant_frame, frame_of
-from pisigma.kinematics.joint_limits import turn_into_limits
+from pisigma.kinematics.joint_limits import wrap_into_limits
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
 from pisigma.se3 import check_transforms, invert, wrap_to_pi
@@ -136,4 +136,4 @@ class AbstractClosedForm(ABC):
     ) -> tuple[Float[Tensor, "*batch dof"], Bool[Tensor, "*batch"]]:
         """Joint values on the turn nearest to 0 or, where only that is within the limits, on another."""
         revolute = torch.tensor(self.robot.revolute, device=q.device)
-        return turn_into_limits(self.robot, torch.where(revolute, wrap_to_pi(q), q))
+        return wrap_into_limits(self.robot, torch.where(revolute, wrap_to_pi(q), q))

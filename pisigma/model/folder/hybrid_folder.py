@@ -55,7 +55,7 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
             "anchors": list(known.space.anchors),
             "free": _free_rows(known),
             "turns": [chosen.turn for chosen in known.features if isinstance(chosen, HeldProducts)],
-            "widening": known.widening,
+            "prior_scale": known.prior_scale,
             "unexplained_m": model.unexplained,
         }
     return found
@@ -225,7 +225,7 @@ def _uncertainty(
     full = torch.zeros(count + len(root) - len(free), root.shape[1], dtype=torch.float64)
     full[[*free, *range(count, len(full))]] = root.double()
     geometry = geometry_of(robot, bases, tools)
-    return PositionUncertainty(space, geometry, _weighted(known, hybrid), full, known.widening)
+    return PositionUncertainty(space, geometry, _weighted(known, hybrid), full, known.prior_scale)
 
 
 def _weighted(known: UncertaintySection, hybrid: HybridArm | None) -> tuple[AbstractFeatures, ...]:

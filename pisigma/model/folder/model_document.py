@@ -92,7 +92,7 @@ class UncertaintySection(Section):
         free: which parameters have a row in the root; the others' rows are 0. Behind them come all weights.
         turns: whose turn it is, for every stretch of weights of product units that stands behind the others: see
             `pisigma.hybrid.held_products.HeldProducts`.
-        widening: see `pisigma.hybrid.uncertainty.PositionUncertainty`.
+        prior_scale: see `pisigma.hybrid.uncertainty.PositionUncertainty`.
         unexplained_m: see `pisigma.model.calibrated_model.CalibratedModel`.
     """
 
@@ -100,7 +100,7 @@ class UncertaintySection(Section):
     anchors: tuple[str, ...]
     free: tuple[Annotated[int, Field(ge=0)], ...]
     turns: tuple[Annotated[int, Field(ge=0)], ...]
-    widening: Annotated[float, Field(gt=0)]
+    prior_scale: Annotated[float, Field(gt=0)]
     unexplained_m: Annotated[float, Field(ge=0)]
 
 

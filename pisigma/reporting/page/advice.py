@@ -95,7 +95,7 @@ def _in_range(ends: list[Stretch], limits: Stretch, turn: float | None) -> tuple
 
 def _joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> list[str]:
     """Joints whose range was measured in part only."""
-    q = model.starts if rows is None or rows.origin == "unseen" else rows.measurements.q
+    q = model.starts if rows is None or rows.origin == "other" else rows.measurements.q
     if not len(q):
         return []
     parts = []
@@ -155,7 +155,7 @@ def _outside(rows: JudgedRows | None) -> list[str]:
 def _weak_parameters(metrics: Mapping[str, Any]) -> list[str]:
     lines = [
         f"Hardly identified: {line.rstrip('.')}. Choose poses that move more of what it depends on."
-        for line in metrics.get("unseen", ())
+        for line in metrics.get("weak_directions", ())
     ]
     unsure = [
         row["name"]

@@ -69,7 +69,7 @@ def map_of_rows(model: CalibratedModel, rows: JudgedRows) -> ErrorMap:
     whose = {
         "held_out": "each judged by a calibration that never saw it",
         "training": "which the model was made of, so errors after it are not those of a prediction",
-        "unseen": "which the model was not made of",
+        "other": "which the model was not made of",
     }[rows.origin]
     layers = [
         Layer("before", "before (nominal)", "mm", _mm(rows.before.position), "Error of the robot as drawn."),

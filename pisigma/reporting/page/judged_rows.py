@@ -31,7 +31,7 @@ class JudgedRows:
 
     Attributes:
         origin: "held_out": errors under calibrations that never saw the row; "training": of the rows that the model
-            was made of; "unseen": of other rows.
+            was made of; "other": of other rows.
         measurements: the rows; of a model's own held-out rows joint values and names only.
         place: position of the tool in the robot's own base [m].
         models: by name, "nominal" first and the model last, errors of every row.
@@ -83,7 +83,7 @@ def rows_of_file(
     Raises:
         MeasurementError: no row can be judged.
     """
-    rows, remarks = _unseen(measurements)
+    rows, remarks = _other_rows(measurements)
     digest = rows.content_hash()
     if held_out is not None and digest == held_out.data_sha256:
         residual = held_out.residual
@@ -91,8 +91,8 @@ def rows_of_file(
         known = residual if kept else _model_errors(model, rows)[1]
         origins = ("held_out", "held_out" if kept else "training")
         return _judged(model, rows, held_out.models, known, origins, [*remarks, *_dealt(model)])
-    origin = "training" if digest == model.provenance.data_sha256 else "unseen"
-    remarks += _seen_before(model, rows) if origin == "unseen" else []
+    origin = "training" if digest == model.provenance.data_sha256 else "other"
+    remarks += _seen_before(model, rows) if origin == "other" else []
     errors, residual = _model_errors(model, rows)
     if not (torch.isfinite(errors.position).any() or errors.rotation is not None):
         raise MeasurementError(
@@ -123,8 +123,8 @@ def rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
 
 
 def _dealt(model: CalibratedModel) -> list[str]:
-    """A sentence where the errors that are kept of every row are those of one dealing among several."""
-    times = model.metrics.get("cross_validation", {}).get("dealings", 1)
+    """A sentence where the errors that are kept of every row are those of one repeat among several."""
+    times = model.metrics.get("cross_validation", {}).get("repeats", 1)
     if times == 1:
         return []
     return [
@@ -181,7 +181,7 @@ def _judged(
     )
 
 
-def _unseen(measurements: Measurements) -> tuple[Measurements, list[str]]:
+def _other_rows(measurements: Measurements) -> tuple[Measurements, list[str]]:
     """The rows marked as test, or all where none is."""
     test = torch.tensor([name == "test" for name in measurements.split or ()], dtype=torch.bool)
     if not test.any():

@@ -117,7 +117,7 @@ def read_correlations(path: Path) -> tuple[tuple[tuple[str, ...], Float64[np.nda
 
 
 def _has_parameters(metrics: Mapping[str, Any]) -> bool:
-    return all(name in metrics for name in ("parameters", "redundancy", "unseen", "warnings"))
+    return all(name in metrics for name in ("parameters", "redundancy", "weak_directions", "warnings"))
 
 
 def _pairs(tables: tuple[tuple[tuple[str, ...], np.ndarray], ...]) -> tuple[tuple[str, str, float], ...]:

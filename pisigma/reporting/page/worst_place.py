@@ -37,7 +37,7 @@ def worst_place(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, s
 _AMONG = {
     "held_out": "Of the held-out rows",
     "training": "Of the rows that the model was made of",
-    "unseen": "Of the rows of the file",
+    "other": "Of the rows of the file",
 }
 
 

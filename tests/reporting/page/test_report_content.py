@@ -35,7 +35,7 @@ def test_figures_of_unseen_rows_are_numpys(hybrid, tmp_path):
     arm, model = hybrid
     rows = measured(arm, 150, seed=9)
     content = report_content(model, tmp_path, rows)
-    assert content.rows.origin == "unseen"
+    assert content.rows.origin == "other"
     first = content.accuracies[0]
     assert (first.held_out, first.rows, list(first.models)) == (True, 150, ["nominal", "geometric", "hybrid"])
     error = np.linalg.norm((rows.position - poses_of_rows(model, rows)[:, :3, 3]).numpy(), axis=1) * 1e3
@@ -80,7 +80,7 @@ def test_joint_values_of_the_calibration_measured_again_are_said(hybrid, tmp_pat
     arm, model = hybrid
     again = replace(arm.measurements, position=arm.measurements.position + 1e-5)
     content = report_content(model, tmp_path, again)
-    assert content.rows.origin == "unseen"
+    assert content.rows.origin == "other"
     assert any("200 of these 200 rows have joint values" in line for line in content.rows.remarks)
 
 
@@ -94,7 +94,7 @@ def test_a_folder_that_keeps_held_out_rows_shows_them(hybrid, tmp_path):
         assert_close(content.rows.after.position, 1.1 * training.after.position, rtol=1e-5)
         assert content.parameters.correlations
     other = report_content(kept, tmp_path / "arm", measured(arm, 40, seed=9))
-    assert other.rows.origin == "unseen"
+    assert other.rows.origin == "other"
 
 
 def test_a_model_in_another_frame_is_called_worse(hybrid, tmp_path):
