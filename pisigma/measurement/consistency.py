@@ -22,8 +22,17 @@ NUMBERS: dict[str, tuple[int, ...]] = {
     "touch": (),
     "distance": (),
     "anchor_place": (3,),
+    "approach": (-1,),
 }
-"""Parts that are numbers, with the shape of a row."""
+"""Fields that are numbers, with the shape of a row; -1 stands for the number of joints."""
+PARTIAL = ("anchor_place", "approach")
+"""Fields of which a row may have some values without the others."""
+
+
+def row_shape(name: str, dof: int) -> tuple[int, ...]:
+    """Return the shape that a row of a field has, for a robot with so many joints."""
+    return tuple(dof if size < 0 else size for size in NUMBERS[name])
+
 
 TEXTS = ("frame", "target", "split", "socket", "touch_axis", "anchor", "pair")
 """Parts that are texts."""
@@ -61,7 +70,8 @@ def check_parts(parts: Mapping[str, Any]) -> None:
 def _check_shapes(parts: Mapping[str, Any]) -> None:
     """One row per measurement, float64, on one device."""
     source, q = parts["source"], parts["q"]
-    for name, shape in {"q": (q.shape[1],), **NUMBERS}.items():
+    dof = q.shape[1]
+    for name, shape in {"q": (dof,), **{name: row_shape(name, dof) for name in NUMBERS}}.items():
         values = parts[name]
         if values is None:
             continue
@@ -85,19 +95,22 @@ def _check_shapes(parts: Mapping[str, Any]) -> None:
 
 def _check_values(parts: Mapping[str, Any]) -> None:
     """What is not NaN is finite and can be; a position or a rotation is there whole or not at all."""
-    for name, shape in NUMBERS.items():
+    for name in NUMBERS:
         values = parts[name]
         if values is None:
             continue
-        flat = values.reshape(len(values), math.prod(shape))
+        flat = values.reshape(len(values), math.prod(values.shape[1:]))
         missing = torch.isnan(flat)
         _refuse(parts, torch.isinf(flat).any(-1), name, "is infinite; give NaN where nothing was measured")
-        if name != "anchor_place":
+        if name not in PARTIAL:
             _refuse(parts, missing.any(-1) & ~missing.all(-1), name, "is NaN in part; give all of it or none")
         if name.startswith("sigma"):
             _refuse(parts, flat[:, 0] <= 0, name, "is not above 0; give a standard deviation or NaN")
         if name == "payload":
             _refuse(parts, flat[:, 0] < 0, name, "is below 0; give a mass or NaN")
+        if name == "approach":
+            stated = ~missing & (flat.abs() != 1)
+            _refuse(parts, stated.any(-1), name, "has a value other than +1 or -1; give one of them, or NaN")
 
 
 def _check_rotations(parts: Mapping[str, Any]) -> None:

@@ -57,6 +57,8 @@ class Measurements:
         split: per row "train" or "test" (column `set`), where given.
         payload: per row [kg], where given.
         temperature: per row [deg C], where given.
+        approach: per row and joint, from which side the joint came to its value: +1 as it grew, -1 as it fell,
+            NaN where that is not stated.
         socket: per row, the socket that the target's ball sits in; all rows of one share one unknown point.
         touch_axis: per row, the axis ("x", "y" or "z") of the row's frame along which the target's tip
             touched.
@@ -92,6 +94,7 @@ class Measurements:
     anchor: tuple[str, ...] | None = None
     anchor_place: Float64[Tensor, "rows 3"] | None = None
     pair: tuple[str, ...] | None = None
+    approach: Float64[Tensor, "rows dof"] | None = None
     line: tuple[int, ...] = ()
     source: str = "memory"
     left_out: tuple[LeftOut, ...] = ()

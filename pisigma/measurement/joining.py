@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from pisigma.errors import MeasurementError
-from pisigma.measurement.consistency import NUMBERS, TEXTS
+from pisigma.measurement.consistency import NUMBERS, TEXTS, row_shape
 from pisigma.measurement.dataset import Measurements
 
 
@@ -36,8 +36,9 @@ def join(parts: Sequence[Measurements]) -> Measurements:
             "join: some data sets have a split and some have none; give it to all or to none."
         )
     joined: dict[str, Any] = {"q": torch.cat([part.q for part in parts])}
-    for name, shape in NUMBERS.items():
+    for name in NUMBERS:
         if any(getattr(part, name) is not None for part in parts):
+            shape = row_shape(name, dofs[0])
             joined[name] = torch.cat([_filled(part, name, shape) for part in parts])
     for name in (*TEXTS, "line"):
         if name != "split" or parts[0].split is not None:

@@ -54,6 +54,11 @@ CASES: dict[str, tuple[str | None, str | bytes, tuple[str, ...]]] = {
         ("'roll_deg', 'yaw_deg'", "add pitch_deg"),
     ),
     "incomplete quaternion": (None, f"q1_deg,{POSITION},qx,qy\n", ("'qx', 'qy'", "add qz, qw")),
+    "approach of no joint": (
+        None,
+        f"q1_deg,{POSITION},approach2\n1,1,2,3,1\n",
+        ("line 1", "column 'approach2'", "q1 to q1"),
+    ),
     "too many joints": (
         "kiro3",
         f"q1_deg,q2_deg,q3_mm,q4_deg,q5_deg,{POSITION}\n",
@@ -115,6 +120,11 @@ ROWS = {
         None,
         f"q1_deg,{POSITION},payload_kg\n1,1,2,3,-1\n",
         (2, "column 'payload_kg'", "0 or more"),
+    ),
+    "an approach that is none": (
+        None,
+        f"q1_deg,{POSITION},approach1\n1,1,2,3,0\n",
+        (2, "column 'approach1'", "+1", "leave the cell empty"),
     ),
     "a sigma of nothing": (
         None,

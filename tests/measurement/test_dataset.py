@@ -8,6 +8,7 @@ from testing.closeness import assert_close
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement import LeftOut, Measurements
+from pisigma.measurement.joining import join
 from pisigma.se3 import rotation_from_quaternion
 
 
@@ -29,6 +30,7 @@ def make_measurements(rows: int = 4, dof: int = 3, seed: int = 0) -> Measurement
         split=tuple("train" if row % 2 else "test" for row in range(rows)),
         payload=random(rows),
         temperature=random(rows),
+        approach=random(rows, dof).round() * 2 - 1,
         line=tuple(range(2, rows + 2)),
         source="tracker.csv",
         left_out=(LeftOut(9, "column 'x_mm': empty"),),
@@ -89,6 +91,8 @@ def test_no_poses_without_position_and_rotation(missing: str, word: str):
         ("sigma_rotation", zeros(4) - 1, r"line 2.*not above 0"),
         ("payload", zeros(4) - 1, r"line 2.*below 0"),
         ("temperature", zeros(5), "'temperature'"),
+        ("approach", zeros(4), r"'approach' of shape \(4, 3\)"),
+        ("approach", zeros(4, 3), r"line 2.*other than \+1 or -1"),
         ("frame", ("a",), "'frame' has 1 entries for 4 rows"),
         ("line", (1, 2), "'line' has 2 entries for 4 rows"),
         ("split", ("train", "test", "trian", "test"), r"line 4.*did you mean 'train'"),
@@ -108,7 +112,10 @@ def test_select_carries_everything_along(index: torch.Tensor):
     measurements = make_measurements()
     rows = [2, 0] if index.dtype == torch.int64 else [0, 2]
     chosen = measurements.select(index)
-    for name in ("q", "position", "rotation", "sigma_position", "sigma_rotation", "payload", "temperature"):
+    for name in (
+        *("q", "position", "rotation", "sigma_position", "sigma_rotation"),
+        *("payload", "temperature", "approach"),
+    ):
         assert_close(getattr(chosen, name), getattr(measurements, name)[rows])
     for name in ("frame", "target", "split", "line"):
         assert getattr(chosen, name) == tuple(getattr(measurements, name)[row] for row in rows)
@@ -155,10 +162,19 @@ def test_hash_sees_every_digit(name: str):
     assert changed.content_hash() != measurements.content_hash()
 
 
-@pytest.mark.parametrize("change", [{"target": ("A", "A", "A", "A")}, {"rotation": None}, {"split": None}])
+@pytest.mark.parametrize(
+    "change", [{"target": ("A", "A", "A", "A")}, {"rotation": None}, {"split": None}, {"approach": None}]
+)
 def test_hash_sees_names_and_what_is_absent(change: dict[str, object]):
     measurements = make_measurements()
     assert replace(measurements, **change).content_hash() != measurements.content_hash()
+
+
+def test_joining_leaves_approaches_open_where_a_file_has_none():
+    with_approach, without = make_measurements(), replace(make_measurements(seed=1), approach=None)
+    joined = join([with_approach, without])
+    assert_close(joined.approach[:4], with_approach.approach)
+    assert bool(joined.approach[4:].isnan().all())
 
 
 def test_hash_takes_all_nans_and_all_zeros_as_one():

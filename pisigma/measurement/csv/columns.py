@@ -21,6 +21,7 @@ PRISMATIC_UNITS = ("mm", "m")
 _PER_SI = {"deg": 180 / np.pi, "mm": 1e3}
 
 _JOINT = re.compile(r"q([1-9][0-9]{0,2})_(deg|rad|mm|m)")
+_APPROACH = re.compile(r"approach([1-9][0-9]{0,2})")
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,12 @@ class Column:
         match = _JOINT.fullmatch(self.name)
         return int(match[1]) if match else 0
 
+    @property
+    def approach(self) -> int:
+        """Number of the joint whose direction of approach it holds, from 1; 0 where it holds none."""
+        match = _APPROACH.fullmatch(self.name)
+        return int(match[1]) if match else 0
+
 
 _COLUMNS = {
     column.name: column
@@ -73,7 +80,9 @@ _COLUMNS = {
 def find_column(name: str) -> Column | None:
     """The column of a name, or None where there is no such column."""
     match = _JOINT.fullmatch(name)
-    return Column(name, f"q{match[1]}", match[2]) if match else _COLUMNS.get(name)
+    if match:
+        return Column(name, f"q{match[1]}", match[2])
+    return Column(name, name, "") if _APPROACH.fullmatch(name) else _COLUMNS.get(name)
 
 
 def column_choices(name: str) -> str:
@@ -87,7 +96,7 @@ def column_choices(name: str) -> str:
     meant = name.lower()
     if re.fullmatch(r"q[1-9][0-9]?", meant):  # most joints turn
         meant += "_deg"
-    return nearest_choice(meant, (*joints, *_COLUMNS))
+    return nearest_choice(meant, (*joints, *_COLUMNS, f"approach{joint}"))
 
 
 def quoted(columns: Iterable[Column]) -> str:

@@ -54,6 +54,11 @@ class Layout:
         """The quantities q1, q2, ... in order."""
         return tuple(f"q{number}" for number in range(1, self.dof + 1))
 
+    @property
+    def approaches(self) -> tuple[str, ...]:
+        """The quantities approach1, approach2, ... that the file has."""
+        return tuple(column.quantity for column in self.columns if column.approach)
+
     def column(self, quantity: str) -> Column:
         """The column of a quantity."""
         return self.columns[self.index[quantity]]
@@ -83,6 +88,7 @@ def read_header(table: Table, robot: Robot | None) -> Layout:
     dof = _check_joints(place, columns)
     if robot is not None:
         _check_robot(place, [columns[index[f"q{number}"]] for number in range(1, dof + 1)], robot)
+    _check_approaches(place, columns, dof)
     _check_position(place, columns)
     _check_lengths(place, columns)
     return Layout(columns, index, dof, _check_orientation(place, columns))
@@ -169,6 +175,16 @@ def _check_robot(place: str, joints: list[Column], robot: Robot) -> None:
             raise MeasurementError(
                 f"{place}, column '{column.name}': joint '{joint.name}' of robot '{robot.name}' is "
                 f"{joint.type} and cannot be in {column.unit}; give {choices}."
+            )
+
+
+def _check_approaches(place: str, columns: tuple[Column, ...], dof: int) -> None:
+    """Directions of approach are those of joints that the file has."""
+    for column in columns:
+        if column.approach > dof:
+            raise MeasurementError(
+                f"{place}, column '{column.name}': the file has the joints q1 to q{dof}; correct its number or remove "
+                "the column."
             )
 
 

@@ -28,8 +28,9 @@ def read_csv(
     or with `pair`, the name of the two rows it lies between, given in both.
 
     `roll_deg,pitch_deg,yaw_deg` (RotZ(roll) · RotY(pitch) · RotX(yaw)) or `qx,qy,qz,qw`, `target`, `frame`,
-    `sigma_mm` (of the length in the row), `sigma_deg`, `set`, `payload_kg` and `temperature_c` may be. An
-    empty cell is what was not measured.
+    `sigma_mm` (of the length in the row), `sigma_deg`, `set`, `payload_kg` and `temperature_c` may be, and
+    `approach1` and so on: +1 where that joint's value grew before it stopped, -1 where it fell. An empty cell is
+    what was not measured.
 
     Args:
         path: the file.
@@ -81,6 +82,13 @@ def _measurements(table: Table, layout: Layout, rows: CheckedRows) -> Measuremen
         column = cells[layout.index[quantity]] if quantity in layout.index else ()
         return tuple(column[row].strip() for row in kept) if column else ()
 
+    def approaches() -> Tensor | None:
+        columns = [single(f"approach{number}") for number in range(1, layout.dof + 1)]
+        if all(column is None for column in columns):
+            return None
+        missing = torch.full((len(kept),), torch.nan, dtype=torch.float64)
+        return torch.stack([missing if column is None else column for column in columns], 1)
+
     q = numbers(*layout.joints)
     assert q is not None
     orientation = numbers(*layout.orientation)
@@ -103,6 +111,7 @@ def _measurements(table: Table, layout: Layout, rows: CheckedRows) -> Measuremen
         anchor=texts("anchor") or None,
         anchor_place=numbers(*ANCHOR_PLACE),
         pair=texts("pair") or None,
+        approach=approaches(),
         line=tuple(table.lines[row] for row in kept),
         source=table.source,
         left_out=tuple(LeftOut(table.lines[row], faults[row]) for row in sorted(faults)),

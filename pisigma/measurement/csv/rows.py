@@ -225,6 +225,19 @@ def _check_optional(values: _Values, layout: Layout, faults: Faults) -> None:
     for quantity in ("sigma_position", "sigma_rotation", "payload"):
         if quantity in layout.index:
             _check_sign(values[:, layout.index[quantity]], layout.column(quantity), faults)
+    for quantity in layout.approaches:
+        _check_approach(values[:, layout.index[quantity]], layout.column(quantity), faults)
+
+
+def _check_approach(values: Float64[np.ndarray, " rows"], column: Column, faults: Faults) -> None:
+    """The direction from which a joint came is +1 or -1 where it is stated."""
+    faults.add(
+        ~np.isnan(values) & (np.abs(values) != 1),
+        lambda row: (
+            f"column '{column.name}': {values[row]:.6g} was found where +1 (the joint value grew) or -1 (it fell) was "
+            "wanted; correct it or leave the cell empty"
+        ),
+    )
 
 
 def _check_sign(values: Float64[np.ndarray, " rows"], column: Column, faults: Faults) -> None:

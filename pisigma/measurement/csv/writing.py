@@ -101,6 +101,10 @@ def _columns(measurements: Measurements, revolute: tuple[bool, ...]) -> _Columns
     ):
         if optional is not None and not optional.isnan().all():
             columns.add(name, optional, unit)
+    if measurements.approach is not None:
+        for number, approach in enumerate(measurements.approach.T, start=1):
+            if not approach.isnan().all():
+                columns.add(f"approach{number}", approach)
     for name, texts in (
         ("target", measurements.target),
         ("frame", measurements.frame),

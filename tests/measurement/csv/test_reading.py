@@ -52,6 +52,14 @@ def test_columns_stand_in_any_order(write):
     assert (measurements.target, measurements.frame, measurements.split) == (("A",), ("cell",), ("train",))
 
 
+def test_reads_from_which_side_joints_came(write):
+    path = write("q1_rad,q2_rad,x_mm,y_mm,z_mm,approach2\n1,2,0,0,0,1\n1,3,0,0,0,-1\n1,4,0,0,0,\n")
+    approach = Measurements.read_csv(path).approach
+    assert bool(approach[:, 0].isnan().all())
+    assert_close(approach[:2, 1], [1.0, -1.0])
+    assert bool(approach[2, 1].isnan())
+
+
 def test_joints_from_ten_on_are_counted_as_numbers(write):
     names = [f"q{number}_rad" for number in range(11, 0, -1)]
     path = write(",".join([*names, "x_mm,y_mm,z_mm"]) + "\n11,10,9,8,7,6,5,4,3,2,1,0,0,0\n")

@@ -31,6 +31,11 @@ def with_gaps(values: torch.Tensor, gaps: list[bool]) -> torch.Tensor:
     return values
 
 
+def approaches(dof: int) -> st.SearchStrategy[list[float]]:
+    """Directions of approach of all joints in one row, some of them not stated."""
+    return st.lists(st.sampled_from([1.0, -1.0, float("nan")]), min_size=dof, max_size=dof)
+
+
 @st.composite
 def written_fields(draw: st.DrawFn, rows: int, dof: int) -> dict[str, object]:
     """Everything that a file can hold; the orientation as quaternions."""
@@ -58,6 +63,7 @@ def written_fields(draw: st.DrawFn, rows: int, dof: int) -> dict[str, object]:
         "split": draw(st.none() | st.just(("train", "test", "train", "train", "test")[:rows])),
         "payload": optional(0.0),
         "temperature": optional(-100.0),
+        "approach": draw(st.none() | st.just(True)) and tensor(each_row(approaches(dof))),
     }
 
 
