@@ -2,14 +2,17 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
 
 from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.hybrid.common_frames import with_frames_of
 from pisigma.hybrid.coverage import JointCoverage
 from pisigma.hybrid.evidence import effective_share
 from pisigma.hybrid.extrapolation import fade_angle
+from pisigma.hybrid.mini_batches import MANY_ROWS, MiniBatches, batch_checkpoints, refine_in_batches
 from pisigma.hybrid.product_search import best_products
-from pisigma.hybrid.refinement import Refinement, refine, with_held_factors
+from pisigma.hybrid.refinement import refine, with_held_factors
 from pisigma.hybrid.result import HybridResult, LearnedPart
 from pisigma.hybrid.rows import Rows
 from pisigma.hybrid.search import LARGEST_EFFECTIVE_SHARE, Additive, Search, described
@@ -31,6 +34,7 @@ from pisigma.joint_correction.features import (
 from pisigma.measurement.conditions import stated_conditions
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints
+from pisigma.robot.description import Robot
 
 FEATURES = ("series", "gravity", "conditions", *SharedFeatures.CHOICES)
 """Features that may be chosen."""
@@ -38,7 +42,7 @@ SEARCHED_ROWS = 4_000
 """Features and product units are chosen on so many rows at most; everything is fitted to all in the end."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, init=False)
 class HybridCalibrator:
     """Fits `T(q) = base · Π A_i(q_i + Δ_i(q); dh_i + ε_i) · tool` to measurements, Δ a Pi-Sigma network.
 
@@ -52,6 +56,8 @@ class HybridCalibrator:
         harmonics: of the Fourier series, tried in this order.
         orders: numbers of factors of product units, tried in this order; none for an additive correction.
         gravity: direction in which things fall, in the frame of the robot's first row.
+        mini_batches: whether the unknowns of the chosen model are trained on mini-batches instead of with the
+            normal equations of all rows: True or False; how; or "auto", which does so from `MANY_ROWS` rows on.
     """
 
     geometric: GeometricCalibrator
@@ -59,8 +65,45 @@ class HybridCalibrator:
     harmonics: tuple[int, ...] = (8, 24, 56, 110)
     orders: tuple[tuple[int, ...], ...] = ((2,), (2, 2), (2, 2, 2, 2))
     gravity: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    mini_batches: MiniBatches | bool | Literal["auto"] = "auto"
 
-    def __post_init__(self) -> None:
+    def __init__(
+        self,
+        geometric: Robot | GeometricCalibrator,
+        features: tuple[str, ...] = features,
+        harmonics: tuple[int, ...] = harmonics,
+        orders: tuple[tuple[int, ...], ...] = orders,
+        gravity: tuple[float, float, float] = gravity,
+        mini_batches: MiniBatches | bool | Literal["auto"] = mini_batches,
+    ) -> None:
+        """Choose what may be tried.
+
+        Args:
+            geometric: the nominal robot; or a geometric calibrator, where that needs other settings than its
+                defaults.
+            features: see above, as all others.
+            harmonics: of the Fourier series.
+            orders: of the product units.
+            gravity: direction.
+            mini_batches: whether, and how.
+
+        Raises:
+            IdentificationError: a choice does not exist.
+        """
+        if isinstance(geometric, Robot):
+            geometric = GeometricCalibrator(geometric)
+        for name, value in (
+            ("geometric", geometric),
+            ("features", features),
+            ("harmonics", harmonics),
+            ("orders", orders),
+            ("gravity", gravity),
+            ("mini_batches", mini_batches),
+        ):
+            object.__setattr__(self, name, value)
+        self._check()
+
+    def _check(self) -> None:
         """Refuse choices that do not exist."""
         for name in self.features:
             if name not in FEATURES:
@@ -81,19 +124,30 @@ class HybridCalibrator:
         self,
         measurements: Measurements,
         progress: Callable[[str], None] = lambda what: None,
-        refinement: Refinement = refine,
+        checkpoints: Path | None = None,
+        resume: bool = False,
     ) -> HybridResult:
         """Calibrate.
 
         Args:
             measurements: what was measured.
             progress: called with what is being tried.
-            refinement: fits the chosen model to all rows.
+            checkpoints: folder for checkpoints of a training on mini-batches; None keeps none.
+            resume: go on from the checkpoint there.
+
+        Returns:
+            The result. After a training on mini-batches its verdict says how near to the optimum that came.
 
         Raises:
             IdentificationError: see `GeometricCalibrator.solve`.
             PoseError: the joint values do not fit the robot.
+            TrainingError: the training diverged, or there is no checkpoint of this calibration to resume.
+            OutputError: checkpoints cannot be written.
         """
+        batches = self._batches(measurements.rows)
+        kept = None
+        if batches is not None and checkpoints is not None:
+            kept = batch_checkpoints(checkpoints, f"{self}|{measurements.content_hash()}", resume)
         solved = self.geometric.solve(measurements)
         geometric = solved.result()
         search, additive, orders = self._chosen(solved, progress)
@@ -103,7 +157,20 @@ class HybridCalibrator:
             verdict = "Nothing beyond the geometry was found in the data: the geometric calibration stands."
             return _geometric_alone(solved, search, verdict)
         progress("solving for everything")
-        refined = refinement(solved, additive, orders, self.geometric.loss)
+        loss, trained = self.geometric.loss, ""
+        if batches is None:
+            refined = refine(solved, additive, orders, loss)
+        else:
+            refined, trained = refine_in_batches(
+                solved,
+                searched_rows(solved.problem),
+                additive,
+                orders,
+                loss,
+                batches=batches,
+                progress=progress,
+                checkpoints=kept,
+            )
         if effective_share(refined.sums, refined.posterior) > LARGEST_EFFECTIVE_SHARE:
             verdict = (
                 "A joint correction would take up nearly all that the few rows tell, so the geometric calibration "
@@ -129,11 +196,18 @@ class HybridCalibrator:
         share = [trial.left_out for trial in trials if trial.kept][-1]
         verdict = (
             f"A joint correction was kept ({' + '.join(names)}): left-out rows are predicted with {share:.2f} "
-            "times the error of the geometric calibration."
+            f"times the error of the geometric calibration. {trained}".rstrip()
         )
         whole = with_held_factors(refined)
         known = position_uncertainty(whole.rows, whole.design, whole.posterior, whole.sums, geometry)
         return HybridResult(geometric, learned, known, trials, verdict)
+
+    def _batches(self, rows: int) -> MiniBatches | None:
+        """How so many rows are trained on mini-batches; None where they are not."""
+        if isinstance(self.mini_batches, MiniBatches):
+            return self.mini_batches
+        wanted = rows >= MANY_ROWS if self.mini_batches == "auto" else self.mini_batches
+        return MiniBatches() if wanted else None
 
     def _chosen(
         self, solved: SolvedCalibration, progress: Callable[[str], None]

@@ -1,6 +1,5 @@
 """Solve the chosen model on all rows: weights, linearisation and posterior in turn until they agree."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -55,10 +54,6 @@ class Refined:
         return float((1 - held).sum())
 
 
-Refinement = Callable[[SolvedCalibration, Additive, tuple[int, ...], AbstractLoss], Refined]
-"""Fits a chosen model to all rows, as `refine` does."""
-
-
 def refine(
     solved: SolvedCalibration, additive: Additive, orders: tuple[int, ...], loss: AbstractLoss
 ) -> Refined:
@@ -96,7 +91,7 @@ def refine(
     return Refined(rows, design, posterior, sums, point, correction, rounds)
 
 
-def seen_from(
+def refined_at(
     solved: SolvedCalibration, design: Design, posterior: Posterior, loss: AbstractLoss, rounds: int
 ) -> Refined:
     """All rows linearised and weighted at the most probable values of a posterior, and the posterior seen there.

@@ -12,8 +12,6 @@ from pisigma.measurement.dataset import Measurements
 
 Calibrator = GeometricCalibrator | HybridCalibrator
 Result = CalibrationResult | HybridResult
-MANY_ROWS = 100_000
-"""From so many rows on, mini-batches: the normal equations of a thousand unknowns would take minutes."""
 
 
 def geometric_of(calibrator: Calibrator) -> GeometricCalibrator:
@@ -27,20 +25,16 @@ def geometric_result(result: Result) -> CalibrationResult:
 
 
 def fit(calibrator: Calibrator, rows: Measurements, progress: Callable[[str], None]) -> Result:
-    """Calibrate; see the calibrators' `fit`. A hybrid of very many rows is trained on mini-batches.
+    """Calibrate; see the calibrators' `fit`.
 
     Args:
         calibrator: of either kind.
         rows: to calibrate with.
         progress: called with what a hybrid tries.
     """
-    if not isinstance(calibrator, HybridCalibrator):
-        return calibrator.fit(rows)
-    if rows.rows < MANY_ROWS:
-        return calibrator.fit(rows, progress)
-    from pisigma.training.mini_batches import fit_in_batches  # imports lightning, which takes seconds
-
-    return fit_in_batches(calibrator, rows, progress)
+    return (
+        calibrator.fit(rows, progress) if isinstance(calibrator, HybridCalibrator) else calibrator.fit(rows)
+    )
 
 
 def trained(

@@ -1,159 +1,192 @@
-"""Hybrid calibrations of many rows: chosen on some of them, trained on mini-batches of all."""
+"""Adam on mini-batches of a cost that somebody else computes, averaged over the last steps."""
 
-import hashlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import lightning
-from torch import Tensor
+import torch
+from jaxtyping import Float64
+from torch import Tensor, nn
 
 from pisigma.errors import TrainingError
-from pisigma.hybrid.calibrator import HybridCalibrator, searched_rows
-from pisigma.hybrid.refinement import Refined, refine, seen_from
-from pisigma.hybrid.result import HybridResult
-from pisigma.hybrid.search import Additive
-from pisigma.identification.problem.loss import AbstractLoss
-from pisigma.identification.result_assembly import SolvedCalibration
-from pisigma.measurement.dataset import Measurements
-from pisigma.training.batch_training import BatchSchedule, BatchTraining
 from pisigma.training.checkpoint_writer import CheckpointWriter
-from pisigma.training.checkpoints import discard_checkpoints, find_checkpoint, prepare_checkpoints
+from pisigma.training.checkpoints import (
+    FINGERPRINT,
+    discard_checkpoints,
+    find_checkpoint,
+    prepare_checkpoints,
+)
 from pisigma.training.trainer import train
-from pisigma.training.whitened_unknowns import WhitenedUnknowns
 
-STEPS = 300
-"""Without a number of epochs there are at least so many steps, and `FEWEST_EPOCHS`."""
-FEWEST_EPOCHS = 8
-SETTLED = 0.5
-"""[standard deviations of what all rows say] The unknowns are that near to the optimum, or more epochs are advised."""
+FINAL_RATE = 0.1
+"""The learning rate falls along a cosine to this share of what it begins with."""
+AVERAGED = 0.5
+"""The last part of the steps, over which the unknowns are averaged."""
+MOMENTA = (0.9, 0.99)
+"""Of Adam: of the gradient, and of its square."""
+
+BatchCost = Callable[[Tensor, int, int], tuple[Tensor, float]]
+"""From unknowns, number of the epoch and of the batch to the cost, which is derived by the unknowns, and the mean
+squared residual of the batch in units of the noise."""
 
 
 @dataclass(frozen=True)
-class MiniBatches:
-    """How the unknowns are trained.
+class BatchSchedule:
+    """How long and how fast.
 
     Attributes:
-        batch_rows: rows of a mini-batch.
-        epochs: how often every row is seen; None for as often as it takes.
-        learning_rate: first step of every unknown, in standard deviations of what the rows say on which the model
-            is chosen.
+        batches: of an epoch.
+        epochs: how often every row is visited.
+        learning_rate: first step of every unknown, in the unit in which the unknowns count.
         seed: of the order of the rows.
     """
 
-    batch_rows: int = 4_096
-    epochs: int | None = None
-    learning_rate: float = 0.3
-    seed: int = 0
+    batches: int
+    epochs: int
+    learning_rate: float
+    seed: int
 
-    def __post_init__(self) -> None:
-        """Refuse settings that make no sense."""
-        for name, least in (("batch_rows", 1), ("epochs", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if value is not None and (not isinstance(value, int) or value < least):
-                raise TrainingError(f"{name}={value!r}: a whole number of at least {least} was wanted.")
-        if not 0 < self.learning_rate < math.inf:
-            raise TrainingError(
-                f"learning_rate={self.learning_rate:g}: a positive number was wanted; 0.3 suits most data."
-            )
+    @property
+    def steps(self) -> int:
+        """Of the whole training."""
+        return self.batches * self.epochs
 
-    def schedule(self, rows: int) -> BatchSchedule:
-        """For so many rows."""
-        batches = math.ceil(rows / self.batch_rows)
-        epochs = self.epochs or max(FEWEST_EPOCHS, math.ceil(STEPS / batches))
-        return BatchSchedule(batches, epochs, self.learning_rate, self.seed)
+    def rate(self, step: int) -> float:
+        """Share of the learning rate at a step."""
+        done = min(step / self.steps, 1.0)
+        return FINAL_RATE + (1 - FINAL_RATE) * (1 + math.cos(math.pi * done)) / 2
 
 
-def fit_in_batches(
-    calibrator: HybridCalibrator,
-    measurements: Measurements,
-    progress: Callable[[str], None] = lambda what: None,
-    *,
-    batches: MiniBatches = MiniBatches(),
-    checkpoints: Path | None = None,
-    resume: bool = False,
-) -> HybridResult:
-    """Calibrate as `HybridCalibrator.fit` does, but train the unknowns on mini-batches.
-
-    Features, product units, prior sizes and noise come from the rows that the calibrator searches on. All unknowns
-    are then trained on all rows, whitened with what those rows say; a last pass over all rows finds how sure they
-    are.
-
-    Args:
-        calibrator: what may be chosen.
-        measurements: what was measured.
-        progress: called with what is being done.
-        batches: how the unknowns are trained.
-        checkpoints: folder for checkpoints of the training; None keeps none.
-        resume: go on from the checkpoint there.
-
-    Returns:
-        The result; its verdict says how near to the optimum the training came.
-
-    Raises:
-        IdentificationError: see `HybridCalibrator.fit`.
-        PoseError: the joint values do not fit the robot.
-        TrainingError: the training diverged, or there is no checkpoint of this calibration to resume.
-        OutputError: checkpoints cannot be written.
-    """
-    training = _Training(batches, progress, checkpoints)
-    if checkpoints is not None:
-        identity = f"{batches}|{calibrator}|{measurements.content_hash()}"
-        training.fingerprint = hashlib.sha256(identity.encode()).hexdigest()
-        training.resume = resume
-        if resume:
-            find_checkpoint(checkpoints, training.fingerprint)
-        else:
-            prepare_checkpoints(checkpoints)
-    result = calibrator.fit(measurements, progress, training)
-    if checkpoints is not None:
-        discard_checkpoints(checkpoints)
-    if result.learned is None:
-        return result
-    return replace(result, verdict=f"{result.verdict} {training.sentence}")
-
-
-class _Training:
-    """Fits a chosen model on mini-batches, in place of `pisigma.hybrid.refinement.refine`.
+@dataclass(frozen=True)
+class Checkpoints:
+    """Where checkpoints of a training are kept.
 
     Attributes:
-        fingerprint: says what calibration and data a checkpoint belongs to.
-        resume: whether to go on from a checkpoint.
-        sentence: how near to the optimum it came, in the end.
+        folder: for the checkpoints; it is removed when the training is done.
+        fingerprint: says what settings and data a checkpoint belongs to.
+        resume: go on from the checkpoint there, instead of from the start.
     """
 
+    folder: Path
+    fingerprint: str
+    resume: bool = False
+
+    def prepare(self) -> None:
+        """Make the folder; or, to resume, look for the checkpoint there.
+
+        Raises:
+            TrainingError: there is no checkpoint of these settings and data to resume.
+            OutputError: the folder cannot be written.
+        """
+        if self.resume:
+            find_checkpoint(self.folder, self.fingerprint)
+        else:
+            prepare_checkpoints(self.folder)
+
+
+def minimise_in_batches(
+    cost: BatchCost,
+    unknowns: int,
+    schedule: BatchSchedule,
+    progress: Callable[[str], None],
+    checkpoints: Checkpoints | None = None,
+) -> Float64[Tensor, " unknowns"]:
+    """Minimise a cost from 0 on; the average over the last steps (Polyak and Juditsky 1992).
+
+    Args:
+        cost: of a batch.
+        unknowns: how many.
+        schedule: how long and how fast.
+        progress: called with a sentence after every epoch.
+        checkpoints: kept on the way; None keeps none.
+
+    Raises:
+        TrainingError: the training diverged, or the checkpoint to resume is of something else.
+    """
+    module = _BatchTraining(
+        cost, unknowns, schedule, progress, checkpoints.fingerprint if checkpoints else ""
+    )
+    callbacks: list[lightning.Callback] = []
+    start = None
+    if checkpoints is not None:
+        callbacks.append(CheckpointWriter(checkpoints.folder, schedule.epochs))
+        if checkpoints.resume:
+            start, _ = find_checkpoint(checkpoints.folder, checkpoints.fingerprint)
+    train(module, range(schedule.batches), schedule.epochs, callbacks, start)
+    if checkpoints is not None:
+        discard_checkpoints(checkpoints.folder)
+    return module.average.detach()
+
+
+class _BatchTraining(lightning.LightningModule):
+    """The loop.
+
+    Attributes:
+        z: the unknowns.
+        average: mean of z over the last steps.
+        averaged: number of these steps so far.
+        misfit: mean squared residual of the epoch so far.
+    """
+
+    average: Tensor
+    averaged: Tensor
+    misfit: Tensor
+
     def __init__(
-        self, batches: MiniBatches, progress: Callable[[str], None], checkpoints: Path | None
+        self,
+        cost: BatchCost,
+        unknowns: int,
+        schedule: BatchSchedule,
+        progress: Callable[[str], None],
+        fingerprint: str,
     ) -> None:
-        self.batches, self.progress, self.checkpoints = batches, progress, checkpoints
-        self.fingerprint, self.resume, self.sentence = "", False, ""
+        super().__init__()
+        self.cost, self.schedule, self.progress, self.fingerprint = cost, schedule, progress, fingerprint
+        nothing = torch.zeros(unknowns, dtype=torch.float64)
+        self.z = nn.Parameter(nothing.clone())
+        self.register_buffer("average", nothing.clone())
+        self.register_buffer("averaged", torch.zeros((), dtype=torch.int64))
+        self.register_buffer("misfit", torch.zeros((), dtype=torch.float64))
 
-    def __call__(
-        self, solved: SolvedCalibration, additive: Additive, orders: tuple[int, ...], loss: AbstractLoss
-    ) -> Refined:
-        """See `refine`."""
-        some = replace(solved, problem=searched_rows(solved.problem))
-        unknowns = WhitenedUnknowns.around(refine(some, additive, orders, loss))
-        schedule = self.batches.schedule(solved.problem.q.shape[0])
-        module = BatchTraining(solved.problem, unknowns, schedule, self.progress, self.fingerprint)
-        callbacks: list[lightning.Callback] = []
-        checkpoint = None
-        if self.checkpoints is not None:
-            callbacks.append(CheckpointWriter(self.checkpoints, schedule.epochs))
-            if self.resume:
-                checkpoint, _ = find_checkpoint(self.checkpoints, self.fingerprint)
-        train(module, range(schedule.batches), schedule.epochs, callbacks, checkpoint)
-        design, posterior = unknowns.solution(module.solution())
-        self.progress("looking at all rows")
-        seen = seen_from(solved, replace(design, problem=solved.problem), posterior, loss, schedule.epochs)
-        return self._judged(seen, posterior.x, schedule.epochs)
+    def configure_optimizers(self) -> Any:
+        """Adam whose steps get shorter."""
+        adam = torch.optim.Adam([self.z], lr=self.schedule.learning_rate, betas=MOMENTA)
+        falling = torch.optim.lr_scheduler.LambdaLR(adam, lambda step: self.schedule.rate(step))
+        return {"optimizer": adam, "lr_scheduler": {"scheduler": falling, "interval": "step"}}
 
-    def _judged(self, seen: Refined, x: Tensor, epochs: int) -> Refined:
-        """The unknowns as trained, and a sentence on how far from the optimum they are."""
-        deviation = seen.posterior.covariance.diagonal().clamp(min=1e-300).sqrt()
-        off = float(((seen.posterior.x - x) / deviation).square().mean().sqrt())
-        self.sentence = f"Trained on mini-batches to within {off:.2g} standard deviations of the optimum."
-        if not off <= SETTLED:
-            self.sentence += f" That is not settled: give more than {epochs} epochs."
-        return replace(seen, posterior=replace(seen.posterior, x=x))
+    def training_step(self, batch: int, batch_idx: int) -> Tensor:
+        """Cost of a batch."""
+        cost, misfit = self.cost(self.z, self.current_epoch, batch)
+        self.misfit += (misfit - self.misfit) / (batch_idx + 1)
+        return cost
+
+    def on_train_batch_end(self, outputs: Any, batch: int, batch_idx: int) -> None:
+        """Average the unknowns of the last steps."""
+        step = self.current_epoch * self.schedule.batches + batch_idx + 1
+        if step > (1 - AVERAGED) * self.schedule.steps:
+            self.averaged += 1
+            self.average += (self.z.detach() - self.average) / self.averaged
+
+    def on_train_epoch_end(self) -> None:
+        """Say how far it is.
+
+        Raises:
+            TrainingError: the training diverged.
+        """
+        misfit = float(self.misfit.sqrt())
+        if not math.isfinite(misfit) or not bool(torch.isfinite(self.z).all()):
+            raise TrainingError(
+                f"the training on mini-batches diverged in epoch {self.current_epoch + 1}; lower learning_rate "
+                f"({self.schedule.learning_rate:g})."
+            )
+        self.progress(
+            f"mini-batches, epoch {self.current_epoch + 1} of {self.schedule.epochs}, residuals {misfit:.3f} times "
+            "the noise"
+        )
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Say what the checkpoint belongs to."""
+        checkpoint[FINGERPRINT] = self.fingerprint

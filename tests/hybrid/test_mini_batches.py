@@ -14,12 +14,11 @@ from testing.models import no_type_checker
 
 from pisigma.errors import TrainingError
 from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.hybrid.mini_batches import BatchRows, MiniBatches
 from pisigma.hybrid.result import HybridResult
-from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.training.batch_training import BatchRows, BatchSchedule
-from pisigma.training.mini_batches import MiniBatches, fit_in_batches
+from pisigma.training.mini_batches import BatchSchedule
 
 SETTINGS = MiniBatches(batch_rows=1_000, epochs=10)
 ROWS = 5_000
@@ -52,24 +51,28 @@ def data() -> tuple[Measurements, Measurements]:
 
 
 @functools.cache
-def calibrator(orders: tuple[tuple[int, ...], ...]) -> HybridCalibrator:
+def calibrator(
+    orders: tuple[tuple[int, ...], ...], mini_batches: MiniBatches | bool | str = SETTINGS
+) -> HybridCalibrator:
     """That tries one series, and product units."""
-    geometric = GeometricCalibrator(Robot.load("rb5"))
-    return HybridCalibrator(geometric, features=("series",), harmonics=(4,), orders=orders)
+    robot = Robot.load("rb5")
+    return HybridCalibrator(
+        robot, features=("series",), harmonics=(4,), orders=orders, mini_batches=mini_batches
+    )
 
 
 @functools.cache
 def exact(orders: tuple[tuple[int, ...], ...]) -> HybridResult:
     """Fitted with the normal equations of all rows."""
     with no_type_checker():
-        return calibrator(orders).fit(data()[0])
+        return calibrator(orders, False).fit(data()[0])
 
 
 @functools.cache
 def trained(orders: tuple[tuple[int, ...], ...]) -> HybridResult:
     """The same on mini-batches."""
     with no_type_checker():
-        return fit_in_batches(calibrator(orders), data()[0], batches=SETTINGS)
+        return calibrator(orders).fit(data()[0])
 
 
 def rms(result: HybridResult) -> float:
@@ -105,16 +108,15 @@ def test_the_verdict_says_how_near_to_the_optimum_it_came():
     assert "to within 0." in trained(()).verdict
     assert "more than" not in trained(()).verdict
     with no_type_checker():
-        short = fit_in_batches(
-            calibrator(()), data()[0], batches=MiniBatches(batch_rows=ROWS, epochs=1, learning_rate=1e-3)
-        )
+        settings = MiniBatches(batch_rows=ROWS, epochs=1, learning_rate=1e-3)
+        short = calibrator((), settings).fit(data()[0])
     assert "give more than 1 epochs" in short.verdict
 
 
 def test_a_seed_repeats_exactly_and_another_differs():
     with no_type_checker():
-        again = fit_in_batches(calibrator(()), data()[0], batches=SETTINGS)
-        other = fit_in_batches(calibrator(()), data()[0], batches=dataclasses.replace(SETTINGS, seed=1))
+        again = calibrator(()).fit(data()[0])
+        other = calibrator((), dataclasses.replace(SETTINGS, seed=1)).fit(data()[0])
     poses = trained(()).predicted_poses(data()[1])
     assert_close(again.predicted_poses(data()[1]), poses, atol=0)
     assert float((other.predicted_poses(data()[1]) - poses).abs().max()) > 1e-9
@@ -127,11 +129,9 @@ def test_an_interrupted_training_goes_on_where_it_was(tmp_path: Path):
 
     with no_type_checker():
         with pytest.raises(InterruptedError):
-            fit_in_batches(calibrator(()), data()[0], interrupt, batches=SETTINGS, checkpoints=tmp_path)
+            calibrator(()).fit(data()[0], interrupt, checkpoints=tmp_path)
         epochs: list[str] = []
-        resumed = fit_in_batches(
-            calibrator(()), data()[0], epochs.append, batches=SETTINGS, checkpoints=tmp_path, resume=True
-        )
+        resumed = calibrator(()).fit(data()[0], epochs.append, checkpoints=tmp_path, resume=True)
     assert not any("epoch 3 " in what for what in epochs)
     assert any("epoch 6 " in what for what in epochs)
     assert_close(resumed.predicted_poses(data()[1]), trained(()).predicted_poses(data()[1]), atol=0)
@@ -139,7 +139,7 @@ def test_an_interrupted_training_goes_on_where_it_was(tmp_path: Path):
 
 def test_a_checkpoint_of_other_settings_is_refused(tmp_path: Path):
     with pytest.raises(TrainingError, match="without --resume"):
-        fit_in_batches(calibrator(()), data()[0], batches=SETTINGS, checkpoints=tmp_path, resume=True)
+        calibrator(()).fit(data()[0], checkpoints=tmp_path, resume=True)
 
 
 @pytest.mark.parametrize(
@@ -180,4 +180,14 @@ def test_an_epoch_counts_all_rows_equally_and_keeps_pairs_together():
 
 def test_a_training_that_diverges_says_so():
     with no_type_checker(), pytest.raises(TrainingError, match="diverged in epoch 1; lower learning_rate"):
-        fit_in_batches(calibrator(()), data()[0], batches=dataclasses.replace(SETTINGS, learning_rate=1e200))
+        calibrator((), dataclasses.replace(SETTINGS, learning_rate=1e200)).fit(data()[0])
+
+
+def test_very_many_rows_are_trained_on_mini_batches(monkeypatch):
+    monkeypatch.setattr("pisigma.hybrid.calibrator.MANY_ROWS", ROWS)
+    with no_type_checker():
+        automatic = calibrator((), "auto")
+        assert automatic._batches(ROWS) == MiniBatches()
+        assert automatic._batches(ROWS - 1) is None
+        assert calibrator((), True)._batches(1) == MiniBatches()
+        assert calibrator((), False)._batches(ROWS) is None

@@ -25,7 +25,7 @@ class WhitenedUnknowns:
 
     Attributes:
         design: of the few rows.
-        found: their posterior, whose prior sizes and noise stand.
+        posterior: of their unknowns, whose prior sizes and noise stand.
         held: choices of free factors, that of `design` first; none without product units.
         start: x where z is 0.
         root: root of the covariance of x.
@@ -34,7 +34,7 @@ class WhitenedUnknowns:
     """
 
     design: Design
-    found: Posterior
+    posterior: Posterior
     held: tuple[HeldProducts, ...]
     start: Float64[Tensor, " unknowns"]
     root: Float64[Tensor, "unknowns unknowns"]
@@ -50,7 +50,7 @@ class WhitenedUnknowns:
         extra = len(covariance) - few.design.unknowns
         return WhitenedUnknowns(
             design=few.design,
-            found=few.posterior,
+            posterior=few.posterior,
             held=tuple(chosen for chosen in whole.design.features if isinstance(chosen, HeldProducts)),
             start=torch.cat([few.posterior.x, few.posterior.x.new_zeros(extra)]),
             root=covariance_root(covariance, change),
@@ -93,7 +93,7 @@ class WhitenedUnknowns:
         """Design and posterior with these unknowns as the most probable values, held factors of length 1."""
         x = x.detach()
         if not self.held:
-            return self.design, replace(self.found, x=x)
+            return self.design, replace(self.posterior, x=x)
         first, factors = self.held[0], self.factors(x)
         length, unit = factors.norm(dim=-1), normalised(factors)
         free, start = [], 0
@@ -105,7 +105,7 @@ class WhitenedUnknowns:
         weights = x[: self.design.stretch(len(self._additive)).start]
         x = torch.cat([weights, torch.stack(free, 1).flatten()])
         design = replace(self.design, features=(*self._additive, held))
-        return design, replace(self.found, x=x)
+        return design, replace(self.posterior, x=x)
 
     @property
     def _additive(self) -> tuple[AbstractFeatures, ...]:

@@ -1,0 +1,226 @@
+"""Hybrid calibrations of very many rows: the unknowns of the chosen model trained on mini-batches of all rows."""
+
+import hashlib
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.errors import TrainingError
+from pisigma.hybrid.refinement import Refined, refine, refined_at
+from pisigma.hybrid.search import Additive
+from pisigma.hybrid.sensor_values import SensorValues, sensor_values
+from pisigma.hybrid.whitened_unknowns import WhitenedUnknowns
+from pisigma.identification.problem.loss import AbstractLoss
+from pisigma.identification.problem.problem import CalibrationProblem
+from pisigma.identification.result_assembly import SolvedCalibration
+
+if TYPE_CHECKING:
+    from pisigma.training.mini_batches import BatchSchedule, Checkpoints
+
+MANY_ROWS = 100_000
+"""From so many rows on, mini-batches: the normal equations of a thousand unknowns would take minutes."""
+STEPS = 300
+"""Without a number of epochs there are at least so many steps, and `FEWEST_EPOCHS`."""
+FEWEST_EPOCHS = 8
+SETTLED = 0.5
+"""[standard deviations of what all rows say] The unknowns are that near to the optimum, or more epochs are advised."""
+
+
+@dataclass(frozen=True)
+class MiniBatches:
+    """How the unknowns are trained.
+
+    Attributes:
+        batch_rows: rows of a mini-batch.
+        epochs: how often every row is visited; None for as often as it takes.
+        learning_rate: first step of every unknown, in standard deviations of what the rows say on which the model
+            is chosen.
+        seed: of the order of the rows.
+    """
+
+    batch_rows: int = 4_096
+    epochs: int | None = None
+    learning_rate: float = 0.3
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Refuse settings that make no sense."""
+        for name, least in (("batch_rows", 1), ("epochs", 1), ("seed", 0)):
+            value = getattr(self, name)
+            if value is not None and (not isinstance(value, int) or value < least):
+                raise TrainingError(f"{name}={value!r}: a whole number of at least {least} was wanted.")
+        if not 0 < self.learning_rate < math.inf:
+            raise TrainingError(
+                f"learning_rate={self.learning_rate:g}: a positive number was wanted; 0.3 suits most data."
+            )
+
+    def schedule(self, rows: int) -> "BatchSchedule":
+        """For so many rows."""
+        from pisigma.training.mini_batches import BatchSchedule  # imports lightning, which takes seconds
+
+        batches = math.ceil(rows / self.batch_rows)
+        epochs = self.epochs or max(FEWEST_EPOCHS, math.ceil(STEPS / batches))
+        return BatchSchedule(batches, epochs, self.learning_rate, self.seed)
+
+
+def batch_checkpoints(folder: Path, identity: str, resume: bool) -> "Checkpoints":
+    """Checkpoints of a training, in a folder that is ready for them.
+
+    Args:
+        folder: for the checkpoints.
+        identity: all settings and data, in words.
+        resume: go on from the checkpoint there.
+
+    Raises:
+        TrainingError: there is no checkpoint of these settings and data to resume.
+        OutputError: the folder cannot be written.
+    """
+    from pisigma.training.mini_batches import Checkpoints
+
+    checkpoints = Checkpoints(folder, hashlib.sha256(identity.encode()).hexdigest(), resume)
+    checkpoints.prepare()
+    return checkpoints
+
+
+def refine_in_batches(
+    solved: SolvedCalibration,
+    searched: CalibrationProblem,
+    additive: Additive,
+    orders: tuple[int, ...],
+    loss: AbstractLoss,
+    *,
+    batches: MiniBatches,
+    progress: Callable[[str], None],
+    checkpoints: "Checkpoints | None" = None,
+) -> tuple[Refined, str]:
+    """Fit a chosen model as `pisigma.hybrid.refinement.refine` does, but on mini-batches.
+
+    Prior sizes and noise come from the rows that were searched on. All unknowns are then trained on all rows,
+    whitened with what those rows say; a last pass over all rows finds how sure they are.
+
+    Args:
+        solved: the geometric calibration, where it starts.
+        searched: the problem with the rows on which the model was chosen.
+        additive: the chosen unit of order 1, as fitted in the search.
+        orders: of the chosen product units.
+        loss: how far-off rows count.
+        batches: how the unknowns are trained.
+        progress: called with what is being done.
+        checkpoints: kept on the way; None keeps none.
+
+    Returns:
+        The solved hybrid, and a sentence on how near to the optimum the training came.
+
+    Raises:
+        TrainingError: the training diverged, or the checkpoint to resume is of something else.
+    """
+    from pisigma.training.mini_batches import minimise_in_batches
+
+    unknowns = WhitenedUnknowns.around(refine(replace(solved, problem=searched), additive, orders, loss))
+    schedule = batches.schedule(solved.problem.q.shape[0])
+    cost = HybridBatchCost(solved.problem, unknowns, schedule)
+    z = minimise_in_batches(cost, len(unknowns.start), schedule, progress, checkpoints)
+    design, posterior = unknowns.solution(unknowns.values(z.to(solved.problem.q)))
+    progress("looking at all rows")
+    refined = refined_at(solved, replace(design, problem=solved.problem), posterior, loss, schedule.epochs)
+    deviation = refined.posterior.covariance.diagonal().clamp(min=1e-300).sqrt()
+    off = float(((refined.posterior.x - posterior.x) / deviation).square().mean().sqrt())
+    sentence = f"Trained on mini-batches to within {off:.2g} standard deviations of the optimum."
+    if not off <= SETTLED:
+        sentence += f" That is not settled: give more than {schedule.epochs} epochs."
+    return replace(refined, posterior=replace(refined.posterior, x=posterior.x)), sentence
+
+
+class BatchRows:
+    """Divides the rows into batches, in another order every epoch.
+
+    Rows of a pair stay together. Rows of sensors that are certain are in every batch: they are few and hold the
+    scale.
+    """
+
+    def __init__(self, problem: CalibrationProblem, schedule: "BatchSchedule") -> None:
+        """Look which rows go together."""
+        rows, pairs = problem.q.shape[0], problem.pairs
+        unit = torch.arange(rows)
+        unit[: 2 * pairs] //= 2
+        unit[2 * pairs :] -= pairs
+        always = torch.zeros(rows, dtype=torch.bool)
+        for sensor in problem.sensors:
+            if sensor.certain:
+                always |= sensor.seen.cpu()
+        self._unit, self._always, self._schedule = unit, always, schedule
+        self._epoch, self._batch_of_unit = -1, unit
+
+    def of(self, epoch: int, batch: int) -> tuple[Int64[Tensor, " chosen"], Float64[Tensor, " chosen"]]:
+        """Rows of a batch in ascending order, and how often each counts; an epoch adds up to `batches` times all."""
+        if epoch != self._epoch:
+            generator = torch.Generator().manual_seed(self._schedule.seed + epoch)
+            units = int(self._unit[-1]) + 1
+            self._batch_of_unit = torch.randperm(units, generator=generator) % self._schedule.batches
+            self._epoch = epoch
+        rows = ((self._batch_of_unit[self._unit] == batch) | self._always).nonzero()[:, 0]
+        return rows, torch.where(self._always[rows], 1.0, float(self._schedule.batches)).double()
+
+
+class HybridBatchCost:
+    """What a batch costs at whitened unknowns: about `|z|² / 2`.
+
+    It is the cost of all rows and of the prior as the batch shows it, divided by how many times more rows there are
+    than the unknowns were whitened with. Residuals and their derivatives by geometry and joint values come in closed
+    form from the kinematics, those of the network by backpropagation.
+    """
+
+    def __init__(
+        self, problem: CalibrationProblem, unknowns: WhitenedUnknowns, schedule: "BatchSchedule"
+    ) -> None:
+        """Prepare.
+
+        Args:
+            problem: all rows.
+            unknowns: whitened with some of the rows.
+            schedule: how many batches, in which order.
+        """
+        self._problem, self._unknowns = problem, unknowns
+        self._rows = BatchRows(problem, schedule)
+        self._share = unknowns.design.problem.q.shape[0] / problem.q.shape[0]
+
+    def __call__(self, z: Float64[Tensor, " unknowns"], epoch: int, batch: int) -> tuple[Tensor, float]:
+        """Cost whose derivative is that of the batch's rows and the prior, and the mean squared residual."""
+        rows, counts = self._rows.of(epoch, batch)
+        few = self._problem.select(rows.to(self._problem.q.device))
+        active, counts = len(few.active), counts.to(few.q)
+        x = self._unknowns.values(z.to(few.q))
+        delta = self._unknowns.shift(x, few.state)
+        cost = 0.5 * (self._unknowns.precision * x.square()).sum()
+        point = few.nominal.index_add(0, few.active, x.detach()[:active])
+        values = sensor_values(few, point, partial(_whatever_the_state, delta.detach()))
+        square, count = 0.0, 0.0
+        for number, sensor in enumerate(values):
+            root = self._root(few, number, sensor) * counts[sensor.row].sqrt()
+            force = sensor.residual * root[:, None].square()
+            moved = sensor.geometry @ x[:active]
+            moved = moved + torch.einsum("rcj,rj->rc", sensor.joints, delta[sensor.row])
+            if sensor.other_row is not None and sensor.other_joints is not None:
+                moved = moved + torch.einsum("rcj,rj->rc", sensor.other_joints, delta[sensor.other_row])
+            cost = cost - (force * moved).sum()
+            square += float((force * sensor.residual).sum())
+            count += float(counts[sensor.row].sum()) * sensor.components
+        return self._share * cost, square / count
+
+    def _root(self, few: CalibrationProblem, number: int, sensor: SensorValues) -> Float64[Tensor, " seen"]:
+        """Root of every row's weight over its variance."""
+        root = sensor.root / self._unknowns.posterior.noise[number]
+        distance = sensor.residual.norm(dim=1) * root
+        loss = few.loss_of(few.sensors[number])
+        return root * loss.weight(distance, sensor.components).sqrt()
+
+
+def _whatever_the_state(delta: Tensor, state: object) -> Tensor:
+    return delta
