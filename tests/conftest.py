@@ -1,4 +1,4 @@
-"""Fixtures for all tests, and the folder of test support on the import path."""
+"""Fixtures for all tests, and the folders of test support and of the papers on the import path."""
 
 import os
 import sys
@@ -12,6 +12,7 @@ import pytest
 import torch
 
 sys.path.insert(0, str(Path(__file__).parent))
+sys.path.append(str(Path(__file__).parent.parent / "training" / "papers"))
 
 from testing.models import no_type_checker
 

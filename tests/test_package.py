@@ -42,7 +42,6 @@ LAYERS = (
     "verification",
     "recipes",
     "reporting",
-    "studies",
     "workflow",
     "cli",
 )
@@ -57,7 +56,6 @@ NOT_YET = (
     ("reporting/distilled_card.py", "pisigma.workflow.distillation"),
     ("reporting/distilled_report.py", "pisigma.workflow.distillation"),
     ("reporting/distilled_report.py", "pisigma.workflow.solved_poses"),
-    ("reporting/training_course.py", "pisigma.workflow.run"),
     ("reporting/training_report.py", "pisigma.workflow.run"),
     ("training/patterns.py", "pisigma.recipes.recipe"),
     ("verification/verification.py", "pisigma.reporting.comparison_report"),

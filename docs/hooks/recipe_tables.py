@@ -15,12 +15,11 @@ from pydantic_core import PydanticUndefined
 
 from pisigma.recipes.geometric_recipe import GeometricRecipe
 from pisigma.recipes.hybrid_recipe import HybridRecipe
-from pisigma.recipes.jig_recipe import JigRecipe
 from pisigma.recipes.recipe import Recipe
 
 PAGE = Path(__file__).parent.parent / "reference" / "recipes.md"
 BEGIN, END = "<!-- begin: keys -->", "<!-- end: keys -->"
-KINDS = (Recipe, GeometricRecipe, HybridRecipe, JigRecipe)
+KINDS = (Recipe, GeometricRecipe, HybridRecipe)
 
 _PLAIN = {
     float: "number",

@@ -30,14 +30,9 @@ def train(
     started = time.perf_counter()
     from pisigma.recipes.geometric_recipe import GeometricRecipe
     from pisigma.recipes.hybrid_recipe import HybridRecipe
-    from pisigma.recipes.jig_recipe import JigRecipe
     from pisigma.recipes.recipe_kinds import read_any_recipe
 
     stated = read_any_recipe(recipe)
-    if isinstance(stated, JigRecipe):
-        from pisigma.cli.train_jigs import train_jigs
-
-        return train_jigs(stated, recipe, data, out, resume, as_json)
     if isinstance(stated, GeometricRecipe):
         from pisigma.cli.train_geometric import train_geometric
 
@@ -52,7 +47,6 @@ def train(
     from pisigma.recipes.recipe import recipe_hash
     from pisigma.recipes.recipe_data import load_measurements, split_sets
     from pisigma.reporting.card import write_card
-    from pisigma.reporting.training_course import report_course
     from pisigma.reporting.training_report import report_training
     from pisigma.training.checkpoints import checkpoint_folder, discard_checkpoints
     from pisigma.workflow.run import RunOptions, train_recipe
@@ -70,7 +64,7 @@ def train(
     discard_checkpoints(checkpoints)
     result = {"model": str(folder), "seconds": round(time.perf_counter() - started, 3), **report}
     if as_json:
-        print_json(result | report_course(stated, run))
+        print_json(result)
     else:
         _print_report(result)
 

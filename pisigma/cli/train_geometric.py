@@ -44,7 +44,6 @@ def train_geometric(
     from pisigma.recipes.recipe_data import simulate_held_out, simulate_training
     from pisigma.reporting.calibration_card import write_calibration_card
     from pisigma.reporting.calibration_report import report_calibration
-    from pisigma.reporting.elimination_cases import report_correlations, report_eliminations
     from pisigma.robot.description import Robot
 
     if data is not None or resume:
@@ -72,12 +71,10 @@ def train_geometric(
     with staged_folder(folder) as scratch:
         save_model(replace(model, metrics=report), scratch)
         write_calibration_card(model, result, rows, None, report, texts, scratch)
-    comparison = {**report_eliminations(stated, result, rows, held_out), **report_correlations(result)}
     finished = {
         "model": str(folder),
         "seconds": round(time.perf_counter() - started, 3),
         **report,
-        **comparison,
     }
     if as_json:
         print_json(finished)

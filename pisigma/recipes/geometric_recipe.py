@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt
@@ -11,7 +10,7 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import HampelLoss, SquaredLoss
-from pisigma.identification.problem.parameters import ParameterSpace, Prior
+from pisigma.identification.problem.parameters import Prior
 from pisigma.identification.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
@@ -85,8 +84,6 @@ class GeometricRecipe(Section):
         measurements: what is measured for the calibration.
         held_out: what the calibration is judged on and never sees.
         calibration: settings of the calibrator.
-        elimination_cases: lists of parameters of the arm; the report calibrates without each, and without leaving out
-            any, to compare.
         paper: published figures to stand beside ours, by name.
     """
 
@@ -99,7 +96,6 @@ class GeometricRecipe(Section):
     measurements: SimulatedMeasurements
     held_out: SimulatedMeasurements
     calibration: CalibrationSection = CalibrationSection()
-    elimination_cases: tuple[tuple[str, ...], ...] = ()
     paper: dict[str, float | int | str | list[str] | list[list[str]]] = Field(default_factory=dict)
 
     def calibrate(self, measurements: Measurements) -> CalibrationResult:
@@ -109,19 +105,6 @@ class GeometricRecipe(Section):
             IdentificationError: the rows do not determine what is asked for.
         """
         return self.calibration.calibrator(Robot.load(self.robot)).fit(measurements)
-
-    def calibrate_without(self, removed: Sequence[str], measurements: Measurements) -> CalibrationResult:
-        """Calibrate all parameters of the arm but those removed, however redundant the others are.
-
-        Raises:
-            IdentificationError: the rows do not determine what is asked for.
-        """
-        robot = Robot.load(self.robot)
-        space = ParameterSpace(robot, (self.measurements.frame,), ("",))
-        arm = [parameter.name for parameter in space.parameters[: space.arm_size]]
-        calibrator = self.calibration.calibrator(robot)
-        free = tuple(name for name in arm if name not in removed)
-        return replace(calibrator, free=free, elimination="none").fit(measurements)
 
 
 def calibration_section(free: str, prior_mm: float, prior_mrad: float, robust: bool) -> CalibrationSection:

@@ -70,17 +70,6 @@ def geometric_checks(recipe: "GeometricRecipe", robot: Robot) -> Iterator[Check]
     calibrator = recipe.calibration.calibrator(robot)
     space = ParameterSpace(robot, (recipe.measurements.frame,), ("",))
     yield ("calibration", "free"), partial(calibrator.candidates, space)
-    for index, removed in enumerate(recipe.elimination_cases):
-        yield ("elimination_cases", index), partial(_check_parameters, removed, space)
-
-
-def _check_parameters(names: Sequence[str], space: ParameterSpace) -> None:
-    valid = [parameter.name for parameter in space.parameters[: space.arm_size]]
-    for name in names:
-        if name not in valid:
-            raise RecipeError(
-                f"there is no parameter '{name}' of the arm to leave out; {nearest_choice(name, valid)}"
-            )
 
 
 def _check_frames(calibrated: str, judged: str) -> None:

@@ -10,7 +10,6 @@ from pisigma.measurement.joining import join
 from pisigma.measurement.splits import TrainTest
 from pisigma.recipes.geometric_recipe import GeometricRecipe
 from pisigma.recipes.hybrid_recipe import HybridRecipe, repeated
-from pisigma.recipes.jig_recipe import JigRecipe
 from pisigma.recipes.recipe import Recipe, SimulatedData
 from pisigma.robot.description import Robot
 from pisigma.simulation.true_robot import TrueRobot
@@ -56,26 +55,22 @@ def load_measurements(recipe: Recipe | HybridRecipe, data: Path | None) -> Measu
     return Measurements.read_csv(data, robot)
 
 
-def simulate_training(recipe: Recipe | GeometricRecipe | HybridRecipe | JigRecipe) -> Measurements:
-    """Measure the training rows of a recipe on its true robot; with jigs, the touches of the first seed.
+def simulate_training(recipe: Recipe | GeometricRecipe | HybridRecipe) -> Measurements:
+    """Measure the training rows of a recipe on its true robot.
 
     Raises:
         RecipeError: the recipe is for measured data.
     """
-    if isinstance(recipe, JigRecipe):
-        return recipe.measure(recipe.draw_touches(0), 0)
     section = recipe.measurements if isinstance(recipe, GeometricRecipe) else simulated_data(recipe).training
     return section.measure(_true_robot(recipe))
 
 
-def simulate_held_out(recipe: Recipe | GeometricRecipe | HybridRecipe | JigRecipe) -> Measurements:
+def simulate_held_out(recipe: Recipe | GeometricRecipe | HybridRecipe) -> Measurements:
     """Measure the held-out rows of a recipe on its true robot.
 
     Raises:
-        RecipeError: the recipe is for measured data, or has no held-out rows.
+        RecipeError: the recipe is for measured data.
     """
-    if isinstance(recipe, JigRecipe):
-        raise RecipeError(f"recipe '{recipe.name}' has no held-out rows; leave --held-out out.")
     section = recipe.held_out if isinstance(recipe, GeometricRecipe) else simulated_data(recipe).held_out
     return section.measure(_true_robot(recipe))
 

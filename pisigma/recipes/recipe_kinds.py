@@ -10,17 +10,16 @@ from pydantic import ConfigDict
 from pisigma.errors import RecipeError
 from pisigma.recipes.geometric_recipe import GeometricRecipe
 from pisigma.recipes.hybrid_recipe import HybridRecipe, hybrid_checks
-from pisigma.recipes.jig_recipe import JigRecipe
 from pisigma.recipes.recipe import Recipe, read_recipe
 from pisigma.recipes.recipe_checks import check_fit, geometric_checks
 from pisigma.yaml_file import Section, read_yaml
 
-AnyRecipe = Recipe | GeometricRecipe | HybridRecipe | JigRecipe
+AnyRecipe = Recipe | GeometricRecipe | HybridRecipe
 
 
 class _KindOnly(Section):
     model_config = ConfigDict(extra="ignore")
-    kind: Literal["inverse_calibration", "geometric_calibration", "hybrid_calibration", "jig_calibration"] = (
+    kind: Literal["inverse_calibration", "geometric_calibration", "hybrid_calibration"] = (
         "inverse_calibration"
     )
 
@@ -36,7 +35,6 @@ def read_any_recipe(path: str | os.PathLike[str]) -> AnyRecipe:
         "inverse_calibration": read_recipe,
         "geometric_calibration": read_geometric_recipe,
         "hybrid_calibration": read_hybrid_recipe,
-        "jig_calibration": read_jig_recipe,
     }
     return readers[read_yaml(path, _KindOnly, RecipeError).kind](path)
 
@@ -63,12 +61,3 @@ def read_hybrid_recipe(path: str | os.PathLike[str]) -> HybridRecipe:
     recipe = read_yaml(path, HybridRecipe, RecipeError)
     check_fit(path, recipe.robot, partial(hybrid_checks, recipe))
     return recipe
-
-
-def read_jig_recipe(path: str | os.PathLike[str]) -> JigRecipe:
-    """Read a recipe of a robot that touches jigs.
-
-    Raises:
-        RecipeError: the file cannot be read or does not fit; the message names file, line and key.
-    """
-    return read_yaml(path, JigRecipe, RecipeError)

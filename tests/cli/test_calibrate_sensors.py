@@ -3,11 +3,21 @@
 import json
 
 import pytest
+from testing.models import no_type_checker
+
+from command import write_touches
 
 
-def test_touches_on_jigs(run, repository, tmp_path):
-    touches = tmp_path / "touches.csv"
-    assert run("simulate", repository / "training" / "jigs.yaml", "--out", touches).exit_code == 0
+@pytest.fixture(scope="module")
+def touches(repository, tmp_path_factory):
+    """Simulated touches of a welding robot on two jigs."""
+    file = tmp_path_factory.mktemp("touches") / "touches.csv"
+    with no_type_checker():
+        write_touches(repository / "training", file)
+    return file
+
+
+def test_touches_on_jigs(run, touches, tmp_path):
     result = run(
         "calibrate",
         "welding",
@@ -66,9 +76,7 @@ def test_placements_of_a_real_panda_left_out_in_turn(run, shared_data, tmp_path)
     assert "The known distance of held-out sockets (6 of them) is met to 0.0" in card
 
 
-def test_jigs_held_out_in_turn(run, repository, tmp_path):
-    touches = tmp_path / "touches.csv"
-    assert run("simulate", repository / "training" / "jigs.yaml", "--out", touches).exit_code == 0
+def test_jigs_held_out_in_turn(run, touches, tmp_path):
     result = run(
         "calibrate",
         "welding",

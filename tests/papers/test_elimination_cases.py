@@ -5,10 +5,11 @@ import json
 import pytest
 from testing.closeness import assert_close
 
+from elimination_cases import report_correlations, report_eliminations
 from pisigma.errors import RecipeError
 from pisigma.recipes.recipe_data import simulate_held_out, simulate_training
 from pisigma.recipes.recipe_kinds import read_geometric_recipe
-from pisigma.reporting.elimination_cases import report_correlations, report_eliminations
+from published import read_published
 
 
 @pytest.fixture(scope="module")
@@ -22,14 +23,14 @@ def calibrated(recipe):
     return recipe.calibrate(rows), rows
 
 
-def test_every_case_predicts_the_same_and_keeps_the_sums(recipe, calibrated):
+def test_every_case_predicts_the_same_and_keeps_the_sums(repository, recipe, calibrated):
     result, rows = calibrated
-    two = recipe.model_copy(update={"elimination_cases": recipe.elimination_cases[:2]})
-    report = report_eliminations(two, result, rows, simulate_held_out(recipe))
+    two = read_published(repository / "training").redundant_sums["rb5"].cases[:2]
+    report = report_eliminations(recipe, two, result, rows, simulate_held_out(recipe))
     json.dumps(report, allow_nan=False)
     first, second, none = report["elimination_cases"]
     assert [case["parameters"] for case in (first, second, none)] == [28, 28, 35]
-    assert [case["removed"] for case in (first, second, none)] == [*map(list, two.elimination_cases), []]
+    assert [case["removed"] for case in (first, second, none)] == [*map(list, two), []]
     for case in (first, second, none):
         assert case["held_out_rms_mm"] < 1e-9
         assert_close(case["rmse_mm"][0], result.rms_path[0] * 1e3, rtol=1e-12)
@@ -38,12 +39,6 @@ def test_every_case_predicts_the_same_and_keeps_the_sums(recipe, calibrated):
     assert first["values"]["d_3"] == 0
     assert second["values"]["d_4"] == pytest.approx(110.7)
     assert_close(report["true_values"]["d_6"] - 94.7, 0.0, atol=1.0)
-
-
-def test_a_recipe_without_cases_reports_none(recipe, calibrated):
-    result, rows = calibrated
-    without = recipe.model_copy(update={"elimination_cases": ()})
-    assert report_eliminations(without, result, rows, rows) == {}
 
 
 def test_correlations_are_json_with_none_where_there_is_no_effect(recipe, calibrated):
@@ -56,10 +51,6 @@ def test_correlations_are_json_with_none_where_there_is_no_effect(recipe, calibr
         assert set(angles["values"][place[name]]) == {None}
 
 
-def test_a_case_that_names_no_parameter_is_refused(repository, tmp_path):
-    text = (repository / "training" / "rb5_redundancy.yaml").read_text(encoding="utf-8")
-    (tmp_path / "r.yaml").write_text(text.replace("[a_6, d_2, d_3,", "[a_6, d_2, d_33,", 1))
-    with pytest.raises(
-        RecipeError, match=r"line 2\d.*there is no parameter 'd_33' of the arm.*did you mean 'd_3'"
-    ):
-        read_geometric_recipe(tmp_path / "r.yaml")
+def test_a_case_that_names_no_parameter_is_refused(recipe, calibrated):
+    with pytest.raises(RecipeError, match=r"there is no parameter 'd_33' of the arm.*did you mean 'd_3'"):
+        report_eliminations(recipe, [["d_33"]], *calibrated, calibrated[1])

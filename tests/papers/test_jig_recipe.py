@@ -6,20 +6,22 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.errors import IdentificationError, RecipeError
-from pisigma.recipes.jig_recipe import (
+from jig_recipe import (
+    JIGS,
     JigRecipe,
     calibrate_on,
     nominal_calibration,
+    read_jig_recipe,
 )
-from pisigma.recipes.recipe_kinds import read_any_recipe, read_jig_recipe
+from pisigma.errors import IdentificationError, RecipeError
+from pisigma.recipes.recipe_kinds import read_any_recipe
 from pisigma.se3 import wrap_to_pi
 from pisigma.simulation import JigPlacement
 
 
 @pytest.fixture(scope="module")
 def recipe(repository) -> JigRecipe:
-    return read_jig_recipe(repository / "training" / "jigs.yaml")
+    return read_jig_recipe(repository / "training" / JIGS)
 
 
 def small(recipe: JigRecipe, **changes: object) -> JigRecipe:
@@ -27,9 +29,9 @@ def small(recipe: JigRecipe, **changes: object) -> JigRecipe:
     return recipe.model_copy(update={"touches": touches} | changes)
 
 
-def test_it_is_of_its_own_kind(repository):
-    assert isinstance(read_any_recipe(repository / "training" / "jigs.yaml"), JigRecipe)
-    assert not isinstance(read_any_recipe(repository / "training" / "kiro3.yaml"), JigRecipe)
+def test_the_product_does_not_train_it(repository):
+    with pytest.raises(RecipeError, match=r"'kind' cannot be 'jig_calibration'"):
+        read_any_recipe(repository / "training" / JIGS)
 
 
 def test_the_true_robot_has_the_papers_values(recipe):
@@ -121,7 +123,7 @@ def test_touches_on_no_jig_are_refused(recipe):
     ],
 )
 def test_recipes_that_do_not_fit_are_refused(repository, tmp_path, old, new, message):
-    text = (repository / "training" / "jigs.yaml").read_text(encoding="utf-8")
+    text = (repository / "training" / JIGS).read_text(encoding="utf-8")
     assert old in text
     path = tmp_path / "jigs.yaml"
     path.write_text(text.replace(old, new, 1), encoding="utf-8")

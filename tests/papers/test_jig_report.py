@@ -7,31 +7,29 @@ import pytest
 import torch
 from testing.closeness import assert_close
 from testing.models import no_type_checker
-from typer.testing import CliRunner
 
 import pisigma
-from pisigma.cli.main import app
+from jig_accuracy import Bench, deviation, measure_accuracy, rms
+from jig_recipe import JIGS, JigCalibration, calibrate_on, nominal_calibration, read_jig_recipe
+from jig_report import FIGURES, run_jigs, seed_figures
+from jig_run import run_jigs_recipe
+from jig_tables import all_tables
 from pisigma.errors import RecipeError
-from pisigma.recipes.jig_recipe import JigCalibration, calibrate_on, nominal_calibration
-from pisigma.recipes.recipe_kinds import read_jig_recipe
 from pisigma.se3 import rotation_from_rpy
-from pisigma.studies.jig_accuracy import Bench, deviation, measure_accuracy, rms
-from pisigma.studies.jig_report import FIGURES, run_jigs, seed_figures
-from pisigma.studies.jig_tables import all_tables
 
 PICTURES = ("touches.png", "errors.png", "straight_lines.png", "seeds.png")
 
 
 @pytest.fixture(scope="module")
 def recipe(repository):
-    return read_jig_recipe(repository / "training" / "jigs.yaml")
+    return read_jig_recipe(repository / "training" / JIGS)
 
 
 @pytest.fixture(scope="module")
 def trained(repository, tmp_path_factory):
-    """What `pisigma train` gives for a small form of the shipped recipe: the folder and the report."""
+    """What running gives for a small form of the shipped recipe: the folder and the report."""
     folder = tmp_path_factory.mktemp("jigs")
-    text = (repository / "training" / "jigs.yaml").read_text(encoding="utf-8")
+    text = (repository / "training" / JIGS).read_text(encoding="utf-8")
     for old, new in (
         ("touches: {count: 96", "touches: {count: 48"),
         ("candidates: {count: 1000", "candidates: {count: 150"),
@@ -42,11 +40,9 @@ def trained(repository, tmp_path_factory):
         assert old in text
         text = text.replace(old, new)
     (folder / "jigs.yaml").write_text(text, encoding="utf-8")
-    command = ["train", str(folder / "jigs.yaml"), "--out", str(folder / "model"), "--json"]
     with no_type_checker():
-        result = CliRunner().invoke(app, command)
-    assert result.exit_code == 0, result.output
-    return folder / "model", json.loads(result.stdout)
+        report = run_jigs_recipe(folder / "jigs.yaml", folder / "model")
+    return folder / "model", json.loads(json.dumps(report, allow_nan=False))
 
 
 def test_rms_and_deviation_are_those_of_the_papers_tables(recipe):
@@ -168,11 +164,3 @@ def test_the_model_holds_both_jigs_and_brings_the_tool_there(trained, recipe):
     with no_type_checker():
         reached = T_jig_base @ true_robot.forward(torch.as_tensor(solve(wanted).q))
     assert float((reached - wanted)[:, :3, 3].norm(dim=-1).max()) < 2e-3
-
-
-def test_other_options_are_refused(repository, tmp_path):
-    path = str(repository / "training" / "jigs.yaml")
-    with no_type_checker():
-        result = CliRunner().invoke(app, ["train", path, "--resume", "--out", str(tmp_path / "m")])
-    assert result.exit_code == 2
-    assert "has no use for --resume" in result.stderr

@@ -1,18 +1,24 @@
 """`training/README.md` is what its generator makes of the stored results, whole, and with every table of the papers."""
 
 import json
+import os
 import re
 import shutil
+import subprocess
+import sys
 
 import pytest
 import yaml
 
+from command import main
+from markdown_text import FIGURES, command_of, link_to, plain, scientific
+from page import PAGE, page_text
 from pisigma.errors import RecipeError
-from pisigma.studies.papers.__main__ import main
-from pisigma.studies.papers.markdown_text import FIGURES, link_to, plain, scientific
-from pisigma.studies.papers.page import PAGE, page_text
-from pisigma.studies.papers.published import read_published
-from pisigma.studies.papers.stored_results import read_results, result_text, run_recipe
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot import Robot
+from published import read_published
+from recipe_runs import run_recipe
+from stored_results import read_results, result_text
 
 TABLES = {"jeong1998": 2, "park2022": 10, "jigs": 10}
 PICTURES = {"jeong1998": 8, "park2022": 11, "jigs": 6}
@@ -36,7 +42,7 @@ def remade(training, tmp_path_factory):
     """The folder of the recipes without its page and pictures, and these made again."""
     folder = tmp_path_factory.mktemp("papers") / "training"
     shutil.copytree(training, folder, ignore=shutil.ignore_patterns(PAGE, FIGURES))
-    assert main([str(folder)]) == 0
+    assert main(["--folder", str(folder)]) == 0
     return folder
 
 
@@ -55,13 +61,11 @@ def test_the_pictures_are_those_that_the_page_shows(training, remade, page):
 
 
 def test_every_recipe_has_a_stored_result_and_a_part_of_the_page(training, page):
-    recipes = {path.stem for path in training.glob("*.yaml")}
+    recipes = {path.stem for path in training.glob("*.yaml")} | {"jigs"}
     assert set(read_results(training).by_name) == recipes
     assert set(read_published(training).notes) == recipes
     for name in recipes:
-        assert (
-            page.count(f"pisigma train training/{name}.yaml") >= 2
-        )  # in the overview, and above its figures
+        assert page.count(command_of(name)) >= 2  # in the overview, and above its figures
 
 
 def _sections(page: str) -> dict[str, str]:
@@ -178,18 +182,28 @@ def test_a_missing_or_broken_result_is_named(training, tmp_path, capsys):
     with pytest.raises(RecipeError, match=r"kiro3\.json: there is no such result; make it with"):
         page_text(folder)
     (folder / "results" / "kiro3.json").write_text("[]")
-    assert main([str(folder)]) == 2
+    assert main(["--folder", str(folder)]) == 2
     assert "kiro3.json: one JSON object was wanted (it holds no object)" in capsys.readouterr().err
     assert not (folder / PAGE).exists()
 
 
 def test_a_recipe_that_does_not_run_leaves_no_result(tmp_path):
     with pytest.raises(RecipeError, match="ended with status 2"):
-        run_recipe(tmp_path, "none", None)
+        run_recipe(tmp_path, "none", None, tmp_path / "model")
     assert not list(tmp_path.iterdir())
 
 
-def test_data_are_for_running(capsys):
-    with pytest.raises(SystemExit):
-        main(["training", "--data", "x.csv"])
-    assert "--data is for --run" in capsys.readouterr().err
+def test_the_simulated_touches_are_a_measurement_file(repository, tmp_path, capsys):
+    assert main(["touches", "--out", str(tmp_path / "touches.csv")]) == 0
+    assert "192 measurements written to" in capsys.readouterr().out
+    rows = Measurements.read_csv(tmp_path / "touches.csv", Robot.load("welding"))
+    assert set(rows.frame) == {"jig_1", "jig_2"}
+    assert set(rows.touch_axis) == {"x", "y", "z"}
+
+
+def test_the_folder_runs_as_a_script(repository, tmp_path):
+    command = [sys.executable, str(repository / "training" / "papers"), "run", "nothing"]
+    environment = os.environ | {"PYTHONPATH": str(repository)}
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 2
+    assert "nothing.yaml" in done.stderr

@@ -8,11 +8,15 @@ from testing.models import no_type_checker
 from typer.testing import CliRunner
 
 from pisigma.cli.main import app
-from pisigma.studies.papers.stored_results import read_results
+from recipe_runs import extra_figures
+from stored_results import read_results
 
 RELATIVE = 1e-6
 """Figures agree to this, those near rounding level to `ABSOLUTE`."""
 ABSOLUTE = 1e-9
+UNDETERMINED = 1e-3
+"""[mm or deg] More parameters are estimated than the rank allows: along what the data cannot determine, values are the
+processor's rounding. What is determined (errors after every step, of held-out rows too) agrees far better."""
 ROUNDING_MM = 1e-9
 """RMSE below which only the order of the sums counts; the last step may then be missing or one more."""
 
@@ -29,8 +33,9 @@ def again(repository, tmp_path):
         ]
         with no_type_checker():
             result = CliRunner().invoke(app, arguments)
-        assert result.exit_code == 0, result.output
-        return json.loads(result.stdout), read_results(repository / "training")[name]
+            assert result.exit_code == 0, result.output
+            extra = json.loads(json.dumps(extra_figures(repository / "training", name, None)))
+        return json.loads(result.stdout) | extra, read_results(repository / "training")[name]
 
     return run
 
@@ -73,7 +78,9 @@ def test_redundant_parameters(again, name):
             assert_close([a for a, _ in known], [b for _, b in known], atol=2e-6)  # stored with six decimals
     for case, other in zip(found["elimination_cases"], stored["elimination_cases"], strict=True):
         assert (case["removed"], case["parameters"]) == (other["removed"], other["parameters"])
-        same(case["values"], other["values"], "values")
+        assert list(case["values"]) == list(other["values"])
+        assert_close(list(case["values"].values()), list(other["values"].values()), atol=UNDETERMINED)
+        assert case["status"] == other["status"]
         steps = [value for value in other["rmse_mm"] if value > ROUNDING_MM]
         assert len(steps) >= 3
         assert_close(case["rmse_mm"][: len(steps)], steps, rtol=1e-4, atol=ROUNDING_MM)

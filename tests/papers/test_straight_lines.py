@@ -12,7 +12,7 @@ from pisigma.robot import Robot
 from pisigma.se3 import rotation_from_rpy, transform
 from pisigma.simulation.branch import BranchSection
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
-from pisigma.studies.straight_lines import Controller, i_move, move_l
+from straight_lines import Controller, i_move, move_l
 
 BRANCH = BranchSection(name="front/elbow_up/no_flip")
 NOMINAL = Robot.load("welding")

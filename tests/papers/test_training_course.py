@@ -5,8 +5,8 @@ from testing.closeness import assert_close
 
 from pisigma.recipes.recipe import read_recipe
 from pisigma.recipes.recipe_data import load_measurements
-from pisigma.reporting.training_course import EPOCHS_SHOWN, epochs_shown, report_course
 from pisigma.workflow.run import train_recipe
+from training_course import EPOCHS_SHOWN, epochs_shown, report_course
 
 
 @pytest.mark.parametrize("epochs", [0, 1, 2, 7, 80, 3000])

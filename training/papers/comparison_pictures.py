@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from pisigma.reporting.figures import save_figure
-from pisigma.studies.papers.stored_results import Result
+from stored_results import Result
 
 BARS = (("0.85", ""), ("0.65", "////"), ("0.95", "...."), ("0.4", ""))
 """Shade and hatch of bars that stand beside each other."""

@@ -11,8 +11,8 @@ from matplotlib.ticker import NullLocator
 
 from pisigma.errors import RecipeError
 from pisigma.reporting.figures import save_figure
-from pisigma.studies.papers.published import Convergence
-from pisigma.studies.papers.stored_results import Result
+from published import Convergence
+from stored_results import Result
 
 STYLES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
 MARKERS = ("o", "s", "^", "v", "D", "P")

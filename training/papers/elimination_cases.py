@@ -1,10 +1,13 @@
 """The same calibration with different parameters left out, and the correlations that tell which may be."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from pisigma.errors import RecipeError, nearest_choice
 from pisigma.identification.identifiability.pairwise import CorrelationTable
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.result import CalibrationResult
@@ -18,12 +21,17 @@ _DECIMALS = 6
 
 
 def report_eliminations(
-    recipe: GeometricRecipe, result: CalibrationResult, rows: Measurements, held_out: Measurements
+    recipe: GeometricRecipe,
+    cases: Sequence[Sequence[str]],
+    result: CalibrationResult,
+    rows: Measurements,
+    held_out: Measurements,
 ) -> dict[str, Any]:
-    """Calibrate without the parameters of every case of the recipe, and with all (Park et al. 2022, Tables 7 to 10).
+    """Calibrate without the parameters of every case, and with all (Park et al. 2022, Tables 7 to 10).
 
     Args:
-        recipe: names the cases.
+        recipe: what is calibrated.
+        cases: parameters of the arm that are left out; a last case leaves out none.
         result: the recipe's own calibration, for its redundant sets.
         rows: what to calibrate on.
         held_out: what to judge on.
@@ -31,17 +39,18 @@ def report_eliminations(
     Returns:
         ``{"elimination_cases": [...], "true_values": {...}}``: per case what was left out, how many parameters
         were estimated, the RMS error after every iteration, that of held-out rows, and the values of all members
-        of redundant sets [mm, deg]. Empty where the recipe names no case.
+        of redundant sets [mm, deg].
+
+    Raises:
+        RecipeError: a case names no parameter of the arm.
     """
-    if not recipe.elimination_cases:
-        return {}
     names = [name.removeprefix("-") for members in result.pairwise.sets for name in members]
     space = ParameterSpace(result.robot, (recipe.measurements.frame,), ("",))
-    cases = []
-    for removed in (*recipe.elimination_cases, ()):
-        found = recipe.calibrate_without(removed, rows)
+    compared = []
+    for removed in (*cases, ()):
+        found = calibrate_without(recipe, removed, rows)
         errors = errors_under(found, held_out).in_file_units()
-        cases.append(
+        compared.append(
             {
                 "removed": list(removed),
                 "parameters": len(found.free),
@@ -52,7 +61,29 @@ def report_eliminations(
             }
         )
     truth = TrueRobot(Robot.load(recipe.robot), recipe.errors).geometry
-    return {"elimination_cases": cases, "true_values": _values(truth, names, space)}
+    return {"elimination_cases": compared, "true_values": _values(truth, names, space)}
+
+
+def calibrate_without(
+    recipe: GeometricRecipe, removed: Sequence[str], rows: Measurements
+) -> CalibrationResult:
+    """Calibrate all parameters of the arm but those removed, however redundant the others are.
+
+    Raises:
+        RecipeError: what is removed is no parameter of the arm.
+        IdentificationError: the rows do not determine what is asked for.
+    """
+    robot = Robot.load(recipe.robot)
+    space = ParameterSpace(robot, (recipe.measurements.frame,), ("",))
+    arm = [parameter.name for parameter in space.parameters[: space.arm_size]]
+    for name in removed:
+        if name not in arm:
+            raise RecipeError(
+                f"there is no parameter '{name}' of the arm to leave out; {nearest_choice(name, arm)}"
+            )
+    calibrator = recipe.calibration.calibrator(robot)
+    free = tuple(name for name in arm if name not in removed)
+    return replace(calibrator, free=free, elimination="none").fit(rows)
 
 
 def report_correlations(result: CalibrationResult) -> dict[str, Any]:

@@ -7,12 +7,12 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from jig_recipe import JigCalibration, JigRecipe
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.recipes.jig_recipe import JigCalibration, JigRecipe
 from pisigma.robot.description import Robot
 from pisigma.se3 import transform_from_xyzrpy
 from pisigma.simulation.true_robot import TrueRobot
-from pisigma.studies.straight_lines import Controller
+from straight_lines import Controller
 
 DEFINITIONS = (
     "absolute error, robot frame: the controller solves the inverse kinematics of a test point with its "

@@ -4,9 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.card import CARD
-from pisigma.studies.jig_figures import (
+from jig_figures import (
     ERRORS_PNG,
     LINES_PNG,
     SEEDS_PNG,
@@ -16,8 +14,10 @@ from pisigma.studies.jig_figures import (
     draw_seeds,
     draw_touches,
 )
-from pisigma.studies.jig_report import BOTH, DEFAULT, PLANNED, RANDOM, JigRun
-from pisigma.studies.jig_tables import Table, all_tables
+from jig_report import BOTH, DEFAULT, PLANNED, RANDOM, JigRun
+from jig_tables import Table, all_tables
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.reporting.card import CARD
 
 _SETUPS = {"nominal": "nominal", BOTH: "both", DEFAULT: "both, default"}
 

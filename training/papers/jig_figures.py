@@ -15,11 +15,11 @@ from mpl_toolkits.mplot3d.art3d import (  # type: ignore[import-untyped]
 )
 from torch import Tensor
 
+from jig_accuracy import Accuracy
 from pisigma.measurement.jig import Jig
 from pisigma.reporting.figures import save_figure
 from pisigma.simulation.touch_candidates import TouchCandidates
-from pisigma.studies.jig_accuracy import Accuracy
-from pisigma.studies.straight_lines import TrackedLine
+from straight_lines import TrackedLine
 
 TOUCHES_PNG = "touches.png"
 ERRORS_PNG = "errors.png"

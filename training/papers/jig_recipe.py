@@ -1,7 +1,9 @@
 """Recipes of a robot that touches jigs: what is wrong, what is touched, and what is looked at afterwards."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -27,13 +29,17 @@ from pisigma.simulation.sensor_noise import SensorNoise
 from pisigma.simulation.touch_candidates import TouchCandidates, TouchCandidatesSection
 from pisigma.simulation.touching import simulate_touches
 from pisigma.simulation.true_robot import ErrorSource, TrueRobot
-from pisigma.yaml_file import Section
+from pisigma.yaml_file import Section, read_yaml
 
 Triple = tuple[float, float, float]
 Free = Literal["paper", "default"]
 
 CLEAR_OF_SINGULARITIES = 0.05
 """Least `singularity_measure` of the poses of the workspace."""
+
+
+JIGS = Path("papers") / "jigs.yaml"
+"""The recipe in the folder of the recipes."""
 
 
 class PointSection(Section):
@@ -193,6 +199,15 @@ class JigRecipe(Section):
             prior,
             self.noise.sigma() or 1e-6,
         )
+
+
+def read_jig_recipe(path: str | os.PathLike[str]) -> JigRecipe:
+    """Read a recipe of a robot that touches jigs.
+
+    Raises:
+        RecipeError: the file cannot be read or does not fit; the message names file, line and key.
+    """
+    return read_yaml(path, JigRecipe, RecipeError)
 
 
 @dataclass(frozen=True, eq=False)

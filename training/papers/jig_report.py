@@ -9,13 +9,7 @@ import numpy as np
 import torch
 from jaxtyping import Float64
 
-from pisigma.errors import RecipeError
-from pisigma.measurement.dataset import Measurements
-from pisigma.planning.touch_planning import PlanningProblem, TouchPlan, plan_touches
-from pisigma.recipes.jig_recipe import JigCalibration, JigRecipe, calibrate_on, nominal_calibration
-from pisigma.robot.description import FRAME_COLUMNS, Robot
-from pisigma.simulation.touch_candidates import TouchCandidates
-from pisigma.studies.jig_accuracy import (
+from jig_accuracy import (
     DEFINITIONS,
     Accuracy,
     Bench,
@@ -24,7 +18,13 @@ from pisigma.studies.jig_accuracy import (
     measure_accuracy,
     rms,
 )
-from pisigma.studies.straight_lines import TrackedLine, i_move, move_l
+from jig_recipe import JigCalibration, JigRecipe, calibrate_on, nominal_calibration
+from pisigma.errors import RecipeError
+from pisigma.measurement.dataset import Measurements
+from pisigma.planning.touch_planning import PlanningProblem, TouchPlan, plan_touches
+from pisigma.robot.description import FRAME_COLUMNS, Robot
+from pisigma.simulation.touch_candidates import TouchCandidates
+from straight_lines import TrackedLine, i_move, move_l
 
 Progress = Callable[[str], None]
 

@@ -1,9 +1,7 @@
 """A robot that touches jigs beside Lim et al., Tables 1 to 10."""
 
-from pisigma.recipes.jig_recipe import JigRecipe
-from pisigma.reporting.markdown import markdown_table
-from pisigma.robot.description import Robot
-from pisigma.studies.jig_tables import (
+from jig_recipe import JigRecipe
+from jig_tables import (
     Table,
     component_table,
     error_table,
@@ -11,10 +9,12 @@ from pisigma.studies.jig_tables import (
     parameter_table,
     seed_table,
 )
-from pisigma.studies.papers.markdown_text import command_block, folded, picture, plain
-from pisigma.studies.papers.published import Published
-from pisigma.studies.papers.redundancy_sections import dh_lines
-from pisigma.studies.papers.stored_results import Result, StoredResults
+from markdown_text import command_block, folded, picture, plain
+from pisigma.reporting.markdown import markdown_table
+from pisigma.robot.description import Robot
+from published import Published
+from redundancy_sections import dh_lines
+from stored_results import Result, StoredResults
 
 JIG_COMPARISON = "jigs.png"
 

@@ -3,11 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
+from markdown_text import command_block, picture
 from pisigma.reporting.markdown import markdown_table
 from pisigma.reporting.tables import figure_text
-from pisigma.studies.papers.markdown_text import command_block, picture
-from pisigma.studies.papers.published import Published
-from pisigma.studies.papers.stored_results import StoredResults
+from published import Published
+from stored_results import StoredResults
 
 KIRO3_ENERGY = "kiro3_energy.png"
 KIRO3_ERRORS = "kiro3_errors.png"

@@ -2,6 +2,8 @@
 
 import re
 
+from jig_recipe import JIGS
+
 FIGURES = "figures"
 """Folder of the pictures, beside the page."""
 
@@ -11,6 +13,8 @@ DATA = {"ur10_inverse": "series_c_train.csv", "ur10_hybrid": "series_c_train.csv
 
 def command_of(name: str) -> str:
     """The command that runs a recipe."""
+    if name == JIGS.stem:
+        return f"python training/papers run {name}"
     data = f" --data {DATA[name]}" if name in DATA else ""
     return f"pisigma train training/{name}.yaml{data}"
 

@@ -1,10 +1,10 @@
 """Recipes that stand beside no paper: measured robots, and the hybrid."""
 
+from markdown_text import command_block, picture
 from pisigma.reporting.markdown import markdown_table
 from pisigma.reporting.tables import pose_table
-from pisigma.studies.papers.markdown_text import command_block, picture
-from pisigma.studies.papers.published import Published
-from pisigma.studies.papers.stored_results import Result, StoredResults
+from published import Published
+from stored_results import Result, StoredResults
 
 LEARNING_CURVES = "learning_curves.png"
 

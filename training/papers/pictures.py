@@ -2,15 +2,15 @@
 
 from pathlib import Path
 
-from pisigma.studies.papers.comparison_pictures import draw_jigs, draw_joint_errors, draw_learning_curves
-from pisigma.studies.papers.course_pictures import draw_energies, draw_errors_on_grid, draw_rmse
-from pisigma.studies.papers.jig_sections import JIG_COMPARISON
-from pisigma.studies.papers.joint_sections import JOINT_ERRORS, KIRO3_ENERGY, KIRO3_ERRORS, KIRO4_ENERGY
-from pisigma.studies.papers.markdown_text import FIGURES
-from pisigma.studies.papers.measured_sections import HYBRIDS, LEARNING_CURVES
-from pisigma.studies.papers.published import Published
-from pisigma.studies.papers.redundancy_sections import RMSE_BY_ITERATION, ROBOTS
-from pisigma.studies.papers.stored_results import StoredResults
+from comparison_pictures import draw_jigs, draw_joint_errors, draw_learning_curves
+from course_pictures import draw_energies, draw_errors_on_grid, draw_rmse
+from jig_sections import JIG_COMPARISON
+from joint_sections import JOINT_ERRORS, KIRO3_ENERGY, KIRO3_ERRORS, KIRO4_ENERGY
+from markdown_text import FIGURES
+from measured_sections import HYBRIDS, LEARNING_CURVES
+from published import Published
+from redundancy_sections import RMSE_BY_ITERATION, ROBOTS
+from stored_results import StoredResults
 
 
 def draw_pictures(folder: Path, published: Published, results: StoredResults) -> None:

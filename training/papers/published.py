@@ -120,6 +120,7 @@ class RedundantSums(Section):
         members: the parameters.
         unit: of the figures.
         parameters: how many were estimated, per case.
+        cases: parameters of the arm that are left out; a last case leaves out none.
         values: per case, of the members.
         sums: per case.
     """
@@ -128,6 +129,7 @@ class RedundantSums(Section):
     members: tuple[str, ...]
     unit: Literal["mm", "rad"]
     parameters: tuple[int, ...]
+    cases: tuple[tuple[str, ...], ...]
     values: tuple[tuple[float, ...], ...]
     sums: tuple[float, ...]
 

@@ -5,11 +5,11 @@ from typing import Any
 
 import numpy as np
 
+from markdown_text import command_block, folded, picture, plain, scientific
 from pisigma.reporting.markdown import markdown_table
 from pisigma.robot.description import Robot
-from pisigma.studies.papers.markdown_text import command_block, folded, picture, plain, scientific
-from pisigma.studies.papers.published import CorrelationTriangle, DhTable, Published
-from pisigma.studies.papers.stored_results import Result, StoredResults
+from published import CorrelationTriangle, DhTable, Published
+from stored_results import Result, StoredResults
 
 RMSE_BY_ITERATION = "rmse_by_iteration.png"
 

@@ -1,20 +1,17 @@
-"""What the recipes gave, as stored: `training/results/NAME.json`, printed by `pisigma train NAME --json`."""
+"""What the recipes gave, as stored: `training/results/NAME.json`."""
 
 import json
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pisigma.errors import RecipeError
-from pisigma.export.output_file import write_whole
 
+PAPERS = "papers"
 RESULTS = "results"
+"""Folders within that of the recipes."""
 
 Result = dict[str, Any]
-
-_COMMAND = "from pisigma.cli.main import run; run()"
 
 
 @dataclass(frozen=True)
@@ -23,7 +20,7 @@ class StoredResults:
 
     Attributes:
         folder: the folder of the recipes.
-        by_name: what `pisigma train` printed.
+        by_name: what the recipes gave.
     """
 
     folder: Path
@@ -38,7 +35,7 @@ class StoredResults:
         if name not in self.by_name:
             raise RecipeError(
                 f"{self.folder / RESULTS / name}.json: there is no such result; make it with "
-                f"`python -m pisigma.studies.papers {self.folder} --run {name}`."
+                f"`python {self.folder / PAPERS} run {name}`."
             )
         return self.by_name[name]
 
@@ -59,26 +56,6 @@ def read_results(folder: Path) -> StoredResults:
         except ValueError as problem:
             raise RecipeError(f"{path}: one JSON object was wanted ({problem}); make it again.") from None
     return StoredResults(folder, found)
-
-
-def run_recipe(folder: Path, name: str, data: Path | None) -> None:
-    """Run `pisigma train` on a recipe and store what it prints, one value a line.
-
-    Args:
-        folder: the folder of the recipes.
-        name: the recipe.
-        data: measured data, where it asks for them.
-
-    Raises:
-        RecipeError: the command failed; it has said why on stderr.
-    """
-    command = [sys.executable, "-c", _COMMAND, "train", str(folder / f"{name}.yaml"), "--json"]
-    command += ["--data", str(data)] if data else []
-    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=False)
-    if done.returncode:
-        raise RecipeError(f"{folder / name}.yaml: `pisigma train` ended with status {done.returncode}.")
-    (folder / RESULTS).mkdir(exist_ok=True)
-    write_whole(folder / RESULTS / f"{name}.json", result_text(_object(done.stdout)))
 
 
 def result_text(result: Result) -> str:

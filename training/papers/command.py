@@ -1,0 +1,88 @@
+"""The command `python training/papers`: make the page of the recipes again, or run one of them and store its result."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from jig_recipe import JIGS, read_jig_recipe
+from page import PAGE, page_text
+from pictures import draw_pictures
+from pisigma.errors import PisigmaError
+from pisigma.export.output_file import write_whole
+from pisigma.robot.description import Robot
+from published import read_published
+from recipe_runs import run_recipe
+from stored_results import read_results
+
+FOLDER = Path(__file__).resolve().parent.parent
+"""The folder of the recipes."""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command.
+
+    Args:
+        arguments: of the command line; None takes the process's.
+
+    Returns:
+        The exit status: 0 done, 2 something is missing or does not fit.
+    """
+    chosen = _parser().parse_args(arguments)
+    try:
+        if chosen.command == "run":
+            run_recipe(chosen.folder, chosen.name, chosen.data, chosen.out)
+        elif chosen.command == "touches":
+            write_touches(chosen.folder, chosen.out)
+        else:
+            write_page(chosen.folder)
+    except PisigmaError as problem:
+        print(f"pisigma: {problem}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python training/papers",
+        description="Write README.md and figures/ of the recipes from their stored results, or do one of these:",
+    )
+    parser.add_argument("--folder", type=Path, default=FOLDER, help="the folder of the recipes")
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND")
+    run = commands.add_parser("run", help="run a recipe and store its result")
+    run.add_argument("name", help="name of the recipe, such as kiro3 or jigs")
+    run.add_argument("--data", type=Path, metavar="CSV", help="measured data, where the recipe asks for them")
+    run.add_argument("--out", type=Path, metavar="DIR", help="model folder to write [runs/NAME]")
+    touches = commands.add_parser("touches", help="write the simulated touches of the recipe jigs")
+    touches.add_argument("--out", type=Path, metavar="CSV", required=True, help="file to write")
+    return parser
+
+
+def write_page(folder: Path) -> None:
+    """Write the page and its pictures.
+
+    Args:
+        folder: the folder of the recipes.
+
+    Raises:
+        PisigmaError: something is missing or does not fit; the page is as it was.
+    """
+    text = page_text(folder)
+    draw_pictures(folder, read_published(folder), read_results(folder))
+    write_whole(folder / PAGE, text)
+
+
+def write_touches(folder: Path, out: Path) -> None:
+    """Write the touches of the first seed on both jigs as a measurement file.
+
+    Args:
+        folder: the folder of the recipes.
+        out: the CSV file to write.
+
+    Raises:
+        PisigmaError: the recipe does not fit, or the file cannot be written.
+    """
+    recipe = read_jig_recipe(folder / JIGS)
+    rows = recipe.measure(recipe.draw_touches(0), 0)
+    rows.write_csv(out, Robot.load(recipe.robot))
+    print(f"{rows.rows} measurements written to {out}.")
