@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from pydantic import Field
 
 from pisigma.robot.description import Robot
-from pisigma.simulation.source import AbstractGeometrySource, GeometryChange
+from pisigma.simulation.errors.source import AbstractGeometrySource, GeometryChange
 
 _LENGTH_IN_ROW = np.array([False, True, True, False, False])
 _LENGTH_IN_FRAME = np.array([True, True, True, False, False, False])

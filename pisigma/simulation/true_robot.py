@@ -14,13 +14,13 @@ from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.numeric import solve_numeric
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
-from pisigma.simulation.encoder import EncoderQuantisation
-from pisigma.simulation.geometric import GeometricDeviation
+from pisigma.simulation.errors.encoder import EncoderQuantisation
+from pisigma.simulation.errors.geometric import GeometricDeviation
 from pisigma.simulation.geometric_random import RandomGeometricDeviation
-from pisigma.simulation.joint_compliance import JointCompliance
-from pisigma.simulation.joint_offset import JointOffset
-from pisigma.simulation.source import AbstractGeometrySource, JointErrorFunction
-from pisigma.simulation.transmission import TransmissionHarmonics
+from pisigma.simulation.errors.joint_compliance import JointCompliance
+from pisigma.simulation.errors.joint_offset import JointOffset
+from pisigma.simulation.errors.source import AbstractGeometrySource, JointErrorFunction
+from pisigma.simulation.errors.transmission import TransmissionHarmonics
 from pisigma.yaml_file import Section
 
 ErrorSource = (

@@ -15,7 +15,7 @@ from pisigma.joint_correction.features import FourierSeries, GravityTorques
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.simulation import TrueRobot
-from pisigma.simulation.joint_compliance import JointCompliance, LinkMass
+from pisigma.simulation.errors.joint_compliance import JointCompliance, LinkMass
 
 
 def sagging(seed: int, widest: float = 1.0) -> tuple[Robot, Measurements]:

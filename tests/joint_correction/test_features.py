@@ -22,7 +22,7 @@ from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot, Row
 from pisigma.se3 import rpy_from_rotation
-from pisigma.simulation.joint_compliance import LinkMass, gravity_load
+from pisigma.simulation.errors.joint_compliance import LinkMass, gravity_load
 
 GRAVITY = (1.0, -2.0, -9.0)
 CONDITIONS = ("payload_kg", "temperature_c")

@@ -8,7 +8,7 @@ from testing.closeness import assert_close
 
 from pisigma.errors import RecipeError
 from pisigma.robot import Robot
-from pisigma.simulation.geometric import GeometricDeviation
+from pisigma.simulation.errors.geometric import GeometricDeviation
 from pisigma.simulation.geometric_random import RandomGeometricDeviation
 
 UR10 = Robot.load("ur10")

@@ -10,7 +10,7 @@ from testing.closeness import assert_close
 from pisigma.errors import RecipeError
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot, Row
-from pisigma.simulation.joint_compliance import JointCompliance, LinkMass, gravity_load
+from pisigma.simulation.errors.joint_compliance import JointCompliance, LinkMass, gravity_load
 
 GRAVITY = (1.0, -2.0, -9.0)
 

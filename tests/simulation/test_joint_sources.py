@@ -8,9 +8,9 @@ from testing.closeness import assert_close
 
 from pisigma.errors import RecipeError
 from pisigma.robot import Robot
-from pisigma.simulation.encoder import EncoderQuantisation
-from pisigma.simulation.joint_offset import JointOffset
-from pisigma.simulation.transmission import TransmissionHarmonics
+from pisigma.simulation.errors.encoder import EncoderQuantisation
+from pisigma.simulation.errors.joint_offset import JointOffset
+from pisigma.simulation.errors.transmission import TransmissionHarmonics
 
 KIRO3 = Robot.load("kiro3")
 BATCHES = [(), (1,), (0,), (3, 1, 2)]

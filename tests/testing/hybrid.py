@@ -15,8 +15,8 @@ from pisigma.robot import Robot
 from pisigma.se3 import invert, transform_from_xyzrpy
 from pisigma.simulation import TrueRobot
 from pisigma.simulation.geometric_random import RandomGeometricDeviation
-from pisigma.simulation.joint_compliance import JointCompliance, LinkMass
-from pisigma.simulation.transmission import Harmonic, TransmissionHarmonics
+from pisigma.simulation.errors.joint_compliance import JointCompliance, LinkMass
+from pisigma.simulation.errors.transmission import Harmonic, TransmissionHarmonics
 
 NOISE = 3e-5
 """[m] Of a measured coordinate."""

@@ -12,10 +12,10 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.se3 import transform_from_xyzrpy
 from pisigma.simulation import TrueRobot
-from pisigma.simulation.encoder import EncoderQuantisation
+from pisigma.simulation.errors.encoder import EncoderQuantisation
 from pisigma.simulation.geometric_random import RandomGeometricDeviation
-from pisigma.simulation.joint_compliance import JointCompliance, LinkMass
-from pisigma.simulation.transmission import Harmonic, TransmissionHarmonics
+from pisigma.simulation.errors.joint_compliance import JointCompliance, LinkMass
+from pisigma.simulation.errors.transmission import Harmonic, TransmissionHarmonics
 from pisigma.simulation.true_robot import ErrorSource
 
 NOISE = 3e-5

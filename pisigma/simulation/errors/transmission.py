@@ -11,7 +11,7 @@ from torch import Tensor
 from pisigma.errors import RecipeError
 from pisigma.robot.description import Robot
 from pisigma.simulation.joint_names import joint_index, joint_values
-from pisigma.simulation.source import AbstractJointSource, JointErrorFunction
+from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction
 from pisigma.yaml_file import Section
 
 

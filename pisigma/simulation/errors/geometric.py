@@ -9,7 +9,7 @@ from pydantic import Field
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection
 from pisigma.simulation.joint_names import row_index
-from pisigma.simulation.source import AbstractGeometrySource, GeometryChange
+from pisigma.simulation.errors.source import AbstractGeometrySource, GeometryChange
 from pisigma.yaml_file import Section
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.robot.description import Robot
 from pisigma.simulation.joint_names import joint_values
-from pisigma.simulation.source import AbstractJointSource, JointErrorFunction
+from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction
 
 
 class EncoderQuantisation(AbstractJointSource):
