@@ -1,16 +1,27 @@
 """Reading YAML files into validated, typed documents, with file and line in every complaint."""
 
+import functools
 import json
 import os
 import re
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar, Union
 
 import yaml
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    TypeAdapter,
+    ValidationError,
+)
+from pydantic_core import CoreSchema, core_schema
 
 from pisigma.errors import PisigmaError, nearest_choice
-from pisigma.yaml_schema import allowed_texts, valid_keys
 
 MAXIMUM_NODES = 1_000_000
 """Values that a file may hold, aliases written out."""
@@ -20,6 +31,46 @@ class Section(BaseModel):
     """Base of every section of a file that people write: frozen, and no key that it does not know."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+@dataclass(frozen=True, eq=False)
+class OneOf:
+    """Annotates a value as a section of a registry, chosen by its `kind`; sections may be registered later.
+
+    `Annotated[AbstractErrorSource, OneOf(ERROR_SOURCES)]` reads `{kind: encoder, ...}` as the section that is
+    registered as "encoder", and its complaints list what is registered then.
+
+    Attributes:
+        registry: two sections or more by their kinds.
+    """
+
+    registry: Mapping[str, type[Section]]
+
+    def _sections(self) -> Any:  # a TypeAdapter, which beartype does not take for a type
+        return _one_of(tuple(self.registry.values()))
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        """How pydantic reads the value: by the registry as it is when it reads."""
+        plain = core_schema.no_info_plain_validator_function
+        return core_schema.json_or_python_schema(plain(self._from_json), plain(self._from_python))
+
+    def _from_json(self, value: Any) -> Any:
+        return self._sections().validate_json(json.dumps(value), strict=True)
+
+    def _from_python(self, value: Any) -> Any:
+        return value if isinstance(value, Section) else self._sections().validate_python(value)
+
+    def __get_pydantic_json_schema__(
+        self, schema: CoreSchema, handler: GetJsonSchemaHandler
+    ) -> dict[str, Any]:
+        """What may be written there now."""
+        return handler(self._sections().core_schema)
+
+
+@functools.lru_cache(maxsize=64)
+def _one_of(sections: tuple[type[Section], ...]) -> Any:
+    any_of: Any = Annotated[Union[sections], Field(discriminator="kind")]  # noqa: UP007
+    return TypeAdapter(any_of)
 
 
 Document = TypeVar("Document", bound=BaseModel)
@@ -214,3 +265,60 @@ def _locate(node: yaml.Node, path: _Path) -> tuple[int, list[str | int]]:
             continue
         keys.append(part)
     return line, keys
+
+
+_Schema = dict[str, Any]
+
+
+def valid_keys(document: type[BaseModel], path: _Path) -> set[str]:
+    """Keys that are valid where a validation path leads."""
+    return {key for schema in _follow(document, path) for key in schema.get("properties", {})}
+
+
+def allowed_texts(document: type[BaseModel], path: _Path) -> list[str]:
+    """Texts that are allowed where a validation path leads, sorted; none where any text is."""
+    found: set[str] = set()
+    for schema in _follow(document, path):
+        values = [schema["const"]] if "const" in schema else schema.get("enum", [])
+        found |= {value for value in values if isinstance(value, str)}
+    return sorted(found)
+
+
+def _follow(document: type[BaseModel], path: _Path) -> list[_Schema]:
+    """Plain schemas at the end of a validation path, which holds keys, indices and tags of unions."""
+    schema = document.model_json_schema()
+    definitions = schema.get("$defs", {})
+    nodes = _alternatives([schema], definitions)
+    for part in path:
+        following: list[_Schema] = []
+        for candidate in nodes:
+            if part in candidate.get("properties", {}):
+                following.append(candidate["properties"][part])
+            elif isinstance(part, int) and ("items" in candidate or "prefixItems" in candidate):
+                following.append(candidate.get("items") or candidate["prefixItems"][part])
+            elif isinstance(candidate.get("additionalProperties"), dict):
+                following.append(candidate["additionalProperties"])
+        if following:
+            nodes = _alternatives(following, definitions)
+        else:  # a union's tag: keep the alternative of that tag
+            nodes = [candidate for candidate in nodes if part in _tags(candidate)] or nodes
+    return nodes
+
+
+def _tags(schema: _Schema) -> list[Any]:
+    return [value.get("const") for value in schema.get("properties", {}).values()]
+
+
+def _alternatives(nodes: list[_Schema], definitions: dict[str, _Schema]) -> list[_Schema]:
+    """Resolve references and unions into the plain schemas that they stand for."""
+    plain: list[_Schema] = []
+    open_nodes = list(nodes)
+    while open_nodes:
+        schema = open_nodes.pop()
+        if "$ref" in schema:
+            open_nodes.append(definitions[schema["$ref"].rsplit("/", 1)[-1]])
+        elif "anyOf" in schema or "oneOf" in schema:
+            open_nodes += schema.get("anyOf", []) + schema.get("oneOf", [])
+        else:
+            plain.append(schema)
+    return plain

@@ -20,7 +20,6 @@ from pisigma.model.folder.model_folder import save_model
 
 LAYERS = (
     "errors",
-    "yaml_schema",
     "yaml_file",
     "se3",
     "robot",

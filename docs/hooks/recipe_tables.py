@@ -16,6 +16,7 @@ from pydantic_core import PydanticUndefined
 from pisigma.recipes.geometric_recipe import GeometricRecipe
 from pisigma.recipes.hybrid_recipe import HybridRecipe
 from pisigma.recipes.recipe import Recipe
+from pisigma.yaml_file import OneOf
 
 PAGE = Path(__file__).parent.parent / "reference" / "recipes.md"
 BEGIN, END = "<!-- begin: keys -->", "<!-- end: keys -->"
@@ -54,8 +55,16 @@ def _sections() -> list[type[BaseModel]]:
 def _inner(annotation: Any) -> Iterator[type[BaseModel]]:
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
-    for argument in typing.get_args(annotation):
+    for argument in typing.get_args(_closed(annotation)):
         yield from _inner(argument)
+
+
+def _closed(annotation: Any) -> Any:
+    """The annotation, or the union of all sections of a registry that it names."""
+    for choice in getattr(annotation, "__metadata__", ()):
+        if isinstance(choice, OneOf):
+            return typing.Union[tuple(choice.registry.values())]  # noqa: UP007
+    return annotation
 
 
 def _table(section: type[BaseModel]) -> str:
@@ -105,7 +114,8 @@ def _type(annotation: Any) -> str:
         name = _name(annotation)
         return f"[{name}](#{re.sub(r'[^a-z0-9_]+', '-', name.lower()).strip('-')})"
     if origin is typing.Annotated:
-        return _type(arguments[0])
+        closed = _closed(annotation)
+        return _type(arguments[0] if closed is annotation else closed)
     if origin is typing.Literal:
         return " or ".join(f"`{value}`" for value in arguments)
     if origin in (typing.Union, types.UnionType):

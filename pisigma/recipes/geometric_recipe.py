@@ -92,7 +92,7 @@ class GeometricRecipe(Section):
     description: str
     not_validated: str
     robot: str
-    errors: tuple[Annotated[ErrorSource, Field(discriminator="kind")], ...]
+    errors: tuple[ErrorSource, ...]
     measurements: SimulatedMeasurements
     held_out: SimulatedMeasurements
     calibration: CalibrationSection = CalibrationSection()

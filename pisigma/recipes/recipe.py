@@ -40,7 +40,7 @@ class SimulatedData(Section):
     """
 
     kind: Literal["simulated"]
-    errors: tuple[Annotated[ErrorSource, Field(discriminator="kind")], ...]
+    errors: tuple[ErrorSource, ...]
     training: SimulatedMeasurements
     held_out: SimulatedMeasurements
 

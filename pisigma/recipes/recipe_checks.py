@@ -13,7 +13,7 @@ from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.network.inputs import Inputs
 from pisigma.robot.description import Robot
 from pisigma.simulation.measure import SimulatedMeasurements
-from pisigma.simulation.random_joints import JointsRandom
+from pisigma.simulation.poses import JointsRandom
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.training.fit_sections import GradientDescentSection
 from pisigma.yaml_file import line_of

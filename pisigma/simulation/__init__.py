@@ -1,18 +1,19 @@
 """Simulation: error sources of a true robot, and what sensors would measure on it."""
 
-from pisigma.simulation.branch import BranchSection
-from pisigma.simulation.commanded import joints_for_poses
-from pisigma.simulation.distances import AnchorSection, SimulatedDistances, SimulatedPairs
-from pisigma.simulation.jig_placement import JigPlacement
-from pisigma.simulation.measure import SimulatedMeasurements, simulate
-from pisigma.simulation.noise import MeasurementNoise
-from pisigma.simulation.parts import SimulatedParts, SimulatedSensor
+from pisigma.simulation.commanded import BranchSection, joints_for_poses
+from pisigma.simulation.distances import (
+    AnchorSection,
+    SimulatedDistances,
+    SimulatedPairs,
+    SimulatedSockets,
+    SocketSection,
+)
+from pisigma.simulation.measure import SimulatedMeasurements, SimulatedSensor, SimulatedSensors, simulate
+from pisigma.simulation.noise import MeasurementNoise, SensorNoise
 from pisigma.simulation.poses import WhereToMeasure
-from pisigma.simulation.sensor_noise import SensorNoise
-from pisigma.simulation.sockets import SimulatedSockets, SocketSection
-from pisigma.simulation.touch_candidates import TouchCandidates, TouchCandidatesSection
+from pisigma.simulation.touch_candidates import JigPlacement, TouchCandidates, TouchCandidatesSection
 from pisigma.simulation.touching import SimulatedTouches, simulate_touches
-from pisigma.simulation.true_robot import ErrorSource, TrueRobot, TrueRobotSection
+from pisigma.simulation.true_robot import ErrorSource, TrueRobot, TrueRobotSection, register_error_source
 
 __all__ = [
     "AnchorSection",
@@ -24,8 +25,8 @@ __all__ = [
     "SimulatedDistances",
     "SimulatedMeasurements",
     "SimulatedPairs",
-    "SimulatedParts",
     "SimulatedSensor",
+    "SimulatedSensors",
     "SimulatedSockets",
     "SimulatedTouches",
     "SocketSection",
@@ -35,6 +36,7 @@ __all__ = [
     "TrueRobotSection",
     "WhereToMeasure",
     "joints_for_poses",
+    "register_error_source",
     "simulate",
     "simulate_touches",
 ]

@@ -2,17 +2,159 @@
 
 from typing import TypeVar
 
-from jaxtyping import Float64
-from pydantic import model_validator
+import torch
+from jaxtyping import Bool, Float64
+from pydantic import Field, model_validator
 from torch import Tensor
 
-from pisigma.errors import RecipeError
+from pisigma.errors import RecipeError, UnreachablePoseError, nearest_choice
+from pisigma.kinematics.closed_form import AbstractClosedForm, InverseSolutions, closed_form_solver
 from pisigma.kinematics.joint_limits import wrap_into_limits
-from pisigma.simulation.branch import BranchSection
-from pisigma.simulation.poses import WhereToMeasure
-from pisigma.simulation.random_joints import JointsRandom
+from pisigma.kinematics.numeric import solve_numeric
+from pisigma.kinematics.status import Status
+from pisigma.robot.description import Robot
+from pisigma.se3 import wrap_to_pi
+from pisigma.simulation.errors.source import joint_values
+from pisigma.simulation.poses import JointsRandom, WhereToMeasure
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.yaml_file import Section
+
+
+class BranchSection(Section):
+    """Which of several solutions of the inverse kinematics is taken, the same for all poses of a simulation.
+
+    Attributes:
+        name: a branch of the nominal robot's closed form, by name; or
+        near_deg: joint values to be near to, by name of a revolute joint [deg], 0 where not stated; with a
+            closed form its nearest reachable solution is taken, without one the search for the true solution
+            starts here.
+        near_mm: the same for prismatic joints [mm].
+    """
+
+    name: str | None = None
+    near_deg: dict[str, float] | None = None
+    near_mm: dict[str, float] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _one_way(self) -> "BranchSection":
+        if (self.name is None) == (self.near_deg is None):
+            raise ValueError("state either the name of the branch or near_deg (with near_mm)")
+        if self.name is not None and self.near_mm:
+            raise ValueError("near_mm goes with near_deg, not with name; remove it")
+        return self
+
+    def start(self, robot: Robot, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses dof"]:
+        """Joint values [rad or m] near which the true robot reaches the poses.
+
+        Args:
+            robot: the nominal robot.
+            T: T_base_tool wanted.
+
+        Raises:
+            RecipeError: no such branch or joint, or the robot has no closed form whose branch could be named.
+            UnreachablePoseError: the nominal robot does not reach a pose on this branch.
+        """
+        solver = closed_form_solver(robot)
+        if self.name is not None:
+            return self._named(solver, robot, T)
+        near = self._near(robot).to(T.device)
+        if solver is None:
+            return near.expand(len(T), robot.dof)
+        return _nearest(solver.solve(T), robot, near)
+
+    def find(
+        self, robot: Robot, T: Float64[Tensor, "poses 4 4"]
+    ) -> tuple[Float64[Tensor, "poses dof"], Bool[Tensor, " poses"]]:
+        """Joint values [rad or m] of the nominal robot at poses of which not all need be reachable.
+
+        Args:
+            robot: the nominal robot.
+            T: T_base_tool wanted.
+
+        Returns:
+            Joint values, and whether they reach the pose on this branch, within the limits and away from
+            singularities; where they do not, the values mean nothing.
+
+        Raises:
+            RecipeError: no such branch or joint, or the robot has no closed form whose branch could be named.
+        """
+        solver = closed_form_solver(robot)
+        if self.name is not None:
+            solutions = self._solutions(solver, robot, T)
+            assert solver is not None
+            index = solver.branches.index(self.name)
+            return solutions.q[:, index].nan_to_num(), solutions.status[:, index] == Status.REACHED
+        near = self._near(robot).to(T.device)
+        if solver is None:
+            found = solve_numeric(robot, T, near)
+            return found.q, found.status == Status.REACHED
+        solutions = solver.solve(T)
+        reached = solutions.status == Status.REACHED
+        return _nearest_of(solutions, robot, near, reached).nan_to_num(), reached.any(-1)
+
+    def _near(self, robot: Robot) -> Float64[Tensor, " dof"]:
+        """The joint values to be near to [rad or m]."""
+        fields = ("near_deg", "near_mm")
+        stated = torch.from_numpy(joint_values(robot, self.near_deg or {}, self.near_mm, fields, "branch"))
+        return torch.where(torch.tensor(robot.revolute), torch.deg2rad(stated), stated / 1e3)
+
+    def _solutions(
+        self, solver: AbstractClosedForm | None, robot: Robot, T: Float64[Tensor, "poses 4 4"]
+    ) -> InverseSolutions:
+        """All solutions, when the branch that is named is one of them."""
+        if solver is None:
+            raise RecipeError(
+                f"branch: robot '{robot.name}' has no closed form and so no branch '{self.name}'; "
+                "state near_deg instead."
+            )
+        if self.name not in solver.branches:
+            raise RecipeError(
+                f"branch: robot '{robot.name}' has no branch '{self.name}'; "
+                f"{nearest_choice(str(self.name), solver.branches)}"
+            )
+        return solver.solve(T)
+
+    def _named(
+        self, solver: AbstractClosedForm | None, robot: Robot, T: Float64[Tensor, "poses 4 4"]
+    ) -> Float64[Tensor, "poses dof"]:
+        solutions = self._solutions(solver, robot, T)
+        assert solver is not None
+        index = solver.branches.index(str(self.name))
+        _refuse_unreachable(solutions.status[:, index] == Status.UNREACHABLE, f"branch '{self.name}'")
+        return solutions.q[:, index]
+
+
+def _nearest(
+    solutions: InverseSolutions, robot: Robot, near: Float64[Tensor, " dof"]
+) -> Float64[Tensor, "poses dof"]:
+    """Of each pose's solutions the nearest, by the sum of squared differences, angles wrapped."""
+    unreachable = solutions.status == Status.UNREACHABLE
+    _refuse_unreachable(unreachable.all(-1), "any branch")
+    return _nearest_of(solutions, robot, near, ~unreachable)
+
+
+def _nearest_of(
+    solutions: InverseSolutions,
+    robot: Robot,
+    near: Float64[Tensor, " dof"],
+    allowed: Bool[Tensor, "poses branches"],
+) -> Float64[Tensor, "poses dof"]:
+    """The nearest of the solutions that are allowed."""
+    difference = solutions.q - near
+    revolute = torch.tensor(robot.revolute, device=near.device)
+    difference = torch.where(revolute, wrap_to_pi(difference), difference)
+    distance = torch.where(allowed, (difference * difference).sum(-1), torch.inf)
+    return torch.take_along_dim(solutions.q, distance.argmin(-1)[:, None, None], 1)[:, 0]
+
+
+def _refuse_unreachable(unreachable: Tensor, where: str) -> None:
+    if unreachable.any():
+        raise UnreachablePoseError(
+            f"wanted pose {int(unreachable.nonzero()[0])} (counted from 0; {int(unreachable.sum())} of "
+            f"{len(unreachable)} poses) cannot be reached by the nominal robot on {where}; "
+            "change the region of the poses or the branch."
+        )
+
 
 Own = TypeVar("Own", bound="AbstractCommanded")
 

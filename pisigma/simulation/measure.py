@@ -1,16 +1,21 @@
-"""Measurements that a sensor would make on the true robot."""
+"""Measurements that sensors would make on the true robot: of a tracker, or of several sensors together."""
 
 from dataclasses import replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float64
+from pydantic import Field
 from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joining import join
 from pisigma.simulation.commanded import AbstractCommanded
+from pisigma.simulation.distances import SimulatedDistances, SimulatedPairs, SimulatedSockets
 from pisigma.simulation.noise import MeasurementNoise
+from pisigma.simulation.touching import SimulatedTouches
 from pisigma.simulation.true_robot import TrueRobot
+from pisigma.yaml_file import Section
 
 
 class SimulatedMeasurements(AbstractCommanded):
@@ -69,3 +74,24 @@ def simulate(
 
 def _sigma(q: Float64[Tensor, "rows dof"], sigma: float) -> Float64[Tensor, " rows"] | None:
     return torch.full((len(q),), sigma, dtype=q.dtype, device=q.device) if sigma else None
+
+
+SimulatedSensor = Annotated[
+    SimulatedMeasurements | SimulatedTouches | SimulatedSockets | SimulatedDistances | SimulatedPairs,
+    Field(discriminator="kind"),
+]
+"""What one sensor measures, told apart by `kind`: tracker, touches, sockets, distances or pairs."""
+
+
+class SimulatedSensors(Section):
+    """The part of a recipe that states what several sensors measure on the same true robot.
+
+    Attributes:
+        sensors: one or more; their rows follow each other.
+    """
+
+    sensors: tuple[SimulatedSensor, ...] = Field(min_length=1)
+
+    def measure(self, robot: TrueRobot) -> Measurements:
+        """Simulate all sensors and join their rows, the same at every call. See `pisigma.measurement.join`."""
+        return join([sensor.measure(robot) for sensor in self.sensors])

@@ -1,20 +1,140 @@
-"""Where to measure: wanted poses on grids or at random."""
+"""Where to measure: wanted poses on grids or at random, or random joint values."""
 
 from abc import ABC, abstractmethod
 from typing import Annotated, Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float64
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 from torch import Tensor
 
-from pisigma.se3 import transform
-from pisigma.simulation.orientation import OrientationSection
-from pisigma.simulation.random_joints import JointsRandom
+from pisigma.errors import RecipeError
+from pisigma.robot.description import Robot
+from pisigma.se3 import rotation_from_rpy, transform
+from pisigma.simulation.errors.source import joint_index
 from pisigma.yaml_file import Section
 
+Triple = tuple[float, float, float]
+
+
+class OrientationSection(Section):
+    """`R = R_home · RotZ(roll) · RotY(pitch) · RotX(yaw)`, each angle uniform in +-spread.
+
+    Source: Jeong, Kim and Kwak 1998, section 4.2.1 and appendix B.
+
+    Attributes:
+        home_rpy_deg: R_home as roll, pitch, yaw [deg].
+        home_rotation: R_home as three rows, instead.
+        spread_deg: half the range of roll, pitch and yaw [deg]; 0 for the home orientation everywhere.
+    """
+
+    home_rpy_deg: Triple | None = None
+    home_rotation: tuple[Triple, Triple, Triple] | None = None
+    spread_deg: float = Field(default=0.0, ge=0, le=180)
+
+    @field_validator("home_rotation")
+    @classmethod
+    def _is_rotation(cls, rows: tuple[Triple, Triple, Triple] | None) -> tuple[Triple, Triple, Triple] | None:
+        if rows is not None:
+            R = torch.tensor(rows, dtype=torch.float64)
+            deviation = (R.mT @ R - torch.eye(3, dtype=torch.float64)).abs().max()
+            if deviation > 1e-9 or torch.linalg.det(R) < 0:
+                raise ValueError("three orthonormal, right-handed rows of a rotation are wanted")
+        return rows
+
+    @model_validator(mode="after")
+    def _one_home(self) -> "OrientationSection":
+        if self.home_rpy_deg is not None and self.home_rotation is not None:
+            raise ValueError("state home_rpy_deg or home_rotation, not both")
+        return self
+
+    def rotations(self, count: int, generator: torch.Generator | None) -> Float64[Tensor, "count 3 3"]:
+        """One orientation per pose.
+
+        Args:
+            count: how many.
+            generator: where roll, pitch, yaw are drawn from, as one (count, 3) block; not used without a
+                spread.
+        """
+        if self.home_rotation is not None:
+            home = torch.tensor(self.home_rotation, dtype=torch.float64)
+        else:
+            home = rotation_from_rpy(
+                torch.deg2rad(torch.tensor(self.home_rpy_deg or (0.0,) * 3, dtype=torch.float64))
+            )
+        if not self.spread_deg:
+            return home.expand(count, 3, 3).clone()
+        draws = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
+        return home @ rotation_from_rpy(torch.deg2rad(self.spread_deg * draws))
+
+
 Range = tuple[float, float]
-"""First and last value."""
+"""Smallest and largest value."""
+
+
+class JointsRandom(Section):
+    """Random joint values, uniform and independent, drawn as one (count, dof) block.
+
+    Attributes:
+        kind: "joints_random".
+        count: how many.
+        seed: of the generator.
+        share: share of the range between the joint limits, about its middle, that is used.
+        range_deg: by name of a revolute joint, smallest and largest value [deg]; takes the place of the
+            share.
+        range_mm: by name of a prismatic joint, smallest and largest value [mm].
+    """
+
+    kind: Literal["joints_random"]
+    count: int = Field(ge=1)
+    seed: int = Field(ge=0)
+    share: float = Field(default=1.0, gt=0, le=1)
+    range_deg: dict[str, Range] = Field(default_factory=dict)
+    range_mm: dict[str, Range] = Field(default_factory=dict)
+
+    def joints(self, robot: Robot) -> Float64[Tensor, "count dof"]:
+        """Joint values to command [rad or m], as the controller counts; the same at every call.
+
+        Raises:
+            RecipeError: an unknown joint, a range in the wrong unit or outside the limits, or no limits at
+                all.
+        """
+        bounds = torch.from_numpy(self._bounds(robot))
+        generator = torch.Generator().manual_seed(self.seed)
+        draws = torch.rand(self.count, robot.dof, generator=generator, dtype=torch.float64)
+        return bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) * draws
+
+    def _bounds(self, robot: Robot) -> Float64[np.ndarray, "dof 2"]:
+        with np.errstate(invalid="ignore"):  # joints without limits are complained of below
+            middle, half = robot.limits.mean(1, keepdims=True), np.diff(robot.limits) / 2
+            bounds: np.ndarray = middle + self.share * half * np.array([-1.0, 1.0])
+        for field, other, ranges, kind in (
+            ("range_deg", "range_mm", self.range_deg, "revolute"),
+            ("range_mm", "range_deg", self.range_mm, "prismatic"),
+        ):
+            for name, stated in ranges.items():
+                index = joint_index(robot, name, "joints_random")
+                if robot.joints[index].type != kind:
+                    raise RecipeError(
+                        f"joints_random: joint '{name}' is {robot.joints[index].type}, "
+                        f"so state it in {other}, not in {field}."
+                    )
+                bounds[index] = np.deg2rad(stated) if kind == "revolute" else np.array(stated) / 1e3
+        for joint, (lower, upper) in zip(robot.joints, bounds, strict=True):
+            if not np.isfinite([lower, upper]).all():
+                raise RecipeError(
+                    f"joints_random: joint '{joint.name}' of robot '{robot.name}' has no limits; "
+                    "state its range in range_deg or range_mm."
+                )
+            if not joint.lower - 1e-12 <= lower <= upper <= joint.upper + 1e-12:
+                raise RecipeError(
+                    f"joints_random: the range of joint '{joint.name}' is empty or leaves its limits "
+                    f"({joint.lower:g} to {joint.upper:g} in rad or m); correct it."
+                )
+        return bounds
+
+
 Count = Annotated[int, Field(ge=1)]
 Seed = Annotated[int, Field(ge=0)]
 

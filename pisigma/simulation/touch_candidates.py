@@ -1,5 +1,6 @@
-"""Candidates of touches: a face of a jig, a point on it and a tilt of the torch, all within reach."""
+"""Where jigs stand, and which touches are possible there: a face, a point on it and a tilt of the torch."""
 
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,10 +16,65 @@ from pisigma.kinematics.status import Status
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.jig import Jig
 from pisigma.robot.description import Robot
-from pisigma.se3 import invert, rotation_from_rpy, transform
-from pisigma.simulation.branch import BranchSection
-from pisigma.simulation.jig_placement import JigPlacement, check_names
+from pisigma.robot.robot_file import FrameSection
+from pisigma.se3 import invert, rotation_from_rpy, transform, transform_from_xyzrpy
+from pisigma.simulation.commanded import BranchSection
 from pisigma.yaml_file import Section
+
+
+class JigPlacement(Section):
+    """A jig that stands somewhere, as the operator believes and as it really does.
+
+    `T_jig_base = Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)` says where the robot's base is, seen
+    from the jig (Lim et al., eq. 1). A jig on the floor that is turned about the vertical has a roll.
+
+    Attributes:
+        name: of the placement, and of the frame of its touches.
+        jig: name of a jig that comes with pisigma, or its YAML file.
+        base: T_jig_base as the operator believes.
+        true_base: T_jig_base as it really is; left out, as the operator believes.
+    """
+
+    name: str = Field(min_length=1)
+    jig: str = "stepped"
+    base: FrameSection
+    true_base: FrameSection | None = None
+
+    def load_jig(self) -> Jig:
+        """The jig.
+
+        Raises:
+            MeasurementError: there is no such jig.
+        """
+        return Jig.load(os.fspath(self.jig))
+
+    @property
+    def T_jig_base(self) -> Float64[Tensor, "4 4"]:
+        """Where the operator believes that it stands [m]."""
+        return transform_from_xyzrpy(torch.from_numpy(self.base.to_si()))
+
+    @property
+    def true_T_jig_base(self) -> Float64[Tensor, "4 4"]:
+        """Where it really stands [m]."""
+        return transform_from_xyzrpy(torch.from_numpy((self.true_base or self.base).to_si()))
+
+
+def check_names(placements: Sequence[JigPlacement]) -> None:
+    """Refuse two placements of one name.
+
+    Raises:
+        RecipeError: a name stands twice, or there is no placement.
+    """
+    names = [placement.name for placement in placements]
+    if not names:
+        raise RecipeError("touches: no jig is placed; state at least one placement.")
+    for name in names:
+        if names.count(name) > 1:
+            raise RecipeError(
+                f"touches: the placement '{name}' stands twice; a jig that was moved has a new "
+                "frame, so name it anew."
+            )
+
 
 ROUNDS = 20
 """Draws after which the search for candidates is given up."""

@@ -15,9 +15,8 @@ from pisigma.kinematics.numeric import solve_numeric
 from pisigma.kinematics.status import Status
 from pisigma.measurement.dataset import LeftOut, Measurements
 from pisigma.se3 import invert, transform
-from pisigma.simulation.jig_placement import JigPlacement
-from pisigma.simulation.sensor_noise import NoiseDraws, SensorNoise, draw_noise, row_sigma
-from pisigma.simulation.touch_candidates import TouchCandidates, TouchCandidatesSection
+from pisigma.simulation.noise import NoiseDraws, SensorNoise, draw_noise, row_sigma
+from pisigma.simulation.touch_candidates import JigPlacement, TouchCandidates, TouchCandidatesSection
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.yaml_file import Section
 

@@ -2,11 +2,10 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Annotated
+from typing import Annotated, TypeVar, get_args
 
 import torch
 from jaxtyping import Float
-from pydantic import Field
 from torch import Tensor
 
 from pisigma.errors import RecipeError, UnreachablePoseError
@@ -15,25 +14,58 @@ from pisigma.kinematics.numeric import solve_numeric
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
 from pisigma.simulation.errors.encoder import EncoderQuantisation
-from pisigma.simulation.errors.geometric import GeometricDeviation
-from pisigma.simulation.geometric_random import RandomGeometricDeviation
+from pisigma.simulation.errors.geometric import GeometricDeviation, RandomGeometricDeviation
 from pisigma.simulation.errors.joint_compliance import JointCompliance
 from pisigma.simulation.errors.joint_offset import JointOffset
-from pisigma.simulation.errors.source import AbstractGeometrySource, JointErrorFunction
-from pisigma.simulation.errors.transmission import TransmissionHarmonics
-from pisigma.yaml_file import Section
-
-ErrorSource = (
-    GeometricDeviation
-    | RandomGeometricDeviation
-    | JointOffset
-    | JointCompliance
-    | TransmissionHarmonics
-    | EncoderQuantisation
+from pisigma.simulation.errors.source import (
+    AbstractErrorSource,
+    AbstractGeometrySource,
+    AbstractJointSource,
+    JointErrorFunction,
 )
+from pisigma.simulation.errors.transmission import TransmissionHarmonics
+from pisigma.yaml_file import OneOf, Section
+
+ERROR_SOURCES: dict[str, type[AbstractErrorSource]] = {
+    "geometric": GeometricDeviation,
+    "geometric_random": RandomGeometricDeviation,
+    "joint_offset": JointOffset,
+    "joint_compliance": JointCompliance,
+    "transmission": TransmissionHarmonics,
+    "encoder": EncoderQuantisation,
+}
+"""The registry: every error source by its kind."""
+
+ErrorSource = Annotated[AbstractErrorSource, OneOf(ERROR_SOURCES)]
+"""A section of a recipe that is one of the registered error sources, told apart by `kind`."""
+
+Source = TypeVar("Source", bound=AbstractErrorSource)
 
 ITERATIONS = 200
 """Steps after which solving for the commanded joints is given up; errors of a real robot need about ten."""
+
+
+def register_error_source(source: type[Source]) -> type[Source]:
+    """Make recipes know an error source by its kind; to be called once, or used as a decorator.
+
+    Args:
+        source: subclass of `AbstractJointSource` or `AbstractGeometrySource` whose `kind` is a `Literal`.
+
+    Raises:
+        RecipeError: the class states no kind, or another source has it.
+    """
+    kinds = get_args(source.model_fields["kind"].annotation)
+    if len(kinds) != 1:
+        raise RecipeError(
+            f"{source.__name__}: a Literal of one kind was wanted; declare it such as "
+            'kind: Literal["backlash"] = "backlash".'
+        )
+    if ERROR_SOURCES.setdefault(kinds[0], source) is not source:
+        raise RecipeError(
+            f"{source.__name__}: the kind '{kinds[0]}' is that of {ERROR_SOURCES[kinds[0]].__name__}; name yours "
+            "otherwise."
+        )
+    return source
 
 
 class TrueRobotSection(Section):
@@ -45,7 +77,7 @@ class TrueRobotSection(Section):
     """
 
     robot: str
-    errors: tuple[Annotated[ErrorSource, Field(discriminator="kind")], ...] = ()
+    errors: tuple[ErrorSource, ...] = ()
 
     def true_robot(self) -> "TrueRobot":
         """The true robot.
@@ -72,7 +104,7 @@ class TrueRobot:
     """
 
     nominal: Robot
-    errors: Sequence[ErrorSource] = ()
+    errors: Sequence[AbstractErrorSource] = ()
     geometry: Robot = field(init=False)
     _joint_errors: tuple[JointErrorFunction, ...] = field(init=False, repr=False)
 
@@ -80,20 +112,20 @@ class TrueRobot:
         """Add the geometric errors up and bind the joint errors to the robot."""
         dh, base, tool = self.nominal.dh.copy(), self.nominal.base.copy(), self.nominal.tool.copy()
         joint_errors: list[JointErrorFunction] = []
-        quantised: set[str] = set()
+        stepped: set[str] = set()
         for index, source in enumerate(self.errors):
             place = f"errors[{index}] ({source.kind})"
             if isinstance(source, AbstractGeometrySource):
                 change = source.change(self.nominal, place)
                 dh, base, tool = dh + change.dh, base + change.base, tool + change.tool
                 continue
+            assert isinstance(source, AbstractJointSource)
             joint_errors.append(source.bind(self.nominal, place))
-            if isinstance(source, EncoderQuantisation):
-                if twice := sorted(quantised & source.joint_names):
-                    raise RecipeError(
-                        f"{place}: joint '{twice[0]}' has an encoder already; state one of the two."
-                    )
-                quantised |= source.joint_names
+            if twice := sorted(stepped & source.stepped_joints):
+                raise RecipeError(
+                    f"{place}: joint '{twice[0]}' has an encoder already; state one of the two."
+                )
+            stepped |= source.stepped_joints
         object.__setattr__(self, "errors", tuple(self.errors))
         object.__setattr__(self, "geometry", self.nominal.with_geometry(dh, base, tool))
         object.__setattr__(self, "_joint_errors", tuple(joint_errors))
@@ -101,11 +133,11 @@ class TrueRobot:
     @property
     def has_encoder(self) -> bool:
         """Whether a joint moves in steps."""
-        return any(isinstance(source, EncoderQuantisation) and source.joint_names for source in self.errors)
+        return any(_steps(source) for source in self.errors)
 
     def without_encoder(self) -> "TrueRobot":
         """The same robot, its joints moving continuously."""
-        return replace(self, errors=[e for e in self.errors if not isinstance(e, EncoderQuantisation)])
+        return replace(self, errors=[source for source in self.errors if not _steps(source)])
 
     def joint_error(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
         """How far the joints end up from where they are commanded: actual minus commanded [rad or m].
@@ -190,3 +222,8 @@ class TrueRobot:
                 f"{Status.NOT_CONVERGED.sentence}"
             )
         return self.commanded_joints(solution.q)
+
+
+def _steps(source: AbstractErrorSource) -> bool:
+    """Whether a joint moves in steps by this source."""
+    return isinstance(source, AbstractJointSource) and bool(source.stepped_joints)

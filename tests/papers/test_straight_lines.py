@@ -10,7 +10,7 @@ from pisigma.errors import UnreachablePoseError
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot
 from pisigma.se3 import rotation_from_rpy, transform
-from pisigma.simulation.branch import BranchSection
+from pisigma.simulation.commanded import BranchSection
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
 from straight_lines import Controller, i_move, move_l
 

@@ -8,8 +8,7 @@ from testing.closeness import assert_close
 
 from pisigma.errors import RecipeError
 from pisigma.robot import Robot
-from pisigma.simulation.errors.geometric import GeometricDeviation
-from pisigma.simulation.geometric_random import RandomGeometricDeviation
+from pisigma.simulation.errors.geometric import GeometricDeviation, RandomGeometricDeviation
 
 UR10 = Robot.load("ur10")
 

@@ -10,8 +10,14 @@ from testing.closeness import assert_close
 from pisigma.errors import RecipeError
 from pisigma.robot import Robot
 from pisigma.se3 import check_transforms, rotation_from_rpy
-from pisigma.simulation.poses import CubeGrid, CubeRandom, PolarGrid, PolarRandom, WhereToMeasure
-from pisigma.simulation.random_joints import JointsRandom
+from pisigma.simulation.poses import (
+    CubeGrid,
+    CubeRandom,
+    JointsRandom,
+    PolarGrid,
+    PolarRandom,
+    WhereToMeasure,
+)
 
 # Jeong, Kim and Kwak 1998, section 4.1.1: steps of 40 mm and 8.18 deg, 100 points in the first quadrant.
 KIRO3_GRID = {"r_mm": (200, 560), "r_steps": 10, "phi_deg": (8.18, 81.8), "phi_steps": 10, "z_mm": 300}

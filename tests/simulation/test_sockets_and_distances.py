@@ -7,7 +7,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.errors import RecipeError
-from pisigma.simulation import SimulatedDistances, SimulatedPairs, SimulatedParts, SimulatedSockets
+from pisigma.simulation import SimulatedDistances, SimulatedPairs, SimulatedSensors, SimulatedSockets
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
 from pisigma.yaml_file import parse_yaml
 
@@ -110,7 +110,7 @@ def test_both_poses_of_a_pair_deviate(robot):
 )
 def test_the_seed_of_the_noise_decides(robot, stated: dict):
     hashes = [
-        SimulatedParts(parts=(stated | {"noise": NOISE | {"seed": seed}},)).measure(robot).content_hash()
+        SimulatedSensors(sensors=(stated | {"noise": NOISE | {"seed": seed}},)).measure(robot).content_hash()
         for seed in (1, 1, 2)
     ]
     assert hashes[0] == hashes[1] != hashes[2]
@@ -124,7 +124,7 @@ def test_several_sensors_measure_the_same_robot(robot, tmp_path):
         "candidates": {"count": 6, "seed": 0},
     }
     wire = {"kind": "distances", "poses": JOINTS | {"seed": 9}, "anchor": WIRE}
-    data = SimulatedParts(parts=(tracker, touches, SOCKETS, wire)).measure(robot)
+    data = SimulatedSensors(sensors=(tracker, touches, SOCKETS, wire)).measure(robot)
     assert data.rows == 5 + 6 + 40 + 40
     assert data.kinds == {"position", "touch", "socket", "distance"}
     assert set(data.frame) == {"tracker", "left", ""}
@@ -136,7 +136,7 @@ def test_several_sensors_measure_the_same_robot(robot, tmp_path):
 
 
 RECIPE = """
-parts:
+sensors:
   - {kind: pairs, poses: {kind: joints_random, count: 4, seed: 0}}
   - kind: distances
     poses: {kind: joints_random, count: 4, seed: 0}
@@ -168,9 +168,9 @@ GRID = "polar_grid, r_mm: [1, 2], r_steps: 1, phi_deg: [0, 1], phi_steps: 1, z_m
     ],
 )
 def test_recipes_that_say_too_little_or_too_much_are_refused(robot, old: str, new: str, message: str):
-    assert parse_yaml(RECIPE, SimulatedParts, RecipeError, "recipe.yaml").measure(robot).rows == 10
+    assert parse_yaml(RECIPE, SimulatedSensors, RecipeError, "recipe.yaml").measure(robot).rows == 10
     with pytest.raises(RecipeError, match=message):
-        parse_yaml(RECIPE.replace(old, new, 1), SimulatedParts, RecipeError, "recipe.yaml")
+        parse_yaml(RECIPE.replace(old, new, 1), SimulatedSensors, RecipeError, "recipe.yaml")
 
 
 def test_a_sensor_shows_no_distance_below_zero(robot):

@@ -14,7 +14,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.se3 import invert, transform_from_xyzrpy
 from pisigma.simulation import TrueRobot
-from pisigma.simulation.geometric_random import RandomGeometricDeviation
+from pisigma.simulation.errors.geometric import RandomGeometricDeviation
 from pisigma.simulation.errors.joint_compliance import JointCompliance, LinkMass
 from pisigma.simulation.errors.transmission import Harmonic, TransmissionHarmonics
 

@@ -13,7 +13,7 @@ from pisigma.robot import Robot
 from pisigma.se3 import transform_from_xyzrpy
 from pisigma.simulation import TrueRobot
 from pisigma.simulation.errors.encoder import EncoderQuantisation
-from pisigma.simulation.geometric_random import RandomGeometricDeviation
+from pisigma.simulation.errors.geometric import RandomGeometricDeviation
 from pisigma.simulation.errors.joint_compliance import JointCompliance, LinkMass
 from pisigma.simulation.errors.transmission import Harmonic, TransmissionHarmonics
 from pisigma.simulation.true_robot import ErrorSource

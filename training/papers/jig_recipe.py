@@ -22,11 +22,15 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.planning.touch_planning import PlanningProblem, build_planning_problem
 from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_from_rpy, transform
-from pisigma.simulation.branch import BranchSection
-from pisigma.simulation.jig_placement import JigPlacement, check_names
+from pisigma.simulation.commanded import BranchSection
+from pisigma.simulation.noise import SensorNoise
 from pisigma.simulation.poses import CubeRandom
-from pisigma.simulation.sensor_noise import SensorNoise
-from pisigma.simulation.touch_candidates import TouchCandidates, TouchCandidatesSection
+from pisigma.simulation.touch_candidates import (
+    JigPlacement,
+    TouchCandidates,
+    TouchCandidatesSection,
+    check_names,
+)
 from pisigma.simulation.touching import simulate_touches
 from pisigma.simulation.true_robot import ErrorSource, TrueRobot
 from pisigma.yaml_file import Section, read_yaml
@@ -117,7 +121,7 @@ class JigRecipe(Section):
     description: str
     not_validated: str
     robot: str
-    errors: tuple[Annotated[ErrorSource, Field(discriminator="kind")], ...]
+    errors: tuple[ErrorSource, ...]
     placements: tuple[JigPlacement, ...] = Field(min_length=1)
     touches: TouchCandidatesSection
     noise: SensorNoise

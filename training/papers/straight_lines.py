@@ -13,7 +13,7 @@ from pisigma.kinematics.numeric import solve_numeric
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_from_vector, rotation_vector, transform
-from pisigma.simulation.branch import BranchSection
+from pisigma.simulation.commanded import BranchSection
 from pisigma.simulation.true_robot import TrueRobot
 
 

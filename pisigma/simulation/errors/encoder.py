@@ -9,8 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pisigma.robot.description import Robot
-from pisigma.simulation.joint_names import joint_values
-from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction
+from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_values
 
 
 class EncoderQuantisation(AbstractJointSource):
@@ -27,8 +26,7 @@ class EncoderQuantisation(AbstractJointSource):
     Attributes:
         kind: "encoder".
         pulses_per_revolution: by name of a revolute joint, pulses per turn of the joint (with an encoder on
-            the
-            motor: its pulses times the gear ratio).
+            the motor: its pulses times the gear ratio).
         step_mm: by name of a prismatic joint, travel per pulse [mm].
     """
 
@@ -37,9 +35,9 @@ class EncoderQuantisation(AbstractJointSource):
     step_mm: dict[str, Annotated[float, Field(gt=0)]] = Field(default_factory=dict)
 
     @property
-    def joint_names(self) -> set[str]:
-        """Names of the joints that are quantised."""
-        return set(self.pulses_per_revolution) | set(self.step_mm)
+    def stepped_joints(self) -> frozenset[str]:
+        """Names of the joints that have an encoder."""
+        return frozenset(self.pulses_per_revolution) | frozenset(self.step_mm)
 
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
         """The quantisation as a function of the joint values. See `AbstractJointSource.bind`."""

@@ -1,15 +1,15 @@
-"""Wrong geometry with every error stated: links, base and tool."""
+"""Wrong geometry of links, base and tool: every error stated, or drawn at random."""
 
 from typing import Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 from pydantic import Field
 
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection
-from pisigma.simulation.joint_names import row_index
-from pisigma.simulation.errors.source import AbstractGeometrySource, GeometryChange
+from pisigma.simulation.errors.source import AbstractGeometrySource, GeometryChange, row_index
 from pisigma.yaml_file import Section
 
 
@@ -57,3 +57,62 @@ class GeometricDeviation(AbstractGeometrySource):
         for name, error in self.rows.items():
             dh[row_index(robot, name, place)] = error.to_si()
         return GeometryChange(dh, self.base.to_si(), self.tool.to_si())
+
+
+_LENGTH_IN_ROW = np.array([False, True, True, False, False])
+_LENGTH_IN_FRAME = np.array([True, True, True, False, False, False])
+
+
+class RandomGeometricDeviation(AbstractGeometrySource):
+    """Every geometric parameter differs from the drawing by its own random error.
+
+    `p_true = p_nominal + s · u`, with s the stated size for lengths or angles and u uniform in [-1, 1), or
+    standard normal. From one generator with `seed`, (rows, 5) values are drawn for the DH rows (theta, d, a,
+    alpha, beta), then 6 for the base and 6 for the tool, whatever their sizes, so that a size of 0 leaves the
+    others as they are.
+
+    Source: the parameters are those of Hayati and Mirmirani, Journal of Robotic Systems 2(4), 1985,
+    397-413; random errors on all of them are the usual way to test an identification, for example in
+    Hollerbach, Khalil and Gautier, "Model Identification", Springer Handbook of Robotics, chapter 6.
+
+    Attributes:
+        kind: "geometric_random".
+        distribution: "uniform" (sizes are bounds) or "normal" (sizes are standard deviations).
+        seed: of the generator.
+        length_mm: size for d and a [mm].
+        angle_deg: size for theta, alpha and beta [deg].
+        base_length_mm: size for x, y, z of the base [mm].
+        base_angle_deg: size for roll, pitch, yaw of the base [deg].
+        tool_length_mm: size for x, y, z of the tool [mm].
+        tool_angle_deg: size for roll, pitch, yaw of the tool [deg].
+    """
+
+    kind: Literal["geometric_random"]
+    distribution: Literal["uniform", "normal"]
+    seed: int = Field(ge=0)
+    length_mm: float = Field(ge=0)
+    angle_deg: float = Field(ge=0)
+    base_length_mm: float = Field(default=0.0, ge=0)
+    base_angle_deg: float = Field(default=0.0, ge=0)
+    tool_length_mm: float = Field(default=0.0, ge=0)
+    tool_angle_deg: float = Field(default=0.0, ge=0)
+
+    def change(self, robot: Robot, place: str) -> GeometryChange:
+        """The drawn errors in SI, the same at every call. See `AbstractGeometrySource.change`."""
+        generator = torch.Generator().manual_seed(self.seed)
+        dh = self._draw(generator, len(robot.rows), 5)
+        base, tool = self._draw(generator, 6), self._draw(generator, 6)
+        return GeometryChange(
+            dh * _sizes(_LENGTH_IN_ROW, self.length_mm, self.angle_deg),
+            base * _sizes(_LENGTH_IN_FRAME, self.base_length_mm, self.base_angle_deg),
+            tool * _sizes(_LENGTH_IN_FRAME, self.tool_length_mm, self.tool_angle_deg),
+        )
+
+    def _draw(self, generator: torch.Generator, *shape: int) -> Float64[np.ndarray, "..."]:
+        if self.distribution == "normal":
+            return torch.randn(*shape, generator=generator, dtype=torch.float64).numpy()
+        return (2 * torch.rand(*shape, generator=generator, dtype=torch.float64) - 1).numpy()
+
+
+def _sizes(is_length: np.ndarray, length_mm: float, angle_deg: float) -> Float64[np.ndarray, " columns"]:
+    return np.where(is_length, length_mm / 1e3, np.deg2rad(angle_deg))

@@ -19,8 +19,7 @@ from pisigma.kinematics.components import (
 )
 from pisigma.kinematics.forward import Geometry, iterate_rows
 from pisigma.robot.description import Robot
-from pisigma.simulation.joint_names import joint_values, row_index
-from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction
+from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_values, row_index
 from pisigma.yaml_file import Section
 
 Triple = tuple[float, float, float]

@@ -9,8 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pisigma.robot.description import Robot
-from pisigma.simulation.joint_names import joint_values
-from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction
+from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_values
 
 
 class JointOffset(AbstractJointSource):

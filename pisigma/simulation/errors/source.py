@@ -1,13 +1,14 @@
 """What an error source is: a section of a recipe that changes the geometry or the joint values of a robot."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.errors import RecipeError, nearest_choice
 from pisigma.robot.description import Robot
 from pisigma.yaml_file import Section
 
@@ -30,7 +31,17 @@ class GeometryChange:
     tool: Float64[np.ndarray, " 6"]
 
 
-class AbstractGeometrySource(Section, ABC):
+class AbstractErrorSource(Section, ABC):
+    """An error source; every concrete one is an `AbstractGeometrySource` or an `AbstractJointSource`.
+
+    Attributes:
+        kind: what recipes call it, a `Literal` of one text.
+    """
+
+    kind: str
+
+
+class AbstractGeometrySource(AbstractErrorSource):
     """An error source that changes geometric parameters; the changes of several sources are added."""
 
     @abstractmethod
@@ -46,8 +57,13 @@ class AbstractGeometrySource(Section, ABC):
         """
 
 
-class AbstractJointSource(Section, ABC):
+class AbstractJointSource(AbstractErrorSource):
     """An error source that moves joints away from where they are commanded; several sources are added."""
+
+    @property
+    def stepped_joints(self) -> frozenset[str]:
+        """Names of the joints that move in steps by this source and so cannot end up just anywhere."""
+        return frozenset()
 
     @abstractmethod
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
@@ -60,3 +76,65 @@ class AbstractJointSource(Section, ABC):
         Raises:
             RecipeError: the source does not fit the robot.
         """
+
+
+def row_index(robot: Robot, name: str, place: str) -> int:
+    """Index of the row called `name`.
+
+    Args:
+        robot: the robot.
+        name: what the recipe says.
+        place: where in the recipe, for the complaint.
+
+    Raises:
+        RecipeError: the robot has no such row; the message gives the nearest name.
+    """
+    names = [row.name for row in robot.rows]
+    if name not in names:
+        raise RecipeError(f"{place}: robot '{robot.name}' has no row '{name}'; {nearest_choice(name, names)}")
+    return names.index(name)
+
+
+def joint_index(robot: Robot, name: str, place: str) -> int:
+    """Index of the joint called `name`, counted among the rows that move. See `row_index`."""
+    names = [joint.name for joint in robot.joints]
+    if name not in names:
+        raise RecipeError(
+            f"{place}: robot '{robot.name}' has no joint '{name}'; {nearest_choice(name, names)}"
+        )
+    return names.index(name)
+
+
+def joint_values(
+    robot: Robot,
+    for_revolute: Mapping[str, float],
+    for_prismatic: Mapping[str, float],
+    fields: tuple[str, str],
+    place: str,
+) -> Float64[np.ndarray, " dof"]:
+    """One value per joint from the two mappings of a recipe; a joint that neither names has 0.
+
+    Args:
+        robot: the robot.
+        for_revolute: values of revolute joints, by name.
+        for_prismatic: values of prismatic joints, by name.
+        fields: how the recipe calls the two mappings, revolute first.
+        place: where in the recipe, for complaints.
+
+    Raises:
+        RecipeError: an unknown joint, or one in the mapping of the other type.
+    """
+    values = np.zeros(robot.dof)
+    for mapping, field, other, kind in (
+        (for_revolute, fields[0], fields[1], "revolute"),
+        (for_prismatic, fields[1], fields[0], "prismatic"),
+    ):
+        for name, value in mapping.items():
+            index = joint_index(robot, name, place)
+            found = robot.joints[index].type
+            if found != kind:
+                raise RecipeError(
+                    f"{place}: joint '{name}' is {found}, so state it in {other}, not in {field}."
+                )
+            values[index] = value
+    return values

@@ -10,8 +10,12 @@ from torch import Tensor
 
 from pisigma.errors import RecipeError
 from pisigma.robot.description import Robot
-from pisigma.simulation.joint_names import joint_index, joint_values
-from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction
+from pisigma.simulation.errors.source import (
+    AbstractJointSource,
+    JointErrorFunction,
+    joint_index,
+    joint_values,
+)
 from pisigma.yaml_file import Section
 
 

@@ -1,0 +1,101 @@
+"""An error source from outside the package: recipes take it, and complain about it with file and line."""
+
+from typing import Literal
+
+import pytest
+import torch
+from testing.closeness import assert_close
+
+from pisigma.errors import RecipeError
+from pisigma.robot import Robot
+from pisigma.simulation import TrueRobotSection, register_error_source
+from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_index
+from pisigma.simulation.true_robot import ERROR_SOURCES
+from pisigma.yaml_file import parse_yaml
+
+
+class Drift(AbstractJointSource):
+    """A joint that goes too far by a share: `e_j = share · q_j`."""
+
+    kind: Literal["drift"] = "drift"
+    joint: str
+    share: float
+
+    def bind(self, robot: Robot, place: str) -> JointErrorFunction:
+        """The drift as a function of the joint values."""
+        factor = torch.zeros(robot.dof, dtype=torch.float64)
+        factor[joint_index(robot, self.joint, place)] = self.share
+        return lambda q: factor.to(q) * q
+
+
+@pytest.fixture
+def drift(monkeypatch):
+    """The source, registered for one test."""
+    monkeypatch.setitem(ERROR_SOURCES, "drift", Drift)
+    del ERROR_SOURCES["drift"]
+    return register_error_source(Drift)
+
+
+def read(text: str):
+    return parse_yaml(text, TrueRobotSection, RecipeError, source="recipe.yaml")
+
+
+RECIPE = """robot: ur5
+errors:
+  - kind: joint_offset
+    offset_deg: {theta_1: 1.0}
+  - kind: drift
+    joint: theta_2
+    share: 1e-3
+"""
+
+
+def test_recipes_take_a_registered_source(drift):
+    section = read(RECIPE)
+    q = torch.linspace(0.1, 0.6, 6, dtype=torch.float64)
+    error = section.true_robot().joint_error(q)
+    assert_close(error, [torch.pi / 180, 1e-3 * 0.2, 0, 0, 0, 0], atol=1e-15)
+    assert read(RECIPE) == section
+    assert TrueRobotSection(**section.model_dump()) == section
+    assert section.model_dump()["errors"][1] == {"kind": "drift", "joint": "theta_2", "share": 1e-3}
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        (RECIPE.replace("share: 1e-3", "share: much"), "line 7: 'errors.1.share': .*valid number.*'much'"),
+        (
+            RECIPE.replace("share:", "shrae:"),
+            "line 7: unknown key 'shrae' in 'errors.1'; did you mean 'share'",
+        ),
+        (RECIPE.replace("drift", "drfit"), "line 5: 'errors.1.kind' cannot be 'drfit'; did you mean 'drift'"),
+        (RECIPE.replace("kind: drift", "joint: a"), "recipe.yaml, line 6: the key 'joint' stands twice"),
+        (
+            RECIPE.replace("  - kind: drift\n    joint", "  - joint"),
+            "the key 'kind' is missing in 'errors.1'.*drift",
+        ),
+    ],
+)
+def test_complaints_name_file_line_and_key(drift, text, complaint):
+    with pytest.raises(RecipeError, match=complaint):
+        read(text)
+
+
+def test_a_kind_that_is_not_registered_is_refused():
+    with pytest.raises(RecipeError, match=r"'errors.1.kind' cannot be 'drift'; Valid: encoder, geometric,"):
+        read(RECIPE)
+
+
+def test_registering_twice_is_allowed_but_no_second_source_of_a_kind(drift):
+    assert register_error_source(drift) is drift
+
+    class Other(AbstractJointSource):
+        kind: Literal["encoder"]
+
+    class Nameless(AbstractJointSource):
+        pass
+
+    with pytest.raises(RecipeError, match="the kind 'encoder' is that of EncoderQuantisation"):
+        register_error_source(Other)
+    with pytest.raises(RecipeError, match="Nameless: a Literal of one kind was wanted"):
+        register_error_source(Nameless)
