@@ -241,7 +241,7 @@ def _drawn(
     measurements: "Measurements", parts: "Sequence[Sequence[TrainTest]]", rows: int | None, seed: int
 ) -> "tuple[Measurements, Sequence[Sequence[TrainTest]]]":
     """The rows to calibrate with, all or some of them, and parts with as many training rows."""
-    from pisigma.measurement.drawing import draw_rows, with_fewer
+    from pisigma.measurement.splits import draw_rows, with_fewer
 
     if rows is None:
         return measurements, parts

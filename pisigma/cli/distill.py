@@ -116,7 +116,7 @@ def _region(parent: "CalibratedModel", box: Box | None, joints: Path | None) -> 
         return None
     q = parent.starts.double()
     if joints is not None:
-        from pisigma.measurement.csv.joints import read_joints
+        from pisigma.measurement.csv.reading import read_joints
 
         q = read_joints(joints, parent.robot)
     if box is None:

@@ -22,7 +22,7 @@ from pisigma.inverse.solution import Solution
 from pisigma.kernels.solution import CompiledSolution
 from pisigma.kinematics.status import Status
 from pisigma.measurement.csv.poses import CHUNK_ROWS, PoseChunk, read_pose_chunks
-from pisigma.measurement.dataset import LeftOut
+from pisigma.measurement.fields import LeftOut
 from pisigma.robot.description import Robot
 
 BAD_ROW = "bad_row"

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pisigma.judging.calibration_validation import CalibrationValidation, Progress, validate
 from pisigma.judging.trained_calibrations import Calibrator
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.drawing import with_fewer
-from pisigma.measurement.splits import TrainTest
+from pisigma.measurement.splits import TrainTest, with_fewer
 
 
 @dataclass(frozen=True, eq=False)

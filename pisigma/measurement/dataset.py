@@ -1,12 +1,11 @@
-"""Measurements: joint values commanded, and what a sensor saw there."""
+"""Measurements: joint values commanded, and what a sensor measured there."""
 
 import hashlib
 import json
-import math
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, get_args
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,67 +13,62 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError
-from pisigma.measurement.consistency import NUMBERS, TEXTS, check_parts, row_place
+from pisigma.measurement.csv.reading import read_fields
+from pisigma.measurement.csv.writing import write_fields
+from pisigma.measurement.fields import (
+    KINDS,
+    Kind,
+    LeftOut,
+    MeasuredFields,
+    OnBadRow,
+    check_fields,
+    joined_fields,
+)
+from pisigma.measurement.readings import READINGS
 from pisigma.robot import Robot
 from pisigma.se3 import transform
-
-OnBadRow = Literal["error", "leave_out"]
-
-Kind = Literal["pose", "position", "rotation", "touch", "socket", "distance"]
-"""What a sensor sees in a row; the orientation alone is "rotation", with a position it makes a "pose"."""
-
-
-@dataclass(frozen=True)
-class LeftOut:
-    """A row of a file that could not be used.
-
-    Attributes:
-        line: its line in the file.
-        reason: the column at fault, what stands there and what to do.
-    """
-
-    line: int
-    reason: str
 
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
     """One row a measurement, in SI units.
 
-    What was not measured in a row is NaN there, and "" where it is a name; a column that no row has is None.
+    What was not measured in a row is NaN there, and "" where it is a name; a field that no row has is None.
     A row holds one length at most: a position, a touch, a socket or a distance. The orientation may stand
-    beside any of them. What a second sensor saw at the same joint values is a second row.
+    beside any of them. What a second sensor measured at the same joint values is a second row.
 
     Attributes:
         q: commanded joint values [rad or m], as the controller counts.
         position: measured position of the target in its frame [m].
         rotation: measured rotation of the tool in its frame.
         frame: per row, the frame the sensor measures from; "" where the file names none.
-        target: per row, which reflector on the tool was seen; "" where the file names none.
+        target: per row, which reflector on the tool was measured; "" where the file names none.
         sigma_position: per row, standard deviation of the length that was measured there (of every coordinate
-            of a position) [m], where given.
-        sigma_rotation: per row, standard deviation of a measured angle [rad], where given.
-        split: per row "train" or "test" (column `set`), where given.
-        payload: per row [kg], where given.
-        temperature: per row [deg C], where given.
-        approach: per row and joint, from which side the joint came to its value: +1 as it grew, -1 as it fell,
-            NaN where that is not stated.
+            of a position) [m]; NaN where it is not stated.
+        sigma_rotation: per row, standard deviation of a measured angle [rad]; NaN where it is not stated.
+        split: per row "train" or "test" (column `set`).
+        payload: per row [kg].
+        temperature: per row [deg C].
         socket: per row, the socket that the target's ball sits in; all rows of one share one unknown point.
         touch_axis: per row, the axis ("x", "y" or "z") of the row's frame along which the target's tip
             touched.
         touch: per row, the coordinate at which it touched [m].
         distance: per row [m], from the anchor to the target, or between the targets of the two rows of a
             pair, each of which holds it.
-        anchor: per row, the fixed point that the distance is from; its rows share one place and one zero
+        anchor: per row, the fixed point that the distance is from; its rows share one point and one zero
             offset.
-        anchor_place: per row, the place of the anchor in the row's frame [m], where it is known.
+        anchor_place: per row, where the anchor is in the row's frame [m]; NaN where that is to be identified.
         pair: per row, the pair that it belongs to; a pair has exactly two rows, in one frame.
+        approach: per row and joint, from which side the joint came to its value: +1 as it grew, -1 as it fell,
+            NaN where that is not stated.
+        readings: what registered sensors measured (see `pisigma.sensors.register_sensor`), by column: one number
+            [SI] or one name a row.
         line: per row, the line in the file it came from (0 where it came from none).
         source: the file, or what made the rows.
         left_out: rows of the file that are not here, and why.
 
     Raises:
-        MeasurementError: the parts do not fit together, or a value cannot be one; the message names the row.
+        MeasurementError: the fields do not fit together, or a value cannot be one; the message names the row.
     """
 
     q: Float64[Tensor, "rows dof"]
@@ -95,12 +89,13 @@ class Measurements:
     anchor_place: Float64[Tensor, "rows 3"] | None = None
     pair: tuple[str, ...] | None = None
     approach: Float64[Tensor, "rows dof"] | None = None
+    readings: Mapping[str, Tensor | tuple[str, ...]] = field(default_factory=dict)
     line: tuple[int, ...] = ()
     source: str = "memory"
     left_out: tuple[LeftOut, ...] = ()
 
     def __post_init__(self) -> None:
-        """Fill in the names that were not given and check that everything fits together."""
+        """Fill in names that are missing and check that everything fits together."""
         if self.q.ndim != 2 or self.q.shape[1] == 0:
             raise MeasurementError(
                 f"{self.source}: joint values of shape (rows, joints) were wanted, got {tuple(self.q.shape)}."
@@ -112,7 +107,41 @@ class Measurements:
         for name in ("socket", "touch_axis", "anchor", "pair"):
             names = getattr(self, name) or ()
             object.__setattr__(self, name, tuple(names) if any(names) else None)
-        check_parts({item.name: getattr(self, item.name) for item in fields(self)})
+        check_fields(self.as_fields())
+
+    def as_fields(self) -> MeasuredFields:
+        """Return the rows field by field, without the fields that no row has."""
+        present = {
+            item.name: value
+            for item in fields(self)
+            if item.name not in ("line", "source", "left_out", "readings")
+            and (value := getattr(self, item.name)) is not None
+        }
+        present |= dict(sorted(self.readings.items()))
+        return MeasuredFields(
+            numbers={name: value for name, value in present.items() if isinstance(value, Tensor)},
+            texts={name: value for name, value in present.items() if not isinstance(value, Tensor)},
+            line=self.line,
+            source=self.source,
+            left_out=self.left_out,
+        )
+
+    @staticmethod
+    def from_fields(data: MeasuredFields) -> "Measurements":
+        """Make measurements of their fields; the inverse of `as_fields`.
+
+        Raises:
+            MeasurementError: the fields do not fit together, or a value cannot be one; the message names the row.
+        """
+        columns: dict[str, Any] = {**data.numbers, **data.texts}
+        built_in = {item.name for item in fields(Measurements)}
+        return Measurements(
+            **{name: values for name, values in columns.items() if name in built_in},
+            readings={name: values for name, values in columns.items() if name not in built_in},
+            line=data.line,
+            source=data.source,
+            left_out=data.left_out,
+        )
 
     @property
     def rows(self) -> int:
@@ -124,32 +153,17 @@ class Measurements:
         """Number of joints."""
         return self.q.shape[1]
 
-    def seen(self, kind: Kind) -> Bool[Tensor, " rows"]:
-        """For every row, whether it holds a measurement of a kind.
+    def measured(self, kind: Kind) -> Bool[Tensor, " rows"]:
+        """Say for every row whether it holds a measurement of a kind; see `pisigma.measurement.fields.Kind`.
 
         A row with position and orientation is of the kind "pose" and of no other.
         """
-        if kind == "socket":
-            names = self.socket or ("",) * self.rows
-            return torch.tensor([bool(name) for name in names], dtype=torch.bool, device=self.q.device)
-        if kind in ("touch", "distance"):
-            return self._there(self.touch if kind == "touch" else self.distance)
-        position, rotation = self._there(self.position), self._there(self.rotation)
-        return {
-            "pose": position & rotation,
-            "position": position & ~rotation,
-            "rotation": rotation & ~position,
-        }[kind]
-
-    def _there(self, values: Tensor | None) -> Bool[Tensor, " rows"]:
-        if values is None:
-            return torch.zeros(self.rows, dtype=torch.bool, device=self.q.device)
-        return torch.isfinite(values.reshape(self.rows, math.prod(values.shape[1:]))).all(-1)
+        return self.as_fields().measured(kind)
 
     @property
     def kinds(self) -> frozenset[Kind]:
         """What was measured in any of the rows; empty where nothing was."""
-        return frozenset(kind for kind in get_args(Kind) if bool(self.seen(kind).any()))
+        return frozenset(kind for kind in (*KINDS, *READINGS) if bool(self.measured(kind).any()))
 
     @property
     def T(self) -> Float64[Tensor, "rows 4 4"]:
@@ -167,8 +181,8 @@ class Measurements:
         return transform(self.rotation, self.position)
 
     def place(self, row: int) -> str:
-        """Where a row is from, as complaints say it: file and line, or source and row counted from 0."""
-        return row_place(self.source, self.line, row)
+        """Name a row as complaints do: by file and line, or by source and row counted from 0."""
+        return self.as_fields().label(row)
 
     def select(self, index: Tensor) -> "Measurements":
         """The rows of an index, in its order, or of a mask, with everything that belongs to them.
@@ -195,48 +209,37 @@ class Measurements:
                 f"{self.source}: rows 0 to {self.rows - 1} were wanted, the index goes from "
                 f"{int(index.min())} to {int(index.max())}."
             )
-        chosen: dict[str, Any] = {}
-        places = index.tolist()
-        for name in ("q", *NUMBERS, *TEXTS, "line"):
-            values = getattr(self, name)
-            if isinstance(values, Tensor):
-                chosen[name] = values[index]
-            elif values is not None:
-                chosen[name] = tuple(values[place] for place in places)
-        return replace(self, **chosen)
+        return Measurements.from_fields(self.as_fields().select(index))
 
     def content_hash(self) -> str:
         """SHA-256 (hexadecimal) of the values, wherever they came from: equal values, equal hash."""
         digest = hashlib.sha256()
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if item.name in ("line", "source", "left_out") or value is None:
-                continue
-            if isinstance(value, Tensor):
-                array = value.detach().cpu().numpy().astype("<f8") + 0.0  # -0.0 becomes 0.0
+        data = self.as_fields()
+        order = [item.name for item in fields(self)] + sorted(self.readings)
+        for name in order:
+            if name in data.numbers:
+                array = data.numbers[name].detach().cpu().numpy().astype("<f8") + 0.0  # -0.0 becomes 0.0
                 array[np.isnan(array)] = np.nan  # there are many NaN, one is enough
-                digest.update(f"{item.name} {array.shape}:".encode() + array.tobytes())
-            else:
-                digest.update(f"{item.name}:{json.dumps(value)}".encode())
+                digest.update(f"{name} {array.shape}:".encode() + array.tobytes())
+            elif name in data.texts:
+                digest.update(f"{name}:{json.dumps(data.texts[name])}".encode())
         return digest.hexdigest()
 
     @staticmethod
     def read_csv(
         path: str | os.PathLike[str], robot: Robot | None = None, on_bad_row: OnBadRow = "error"
     ) -> "Measurements":
-        """Read a CSV file; units come from the column names. See `pisigma.measurement.csv.reading.read_csv`.
+        """Read a CSV file; units come from the column names. See `pisigma.measurement.csv.reading.read_fields`.
 
         Args:
             path: the file.
-            robot: checks number, units and limits of the joints, where given.
+            robot: checks number, units and limits of the joints; None checks none of them.
             on_bad_row: "error", or "leave_out" to go on without it and to report it in `left_out`.
 
         Raises:
             MeasurementError: the file or a row cannot be used; the message names file, line and column.
         """
-        from pisigma.measurement.csv.reading import read_csv
-
-        return read_csv(path, robot, on_bad_row)
+        return Measurements.from_fields(read_fields(path, robot, on_bad_row))
 
     def write_csv(
         self,
@@ -244,7 +247,10 @@ class Measurements:
         robot: Robot | None = None,
         revolute: Sequence[bool] | None = None,
     ) -> None:
-        """Write a CSV file that `read_csv` reads back. See `pisigma.measurement.csv.writing.write_csv`.
+        """Write a CSV file that `read_csv` reads back: degrees and millimetres with every digit, and quaternions.
+
+        The file is put in its place in one step when it is complete. Read back it gives the same values to 1e-12
+        relative (a rotation, where it is orthonormal to that).
 
         Args:
             path: the file; written whole or not at all.
@@ -252,9 +258,42 @@ class Measurements:
             revolute: the same per joint, without a robot; with neither, all joints turn.
 
         Raises:
-            MeasurementError: the measurements cannot be written such that they can be read back.
+            MeasurementError: the measurements would not read back: no row, a row in which nothing was measured, two
+                equal rows, a name that a CSV cell cannot hold, or joints that do not fit.
             OutputError: the file cannot be written there.
         """
-        from pisigma.measurement.csv.writing import write_csv
+        origin = "'revolute'" if robot is None else f"robot '{robot.name}'"
+        turning = (True,) * self.dof if revolute is None else tuple(revolute)
+        turning = turning if robot is None else robot.revolute
+        if len(turning) != self.dof:
+            raise MeasurementError(
+                f"{self.source}: has {self.dof} joints, but {origin} has {len(turning)}; give the robot that was "
+                "measured."
+            )
+        write_fields(self.as_fields(), path, turning)
 
-        write_csv(self, path, robot, revolute)
+
+def join(data: Sequence[Measurements]) -> Measurements:
+    """Put the rows of several data sets behind each other; what one of them lacks is NaN or "" in its rows.
+
+    Frames, targets, sockets, anchors and pairs of one name are taken for the same.
+
+    Args:
+        data: one or more, of robots with equally many joints.
+
+    Raises:
+        MeasurementError: there is no data set, numbers of joints differ, only some of them say which rows are for the
+            test, or rows contradict each other.
+    """
+    if not data:
+        raise MeasurementError("join: one or more data sets were wanted, got none.")
+    dofs = sorted({one.dof for one in data})
+    if len(dofs) > 1:
+        raise MeasurementError(
+            f"join: data sets of {dofs[0]} and of {dofs[-1]} joints cannot be joined; give those of one robot."
+        )
+    if len({one.split is None for one in data if one.rows}) > 1:
+        raise MeasurementError(
+            "join: some data sets have a split and some have none; give it to all or to none."
+        )
+    return Measurements.from_fields(joined_fields([one.as_fields() for one in data]))

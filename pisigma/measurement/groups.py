@@ -25,7 +25,7 @@ def groups_of_equal_joints(q: Float64[Tensor, "rows dof"]) -> Int64[Tensor, " ro
 
 
 def groups_to_keep_whole(measurements: Measurements) -> Int64[Tensor, " rows"]:
-    """Number the groups of rows that training and test must not part, in the order of their first row.
+    """Number the groups of rows that a split must keep together, in the order of their first row.
 
     Rows of equal joint values belong together, and so do the two rows of a pair and everything that either of
     them belongs to.
@@ -55,9 +55,9 @@ def placements(measurements: Measurements) -> tuple[str, ...]:
     names = measurements.frame
     if measurements.socket is not None:
         names = tuple(name.rpartition("/")[0] or name for name in measurements.socket)
-    found = list(dict.fromkeys(name for name in names if name))
-    if len(found) < 2:
-        what = f"'{found[0]}' is the only one" if found else "neither sockets nor frames have names"
+    placed = list(dict.fromkeys(name for name in names if name))
+    if len(placed) < 2:
+        what = f"'{placed[0]}' is the only one" if placed else "neither sockets nor frames have names"
         raise MeasurementError(
             f"{measurements.source}: two placements or more were wanted, but {what}; name sockets by placement, "
             "such as low/0 and low/1, or frames, or split by joints, time or space."

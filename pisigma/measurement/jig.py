@@ -1,4 +1,4 @@
-"""Jigs: stepped blocks whose faces a tip touches, known in the frame of the jig."""
+"""Jigs: stepped blocks whose faces, at known coordinates of the jig's frame, a tip touches."""
 
 import os
 from dataclasses import dataclass

@@ -1,16 +1,15 @@
 """Which length was measured in a row, and whether rows fit together: the rules for all of it."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
+from pisigma.measurement.readings import RowFault
+
 AXES = ("x", "y", "z")
 """Names of the axes of a frame, as a touch gives them."""
-
-RowFault = tuple[Bool[np.ndarray, " rows"], Callable[[int], str]]
-"""Rows at fault, and what is wrong with one of them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +28,7 @@ class LengthCells:
         distance: distance from the anchor, or between the tool points of a pair.
         anchor_place: where the anchor stands.
         sigma: standard deviation of the length.
+        others: by registered sensor that measures a length, the rows that have one.
     """
 
     labels: Mapping[str, str]
@@ -42,18 +42,20 @@ class LengthCells:
     distance: Float64[np.ndarray, " rows"]
     anchor_place: Float64[np.ndarray, "rows 3"]
     sigma: Float64[np.ndarray, " rows"]
+    others: Mapping[str, Bool[np.ndarray, " rows"]] = field(default_factory=dict)
 
     def label(self, quantity: str) -> str:
         """What complaints call a quantity."""
         return self.labels.get(quantity, f"column '{quantity}'")
 
-    def seen(self) -> dict[str, Bool[np.ndarray, " rows"]]:
+    def measured(self) -> dict[str, Bool[np.ndarray, " rows"]]:
         """For every quantity that is a length, the rows that have one."""
         return {
             "position": self.position,
             "socket": _named(self.socket),
             "touch": ~np.isnan(self.touch),
             "distance": ~np.isnan(self.distance),
+            **self.others,
         }
 
 
@@ -70,13 +72,13 @@ def row_faults(cells: LengthCells) -> Iterator[RowFault]:
     Yields:
         Rows at fault, and a function that says what is wrong with one of them and what to do.
     """
-    seen = cells.seen()
-    yield from _touch_faults(cells, seen["touch"])
-    yield from _distance_faults(cells, seen["distance"])
-    several = np.sum(list(seen.values()), axis=0) > 1
+    measured = cells.measured()
+    yield from _touch_faults(cells, measured["touch"])
+    yield from _distance_faults(cells, measured["distance"])
+    several = np.sum(list(measured.values()), axis=0) > 1
 
     def describe(row: int) -> str:
-        names = " and ".join(cells.label(name) for name, there in seen.items() if there[row])
+        names = " and ".join(cells.label(name) for name, there in measured.items() if there[row])
         return (
             f"{names}: a row holds one measured length; put each in a row of its own, with equal joint values"
         )
@@ -91,11 +93,11 @@ def _touch_faults(cells: LengthCells, touch: Bool[np.ndarray, " rows"]) -> Itera
         np.array([name not in ("", *AXES) for name in cells.touch_axis], dtype=bool),
         lambda row: f"{label}: '{cells.touch_axis[row]}' is no axis; write x, y or z",
     )
-    yield touch & ~axis, lambda row: f"{label}: no axis was given for the touch; write x, y or z"
+    yield touch & ~axis, lambda row: f"{label}: the touch has no axis; write x, y or z"
     yield (
         axis & ~touch,
         lambda row: (
-            f"{value}: no coordinate was given for the touch along {cells.touch_axis[row]}; "
+            f"{value}: the touch along {cells.touch_axis[row]} has no coordinate; "
             "give it, or remove the "
             "axis too"
         ),
@@ -115,7 +117,7 @@ def _distance_faults(cells: LengthCells, distance: Bool[np.ndarray, " rows"]) ->
     label, names = cells.label("distance"), (cells.label("anchor"), cells.label("pair"))
     yield (
         cells.distance < 0,
-        lambda row: f"{label}: {cells.distance[row]:.6g} was found where 0 or more was wanted; correct it",
+        lambda row: f"{label}: {cells.distance[row]:.6g} stands where 0 or more was wanted; correct it",
     )
     yield (
         distance & ~anchor & ~pair,
@@ -131,7 +133,7 @@ def _distance_faults(cells: LengthCells, distance: Bool[np.ndarray, " rows"]) ->
     )
     yield (
         (anchor | pair) & ~distance,
-        lambda row: f"{label}: no distance was given for '{cells.anchor[row] or cells.pair[row]}'; give it",
+        lambda row: f"{label}: the distance is missing for '{cells.anchor[row] or cells.pair[row]}'; give it",
     )
     missing = np.isnan(cells.anchor_place)
     yield (
@@ -142,7 +144,7 @@ def _distance_faults(cells: LengthCells, distance: Bool[np.ndarray, " rows"]) ->
     )
     yield (
         np.asarray(~missing.all(1) & ~anchor),
-        lambda row: f"{names[0]}: no anchor is named, but its place is given; name the anchor",
+        lambda row: f"{names[0]}: the place of an anchor is stated without its name; name the anchor",
     )
 
 

@@ -1,6 +1,7 @@
-"""Parting measurements into training and test; rows of equal joint values, and of a pair, stay together."""
+"""Splits of measurements into training and test rows; rows of equal joint values, and of a pair, stay together."""
 
 import heapq
+from collections.abc import Sequence
 from typing import Literal, get_args
 
 import torch
@@ -8,6 +9,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.measurement.conditions import CONDITIONS, conditions_of
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints as groups_of_equal_joints
 from pisigma.measurement.groups import groups_to_keep_whole, placement_groups
@@ -17,9 +19,11 @@ SplitBy = Literal["joints", "interleaved", "time", "space", "placement"]
 the measured positions; by placement: all sockets of a placement together, or all rows of a frame."""
 
 AT_RANDOM: tuple[SplitBy, ...] = ("joints", "placement")
-"""Ways that deal groups at random, so that repeat again gives other folds."""
-JUDGED_GROUPS, MOST_DEALINGS = 200, 10
-"""Groups held out, counted anew in every repeat, after which the luck of the repeat hardly shows."""
+"""Ways that put groups into folds at random, so that another repeat gives other folds."""
+JUDGED_GROUPS, MOST_REPEATS = 200, 10
+"""Groups held out, counted anew in every repeat, after which the luck of a single repeat hardly shows."""
+SeriesColumn = Literal["frame", "target", "set", "payload_kg", "temperature_c"]
+"""Columns of a measurement file by which series differ."""
 
 TrainTest = tuple[Int64[Tensor, " _train"], Int64[Tensor, " _test"]]
 """Rows to train on and rows to test on, each in the order of the measurements."""
@@ -28,17 +32,17 @@ TrainTest = tuple[Int64[Tensor, " _train"], Int64[Tensor, " _test"]]
 def k_folds(
     measurements: Measurements, folds: int | None, seed: int | torch.Generator, by: SplitBy = "joints"
 ) -> tuple[TrainTest, ...]:
-    """Part the measurements into folds, each of which is the test once.
+    """Split the measurements into folds, each of which is the test once.
 
     Args:
-        measurements: what to part.
+        measurements: what to split.
         folds: how many, 2 or more; None for as many as there are groups to keep whole.
         seed: decides which groups come together by joints and by placement; unused otherwise.
-        by: "joints": groups of equal joints, shuffled and dealt such that folds are as equal as the groups
+        by: "joints": groups of equal joints, shuffled and assigned such that folds are as equal as the groups
             allow; "interleaved": the same unshuffled, so that groups of one size go to the folds in turn, as
-            scikit-learn's GroupKFold deals them; "time": contiguous blocks of the rows' order, a group counting
+            with scikit-learn's GroupKFold; "time": contiguous blocks of the rows' order, a group counting
             where its first row stands; "space": blocks from cutting the measured positions again and again
-            across their widest axis; "placement": dealt like joints, but whole placements (see `placements`);
+            across their widest axis; "placement": assigned like joints, but whole placements (see `placements`);
             rows of none are in no test.
 
     Returns:
@@ -59,7 +63,7 @@ def k_folds(
     fold = torch.zeros(len(sizes), dtype=torch.int64)
     if by in ("joints", "placement", "interleaved"):
         order = torch.arange(len(sizes)) if by == "interleaved" else _shuffled(len(sizes), seed)
-        _deal(fold, sizes, order, folds)
+        _assign(fold, sizes, order, folds)
     else:
         positions = _group_positions(measurements, group, len(sizes)) if by == "space" else None
         _cut_into_folds(fold, sizes, positions, torch.arange(len(sizes)), 0, folds)
@@ -73,18 +77,18 @@ def repeats(
     by: SplitBy = "joints",
     times: int | None = None,
 ) -> tuple[tuple[TrainTest, ...], ...]:
-    """Part the measurements into folds several times over, differently each time.
+    """Split the measurements into folds several times over, differently each time.
 
     With few groups the error of held-out rows depends on which of them came together; over several repeats that
     averages out (Burman 1989, Biometrika 76(3), 503-514).
 
     Args:
-        measurements: what to part.
+        measurements: what to split.
         folds: how many, 2 or more; None for as many as there are groups.
         seed: of the first repeat; the others follow from it.
         by: see `k_folds`.
-        times: how many repeats; None for as many as it takes to hold out `JUDGED_GROUPS` groups, `MOST_DEALINGS` at
-            most, and one where groups are not dealt at random, by placement, or one by one.
+        times: how many repeats; None for as many as it takes to hold out `JUDGED_GROUPS` groups, `MOST_REPEATS` at
+            most, and one where groups are not assigned at random, by placement, or one by one.
 
     Returns:
         Per repeat its folds, as from `k_folds`; the first one as with `k_folds`.
@@ -97,7 +101,7 @@ def repeats(
     groups = len(_groups(measurements, by)[1])
     differ = by in AT_RANDOM and len(first) < groups
     if times is None:
-        usual = min(JUDGED_GROUPS // groups, MOST_DEALINGS)
+        usual = min(JUDGED_GROUPS // groups, MOST_REPEATS)
         times = max(usual, 1) if by == "joints" and differ else 1
     if times > 1 and not differ:
         what = f"{groups} folds of {groups} {_kind(by)}" if by in AT_RANDOM else f"folds by {by}"
@@ -114,7 +118,7 @@ def holdout(
     """Keep a share of the measurements for the test.
 
     Args:
-        measurements: what to part.
+        measurements: what to split.
         share: of the rows for the test, between 0 and 1; met as closely as the groups allow.
         seed: decides which rows by joints and by placement; unused otherwise.
         by: "joints": groups of equal joints at random; "interleaved": every so many groups one; "time": the last
@@ -145,6 +149,130 @@ def holdout(
     return _train_test(measurements, is_test[group] & (group >= 0))
 
 
+def draw_rows(measurements: Measurements, rows: int, seed: int) -> Int64[Tensor, " _drawn"]:
+    """Draw rows at random; those of equal joint values, and of a pair, come together.
+
+    With one seed a smaller draw is part of every larger one.
+
+    Args:
+        measurements: to draw from.
+        rows: how many are wanted; it is met as closely as whole configurations allow.
+        seed: of the draw.
+
+    Returns:
+        Numbers of the rows in the order of the measurements.
+
+    Raises:
+        MeasurementError: there are fewer rows, or less than one is wanted.
+    """
+    if not 1 <= rows <= measurements.rows:
+        raise MeasurementError(
+            f"{measurements.source}: {rows} training rows were wanted, but there are {measurements.rows} to draw "
+            f"from; ask for 1 to {measurements.rows}."
+        )
+    group = groups_to_keep_whole(measurements).cpu()
+    sizes = torch.bincount(group)
+    order = torch.randperm(len(sizes), generator=torch.Generator().manual_seed(seed))
+    count = int((sizes[order].cumsum(0) - rows).abs().argmin()) + 1
+    return torch.isin(group, order[:count]).nonzero()[:, 0].to(measurements.q.device)
+
+
+def with_fewer(
+    measurements: Measurements, splits: Sequence[TrainTest], rows: int, seed: int
+) -> tuple[TrainTest, ...]:
+    """Draw the training rows of every split of a cross-validation; its test rows stay. See `draw_rows`.
+
+    Raises:
+        MeasurementError: a split has fewer training rows.
+    """
+    return tuple((train[draw_rows(measurements.select(train), rows, seed)], test) for train, test in splits)
+
+
+def series_of(measurements: Measurements, column: SeriesColumn) -> tuple[str, ...]:
+    """Name of the series that every row belongs to, as a column says; "" where it says nothing.
+
+    Of several files, name the rows of each instead: `("monday",) * a.rows + ("friday",) * b.rows` for `join([a, b])`.
+
+    Raises:
+        MeasurementError: the column is unknown or no row has a value in it.
+    """
+    if column not in get_args(SeriesColumn):
+        raise MeasurementError(
+            f"series by '{column}' are unknown; {nearest_choice(column, get_args(SeriesColumn))}"
+        )
+    if column in CONDITIONS:
+        values = conditions_of(measurements, (column,))[:, 0].tolist()
+        names = tuple("" if value != value else f"{value:g}" for value in values)
+    else:
+        column_values = measurements.split if column == "set" else getattr(measurements, column)
+        names = tuple(column_values or ("",) * measurements.rows)
+    if not any(names):
+        raise MeasurementError(f"{measurements.source}: no row has a value in the column '{column}'.")
+    return names
+
+
+def one_against_another(
+    measurements: Measurements, names: Sequence[str], test: str, train: str | None = None
+) -> TrainTest:
+    """Train on one series and test on another.
+
+    Rows whose joint values, or whose pair, occur in the tested series too are not trained with, so that no
+    configuration is judged that was learned.
+
+    Args:
+        measurements: what to part.
+        names: series of every row; rows of "" are in neither part.
+        test: the series to test on.
+        train: the series to train on; None for all others.
+
+    Returns:
+        The rows to train on and the rows to test on.
+
+    Raises:
+        MeasurementError: there is no such series, both are the same, there is not a name per row, or no row is left
+            to train on.
+    """
+    if len(names) != measurements.rows:
+        raise MeasurementError(
+            f"{measurements.source}: a series for each of {measurements.rows} rows was wanted, got {len(names)}."
+        )
+    present = {name for name in names if name}
+    for wanted in (test,) if train is None else (test, train):
+        if wanted not in present:
+            raise MeasurementError(
+                f"{measurements.source}: there is no series '{wanted}'; {nearest_choice(wanted, present)}"
+            )
+    if train == test:
+        raise MeasurementError(
+            f"{measurements.source}: series '{test}' cannot be tested on itself; choose two."
+        )
+    device = measurements.q.device
+    tested = torch.tensor([name == test for name in names], device=device)
+    others = [bool(name) and name != test and train in (None, name) for name in names]
+    group = groups_to_keep_whole(measurements)
+    trained = torch.tensor(others, device=device) & ~torch.isin(group, group[tested])
+    if not trained.any():
+        raise MeasurementError(
+            f"{measurements.source}: no row is left to train on when series '{test}' is tested, as all others have "
+            "joint values that occur in it; measure other poses."
+        )
+    return trained.nonzero()[:, 0], tested.nonzero()[:, 0]
+
+
+def leave_one_series_out(measurements: Measurements, names: Sequence[str]) -> tuple[TrainTest, ...]:
+    """Test on every series once, each time training on all others, in the order in which they appear.
+
+    For what is raised see `one_against_another`.
+
+    Raises:
+        MeasurementError: there are not two series.
+    """
+    series = [name for name in dict.fromkeys(names) if name]
+    if len(series) < 2:
+        raise MeasurementError(f"{measurements.source}: two series or more were wanted, got {len(series)}.")
+    return tuple(one_against_another(measurements, names, name) for name in series)
+
+
 def _groups(
     measurements: Measurements, by: SplitBy
 ) -> tuple[Int64[Tensor, " rows"], Int64[Tensor, " groups"]]:
@@ -164,7 +292,7 @@ def _check_several(measurements: Measurements, sizes: Int64[Tensor, " groups"], 
     if len(sizes) < 2:
         what = "placement" if by == "placement" else "joint vector, so they are one pose"
         raise MeasurementError(
-            f"{measurements.source}: all {measurements.rows} rows are of one {what}, which cannot be parted into "
+            f"{measurements.source}: all {measurements.rows} rows are of one {what}, which cannot be split into "
             "training and test; measure at other joint values, spread over the workspace."
         )
 
@@ -178,13 +306,13 @@ def _shuffled(count: int, seed: int | torch.Generator) -> Int64[Tensor, " count"
     return torch.randperm(count, generator=generator, device=generator.device).cpu()
 
 
-def _deal(
+def _assign(
     fold: Int64[Tensor, " groups"],
     sizes: Int64[Tensor, " groups"],
     order: Int64[Tensor, " groups"],
     folds: int,
 ) -> None:
-    """Deal the groups, large ones first, each to the fold with the fewest rows."""
+    """Assign the groups, large ones first, each to the fold with the fewest rows."""
     order = order[sizes[order].argsort(descending=True, stable=True)]
     heap = [(0, number) for number in range(folds)]
     for group, size in zip(order.tolist(), sizes[order].tolist(), strict=True):
@@ -195,10 +323,10 @@ def _deal(
 
 def _interleaved(sizes: Int64[Tensor, " groups"], share: float) -> Bool[Tensor, " groups"]:
     """Which groups are the test, so that of the rows up to any group it holds the share as closely as may be."""
-    is_test, seen, held = [], 0, 0
+    is_test, passed, held = [], 0, 0
     for size in sizes.tolist():
-        seen += size
-        is_test.append(abs(held + size - share * seen) < abs(held - share * seen))
+        passed += size
+        is_test.append(abs(held + size - share * passed) < abs(held - share * passed))
         held += size * is_test[-1]
     if all(is_test) or not any(is_test):
         is_test[-1] = not is_test[-1]
@@ -254,15 +382,15 @@ def _group_positions(
     position = torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
     if measurements.position is not None:
         position = measurements.position.detach().cpu()
-    seen = ~position.isnan().any(-1)
-    count = torch.bincount(group[seen], minlength=groups)
+    measured = ~position.isnan().any(-1)
+    count = torch.bincount(group[measured], minlength=groups)
     if (count == 0).any():
         row = int((group == int((count == 0).nonzero()[0])).nonzero()[0])
         raise MeasurementError(
             f"{measurements.place(row)}: no position was measured, so it cannot be split by space; split by "
             "joints or by time."
         )
-    total = torch.zeros(groups, 3, dtype=torch.float64).index_add(0, group[seen], position[seen])
+    total = torch.zeros(groups, 3, dtype=torch.float64).index_add(0, group[measured], position[measured])
     return total / count[:, None]
 
 

@@ -5,8 +5,7 @@ from pathlib import Path
 import torch
 
 from pisigma.errors import MeasurementError, RecipeError
-from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joining import join
+from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.splits import TrainTest
 from pisigma.recipes.geometric_recipe import GeometricRecipe
 from pisigma.recipes.hybrid_recipe import HybridRecipe, repeated

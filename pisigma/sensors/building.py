@@ -56,7 +56,7 @@ def names_of(names: tuple[str, ...] | None) -> tuple[str, ...]:
 
 
 def _positions(measurements: Measurements, Ts: Tensor) -> AbstractSensor | None:
-    seen = measurements.seen("position") | measurements.seen("pose")
+    seen = measurements.measured("position") | measurements.measured("pose")
     if measurements.position is None or not bool(seen.any()):
         return None
     position = (Ts[:, :3, :3] @ measurements.position[..., None])[..., 0] + Ts[:, :3, 3]
@@ -65,7 +65,7 @@ def _positions(measurements: Measurements, Ts: Tensor) -> AbstractSensor | None:
 
 
 def _rotations(measurements: Measurements, Ts: Tensor, R_tool: Tensor) -> AbstractSensor | None:
-    seen = measurements.seen("rotation") | measurements.seen("pose")
+    seen = measurements.measured("rotation") | measurements.measured("pose")
     if measurements.rotation is None or not bool(seen.any()):
         return None
     rotation = Ts[:, :3, :3] @ measurements.rotation @ R_tool.mT
@@ -78,7 +78,7 @@ def _rotations(measurements: Measurements, Ts: Tensor, R_tool: Tensor) -> Abstra
 
 def _touches(measurements: Measurements, bases: Tensor) -> AbstractSensor | None:
     """`e · (R p + t) = coordinate` is `(R^T e) · p = coordinate - e · t`."""
-    seen = measurements.seen("touch")
+    seen = measurements.measured("touch")
     if measurements.touch is None or not bool(seen.any()):
         return None
     axis = numbers_of(measurements.touch_axis, ("x", "y", "z"), measurements.rows).to(seen.device)
@@ -89,7 +89,7 @@ def _touches(measurements: Measurements, bases: Tensor) -> AbstractSensor | None
 
 
 def _sockets(measurements: Measurements) -> AbstractSensor | None:
-    seen = measurements.seen("socket")
+    seen = measurements.measured("socket")
     if not bool(seen.any()):
         return None
     names = names_of(measurements.socket)
@@ -102,7 +102,7 @@ def _distances(measurements: Measurements) -> AbstractSensor | None:
     if measurements.distance is None or not names:
         return None
     number = numbers_of(measurements.anchor, names, measurements.rows).to(measurements.q.device)
-    seen = measurements.seen("distance") & (number >= 0)
+    seen = measurements.measured("distance") & (number >= 0)
     sigma = _sigma(measurements, measurements.sigma_position, seen, "sigma_mm")
     return DistanceSensor(number, torch.where(seen, measurements.distance, 0.0), seen, sigma)
 
@@ -113,7 +113,7 @@ def _pairs(measurements: Measurements) -> AbstractSensor | None:
         return None
     names = torch.tensor([bool(name) for name in measurements.pair], device=measurements.q.device)
     first = torch.arange(measurements.rows, device=names.device) % 2 == 0
-    seen = measurements.seen("distance") & names & first
+    seen = measurements.measured("distance") & names & first
     sigma = _sigma(measurements, measurements.sigma_position, seen, "sigma_mm")
     return PairSensor(torch.where(seen, measurements.distance, 0.0), seen, sigma)
 

@@ -8,8 +8,7 @@ from jaxtyping import Float64
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joining import join
+from pisigma.measurement.dataset import Measurements, join
 from pisigma.simulation.commanded import AbstractCommanded
 from pisigma.simulation.distances import SimulatedDistances, SimulatedPairs, SimulatedSockets
 from pisigma.simulation.noise import MeasurementNoise

@@ -13,7 +13,8 @@ from pisigma.errors import UnreachablePoseError
 from pisigma.kinematics.joint_limits import wrap_into_limits
 from pisigma.kinematics.numeric import solve_numeric
 from pisigma.kinematics.status import Status
-from pisigma.measurement.dataset import LeftOut, Measurements
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.fields import LeftOut
 from pisigma.se3 import invert, transform
 from pisigma.simulation.noise import NoiseDraws, SensorNoise, draw_noise, row_sigma
 from pisigma.simulation.touch_candidates import JigPlacement, TouchCandidates, TouchCandidatesSection

@@ -14,8 +14,7 @@ from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.prediction import prediction_errors
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joining import join
+from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot import Robot
 
 PLACE = np.array([1.5, -0.2, 0.9])

@@ -9,8 +9,7 @@ from testing.sensors import ARM, TRUE_BASES, joints, pair_data, socket_data, tou
 
 from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joining import join
+from pisigma.measurement.dataset import Measurements, join
 
 
 def calibrator(**options: object) -> GeometricCalibrator:

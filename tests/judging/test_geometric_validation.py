@@ -14,7 +14,7 @@ from pisigma.identification.problem.loss import SquaredLoss
 from pisigma.judging.calibration_validation import validate
 from pisigma.judging.held_out_frames import with_frames
 from pisigma.measurement import Measurements, k_folds
-from pisigma.measurement.joining import join
+from pisigma.measurement.dataset import join
 from pisigma.reporting.held_out_sentences import held_out_lines
 
 KNOWN = {(f"{plate}/0", f"{plate}/1"): 0.05 for plate in ("plate", "low", "high")}

@@ -46,7 +46,7 @@ CASES: dict[str, tuple[str | None, str | bytes, tuple[str, ...]]] = {
     "orientation twice": (
         None,
         f"q1_deg,{POSITION},roll_deg,qx,qy,qz,qw\n",
-        ("'roll_deg'", "'qw'", "given twice"),
+        ("'roll_deg'", "'qw'", "stands twice"),
     ),
     "incomplete angles": (
         None,
@@ -129,7 +129,7 @@ ROWS = {
     "a sigma of nothing": (
         None,
         f"q1_deg,{POSITION},sigma_mm\n1,1,2,3,1e-300\n",
-        (2, "column 'sigma_mm'", "1e-300 was found where 1e-09 or more was wanted"),
+        (2, "column 'sigma_mm'", "1e-300 stands where 1e-09 or more was wanted"),
     ),
     "huge": (
         None,

@@ -8,7 +8,7 @@ from testing.closeness import assert_close
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement import LeftOut, Measurements
-from pisigma.measurement.joining import join
+from pisigma.measurement.dataset import join
 from pisigma.se3 import rotation_from_quaternion
 
 

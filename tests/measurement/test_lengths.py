@@ -45,11 +45,14 @@ def test_kinds_say_what_was_measured():
     ("change", "message"),
     [
         ({"touch_axis": ("", "u", "", "", "")}, r"row 1: 'touch_axis': 'u' is no axis"),
-        ({"touch_axis": None}, r"row 1: 'touch_axis': no axis was given"),
-        ({"touch": None}, r"row 1: 'touch': no coordinate was given for the touch along y"),
+        ({"touch_axis": None}, r"row 1: 'touch_axis': the touch has no axis"),
+        ({"touch": None}, r"row 1: 'touch': the touch along y has no coordinate"),
         ({"frame": ("",) * 5}, r"row 1: 'frame': the touch names no frame"),
-        ({"distance": column(NAN, NAN, -1.0, 0.5, 0.5)}, r"row 2: 'distance': -1 was found"),
-        ({"distance": column(NAN, NAN, NAN, 0.5, 0.5)}, r"row 2: 'distance': no distance was given for 'w'"),
+        ({"distance": column(NAN, NAN, -1.0, 0.5, 0.5)}, r"row 2: 'distance': -1 stands"),
+        (
+            {"distance": column(NAN, NAN, NAN, 0.5, 0.5)},
+            r"row 2: 'distance': the distance is missing for 'w'",
+        ),
         ({"anchor": None, "anchor_place": None}, r"row 2: 'anchor': the distance is from nowhere"),
         ({"anchor": None}, r"row 2: 'anchor'"),
         ({"pair": ("", "", "p", "p", "p")}, r"row 2: 'anchor' and 'pair'"),

@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.joining import join
+from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot import Robot
 from pisigma.se3 import transform_from_xyzrpy
 

@@ -53,7 +53,7 @@ def _frames(setup: CalibrationSetup) -> list[str]:
     data = setup.measurements
     if data.touch is None or data.touch_axis is None or not setup.problem.space.of("base"):
         return []
-    other = (data.seen("position") | data.seen("pose")).tolist()
+    other = (data.measured("position") | data.measured("pose")).tolist()
     found = []
     for frame in setup.problem.space.frames:
         rows = [row for row, name in enumerate(data.frame) if name == frame]
@@ -73,7 +73,9 @@ def frames_adrift(setup: CalibrationSetup) -> list[str]:
     data = setup.measurements
     if data.socket is None and data.distance is None:
         return []
-    held = data.seen("position") | data.seen("pose") | data.seen("touch") | data.seen("rotation")
+    held = (
+        data.measured("position") | data.measured("pose") | data.measured("touch") | data.measured("rotation")
+    )
     if data.anchor_place is not None:
         held |= torch.isfinite(data.anchor_place).all(-1)
     known = {frame for frame, told in zip(data.frame, held.tolist(), strict=True) if told}

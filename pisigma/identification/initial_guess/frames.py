@@ -110,8 +110,8 @@ def check_frame_values(measurements: Measurements, names: tuple[str, ...]) -> No
     """
     if measurements.touch is None:
         return
-    touch = measurements.seen("touch").tolist()
-    other = (measurements.seen("position") | measurements.seen("pose")).tolist()
+    touch = measurements.measured("touch").tolist()
+    other = (measurements.measured("position") | measurements.measured("pose")).tolist()
     for name in names:
         rows = [row for row, frame in enumerate(measurements.frame) if frame == name]
         touches = sum(touch[row] for row in rows)

@@ -138,8 +138,8 @@ def _from_positions(
     bases, tools = dict(given), dict[str, np.ndarray]()
     if measurements.position is None:
         return bases, tools
-    positions = (measurements.seen("position") | measurements.seen("pose")).cpu()
-    touches = measurements.seen("touch").cpu()
+    positions = (measurements.measured("position") | measurements.measured("pose")).cpu()
+    touches = measurements.measured("touch").cpu()
     frame = numbers_of(measurements.frame, space.frames, measurements.rows)
     count = [int((positions & (frame == number)).sum()) for number in range(len(space.frames))]
     for number in sorted(range(len(space.frames)), key=lambda number: -count[number]):
@@ -153,7 +153,7 @@ def _from_positions(
         if part.pair is not None:
             part = replace(part, pair=None, distance=None)
         find_base = free_base and name not in given
-        turned = bool(part.seen("pose").any())
+        turned = bool(part.measured("pose").any())
         if find_base and 3 <= len(rows) < FEW and not turned and set(part.target) <= set(tools):
             bases[name] = _base_by_tools(robot, part, tools)
             continue
@@ -191,7 +191,7 @@ def _touched_rows(
     """The touches of frames whose base is not known yet."""
     if measurements.touch is None:
         return {}
-    touches = measurements.seen("touch").cpu()
+    touches = measurements.measured("touch").cpu()
     frame = numbers_of(measurements.frame, space.frames, measurements.rows)
     found = {name: touches & (frame == number) for number, name in enumerate(space.frames)}
     return {name: rows for name, rows in found.items() if bool(rows.any()) and name not in bases}

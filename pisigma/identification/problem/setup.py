@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import get_args
 
 import numpy as np
 import torch
@@ -17,7 +16,9 @@ from pisigma.identification.problem.noise import renumbered
 from pisigma.identification.problem.parameters import ParameterSpace, Prior, PriorSizes
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.measurement.conditions import conditions_of, stated_conditions, with_conditions
-from pisigma.measurement.dataset import Kind, Measurements
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.fields import KINDS
+from pisigma.measurement.readings import READINGS
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert, rotation_from_rpy, transform_from_xyzrpy
 from pisigma.sensors.building import (
@@ -161,8 +162,8 @@ def build_setup(
 def _usable(measurements: Measurements) -> tuple[Tensor, Measurements]:
     """The rows in which something was seen; those of pairs come first, side by side."""
     seen = torch.zeros(measurements.rows, dtype=torch.bool, device=measurements.q.device)
-    for kind in get_args(Kind):
-        seen = seen | measurements.seen(kind)
+    for kind in (*KINDS, *READINGS):
+        seen = seen | measurements.measured(kind)
     if not bool(seen.any()):
         raise IdentificationError(
             f"{measurements.source}: none of its {len(seen)} rows has a measured value; give positions or poses "

@@ -1,23 +1,131 @@
-"""Checking the header of a measurement file: which quantity stands in which column, in which unit."""
+"""The header of a measurement file: what its columns mean, by their names alone, and whether they fit together."""
 
 import math
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 
-from pisigma.errors import MeasurementError
-from pisigma.measurement.csv.columns import (
-    ANCHOR_PLACE,
-    POSITION,
-    PRISMATIC_UNITS,
-    QUATERNION,
-    REVOLUTE_UNITS,
-    RPY,
-    Column,
-    column_choices,
-    find_column,
-    quoted,
-)
+import numpy as np
+from jaxtyping import Float64
+
+from pisigma.errors import MeasurementError, nearest_choice
 from pisigma.measurement.csv.table import Table
+from pisigma.measurement.readings import READINGS, Unit, reading_numbers, reading_texts
 from pisigma.robot import Robot
+
+POSITION = ("x", "y", "z")
+RPY = ("roll", "pitch", "yaw")
+QUATERNION = ("qx", "qy", "qz", "qw")
+ANCHOR_PLACE = ("anchor_x", "anchor_y", "anchor_z")
+TEXTS = ("target", "frame", "set", "socket", "touch_axis", "anchor", "pair")
+
+REVOLUTE_UNITS: tuple[Unit, ...] = ("deg", "rad")
+PRISMATIC_UNITS: tuple[Unit, ...] = ("mm", "m")
+
+_PER_SI = {"deg": 180 / np.pi, "mm": 1e3}
+
+_JOINT = re.compile(r"q([1-9][0-9]{0,2})_(deg|rad|mm|m)")
+_APPROACH = re.compile(r"approach([1-9][0-9]{0,2})")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a measurement file.
+
+    Attributes:
+        name: as in the header, such as "q1_deg".
+        quantity: what stands in it, such as "q1"; no two columns of a file have the same.
+        unit: "" where there is none.
+    """
+
+    name: str
+    quantity: str
+    unit: Unit
+
+    @property
+    def is_number(self) -> bool:
+        """Whether its cells hold numbers."""
+        return self.quantity not in (*TEXTS, *reading_texts())
+
+    @property
+    def joint(self) -> int:
+        """Number of the joint, from 1; 0 where it is no joint column."""
+        match = _JOINT.fullmatch(self.name)
+        return int(match[1]) if match else 0
+
+    @property
+    def approach(self) -> int:
+        """Number of the joint whose direction of approach it holds, from 1; 0 where it holds none."""
+        match = _APPROACH.fullmatch(self.name)
+        return int(match[1]) if match else 0
+
+
+_COLUMNS: dict[str, Column] = {
+    column.name: column
+    for column in (
+        *(Column(f"{name}_mm", name, "mm") for name in POSITION),
+        *(Column(f"{name}_m", name, "m") for name in POSITION),
+        *(Column(f"{name}_deg", name, "deg") for name in RPY),
+        *(Column(name, name, "") for name in QUATERNION),
+        *(
+            Column(f"{name}_{unit}", name, unit)
+            for name in ("touch", "distance", *ANCHOR_PLACE)
+            for unit in PRISMATIC_UNITS
+        ),
+        *(Column(name, name, "") for name in TEXTS),
+        Column("sigma_mm", "sigma_position", "mm"),
+        Column("sigma_deg", "sigma_rotation", "deg"),
+        Column("payload_kg", "payload", "kg"),
+        Column("temperature_c", "temperature", "c"),
+    )
+}
+
+
+def find_column(name: str) -> Column | None:
+    """Return the column of a name, or None where there is no such column."""
+    match = _JOINT.fullmatch(name)
+    if match:
+        unit = next(unit for unit in (*REVOLUTE_UNITS, *PRISMATIC_UNITS) if unit == match[2])
+        return Column(name, f"q{match[1]}", unit)
+    return Column(name, name, "") if _APPROACH.fullmatch(name) else _columns().get(name)
+
+
+def _columns() -> dict[str, Column]:
+    """All columns but those of joints, with those that registered sensors add."""
+    added = [column for readings in READINGS.values() for column in readings.columns]
+    names = [
+        (f"{one.name}_{unit}" if unit else one.name, one.name, unit) for one in added for unit in one.units
+    ]
+    return _COLUMNS | {name: Column(name, quantity, unit) for name, quantity, unit in names}
+
+
+def column_choices(name: str) -> str:
+    """Say which columns there are and which is nearest to an unknown `name`.
+
+    Joint columns are listed for one joint: the one that `name` seems to mean, else the first.
+    """
+    number = re.search(r"[1-9][0-9]?", name)
+    joint = number[0] if number else "1"
+    joints = (f"q{joint}_{unit}" for unit in (*REVOLUTE_UNITS, *PRISMATIC_UNITS))
+    meant = name.lower()
+    if re.fullmatch(r"q[1-9][0-9]?", meant):  # most joints turn
+        meant += "_deg"
+    return nearest_choice(meant, (*joints, *_columns(), f"approach{joint}"))
+
+
+def quoted(columns: Iterable[Column]) -> str:
+    """Names of columns as complaints list them."""
+    return ", ".join(f"'{column.name}'" for column in columns)
+
+
+def to_si(values: Float64[np.ndarray, "*shape"], unit: str) -> Float64[np.ndarray, "*shape"]:
+    """Values of a column in SI units (temperature stays in deg C)."""
+    return values / _PER_SI.get(unit, 1.0)
+
+
+def from_si(values: Float64[np.ndarray, "*shape"], unit: str) -> Float64[np.ndarray, "*shape"]:
+    """Values in the unit of a column; inverse of `to_si`."""
+    return values * _PER_SI.get(unit, 1.0)
 
 
 @dataclass(frozen=True)
@@ -47,7 +155,7 @@ class Layout:
 
         The names are among them, so that a name without its value is complained of as such.
         """
-        return tuple(name for name in ("socket", *_NEEDED) if name in self.index)
+        return tuple(name for name in ("socket", *_NEEDED, *reading_numbers()) if name in self.index)
 
     @property
     def joints(self) -> tuple[str, ...]:
@@ -69,7 +177,7 @@ def read_header(table: Table, robot: Robot | None) -> Layout:
 
     Args:
         table: the file.
-        robot: checks number and units of the joint columns, where given.
+        robot: checks number and units of the joint columns; None checks neither.
 
     Raises:
         MeasurementError: a column is unknown, missing or there twice, or units do not fit together.
@@ -91,6 +199,7 @@ def read_header(table: Table, robot: Robot | None) -> Layout:
     _check_approaches(place, columns, dof)
     _check_position(place, columns)
     _check_lengths(place, columns)
+    _check_readings(place, columns)
     return Layout(columns, index, dof, _check_orientation(place, columns))
 
 
@@ -191,7 +300,7 @@ def _check_approaches(place: str, columns: tuple[Column, ...], dof: int) -> None
 def _check_position(place: str, columns: tuple[Column, ...]) -> None:
     """x, y and z are there, in one unit, unless the file has other lengths."""
     present = [column for column in columns if column.quantity in POSITION]
-    if not present and {column.quantity for column in columns} & {"socket", *_NEEDED}:
+    if not present and {column.quantity for column in columns} & {"socket", *_NEEDED, *reading_numbers()}:
         return
     unit = present[0].unit if present else "mm"
     for quantity in POSITION:
@@ -240,6 +349,20 @@ def _check_lengths(place: str, columns: tuple[Column, ...]) -> None:
     _check_one_unit(place, [present[name] for name in ANCHOR_PLACE if name in present])
 
 
+def _check_readings(place: str, columns: tuple[Column, ...]) -> None:
+    """All columns of a registered sensor are there, or none."""
+    present = {column.quantity: column for column in columns}
+    for readings in READINGS.values():
+        there = [column for column in readings.columns if column.name in present]
+        missing = [column for column in readings.columns if column.name not in present]
+        if there and missing:
+            wanted = ", ".join(f"{column.name}_{column.units[0]}".rstrip("_") for column in missing)
+            raise MeasurementError(
+                f"{place}, columns {quoted(present[column.name] for column in there)}: say nothing without the other "
+                f"columns of the sensor '{readings.sensor}'; add {wanted}."
+            )
+
+
 def _check_orientation(place: str, columns: tuple[Column, ...]) -> tuple[str, ...]:
     """The form in which the file gives the orientation, whole and only once."""
     groups = {
@@ -247,8 +370,8 @@ def _check_orientation(place: str, columns: tuple[Column, ...]) -> tuple[str, ..
     }
     if groups[RPY] and groups[QUATERNION]:
         raise MeasurementError(
-            f"{place}, columns {quoted(groups[RPY])} and {quoted(groups[QUATERNION])}: the orientation is "
-            "given twice; keep roll, pitch, yaw or the quaternion."
+            f"{place}, columns {quoted(groups[RPY])} and {quoted(groups[QUATERNION])}: the orientation "
+            "stands twice; keep roll, pitch, yaw or the quaternion."
         )
     for group, present in groups.items():
         if not present:

@@ -12,11 +12,19 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
-from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, Column, find_column, quoted, to_si
-from pisigma.measurement.csv.header import check_separators
+from pisigma.measurement.csv.header import (
+    POSITION,
+    QUATERNION,
+    RPY,
+    Column,
+    check_separators,
+    find_column,
+    quoted,
+    to_si,
+)
 from pisigma.measurement.csv.rows import QUATERNION_TOLERANCE
 from pisigma.measurement.csv.table import split_line
-from pisigma.measurement.dataset import LeftOut
+from pisigma.measurement.fields import LeftOut
 from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy, transform
 
 CHUNK_ROWS = 20_000
@@ -48,7 +56,7 @@ class PoseChunk:
         T: T_base_tool [m] of the rows that are poses.
         line: their lines.
         bad: the other rows and what is wrong with them.
-        share: of the file that has been read, 0 to 1; NaN where its length is not known.
+        share: of the file that has been read, 0 to 1; NaN where its length cannot be told.
     """
 
     T: Float64[Tensor, "rows 4 4"]
@@ -145,9 +153,9 @@ class _Layout:
         if problem:
             raise MeasurementError(f"{place}: the header is no valid CSV ({problem}); check its quotes.")
         names = [name.strip() for name in names]
-        found = _columns(names, place)
-        orientation = RPY if RPY[0] in found else QUATERNION
-        position, angles = (tuple(found[name] for name in group) for group in (POSITION, orientation))
+        columns = _columns(names, place)
+        orientation = RPY if RPY[0] in columns else QUATERNION
+        position, angles = (tuple(columns[name] for name in group) for group in (POSITION, orientation))
         return _Layout(tuple(names), position, angles)
 
     def values(self, lines: Sequence[str]) -> tuple[Float64[np.ndarray, "rows columns"], dict[int, str]]:
@@ -231,7 +239,7 @@ def _number(cell: str) -> float:
 def _columns(header: Sequence[str], place: str) -> dict[str, tuple[int, Column]]:
     """Place and meaning of every column."""
     valid = (*_POSITION_COLUMNS, *_RPY_COLUMNS, *QUATERNION)
-    found: dict[str, tuple[int, Column]] = {}
+    columns: dict[str, tuple[int, Column]] = {}
     for index, name in enumerate(header):
         column = find_column(name)
         if column is None or column.quantity not in (*POSITION, *RPY, *QUATERNION):
@@ -240,24 +248,24 @@ def _columns(header: Sequence[str], place: str) -> dict[str, tuple[int, Column]]
                 f"{place}, column '{name}': no column of a wanted pose; {nearest_choice(name, valid)} Lengths "
                 "may be in m and angles in rad."
             )
-        if column.quantity in found:
+        if column.quantity in columns:
             raise MeasurementError(f"{place}, column '{name}': '{column.quantity}' stands twice; remove one.")
-        found[column.quantity] = (index, column)
-    _check_whole(found, place)
-    return found
+        columns[column.quantity] = (index, column)
+    _check_whole(columns, place)
+    return columns
 
 
-def _check_whole(found: dict[str, tuple[int, Column]], place: str) -> None:
-    given = [group for group in (RPY, QUATERNION) if set(group) & set(found)]
-    if len(given) > 1:
+def _check_whole(columns: dict[str, tuple[int, Column]], place: str) -> None:
+    groups = [group for group in (RPY, QUATERNION) if set(group) & set(columns)]
+    if len(groups) > 1:
         raise MeasurementError(
-            f"{place}: roll, pitch, yaw and a quaternion are both given; keep one of them."
+            f"{place}: roll, pitch, yaw and a quaternion are both there; keep one of them."
         )
-    orientation = given[0] if given else RPY
+    orientation = groups[0] if groups else RPY
     for name in (*POSITION, *orientation):
-        if name not in found:
+        if name not in columns:
             wanted = ", ".join((*_POSITION_COLUMNS, *(_RPY_COLUMNS if orientation == RPY else QUATERNION)))
             raise MeasurementError(f"{place}: the column of '{name}' is missing; a pose has {wanted}.")
-    lengths = [found[name][1] for name in POSITION]
+    lengths = [columns[name][1] for name in POSITION]
     if len({column.unit for column in lengths}) > 1:
         raise MeasurementError(f"{place}, columns {quoted(lengths)}: mixed units; use mm or m for all three.")

@@ -1,40 +1,53 @@
-"""Reading a measurement file: every row checked, every complaint with file, line and column."""
+"""Reading measurement files: whole with every row checked, or the joint values alone."""
 
+import math
 import os
 
 import numpy as np
 import torch
+from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
-from pisigma.measurement.csv.columns import ANCHOR_PLACE, POSITION, QUATERNION, to_si
-from pisigma.measurement.csv.header import Layout, read_header
+from pisigma.measurement.csv.header import (
+    ANCHOR_PLACE,
+    POSITION,
+    PRISMATIC_UNITS,
+    QUATERNION,
+    REVOLUTE_UNITS,
+    Column,
+    Layout,
+    find_column,
+    read_header,
+    to_si,
+)
 from pisigma.measurement.csv.rows import CheckedRows, check_rows
 from pisigma.measurement.csv.table import Table, read_table
-from pisigma.measurement.dataset import LeftOut, Measurements, OnBadRow
+from pisigma.measurement.fields import TEXTS, LeftOut, MeasuredFields, OnBadRow
+from pisigma.measurement.readings import reading_numbers, reading_texts
 from pisigma.robot import Robot
 from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy
 
 
-def read_csv(
+def read_fields(
     path: str | os.PathLike[str], robot: Robot | None = None, on_bad_row: OnBadRow = "error"
-) -> Measurements:
+) -> MeasuredFields:
     """Read a measurement file; the header says quantity and unit of every column, in any order.
 
     `q1_deg` or `q1_rad` and so on (prismatic: `q3_mm` or `q3_m`) must be there, and at least one kind of
     length (each also in `_m`), of which a row holds one: `x_mm,y_mm,z_mm`; `socket`, the name of the fixed
     point that the ball sits in; `touch_axis` (x, y or z) and `touch_mm` with `frame`, the jig; `distance_mm`
     with `anchor`, the name of a fixed point whose place `anchor_x_mm,anchor_y_mm,anchor_z_mm` may be known,
-    or with `pair`, the name of the two rows it lies between, given in both.
+    or with `pair`, the name of the two rows it lies between, which stands in both.
 
     `roll_deg,pitch_deg,yaw_deg` (RotZ(roll) · RotY(pitch) · RotX(yaw)) or `qx,qy,qz,qw`, `target`, `frame`,
     `sigma_mm` (of the length in the row), `sigma_deg`, `set`, `payload_kg` and `temperature_c` may be, and
-    `approach1` and so on: +1 where that joint's value grew before it stopped, -1 where it fell. An empty cell is
-    what was not measured.
+    `approach1` and so on: +1 where that joint's value grew before it stopped, -1 where it fell. Sensors that are
+    registered add columns of their own. An empty cell is what was not measured.
 
     Args:
         path: the file.
-        robot: checks number, units and limits of the joints, where given.
+        robot: checks number, units and limits of the joints; None checks none of them.
         on_bad_row: "error" to raise at the first row that cannot be used, "leave_out" to go on without such
             rows and to list them in `left_out`.
 
@@ -51,7 +64,7 @@ def read_csv(
     rows = check_rows(table, layout, robot)
     if rows.faults and (on_bad_row == "error" or len(rows.faults) == len(table.lines)):
         raise MeasurementError(_complaint(table, rows.faults))
-    return _measurements(table, layout, rows)
+    return _fields(table, layout, rows)
 
 
 def _complaint(table: Table, faults: dict[int, str]) -> str:
@@ -62,7 +75,7 @@ def _complaint(table: Table, faults: dict[int, str]) -> str:
     return f"{table.source}, line {table.lines[row]}, {faults[row]}{others}."
 
 
-def _measurements(table: Table, layout: Layout, rows: CheckedRows) -> Measurements:
+def _fields(table: Table, layout: Layout, rows: CheckedRows) -> MeasuredFields:
     """The sound rows in SI units."""
     values, cells, faults = rows.values, rows.cells, rows.faults
     kept = [row for row in range(len(table.lines)) if row not in faults]
@@ -75,44 +88,91 @@ def _measurements(table: Table, layout: Layout, rows: CheckedRows) -> Measuremen
         return None if np.isnan(stacked).all() else torch.from_numpy(stacked)
 
     def single(quantity: str) -> Tensor | None:
-        found = numbers(quantity)
-        return None if found is None else found[:, 0]
+        column = numbers(quantity)
+        return None if column is None else column[:, 0]
 
-    def texts(quantity: str) -> tuple[str, ...]:
-        column = cells[layout.index[quantity]] if quantity in layout.index else ()
-        return tuple(column[row].strip() for row in kept) if column else ()
-
-    def approaches() -> Tensor | None:
-        columns = [single(f"approach{number}") for number in range(1, layout.dof + 1)]
-        if all(column is None for column in columns):
-            return None
-        missing = torch.full((len(kept),), torch.nan, dtype=torch.float64)
-        return torch.stack([missing if column is None else column for column in columns], 1)
-
-    q = numbers(*layout.joints)
-    assert q is not None
     orientation = numbers(*layout.orientation)
     to_rotation = rotation_from_quaternion if layout.orientation == QUATERNION else rotation_from_rpy
-    return Measurements(
-        q=q,
-        position=numbers(*POSITION),
-        rotation=None if orientation is None else to_rotation(orientation),
-        frame=texts("frame"),
-        target=texts("target"),
-        sigma_position=single("sigma_position"),
-        sigma_rotation=single("sigma_rotation"),
-        split=texts("set") or None,
-        payload=single("payload"),
-        temperature=single("temperature"),
-        socket=texts("socket") or None,
-        touch_axis=texts("touch_axis") or None,
-        touch=single("touch"),
-        distance=single("distance"),
-        anchor=texts("anchor") or None,
-        anchor_place=numbers(*ANCHOR_PLACE),
-        pair=texts("pair") or None,
-        approach=approaches(),
+    approach = torch.full((len(kept), layout.dof), torch.nan, dtype=torch.float64)
+    for quantity in layout.approaches:
+        approach[:, layout.column(quantity).approach - 1] = torch.from_numpy(
+            values[kept, layout.index[quantity]]
+        )
+    fields = {
+        "q": numbers(*layout.joints),
+        "position": numbers(*POSITION),
+        "rotation": None if orientation is None else to_rotation(orientation),
+        "anchor_place": numbers(*ANCHOR_PLACE),
+        "approach": None if bool(approach.isnan().all()) else approach,
+    }
+    singles = ("sigma_position", "sigma_rotation", "payload", "temperature", "touch", "distance")
+    fields |= {name: single(name) for name in (*singles, *reading_numbers())}
+    quantities = {name: "set" if name == "split" else name for name in (*TEXTS, *reading_texts())}
+    texts = {
+        name: tuple(cells[layout.index[quantity]][row].strip() for row in kept)
+        for name, quantity in quantities.items()
+        if quantity in layout.index
+    }
+    return MeasuredFields(
+        numbers={name: column for name, column in fields.items() if column is not None},
+        texts=texts,
         line=tuple(table.lines[row] for row in kept),
         source=table.source,
         left_out=tuple(LeftOut(table.lines[row], faults[row]) for row in sorted(faults)),
     )
+
+
+def read_joints(path: str | os.PathLike[str], robot: Robot) -> Float64[Tensor, "rows dof"]:
+    """Read the columns `q1_deg` or `q1_rad` and so on (prismatic: `q3_mm` or `q3_m`); other columns are not looked at.
+
+    Files of measurements have these columns, and those that `pisigma ik` writes.
+
+    Raises:
+        MeasurementError: the file or a joint's cell cannot be used; the message names file, line and column.
+    """
+    table = read_table(path)
+    columns = [_joint_column(table, number, robot) for number in range(robot.dof)]
+    more = [name for name in table.header if (column := find_column(name)) and column.joint == robot.dof + 1]
+    if more:
+        raise MeasurementError(
+            f"{table.source}, line {table.header_line}, column '{more[0]}': robot '{robot.name}' has {robot.dof} "
+            "joints only; give joint values of this robot."
+        )
+    values = np.empty((len(table.lines), robot.dof))
+    for number, column in enumerate(columns):
+        place = table.header.index(column.name)
+        values[:, number] = to_si(_numbers(table, place), column.unit)
+    return torch.from_numpy(values)
+
+
+def _joint_column(table: Table, number: int, robot: Robot) -> Column:
+    """The column of a joint."""
+    units = REVOLUTE_UNITS if robot.revolute[number] else PRISMATIC_UNITS
+    wanted = [f"q{number + 1}_{unit}" for unit in units]
+    there = [name for name in table.header if name in wanted]
+    if len(there) != 1:
+        what = "is no column" if not there else "are two columns"
+        raise MeasurementError(
+            f"{table.source}, line {table.header_line}: there {what} for joint '{robot.joints[number].name}' of "
+            f"robot '{robot.name}'; give one, {' or '.join(wanted)}."
+        )
+    column = find_column(there[0])
+    assert column is not None
+    return column
+
+
+def _numbers(table: Table, place: int) -> Float64[np.ndarray, " rows"]:
+    """The cells of a column as numbers."""
+    numbers = []
+    for line, fields in zip(table.lines, table.records, strict=True):
+        cell = fields[place].strip() if place < len(fields) else ""
+        try:
+            numbers.append(float(cell))
+        except ValueError:
+            numbers.append(math.nan)
+        if not math.isfinite(numbers[-1]):
+            raise MeasurementError(
+                f"{table.source}, line {line}, column '{table.header[place]}': a number was wanted, got '{cell}'; "
+                "give a joint value or remove the row."
+            )
+    return np.array(numbers)

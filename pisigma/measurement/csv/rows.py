@@ -6,12 +6,10 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from pisigma.measurement.csv.columns import QUATERNION, Column, from_si, quoted, to_si
-from pisigma.measurement.csv.faults import Faults
-from pisigma.measurement.csv.header import Layout
-from pisigma.measurement.csv.lengths import length_cells
-from pisigma.measurement.csv.table import Table
-from pisigma.measurement.lengths import group_faults, row_faults
+from pisigma.measurement.csv.header import ANCHOR_PLACE, QUATERNION, Column, Layout, from_si, quoted, to_si
+from pisigma.measurement.csv.table import Faults, Table
+from pisigma.measurement.lengths import LengthCells, group_faults, row_faults
+from pisigma.measurement.readings import READINGS, SensorReadings
 from pisigma.robot import Robot, Row
 
 LIMIT_TOLERANCE = 1e-9
@@ -53,7 +51,7 @@ def check_rows(table: Table, layout: Layout, robot: Robot | None) -> CheckedRows
     Args:
         table: the file.
         layout: what its header says.
-        robot: checks the limits of the joints, where given.
+        robot: checks the limits of the joints; None does not check them.
     """
     faults = Faults(table.broken)
     cells = _cells(table, faults)
@@ -63,7 +61,9 @@ def check_rows(table: Table, layout: Layout, robot: Robot | None) -> CheckedRows
     with np.errstate(over="ignore"):
         _check_measured(values, cells, layout, faults)
     _check_optional(values, layout, faults)
-    lengths = length_cells(values, cells, layout)
+    for readings in READINGS.values():
+        _check_readings(readings, values, cells, layout, faults)
+    lengths = _length_cells(values, cells, layout)
     for rows, describe in row_faults(lengths):
         faults.add(rows, describe)
     _check_equal_rows(values, cells, layout, table, faults)
@@ -108,7 +108,7 @@ def _numbers(cells: Sequence[str], column: Column, faults: Faults) -> Float64[np
     if odd.any():
         odd[odd] = [bool(cells[row].strip()) for row in np.flatnonzero(odd).tolist()]
         remedy = (
-            "" if column.joint else ", or leave it empty with all that belongs to it where it is not known"
+            "" if column.joint else ", or leave it empty with all that belongs to it if it was not measured"
         )
         faults.add(
             odd,
@@ -144,7 +144,7 @@ def _check_texts(cells: list[Sequence[str]], layout: Layout, faults: Faults) -> 
         faults.add(
             np.array([text not in ("train", "test") for text in texts]),
             lambda row: (
-                f"column 'set': '{texts[row]}' was found where train or test was wanted; write one of them"
+                f"column 'set': '{texts[row]}' stands where train or test was wanted; write one of them"
             ),
         )
 
@@ -221,7 +221,7 @@ def _check_whole(missing: Bool[np.ndarray, "rows group"], columns: list[Column],
 
 
 def _check_optional(values: _Values, layout: Layout, faults: Faults) -> None:
-    """Standard deviations are above 0 by what can be told, payloads not below."""
+    """Standard deviations are measurably above 0, payloads not below."""
     for quantity in ("sigma_position", "sigma_rotation", "payload"):
         if quantity in layout.index:
             _check_sign(values[:, layout.index[quantity]], layout.column(quantity), faults)
@@ -234,7 +234,7 @@ def _check_approach(values: Float64[np.ndarray, " rows"], column: Column, faults
     faults.add(
         ~np.isnan(values) & (np.abs(values) != 1),
         lambda row: (
-            f"column '{column.name}': {values[row]:.6g} was found where +1 (the joint value grew) or -1 (it fell) was "
+            f"column '{column.name}': {values[row]:.6g} stands where +1 (the joint value grew) or -1 (it fell) was "
             "wanted; correct it or leave the cell empty"
         ),
     )
@@ -247,10 +247,25 @@ def _check_sign(values: Float64[np.ndarray, " rows"], column: Column, faults: Fa
     faults.add(
         values < (0 if zero_too else SMALLEST_SIGMA),
         lambda row: (
-            f"column '{column.name}': {values[row]:.6g} was found where {wanted} was wanted; correct it or "
+            f"column '{column.name}': {values[row]:.6g} stands where {wanted} was wanted; correct it or "
             "leave the cell empty"
         ),
     )
+
+
+def _check_readings(
+    readings: SensorReadings, values: _Values, cells: list[Sequence[str]], layout: Layout, faults: Faults
+) -> None:
+    """The readings of a registered sensor are there whole or not at all, and can be."""
+    if not {column.name for column in readings.columns} <= set(layout.index):
+        return
+    columns = [layout.column(name) for name in readings.numbers]
+    numbers = values[:, [layout.index[name] for name in readings.numbers]]
+    _check_whole(np.isnan(numbers), columns, faults)
+    texts = {name: _names(cells, layout, name) for name in readings.texts}
+    si = {column.quantity: to_si(numbers[:, k], column.unit) for k, column in enumerate(columns)}
+    for rows, describe in readings.row_faults({**si, **texts}):
+        faults.add(rows, lambda row, describe=describe: f"columns {quoted(columns)}: {describe(row)}")  # type: ignore[misc]
 
 
 def _check_equal_rows(
@@ -280,5 +295,51 @@ def first_of_equal_rows(values: _Values, texts: Sequence[Sequence[str]]) -> Int6
     keys = zip(
         canonical.view(f"V{canonical.itemsize * canonical.shape[1]}")[:, 0].tolist(), *texts, strict=True
     )
-    seen: dict[tuple[object, ...], int] = {}
-    return np.array([seen.setdefault(key, row) for row, key in enumerate(keys)], dtype=np.int64)
+    first: dict[tuple[object, ...], int] = {}
+    return np.array([first.setdefault(key, row) for row, key in enumerate(keys)], dtype=np.int64)
+
+
+def _length_cells(
+    values: Float64[np.ndarray, "rows columns"], cells: list[Sequence[str]], layout: Layout
+) -> LengthCells:
+    """The cells of a file as the rules for lengths want them, in the file's units."""
+    rows = len(values)
+
+    def numbers(quantity: str) -> Float64[np.ndarray, " rows"]:
+        return values[:, layout.index[quantity]] if quantity in layout.index else np.full(rows, np.nan)
+
+    def names(quantity: str) -> tuple[str, ...]:
+        return _names(cells, layout, quantity) if quantity in layout.index else ("",) * rows
+
+    others = {}
+    for sensor, readings in READINGS.items():
+        if readings.is_length:
+            others[sensor] = ~np.isnan(np.stack([numbers(name) for name in readings.numbers])).any(0)
+    labels = {quantity: f"column '{layout.column(quantity).name}'" for quantity in layout.index}
+    for name, group in (("position", layout.position), ("anchor_place", ANCHOR_PLACE)):
+        if set(group) <= set(layout.index):
+            labels[name] = f"columns {quoted(layout.column(quantity) for quantity in group)}"
+    labels |= {sensor: f"columns of '{sensor}'" for sensor in others}
+    labels["sigma"] = labels.get("sigma_position", "sigma_mm")
+    position = np.zeros(rows, dtype=bool)
+    if layout.position:
+        position = ~np.isnan(np.stack([numbers(name) for name in layout.position], axis=1)).any(1)
+    return LengthCells(
+        labels=labels,
+        frame=names("frame"),
+        socket=names("socket"),
+        touch_axis=names("touch_axis"),
+        anchor=names("anchor"),
+        pair=names("pair"),
+        position=position,
+        touch=numbers("touch"),
+        distance=numbers("distance"),
+        anchor_place=np.stack([numbers(name) for name in ANCHOR_PLACE], axis=1),
+        sigma=numbers("sigma_position"),
+        others=others,
+    )
+
+
+def _names(cells: list[Sequence[str]], layout: Layout, quantity: str) -> tuple[str, ...]:
+    """The texts of a quantity that the file has."""
+    return tuple(cell.strip() for cell in cells[layout.index[quantity]])

@@ -13,36 +13,28 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, OutputError
-from pisigma.measurement.csv.columns import ANCHOR_PLACE, POSITION, QUATERNION, from_si
+from pisigma.measurement.csv.header import ANCHOR_PLACE, POSITION, QUATERNION, from_si
 from pisigma.measurement.csv.rows import first_of_equal_rows
-from pisigma.measurement.dataset import Measurements
-from pisigma.robot import Robot
+from pisigma.measurement.fields import KINDS, TEXTS, MeasuredFields
+from pisigma.measurement.readings import READINGS, Unit, reading_texts
 
 
-def write_csv(
-    measurements: Measurements,
-    path: str | os.PathLike[str],
-    robot: Robot | None = None,
-    revolute: Sequence[bool] | None = None,
-) -> None:
-    """Write a measurement file: degrees and millimetres with every digit, orientations as quaternions.
-
-    The file is put in its place in one step when it is complete. Read back it gives the same values to 1e-12
-    relative (a rotation, where it is orthonormal to that).
+def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: Sequence[bool]) -> None:
+    """Write a measurement file; see `Measurements.write_csv`.
 
     Args:
-        measurements: at least one row.
+        data: at least one row.
         path: the file; one that is there is replaced.
-        robot: says which joints turn (degrees) and which slide (millimetres).
-        revolute: the same per joint, without a robot; with neither, all joints turn.
+        revolute: per joint, whether it turns (degrees) or slides (millimetres).
 
     Raises:
-        MeasurementError: the measurements would not read back: no row, a row in which nothing was measured,
-            two equal rows, a name that a CSV cell cannot hold, or joints that do not fit.
+        MeasurementError: the measurements would not read back.
         OutputError: the file cannot be written there.
     """
-    columns = _columns(measurements, _revolute(measurements, robot, revolute))
-    _check(measurements, columns)
+    if data.rows == 0:
+        raise MeasurementError(f"{data.source}: holds no row to write; give at least one measurement.")
+    columns = _columns(data, revolute)
+    _check(data, columns)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*columns.numbers, *columns.texts])
@@ -61,78 +53,61 @@ class _Columns:
     numbers: dict[str, Float64[np.ndarray, " rows"]] = field(default_factory=dict)
     texts: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
-    def add(self, name: str, values: Tensor, unit: str = "") -> None:
-        self.numbers[name] = from_si(values.detach().cpu().numpy(), unit)
+    def add(self, name: str, values: Tensor, unit: Unit = "", *, even_if_empty: bool = False) -> None:
+        """Add a column; one that would hold nothing is left away."""
+        if even_if_empty or not bool(values.isnan().all()):
+            self.numbers[f"{name}_{unit}" if unit else name] = from_si(values.detach().cpu().numpy(), unit)
 
 
-def _revolute(
-    measurements: Measurements, robot: Robot | None, revolute: Sequence[bool] | None
-) -> tuple[bool, ...]:
-    """For every joint, whether it turns."""
-    if robot is not None:
-        kinds, origin = robot.revolute, f"robot '{robot.name}'"
-    elif revolute is not None:
-        kinds, origin = tuple(revolute), "'revolute'"
-    else:
-        return (True,) * measurements.dof
-    if len(kinds) != measurements.dof:
-        raise MeasurementError(
-            f"{measurements.source}: has {measurements.dof} joints, but {origin} has {len(kinds)}; give the "
-            "robot that was measured."
-        )
-    return kinds
-
-
-def _columns(measurements: Measurements, revolute: tuple[bool, ...]) -> _Columns:
+def _columns(data: MeasuredFields, revolute: Sequence[bool]) -> _Columns:
     """What stands in the file; columns that would hold nothing are left away, but for the position."""
-    columns = _Columns()
-    for number, (q, turns) in enumerate(zip(measurements.q.T, revolute, strict=True), start=1):
-        unit = "deg" if turns else "mm"
-        columns.add(f"q{number}_{unit}", q, unit)
-    _add_lengths(columns, measurements)
-    if measurements.rotation is not None and not measurements.rotation.isnan().all():
-        for name, values in zip(QUATERNION, _quaternions(measurements.rotation).T, strict=True):
+    columns, numbers = _Columns(), data.numbers
+    for number, (q, turns) in enumerate(zip(numbers["q"].T, revolute, strict=True), start=1):
+        columns.add(f"q{number}", q, "deg" if turns else "mm")
+    nothing = torch.full((data.rows, 3), torch.nan, dtype=torch.float64)
+    others = ("socket", "touch", "distance", *READINGS)
+    alone = not any(bool(data.measured(kind).any()) for kind in others)
+    position = numbers.get("position", nothing)
+    for name, values in zip(POSITION, position.T, strict=True):
+        columns.add(name, values, "mm", even_if_empty=alone or not bool(position.isnan().all()))
+    for name in ("touch", "distance"):
+        columns.add(name, numbers.get(name, nothing[:, 0]), "mm")
+    place = numbers.get("anchor_place", nothing)
+    for name, values in zip(ANCHOR_PLACE, place.T, strict=True):
+        columns.add(name, values, "mm", even_if_empty=not bool(place.isnan().all()))
+    if "rotation" in numbers:
+        for name, values in zip(QUATERNION, _quaternions(numbers["rotation"]).T, strict=True):
             columns.add(name, values)
-    for name, optional, unit in (
-        ("sigma_mm", measurements.sigma_position, "mm"),
-        ("sigma_deg", measurements.sigma_rotation, "deg"),
-        ("payload_kg", measurements.payload, ""),
-        ("temperature_c", measurements.temperature, ""),
+    _add_conditions(columns, data)
+    for readings in READINGS.values():
+        for column in readings.columns:
+            if column.name in numbers:
+                columns.add(column.name, numbers[column.name], column.units[0])
+    for name in (
+        "target",
+        "frame",
+        *(text for text in TEXTS if text not in ("target", "frame")),
+        *reading_texts(),
     ):
-        if optional is not None and not optional.isnan().all():
-            columns.add(name, optional, unit)
-    if measurements.approach is not None:
-        for number, approach in enumerate(measurements.approach.T, start=1):
-            if not approach.isnan().all():
-                columns.add(f"approach{number}", approach)
-    for name, texts in (
-        ("target", measurements.target),
-        ("frame", measurements.frame),
-        ("set", measurements.split),
-        ("socket", measurements.socket),
-        ("touch_axis", measurements.touch_axis),
-        ("anchor", measurements.anchor),
-        ("pair", measurements.pair),
-    ):
-        if texts is not None and any(texts):
-            columns.texts[name] = texts
+        if any(data.text(name)):
+            columns.texts["set" if name == "split" else name] = data.text(name)
     return columns
 
 
-def _add_lengths(columns: _Columns, measurements: Measurements) -> None:
-    """The measured lengths; the position also where there is none, unless there are others."""
-    position = measurements.position
-    if position is None:
-        position = measurements.q.new_full((measurements.rows, 3), torch.nan)
-    if not position.isnan().all() or not measurements.kinds & {"socket", "touch", "distance"}:
-        for name, values in zip(POSITION, position.T, strict=True):
-            columns.add(f"{name}_mm", values, "mm")
-    for name, lengths in (("touch_mm", measurements.touch), ("distance_mm", measurements.distance)):
-        if lengths is not None and not lengths.isnan().all():
-            columns.add(name, lengths, "mm")
-    if measurements.anchor_place is not None and not measurements.anchor_place.isnan().all():
-        for name, values in zip(ANCHOR_PLACE, measurements.anchor_place.T, strict=True):
-            columns.add(f"{name}_mm", values, "mm")
+def _add_conditions(columns: _Columns, data: MeasuredFields) -> None:
+    """Standard deviations, and what was different from row to row besides the joint values."""
+    units: tuple[tuple[str, str, Unit], ...] = (
+        ("sigma_position", "sigma", "mm"),
+        ("sigma_rotation", "sigma", "deg"),
+        ("payload", "payload", "kg"),
+        ("temperature", "temperature", "c"),
+    )
+    for field_name, name, unit in units:
+        if field_name in data.numbers:
+            columns.add(name, data.numbers[field_name], unit)
+    if "approach" in data.numbers:
+        for number, approach in enumerate(data.numbers["approach"].T, start=1):
+            columns.add(f"approach{number}", approach)
 
 
 def _quaternions(R: Float64[Tensor, "rows 3 3"]) -> Float64[Tensor, "rows 4"]:
@@ -156,34 +131,27 @@ def _quaternions(R: Float64[Tensor, "rows 3 3"]) -> Float64[Tensor, "rows 4"]:
     return sign * q / length
 
 
-def _check(measurements: Measurements, columns: _Columns) -> None:
+def _check(data: MeasuredFields, columns: _Columns) -> None:
     """Refuse what would not read back."""
-    if measurements.rows == 0:
-        raise MeasurementError(
-            f"{measurements.source}: holds no row to write; give at least one measurement."
-        )
     values = np.stack(list(columns.numbers.values()), axis=1)
-    something = np.zeros(measurements.rows, dtype=bool)
-    for kind in measurements.kinds:
-        something |= measurements.seen(kind).cpu().numpy()
-    nothing = ~something
-    if nothing.any():
-        place = measurements.place(int(nothing.argmax()))
+    nothing = ~torch.stack([data.measured(kind) for kind in (*KINDS, *READINGS)]).any(0).cpu()
+    if bool(nothing.any()):
         raise MeasurementError(
-            f"{place}: nothing was measured in this row; leave it out with select before writing."
+            f"{data.label(int(nothing.nonzero()[0]))}: nothing was measured in this row; leave it out with select "
+            "before writing."
         )
     first = first_of_equal_rows(values, list(columns.texts.values()))
     equal = first != np.arange(len(first))
     if equal.any():
         row = int(equal.argmax())
         raise MeasurementError(
-            f"{measurements.place(row)}: equals row {int(first[row])} in everything; leave one of them out "
+            f"{data.label(row)}: equals row {int(first[row])} in everything; leave one of them out "
             "with select before writing."
         )
     for name, texts in columns.texts.items():
         for text in set(texts):
             if not _fits_cell(text):
-                place = measurements.place(texts.index(text))
+                place = data.label(texts.index(text))
                 raise MeasurementError(
                     f"{place}, column '{name}': the name {text!r} cannot stand in a CSV cell; use one of a "
                     "single line without blanks around it."

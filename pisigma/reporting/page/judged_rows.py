@@ -208,7 +208,7 @@ def _model_errors(model: CalibratedModel, rows: Measurements) -> tuple[PoseError
     none = torch.full((rows.rows,), torch.nan, dtype=torch.float64)
     residual = none[:, None].repeat(1, 3) if rows.position is None else rows.position - T[:, :3, 3]
     if rows.socket is not None:
-        residual = torch.where(rows.seen("socket")[:, None], _from_socket(rows, T[:, :3, 3]), residual)
+        residual = torch.where(rows.measured("socket")[:, None], _from_socket(rows, T[:, :3, 3]), residual)
     return PoseErrors(residual.norm(dim=-1), _turned(rows, T)), residual
 
 

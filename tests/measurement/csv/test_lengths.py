@@ -33,10 +33,10 @@ def read(tmp_path: Path, text: str, on_bad_row: str = "error") -> Measurements:
 def test_a_file_mixes_kinds_and_frames(tmp_path: Path):
     data = read(tmp_path, MIXED)
     assert data.kinds == {"position", "socket", "touch", "distance"}
-    assert data.seen("position").tolist() == [True] + [False] * 7
-    assert data.seen("socket").nonzero()[:, 0].tolist() == [1, 2]
-    assert data.seen("touch").nonzero()[:, 0].tolist() == [3]
-    assert data.seen("distance").nonzero()[:, 0].tolist() == [4, 5, 6, 7]
+    assert data.measured("position").tolist() == [True] + [False] * 7
+    assert data.measured("socket").nonzero()[:, 0].tolist() == [1, 2]
+    assert data.measured("touch").nonzero()[:, 0].tolist() == [3]
+    assert data.measured("distance").nonzero()[:, 0].tolist() == [4, 5, 6, 7]
     assert data.socket == ("", "a/0", "a/0", "", "", "", "", "")
     assert (data.touch_axis[3], data.frame[3], data.anchor[4], data.pair[5:7]) == (
         "z",
@@ -100,7 +100,10 @@ ALL = "q1_deg,x_mm,y_mm,z_mm,socket,frame,touch_axis,touch_mm,distance_mm,anchor
 CASES: dict[str, tuple[str, tuple[str, ...]]] = {
     "no axis": (f"{TOUCH}\n1,left,w,3\n", ("line 2", "column 'touch_axis'", "'w' is no axis", "x, y or z")),
     "capital axis": (f"{TOUCH}\n1,left,X,3\n", ("line 2", "'X' is no axis")),
-    "touch without axis": (f"{TOUCH}\n1,left,,3\n", ("line 2", "column 'touch_axis'", "no axis was given")),
+    "touch without axis": (
+        f"{TOUCH}\n1,left,,3\n",
+        ("line 2", "column 'touch_axis'", "the touch has no axis"),
+    ),
     "axis without touch": (f"{TOUCH}\n1,left,y,\n", ("line 2", "column 'touch_mm'", "along y")),
     "touch without frame": (f"{TOUCH}\n1,,y,3\n", ("line 2", "column 'frame'", "which placement of the jig")),
     "no axis column": (
@@ -130,7 +133,10 @@ CASES: dict[str, tuple[str, tuple[str, ...]]] = {
         "q1_deg,distance_mm,anchor,anchor_x_mm,anchor_y_m,anchor_z_mm\n1,3,w,1,2,3\n",
         ("line 1", "'anchor_y_m'", "one unit"),
     ),
-    "place of no anchor": (f"{WIRE}\n1,3,,1,2,3,bar,,\n2,3,,,,,bar,,\n", ("line 2", "no anchor is named")),
+    "place of no anchor": (
+        f"{WIRE}\n1,3,,1,2,3,bar,,\n2,3,,,,,bar,,\n",
+        ("line 2", "place of an anchor is stated"),
+    ),
     "anchor in two places": (
         f"{WIRE}\n1,3,wire,1,2,3,,,\n2,3,wire,1,2,4,,,\n",
         ("line 2", "'wire' has not the same place", "1 more row"),

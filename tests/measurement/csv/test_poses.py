@@ -49,7 +49,7 @@ def test_quaternions_metres_and_any_order_of_columns(tmp_path):
         ([f"{RPY},q1_deg", "1,2,3,4,5,6,7"], "column 'q1_deg': no column of a wanted pose"),
         ([RPY.replace("roll_deg", "rol_deg"), "1,2,3,4,5,6"], "did you mean 'roll_deg'"),
         ([f"{RPY},x_m", "1,2,3,4,5,6,7"], "column 'x_m': 'x' stands twice"),
-        ([f"{RPY},qx,qy,qz,qw", "1,2,3,4,5,6,0,0,0,1"], "both given; keep one"),
+        ([f"{RPY},qx,qy,qz,qw", "1,2,3,4,5,6,0,0,0,1"], "both there; keep one"),
         ([RPY.replace("y_mm", "y_m"), "1,2,3,4,5,6"], "columns 'x_mm', 'y_m', 'z_mm': mixed units"),
         ([RPY, "1,2,3,4,5,6", "1,2,3,4,5"], "line 3: 6 fields were wanted, got 5"),
         ([RPY, "1,5,2,3,4,5,6"], "decimal point, not a comma"),

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement import Measurements, join
-from pisigma.measurement.series import leave_one_series_out, one_against_another, series_of
+from pisigma.measurement.splits import leave_one_series_out, one_against_another, series_of
 
 
 def rows(labels: list[int], **more: object) -> Measurements:

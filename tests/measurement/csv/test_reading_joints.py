@@ -6,7 +6,7 @@ import pytest
 from testing.closeness import assert_close
 
 from pisigma.errors import MeasurementError
-from pisigma.measurement.csv.joints import read_joints
+from pisigma.measurement.csv.reading import read_joints
 from pisigma.robot import Robot
 
 

@@ -5,7 +5,7 @@ import torch
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement import Measurements, k_folds
-from pisigma.measurement.drawing import draw_rows, with_fewer
+from pisigma.measurement.splits import draw_rows, with_fewer
 
 
 def repeats(configurations: int, each: int) -> Measurements:
