@@ -148,11 +148,11 @@ def _urdf(model: "CalibratedModel", like: Path | None, tip: str | None) -> tuple
 
     robot, told = calibrated_geometry(model), remarks(model)
     if like is None:
-        from pisigma.robot.urdf_writing import robot_to_urdf
+        from pisigma.robot.writing import robot_to_urdf
 
         text = robot_to_urdf(robot, told)
     else:
-        from pisigma.robot.urdf_template import robot_into_urdf
+        from pisigma.robot.writing import robot_into_urdf
 
         text = robot_into_urdf(robot, model.robot, like, tip, told)
     return text, {"robot": robot.name, "joints": robot.dof, "remarks": list(told)}

@@ -10,9 +10,9 @@ def robots(
 ) -> None:
     """List the robots that come with pisigma."""
     from pisigma.cli.output import print_json, print_table
-    from pisigma.robot import catalogue, load_robot
+    from pisigma.robot import Robot, catalogue
 
-    known = [load_robot(name) for name in catalogue()]
+    known = [Robot.load(name) for name in catalogue()]
     if as_json:
         entries = [
             {

@@ -5,8 +5,9 @@ import io
 
 import numpy as np
 
-from pisigma.robot.description import DH_COLUMNS, FRAME_COLUMNS, Robot
-from pisigma.robot.robot_file import robot_to_yaml
+from pisigma.robot.description import Robot
+from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS
+from pisigma.robot.writing import robot_to_yaml
 
 CONVENTION = (
     "A_i = RotZ(theta_i + direction q_i) Trans(a_i, 0, d_i) RotX(alpha_i) RotY(beta_i), a prismatic joint adds "

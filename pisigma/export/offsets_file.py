@@ -8,7 +8,7 @@ import yaml
 
 from pisigma.export.dh_table import cells, file_values, head, in_units
 from pisigma.export.joint_offsets import JointOffsets
-from pisigma.robot.description import FRAME_COLUMNS
+from pisigma.robot.row import FRAME_COLUMNS
 
 MEANING = (
     "The real robot commanded to q stands where the robot as drawn stands at q + offset: command q - offset, "

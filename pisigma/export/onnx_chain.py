@@ -9,7 +9,8 @@ import torch
 from pisigma.export.onnx_graph import OnnxGraph
 from pisigma.joint_correction.features import GravityTorques
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.robot.description import Robot, Row
+from pisigma.robot.description import Robot
+from pisigma.robot.row import Row
 from pisigma.se3 import transform_from_xyzrpy
 
 

@@ -27,7 +27,8 @@ from pisigma.identification.problem.setup import CalibrationSetup, SetupOptions,
 from pisigma.identification.result import CalibrationResult
 from pisigma.identification.result_assembly import Findings, SolvedCalibration
 from pisigma.measurement.dataset import Measurements
-from pisigma.robot.description import FRAME_COLUMNS, Robot
+from pisigma.robot.description import Robot
+from pisigma.robot.row import FRAME_COLUMNS
 from pisigma.sensors.building import PairOfSockets
 
 ROUGH_ROWS = 4_096

@@ -25,7 +25,7 @@ from pisigma.identification.problem.user_coordinates import (
 )
 from pisigma.identification.result import CalibrationResult, Outlier, ParameterEstimate, SensorNoise
 from pisigma.measurement.dataset import Measurements
-from pisigma.robot.description import FRAME_COLUMNS
+from pisigma.robot.row import FRAME_COLUMNS
 from pisigma.se3 import wrap_to_pi
 
 LOST = 1e-10

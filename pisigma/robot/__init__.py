@@ -1,8 +1,8 @@
 """What a robot is: its description, its file and the catalogue."""
 
-from pisigma.robot.description import DH_COLUMNS, FRAME_COLUMNS, JointType, Robot, Row
-from pisigma.robot.loading import catalogue, load_robot
-from pisigma.robot.robot_file import RobotDocument, robot_to_yaml
+from pisigma.robot.description import Robot
+from pisigma.robot.robot_file import RobotDocument, catalogue
+from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, JointType, Row
 
 __all__ = [
     "DH_COLUMNS",
@@ -12,6 +12,4 @@ __all__ = [
     "RobotDocument",
     "Row",
     "catalogue",
-    "load_robot",
-    "robot_to_yaml",
 ]

@@ -2,41 +2,14 @@
 
 import os
 from dataclasses import dataclass, field, replace
-from typing import Literal, get_args
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float64
 
 from pisigma.errors import PoseError, RobotError, nearest_choice
-
-JointType = Literal["revolute", "prismatic", "fixed"]
-
-DH_COLUMNS = ("theta", "d", "a", "alpha", "beta")
-"""Order of the parameters of a row, everywhere; theta, alpha, beta [rad], d, a [m]."""
-
-FRAME_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
-"""Order of the parameters of base and tool, everywhere; x, y, z [m], roll, pitch, yaw [rad]."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """One DH + Hayati row `RotZ(theta + q) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`.
-
-    A prismatic joint adds q to d instead; a fixed row has no joint (an end effector, for example).
-
-    Attributes:
-        name: unique in the robot, such as "theta_1".
-        type: "revolute", "prismatic" or "fixed".
-        direction: +1 or -1: how the controller counts; the joint moves by `direction · q`.
-        lower: smallest joint value [rad or m], as the controller counts; -inf where there is no limit.
-        upper: largest joint value [rad or m].
-    """
-
-    name: str
-    type: JointType
-    direction: int = 1
-    lower: float = -np.inf
-    upper: float = np.inf
+from pisigma.robot.robot_file import read_robot
+from pisigma.robot.row import JointType, Row
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,9 +87,7 @@ class Robot:
             UnknownRobotError: neither a catalogue name nor a file; the message lists the catalogue.
             RobotError: the file does not describe a robot, or links are named where there is no URDF file.
         """
-        from pisigma.robot.loading import load_robot
-
-        return load_robot(robot, base, tip)
+        return Robot(*read_robot(robot, base, tip))
 
     @property
     def joints(self) -> tuple[Row, ...]:

@@ -1,14 +1,16 @@
-"""A robot as a YAML file: millimetres and degrees outside, SI inside."""
+"""Robots from files: the catalogue, YAML (millimetres and degrees outside, SI inside) and URDF."""
 
+import os
+from importlib import resources
+from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-import yaml
 from pydantic import Field, model_validator
 
-from pisigma.errors import RobotError
-from pisigma.robot.description import DH_COLUMNS, FRAME_COLUMNS, JointType, Robot, Row
-from pisigma.yaml_file import Section
+from pisigma.errors import RobotError, UnknownRobotError, nearest_choice
+from pisigma.robot.row import Drawing, JointType, Row
+from pisigma.yaml_file import Section, parse_yaml, read_yaml
 
 Limits = Annotated[tuple[float, float], Field(description="lower and upper")]
 
@@ -90,12 +92,8 @@ class RobotDocument(Section):
             raise ValueError("no row moves; add a revolute or prismatic one")
         return self
 
-    def to_robot(self) -> Robot:
-        """The robot in SI units.
-
-        Raises:
-            RobotError: the parts do not fit together.
-        """
+    def drawing(self) -> Drawing:
+        """The robot in SI units."""
         dh = [
             [
                 np.deg2rad(row.theta_deg),
@@ -106,7 +104,7 @@ class RobotDocument(Section):
             ]
             for row in self.rows
         ]
-        return Robot(
+        return Drawing(
             name=self.name,
             maker=self.maker,
             source=self.source,
@@ -117,44 +115,35 @@ class RobotDocument(Section):
         )
 
 
-def robot_to_yaml(robot: Robot) -> str:
-    """The robot as YAML text that `RobotDocument` reads back, equal to within the rounding of the units.
-
-    Raises:
-        RobotError: a row has one limit only, which a file cannot hold.
-    """
-    rows = []
-    for row, parameters in zip(robot.rows, robot.dh, strict=True):
-        entry: dict[str, object] = {"name": row.name, "type": row.type, "direction": row.direction}
-        entry |= _limits_entry(row)
-        for name, value in zip(DH_COLUMNS, parameters, strict=True):
-            entry |= _in_file_units(name, float(value), length=name in ("d", "a"))
-        rows.append(entry)
-    document: dict[str, object] = {
-        "name": robot.name,
-        "maker": robot.maker,
-        "source": robot.source,
-        "rows": rows,
-    }
-    for frame in ("base", "tool"):
-        values = getattr(robot, frame)
-        section: dict[str, float] = {}
-        for name, value in zip(FRAME_COLUMNS, values, strict=True):
-            section |= _in_file_units(name, float(value), length=name in ("x", "y", "z"))
-        document[frame] = section
-    return yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+def catalogue() -> tuple[str, ...]:
+    """Names of the robots that come with pisigma, sorted."""
+    folder = resources.files("pisigma.robot") / "catalogue"
+    return tuple(
+        sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
+    )
 
 
-def _limits_entry(row: Row) -> dict[str, list[float]]:
-    bounded = np.isfinite([row.lower, row.upper])
-    if not bounded.any():
-        return {}
-    if not bounded.all():
-        raise RobotError(f"row '{row.name}' has one limit only; a robot file holds both or none.")
-    if row.type == "revolute":
-        return {"limits_deg": [float(np.rad2deg(row.lower)), float(np.rad2deg(row.upper))]}
-    return {"limits_mm": [row.lower * 1e3, row.upper * 1e3]}
+def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None) -> Drawing:
+    """Read a robot by catalogue name, from a YAML or from a URDF file. See `Robot.load`."""
+    name = os.fspath(robot)
+    suffix = Path(name).suffix.lower()
+    if suffix == ".urdf" and name not in catalogue():
+        from pisigma.robot.urdf_rows import read_urdf_drawing
 
-
-def _in_file_units(name: str, value: float, length: bool) -> dict[str, float]:
-    return {f"{name}_mm": value * 1e3} if length else {f"{name}_deg": float(np.rad2deg(value))}
+        return read_urdf_drawing(name, base, tip)
+    for option, link in (("base", base), ("tip", tip)):
+        if link is not None:
+            raise RobotError(
+                f"{option}='{link}' names a link of a URDF file, but '{name}' is none; leave it out or give a "
+                ".urdf file."
+            )
+    if name in catalogue():
+        text = (resources.files("pisigma.robot") / "catalogue" / f"{name}.yaml").read_text(encoding="utf-8")
+        return parse_yaml(text, RobotDocument, RobotError, source=f"catalogue/{name}.yaml").drawing()
+    if suffix in (".yaml", ".yml"):
+        return read_yaml(name, RobotDocument, RobotError).drawing()
+    if suffix == ".xacro":
+        raise RobotError(f"{name}: is xacro, which is not read; expand it first (`xacro FILE > robot.urdf`).")
+    raise UnknownRobotError(
+        f"'{name}' is no robot of the catalogue and no .yaml or .urdf file: {nearest_choice(name, catalogue())}"
+    )

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.robot.description import Robot, Row
+from pisigma.robot.row import Drawing, Row
 from pisigma.robot.urdf_chain import Chain, ChainJoint, read_chain
 from pisigma.robot.urdf_frames import (
     ROUNDING,
@@ -35,8 +35,8 @@ Vector = Float64[np.ndarray, " 3"]
 Parameters = tuple[float, float, float, float, float]
 
 
-def load_urdf(path: str | os.PathLike[str], base: str | None = None, tip: str | None = None) -> Robot:
-    """Load the robot between two links of a URDF file.
+def read_urdf_drawing(path: str | os.PathLike[str], base: str | None, tip: str | None) -> Drawing:
+    """Read the robot between two links of a URDF file.
 
     Args:
         path: the file.
@@ -46,7 +46,7 @@ def load_urdf(path: str | os.PathLike[str], base: str | None = None, tip: str | 
     Raises:
         RobotError: the file does not describe a serial robot; see `read_chain`.
     """
-    return rows_of_chain(read_chain(path, base, tip)).robot
+    return rows_of_chain(read_chain(path, base, tip)).drawing
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,11 +54,11 @@ class ChainRows:
     """A chain as rows, and where these stand in its links.
 
     Attributes:
-        robot: rows, base and tool.
+        drawing: rows, base and tool.
         frames: per joint, the frame of its row in that of the joint; they share the axis and move together.
     """
 
-    robot: Robot
+    drawing: Drawing
     frames: tuple[Frame, ...]
 
 
@@ -80,7 +80,7 @@ def rows_of_chain(chain: Chain) -> ChainRows:
         frames.append(inverse(T_row_next) @ row_frame(*parameters))
     T_row_tip = inverse(frames[-1]) @ chain.end
     dh.append(_last_row(T_row_tip))
-    robot = Robot(
+    drawing = Drawing(
         name=chain.name,
         maker="not stated",
         source=f"URDF file {Path(chain.source).name}, from link '{chain.base}' to link '{chain.tip}'",
@@ -89,7 +89,7 @@ def rows_of_chain(chain: Chain) -> ChainRows:
         base=xyzrpy_of(frame),
         tool=xyzrpy_of(inverse(row_frame(*dh[-1])) @ T_row_tip),
     )
-    return ChainRows(robot, tuple(frames))
+    return ChainRows(drawing, tuple(frames))
 
 
 def _direction(joint: ChainJoint) -> int:

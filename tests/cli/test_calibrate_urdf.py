@@ -16,7 +16,7 @@ from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
-from pisigma.robot.urdf_writing import robot_to_urdf
+from pisigma.robot.writing import robot_to_urdf
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.robot import Robot
-from pisigma.robot.urdf_writing import robot_to_urdf
+from pisigma.robot.writing import robot_to_urdf
 
 NOT_TOLD = "The learned joint correction of the model is not in this file"
 

@@ -77,7 +77,7 @@ def test_problem_in_a_process_of_its_own(tmp_path):
 
 def test_a_defect_of_ours_exits_1_with_its_traceback(tmp_path):
     script = (
-        "import sys\nfrom pisigma.robot import loading\n"
+        "import sys\n"
         "import pisigma.robot\npisigma.robot.catalogue = lambda: 1 / 0\n"
         "sys.argv = ['pisigma', 'robots']\nfrom pisigma.cli.main import run\nrun()\n"
     )

@@ -6,7 +6,7 @@ import pytest
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement import Measurements
-from pisigma.robot import load_robot
+from pisigma.robot import Robot
 
 POSITION = "x_mm,y_mm,z_mm"
 
@@ -189,7 +189,7 @@ def message_of(tmp_path: Path, robot: str | None, content: str | bytes) -> str:
     path = tmp_path / "tracker.csv"
     path.write_bytes(content.encode() if isinstance(content, str) else content)
     with pytest.raises(MeasurementError) as caught:
-        Measurements.read_csv(path, load_robot(robot) if robot else None)
+        Measurements.read_csv(path, Robot.load(robot) if robot else None)
     message = str(caught.value)
     assert message.startswith(str(path))
     assert message.endswith(".")

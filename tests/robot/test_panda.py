@@ -7,7 +7,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.robot import load_robot
+from pisigma.robot import Robot
 
 # The maker's modified DH parameters (Craig): a, d [m], alpha [deg] of the frame before every joint; then the flange.
 MAKER = [
@@ -35,7 +35,7 @@ def flange_by_the_maker(q: np.ndarray) -> np.ndarray:
 
 
 def test_the_flange_is_where_the_maker_says():
-    robot = load_robot("panda")
+    robot = Robot.load("panda")
     low, high = robot.limits.T
     for q in np.random.default_rng(0).uniform(low, high, (20, 7)):
         assert_close(forward_kinematics(robot, torch.from_numpy(q)), flange_by_the_maker(q), atol=1e-14)

@@ -7,7 +7,8 @@ import pytest
 from testing.closeness import assert_close
 
 from pisigma.errors import PoseError, RobotError, UnknownRobotError
-from pisigma.robot import Robot, RobotDocument, Row, catalogue, robot_to_yaml
+from pisigma.robot import Robot, RobotDocument, Row, catalogue
+from pisigma.robot.writing import robot_to_yaml
 from pisigma.yaml_file import parse_yaml
 
 TEXT = """\
@@ -24,7 +25,7 @@ tool: {z_mm: 250, yaw_deg: -180}
 
 
 def read(text: str) -> Robot:
-    return parse_yaml(text, RobotDocument, RobotError, "arm.yaml").to_robot()
+    return Robot(*parse_yaml(text, RobotDocument, RobotError, "arm.yaml").drawing())
 
 
 def test_units_and_columns():

@@ -16,7 +16,7 @@ from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot, catalogue
 from pisigma.robot.urdf_rows import NEARLY_PARALLEL
-from pisigma.robot.urdf_writing import robot_to_urdf
+from pisigma.robot.writing import robot_to_urdf
 
 TILTS = (0.0, 1e-9, 1e-7, 1e-5, 1e-3, -1e-3, 0.05, 0.099, 0.101)
 QUARTERS = (0.0, math.pi / 2, -math.pi / 2, math.pi, 1.5707963, 1.5708)

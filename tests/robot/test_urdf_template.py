@@ -12,7 +12,7 @@ from testing.urdf import DrawnJoint, peer_poses, urdf_text
 from pisigma.errors import RobotError
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot
-from pisigma.robot.urdf_template import robot_into_urdf
+from pisigma.robot.writing import robot_into_urdf
 
 TEXT = """\
 <robot name="arm">

@@ -12,7 +12,7 @@ from testing.closeness import assert_close
 from pisigma.errors import OutputError
 from pisigma.robot import Robot, Row
 from pisigma.robot.urdf_frames import frame_of, inverse, row_frame, turn, xyzrpy_of
-from pisigma.robot.urdf_writing import robot_to_urdf
+from pisigma.robot.writing import robot_to_urdf
 
 ROWS = (
     Row("base_joint", "revolute", -1),

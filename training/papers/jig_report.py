@@ -22,7 +22,8 @@ from jig_recipe import JigCalibration, JigRecipe, calibrate_on, nominal_calibrat
 from pisigma.errors import RecipeError
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.touch_planning import PlanningProblem, TouchPlan, plan_touches
-from pisigma.robot.description import FRAME_COLUMNS, Robot
+from pisigma.robot.description import Robot
+from pisigma.robot.row import FRAME_COLUMNS
 from pisigma.simulation.touch_candidates import TouchCandidates
 from straight_lines import TrackedLine, i_move, move_l
 

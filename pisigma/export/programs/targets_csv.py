@@ -9,7 +9,7 @@ import torch
 from pisigma.export.dh_table import file_values, head, in_units
 from pisigma.export.programs.targets import Targets
 from pisigma.export.programs.text import millimetres_and_euler
-from pisigma.robot.description import FRAME_COLUMNS
+from pisigma.robot.row import FRAME_COLUMNS
 
 POSE_COLUMNS = tuple(in_units(name) for name in FRAME_COLUMNS)
 

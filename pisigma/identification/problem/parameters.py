@@ -12,7 +12,8 @@ from torch import Tensor
 
 from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.kinematics.parameter_jacobian import motion_order
-from pisigma.robot.description import DH_COLUMNS, FRAME_COLUMNS, Robot
+from pisigma.robot.description import Robot
+from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS
 from pisigma.sensors.sensor import OwnUnknowns
 
 SOCKET_COLUMNS = ("x", "y", "z")

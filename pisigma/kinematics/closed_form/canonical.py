@@ -24,7 +24,8 @@ from pisigma.kinematics.components import (
     rotate_z,
     translate,
 )
-from pisigma.robot.description import JointType, Robot
+from pisigma.robot.description import Robot
+from pisigma.robot.row import JointType
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,7 +33,7 @@ from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
 from pisigma.network.pi_sigma import PiSigma
 from pisigma.robot.description import Robot
-from pisigma.robot.robot_file import robot_to_yaml
+from pisigma.robot.writing import robot_to_yaml
 
 _PREFIX = "network."
 
@@ -149,7 +149,7 @@ def _build_model(document: ModelDocument, tensors: dict[str, Tensor]) -> Calibra
     Raises:
         ValueError: a tensor is missing, too many or of another shape or type; or a name or count is wrong.
     """
-    robot = document.robot.to_robot()
+    robot = Robot(*document.robot.drawing())
     _check_branches(robot, document.branches)
     network = _empty_network(document, robot)
     samples = "domain.samples" in tensors
@@ -188,7 +188,7 @@ def _build_model(document: ModelDocument, tensors: dict[str, Tensor]) -> Calibra
 def _calibrated_robot(document: ModelDocument, robot: Robot) -> Robot | None:
     if document.calibrated is None:
         return None
-    calibrated = document.calibrated.to_robot()
+    calibrated = Robot(*document.calibrated.drawing())
     if [(row.name, row.type) for row in calibrated.rows] != [(row.name, row.type) for row in robot.rows]:
         raise ValueError("the calibrated robot has other rows than the nominal one")
     if not (np.array_equal(calibrated.base, robot.base) and np.array_equal(calibrated.tool, robot.tool)):

@@ -9,7 +9,7 @@ from testing.closeness import assert_close
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement import Measurements
-from pisigma.robot import load_robot
+from pisigma.robot import Robot
 
 MIXED = """\
 q1_deg,x_mm,y_mm,z_mm,socket,touch_axis,touch_mm,distance_mm,anchor,anchor_x_mm,anchor_y_mm,anchor_z_mm,pair,frame,sigma_mm
@@ -82,7 +82,7 @@ def test_metres_are_read_too(tmp_path: Path):
 
 
 def test_measured_sockets(shared_data: Path, tmp_path: Path):
-    robot = load_robot("panda")
+    robot = Robot.load("panda")
     data = Measurements.read_csv(shared_data / "panda_sockets" / "panda_3.csv", robot)
     assert (data.rows, data.dof, data.kinds) == (387, 7, {"socket"})
     assert len(set(data.socket)) == 12

@@ -9,7 +9,7 @@ from testing.closeness import assert_close
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement import Measurements
-from pisigma.robot import load_robot
+from pisigma.robot import Robot
 from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy
 
 
@@ -136,7 +136,7 @@ def test_repeated_joints_with_other_readings_or_targets_are_measurements(write):
 
 
 def test_rounding_at_a_limit_is_no_fault(write):
-    robot = load_robot("ur10")
+    robot = Robot.load("ur10")
     upper = float(robot.limits[0, 1])
     row = ",".join(repr(upper + 9e-10) for _ in range(6))
     text = "q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,x_mm,y_mm,z_mm\n"
@@ -162,7 +162,7 @@ def test_leaves_out_rows_on_request_and_says_why(write):
         '1,2,-3,4,1,2,3,0.1,"train\n'
         "1,2,-4,4,1,2,3,0.1,test\n"
     )
-    measurements = Measurements.read_csv(path, load_robot("kiro3"), on_bad_row="leave_out")
+    measurements = Measurements.read_csv(path, Robot.load("kiro3"), on_bad_row="leave_out")
     assert measurements.line == (2, 12)
     assert measurements.split == ("train", "test")
     assert_close(measurements.q[:, 2], [-3e-3, -4e-3])
@@ -173,7 +173,7 @@ def test_leaves_out_rows_on_request_and_says_why(write):
     with pytest.raises(
         MeasurementError, match=r"data\.csv, line 3, all columns: .*\(8 more rows have a fault\)\.$"
     ):
-        Measurements.read_csv(path, load_robot("kiro3"))
+        Measurements.read_csv(path, Robot.load("kiro3"))
 
 
 def test_says_so_where_no_row_can_be_used(write):
@@ -190,7 +190,7 @@ def test_says_so_where_no_row_can_be_used(write):
     ],
 )
 def test_reads_measured_robots(shared_data: Path, file: str, robot: str | None, rows: int, kind: str):
-    measurements = Measurements.read_csv(shared_data / file, load_robot(robot) if robot else None)
+    measurements = Measurements.read_csv(shared_data / file, Robot.load(robot) if robot else None)
     assert (measurements.rows, measurements.dof, measurements.kinds) == (rows, 6, {kind})
     assert measurements.line == tuple(range(2, rows + 2))
     assert measurements.left_out == ()

@@ -13,7 +13,7 @@ from testing.closeness import assert_close
 
 from pisigma.errors import MeasurementError, OutputError
 from pisigma.measurement import Measurements
-from pisigma.robot import load_robot
+from pisigma.robot import Robot
 from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy
 
 TEXT = st.text(st.characters(exclude_categories=("Cs", "Cc")), max_size=6).filter(
@@ -119,7 +119,7 @@ def make(rows: int = 2) -> Measurements:
 
 
 def test_units_are_those_of_the_robot(tmp_path: Path):
-    path, robot = tmp_path / "data.csv", load_robot("kiro3")
+    path, robot = tmp_path / "data.csv", Robot.load("kiro3")
     make().write_csv(path, robot)
     assert path.read_text().splitlines()[0] == "q1_deg,q2_deg,q3_mm,q4_deg,x_mm,y_mm,z_mm"
     assert_same(Measurements.read_csv(path, robot), make())
@@ -131,7 +131,7 @@ def test_all_joints_turn_where_nothing_is_said(tmp_path: Path):
 
 
 def test_measured_poses_read_back(tmp_path: Path, shared_data: Path):
-    robot = load_robot("ur10")
+    robot = Robot.load("ur10")
     measured = Measurements.read_csv(shared_data / "ur10" / "series_c_train.csv", robot)
     measured.write_csv(tmp_path / "data.csv", robot)
     assert_same(Measurements.read_csv(tmp_path / "data.csv", robot), measured)
@@ -164,7 +164,7 @@ def test_refuses_no_rows(tmp_path: Path):
 
 def test_refuses_another_robot(tmp_path: Path):
     with pytest.raises(MeasurementError, match="has 4 joints, but robot 'ur10' has 6"):
-        make().write_csv(tmp_path / "data.csv", load_robot("ur10"))
+        make().write_csv(tmp_path / "data.csv", Robot.load("ur10"))
     with pytest.raises(MeasurementError, match="has 4 joints, but 'revolute' has 1"):
         make().write_csv(tmp_path / "data.csv", revolute=[True])
 

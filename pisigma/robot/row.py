@@ -1,0 +1,58 @@
+"""What a serial robot is written down as: DH + Hayati rows with their joints, base and tool, in SI units."""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+JointType = Literal["revolute", "prismatic", "fixed"]
+
+DH_COLUMNS = ("theta", "d", "a", "alpha", "beta")
+"""Order of the parameters of a row, everywhere; theta, alpha, beta [rad], d, a [m]."""
+
+FRAME_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
+"""Order of the parameters of base and tool, everywhere; x, y, z [m], roll, pitch, yaw [rad]."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One DH + Hayati row `RotZ(theta + q) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`.
+
+    A prismatic joint adds q to d instead; a fixed row has no joint (an end effector, for example).
+
+    Attributes:
+        name: unique in the robot, such as "theta_1".
+        type: "revolute", "prismatic" or "fixed".
+        direction: +1 or -1: how the controller counts; the joint moves by `direction · q`.
+        lower: smallest joint value [rad or m], as the controller counts; -inf where there is no limit.
+        upper: largest joint value [rad or m].
+    """
+
+    name: str
+    type: JointType
+    direction: int = 1
+    lower: float = -np.inf
+    upper: float = np.inf
+
+
+class Drawing(NamedTuple):
+    """What a file says of a robot, not yet checked as a whole; see `Robot`, which has the same attributes.
+
+    Attributes:
+        name: short name, as in the catalogue.
+        maker: who builds it.
+        source: where the figures come from.
+        rows: joints and fixed rows, from the base to the tool.
+        dh: `(rows, 5)`, columns as `DH_COLUMNS`.
+        base: as `FRAME_COLUMNS`.
+        tool: as `FRAME_COLUMNS`.
+    """
+
+    name: str
+    maker: str
+    source: str
+    rows: tuple[Row, ...]
+    dh: Float64[np.ndarray, " rows 5"]
+    base: Float64[np.ndarray, " 6"]
+    tool: Float64[np.ndarray, " 6"]

@@ -1,0 +1,255 @@
+"""A robot as the text of a file: YAML, URDF, or the URDF that it was drawn in with other origins."""
+
+import os
+from collections.abc import Collection
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import yaml
+
+from pisigma.errors import OutputError, RobotError
+from pisigma.robot.description import Robot
+from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, Drawing, Row
+from pisigma.robot.urdf_chain import Chain, origin_of, parse_xml, read_chain, read_urdf
+from pisigma.robot.urdf_frames import Frame, frame_of, inverse, row_frame, shift, turn, xyzrpy_of
+from pisigma.robot.urdf_rows import ChainRows, rows_of_chain
+
+
+def robot_to_yaml(robot: Robot) -> str:
+    """The robot as YAML text that `Robot.load` reads back, equal to within the rounding of the units.
+
+    Raises:
+        RobotError: a row has one limit only, which a file cannot hold.
+    """
+    rows = []
+    for row, parameters in zip(robot.rows, robot.dh, strict=True):
+        entry: dict[str, object] = {"name": row.name, "type": row.type, "direction": row.direction}
+        entry |= _limits_entry(row)
+        for name, value in zip(DH_COLUMNS, parameters, strict=True):
+            entry |= _in_file_units(name, float(value), length=name in ("d", "a"))
+        rows.append(entry)
+    document: dict[str, object] = {
+        "name": robot.name,
+        "maker": robot.maker,
+        "source": robot.source,
+        "rows": rows,
+    }
+    for frame in ("base", "tool"):
+        values = getattr(robot, frame)
+        section: dict[str, float] = {}
+        for name, value in zip(FRAME_COLUMNS, values, strict=True):
+            section |= _in_file_units(name, float(value), length=name in ("x", "y", "z"))
+        document[frame] = section
+    return yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+
+
+def _limits_entry(row: Row) -> dict[str, list[float]]:
+    bounded = np.isfinite([row.lower, row.upper])
+    if not bounded.any():
+        return {}
+    if not bounded.all():
+        raise RobotError(f"row '{row.name}' has one limit only; a robot file holds both or none.")
+    if row.type == "revolute":
+        return {"limits_deg": [float(np.rad2deg(row.lower)), float(np.rad2deg(row.upper))]}
+    return {"limits_mm": [row.lower * 1e3, row.upper * 1e3]}
+
+
+def _in_file_units(name: str, value: float, length: bool) -> dict[str, float]:
+    return {f"{name}_mm": value * 1e3} if length else {f"{name}_deg": float(np.rad2deg(value))}
+
+
+BASE_LINK = "base_link"
+TOOL_LINK = "tool0"
+
+
+def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
+    """The robot as URDF with the same forward kinematics from `base_link` to `tool0`.
+
+    A joint stands where its row has it after `RotZ(theta) · Trans(0, 0, d)` and moves about or along its own z
+    axis, or the other way round where its direction is -1; `Trans(a, 0, 0) · RotX(alpha) · RotY(beta)` leads
+    on to the next. No common normal is needed, so parallel axes stay where they are. Base and tool are fixed
+    joints, links are named `link_1` and so on, joints like the rows. `effort` and `velocity`, which the
+    format asks for, are written as 0: not known.
+
+    Args:
+        robot: the robot.
+        comments: sentences to write at the top.
+
+    Raises:
+        OutputError: a joint has limits that the format cannot say.
+    """
+    root = ElementTree.Element("robot", name=robot.name)
+    for sentence in comments:
+        root.append(ElementTree.Comment(comment_text(sentence)))
+    names = {row.name for row in robot.rows}
+    link = "link_0"
+    _link(root, BASE_LINK)
+    _link(root, link)
+    _joint(root, unused_name("base_joint", names), "fixed", (BASE_LINK, link), frame_of(robot.base))
+    behind = np.eye(4)
+    for number, (row, (theta, d, a, alpha, beta)) in enumerate(
+        zip(robot.rows, robot.dh.tolist(), strict=True), 1
+    ):
+        following = f"link_{number}"
+        _link(root, following)
+        origin = behind @ turn(2, theta) @ shift(0.0, 0.0, d)
+        element = _joint(root, row.name, _type(row, robot.name), (link, following), origin)
+        if row.type != "fixed":
+            ElementTree.SubElement(element, "axis", xyz=f"0 0 {row.direction}")
+        if np.isfinite(row.upper):
+            ElementTree.SubElement(
+                element, "limit", lower=repr(row.lower), upper=repr(row.upper), effort="0", velocity="0"
+            )
+        link, behind = following, row_frame(0.0, 0.0, a, alpha, beta)
+    _link(root, TOOL_LINK)
+    tool = behind @ frame_of(robot.tool)
+    _joint(root, unused_name("tool_joint", names), "fixed", (link, TOOL_LINK), tool)
+    ElementTree.indent(root)
+    return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
+
+
+def _link(root: ElementTree.Element, name: str) -> None:
+    ElementTree.SubElement(root, "link", name=name)
+
+
+def _joint(
+    root: ElementTree.Element, name: str, kind: str, links: tuple[str, str], origin: Frame
+) -> ElementTree.Element:
+    element = ElementTree.SubElement(root, "joint", name=name, type=kind)
+    ElementTree.SubElement(element, "origin", origin_attributes(origin))
+    ElementTree.SubElement(element, "parent", link=links[0])
+    ElementTree.SubElement(element, "child", link=links[1])
+    return element
+
+
+def _type(row: Row, robot: str) -> str:
+    """What the format calls the joint."""
+    bounded = np.isfinite([row.lower, row.upper])
+    if row.type == "fixed" or bounded.all():
+        return row.type
+    if row.type == "revolute" and not bounded.any():
+        return "continuous"
+    raise OutputError(
+        f"robot '{robot}', joint '{row.name}': URDF wants a lower and an upper limit of a {row.type} joint, "
+        f"but it has {'one only' if bounded.any() else 'none'}; give the robot both."
+    )
+
+
+def origin_attributes(T: Frame) -> dict[str, str]:
+    """`xyz` and `rpy` of a frame with all digits; `rpy` turns about the fixed axes x, y, z, in this order."""
+    x, y, z, roll, pitch, yaw = (repr(float(value) + 0.0) for value in xyzrpy_of(T))
+    return {"xyz": f"{x} {y} {z}", "rpy": f"{yaw} {pitch} {roll}"}
+
+
+def unused_name(name: str, names: Collection[str]) -> str:
+    """The name, with lines under it until none of the others is the same."""
+    while name in names:
+        name += "_"
+    return name
+
+
+def comment_text(sentence: str) -> str:
+    """A sentence as the content of an XML comment."""
+    return f" {' '.join(sentence.split()).replace('--', '- -')} "
+
+
+CALIBRATED_FRAME = "calibrated_frame"
+CALIBRATED_TOOL = "calibrated_tool"
+SAME = 1e-9
+"""Largest difference [m or rad] of rows that are taken for those of the file."""
+
+
+def robot_into_urdf(
+    calibrated: Robot,
+    nominal: Robot,
+    path: str | os.PathLike[str],
+    tip: str | None = None,
+    comments: tuple[str, ...] = (),
+) -> str:
+    """The file with the origins of a calibrated robot; links, meshes, limits and all else stay.
+
+    Every joint after the first stands in the link before it where the calibration has it. Links keep their
+    places at the joints that carry them, so meshes still fit. Two links are added: `calibrated_frame`, the
+    parent of the root, is the frame that the model's poses are given in, and `calibrated_tool`, a child of the
+    tip, is the model's tool; from one to the other the forward kinematics is the calibrated robot's.
+
+    Args:
+        calibrated: the robot as identified.
+        nominal: the robot as loaded from the file, base and tool apart.
+        path: the file.
+        tip: the link that was the tool.
+        comments: sentences to write at the top.
+
+    Raises:
+        RobotError: the file cannot be used, or is of another robot.
+    """
+    from lxml import etree
+
+    chain = read_chain(path, tip=tip)
+    rows = rows_of_chain(chain)
+    _check_same(rows.drawing, nominal, str(path))
+    urdf, _ = read_urdf(path)
+    root = parse_xml(path, everything=True)
+    elements = {element.get("name"): element for element in root.iterchildren("{*}joint")}
+    for name, origin in _new_origins(chain, rows, calibrated, urdf).items():
+        _set_origin(elements[name], origin)
+    T_frame_base = frame_of(calibrated.base) @ inverse(frame_of(rows.drawing.base))
+    last = row_frame(*calibrated.dh[-1].tolist()) @ frame_of(calibrated.tool)
+    _add_link(root, CALIBRATED_FRAME, None, chain.base, T_frame_base)
+    _add_link(root, CALIBRATED_TOOL, chain.tip, None, inverse(chain.end) @ rows.frames[-1] @ last)
+    for sentence in reversed(comments):
+        root.insert(0, etree.Comment(comment_text(sentence)))
+    etree.indent(root)
+    return f'<?xml version="1.0"?>\n{etree.tostring(root, encoding="unicode")}\n'
+
+
+def _check_same(drawn: Drawing, nominal: Robot, path: str) -> None:
+    """Refuse a file of another robot."""
+    kinds, wanted = ([(row.name, row.type, row.direction) for row in r.rows] for r in (drawn, nominal))
+    if kinds != wanted:
+        joints, other = (", ".join(row.name for row in r.rows) for r in (drawn, nominal))
+        raise RobotError(
+            f"{path}: has the joints {joints}, but the model those of {other}; give the file that the robot was "
+            "loaded from, and the same tip."
+        )
+    far = float(np.abs(drawn.dh - nominal.dh)[:-1].max(initial=0.0))
+    if far > SAME:
+        raise RobotError(
+            f"{path}: its nominal geometry is not the model's (off by {far:.2g} m or rad); give the file that the "
+            "robot was loaded from."
+        )
+
+
+def _new_origins(chain: Chain, rows: ChainRows, calibrated: Robot, urdf: Any) -> dict[str, Frame]:
+    """Origins of the joints that move, in the links before them; that of the first stays."""
+    found: dict[str, Frame] = {}
+    for i, joint in enumerate(chain.joints[1:], 1):
+        whole = rows.frames[i - 1] @ row_frame(*calibrated.dh[i - 1].tolist()) @ inverse(rows.frames[i])
+        # Fixed joints between the two stay; what is before the joint's own origin is their product.
+        before = joint.origin @ inverse(origin_of(urdf.joint_map[joint.name]))
+        found[joint.name] = inverse(before) @ whole
+    return found
+
+
+def _set_origin(element: Any, origin: Frame) -> None:
+    from lxml import etree
+
+    part = next(element.iterchildren("{*}origin"), None)
+    if part is None:
+        part = etree.SubElement(element, "origin")
+        element.insert(0, part)
+    part.attrib.update(origin_attributes(origin))
+
+
+def _add_link(root: Any, name: str, parent: str | None, child: str | None, origin: Frame) -> None:
+    """A link with a fixed joint to the one that is given."""
+    from lxml import etree
+
+    name = unused_name(name, {element.get("name") for element in root.iterchildren("{*}link")})
+    joints = {element.get("name") for element in root.iterchildren("{*}joint")}
+    etree.SubElement(root, "link", name=name)
+    joint = etree.SubElement(root, "joint", name=unused_name(f"{name}_joint", joints), type="fixed")
+    _set_origin(joint, origin)
+    etree.SubElement(joint, "parent", link=parent or name)
+    etree.SubElement(joint, "child", link=child or name)
