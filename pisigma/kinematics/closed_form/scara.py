@@ -10,8 +10,7 @@ from torch import Tensor
 
 from pisigma.kinematics.closed_form.canonical import canonical_rows
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
-from pisigma.kinematics.closed_form.tolerance import rounding
-from pisigma.kinematics.closed_form.two_link import solve_two_link
+from pisigma.kinematics.closed_form.two_link import rounding, solve_two_link
 from pisigma.kinematics.components import Frame, Scalar, as_tensors
 from pisigma.robot.description import Robot
 

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from pisigma.kinematics.closed_form.canonical import canonical_rows
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
-from pisigma.kinematics.closed_form.tolerance import rounding, singular_tolerance
-from pisigma.kinematics.closed_form.two_link import solve_two_link
+from pisigma.kinematics.closed_form.two_link import rounding, singular_tolerance, solve_two_link
 from pisigma.kinematics.components import Columns, Frame, Scalar, as_tensors
 from pisigma.robot.description import Robot
 
