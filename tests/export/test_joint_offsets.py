@@ -49,7 +49,7 @@ def test_offsets_come_back(name):
     model = dataclasses.replace(geometric_model(name, with_offsets(flipped, offsets)), robot=flipped)
     found = fit_joint_offsets(model)
     assert_close(found.values, [0, *offsets[1:5], 0], atol=1e-9)
-    assert found.weak_directions == ("theta_1", "theta_6")
+    assert found.unobservable == ("theta_1", "theta_6")
     assert found.lost.maximum < 1e-9
     assert found.nominal.mean > 1e-3
     assert found.nominal.mean < found.nominal.p95 < found.nominal.maximum
@@ -64,7 +64,7 @@ def test_parallel_axes_leave_base_and_tool_open():
     """On a SCARA the second joint alone is told from base and tool, which share two directions themselves."""
     model = geometric_model("kiro3", with_offsets(Robot.load("kiro3"), [0.0, 0.02, 0.0, 0.0]))
     found = fit_joint_offsets(model)
-    assert found.weak_directions == ("theta_1", "d_3", "theta_4")
+    assert found.unobservable == ("theta_1", "d_3", "theta_4")
     assert_close(found.values, [0, 0.02, 0, 0], atol=1e-6)
     assert found.lost.maximum < 1e-7
     assert np.abs(found.robot.base).max() < 0.1
