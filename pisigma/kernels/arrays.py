@@ -2,6 +2,8 @@
 
 from typing import Any, NamedTuple
 
+from pisigma.kinematics.status import Status
+
 NOMINAL, GEOMETRIC, HYBRID, DRAWN = 0, 1, 2, 3
 """Which arm: as modelled, with the identified geometry, with the geometry that goes with the correction, and as
 drawn without base, on which gravity acts."""
@@ -14,6 +16,22 @@ FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
 NO_CLOSED_FORM, SCARA, SPHERICAL_WRIST, THREE_PARALLEL = 0, 1, 2, 3
 """Which closed form the nominal arm has."""
 
+
+REACHED = int(Status.REACHED)
+SINGULAR = int(Status.SINGULAR)
+OUTSIDE_LIMITS = int(Status.OUTSIDE_JOINT_LIMITS)
+OUTSIDE_DOMAIN = int(Status.OUTSIDE_DOMAIN)
+UNREACHABLE = int(Status.UNREACHABLE)
+INVALID = int(Status.INVALID_POSE)
+
+FINE, NOT_FINITE, LAST_ROW, NOT_ORTHONORMAL, LEFT_HANDED, NEAR_NOT_FINITE = -1, 1, 2, 3, 4, 5
+"""What is wrong with a matrix that should be a pose, or with the joint values to be near to."""
+
+ANY_BRANCH, EVERY_BRANCH = -1, -2
+"""Instead of the index of a branch."""
+
+SOLVE, EVALUATE, FORWARD = 0, 1, 2
+"""What the kernels are to do: solve poses, evaluate the corrected arm, or only where an arm stands and how it moves."""
 
 ANGLE, SINE, COSINE = 6, 7, 8
 """What an input of a network is; 0 to 5 are coordinates of the pose, in the order of `network.inputs.POSE_INPUTS`."""

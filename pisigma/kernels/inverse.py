@@ -5,28 +5,43 @@ from typing import Any, no_type_check
 
 from numba import njit
 
-from pisigma.kernels.arrays import NO_CLOSED_FORM, NOMINAL
+from pisigma.kernels.arrays import (
+    BLENDED,
+    GEOMETRIC,
+    HYBRID,
+    NO_CLOSED_FORM,
+    NOMINAL,
+    OUTSIDE_DOMAIN,
+    OUTSIDE_LIMITS,
+    REACHED,
+    SINGULAR,
+    UNREACHABLE,
+)
 from pisigma.kernels.closed_form import all_branches, nearest_turn, wrap_into_limits
-from pisigma.kernels.codes import UNREACHABLE
-from pisigma.kernels.corrected import add_correction, choose_corrected, finish_corrected
-from pisigma.kernels.finishing import finish
-from pisigma.kernels.newton import ACCEPTED, TOLERANCE, newton, search
-from pisigma.kernels.recovery import MORE_ATTEMPTS, branch_of, nearest_starts, recover, within_reach
-from pisigma.kernels.rotations import wrap
+from pisigma.kernels.damped_step import is_singular
+from pisigma.kernels.motion import move
+from pisigma.kernels.network import add_correction, choose_corrected, finish_corrected
+from pisigma.kernels.newton import newton, search
+from pisigma.kernels.recovery import branch_of, nearest_starts, recover, within_reach
+from pisigma.kernels.rotations import pose_error, wrap
 from pisigma.kernels.rows import copy, fill
+from pisigma.kinematics.tolerances import (
+    ACCEPTED,
+    AWAY,
+    LARGEST_CORRECTION,
+    LIMIT_TOLERANCE,
+    MORE_ATTEMPTS,
+    SINGULAR_TOLERANCE,
+    TOLERANCE,
+)
 
 Array = Any
 Record = Any
 
-_MARGIN = 1.0
-"""[rad or m] Corrections are smaller, so that branches that are farther off need not be corrected to be compared."""
-AWAY = 0.1
-"""[rad or m] A solution farther from where it was to be near to may not be the one that was meant."""
-
 
 @njit(error_model="numpy")
 @no_type_check
-def solve_pose(description: Record, memory: Record, has_near: bool, branch: int, found: Array) -> None:
+def solve_pose(description: Record, memory: Record, has_near: bool, branch: int, out: Array) -> None:
     """Find commanded joint values for the pose in `memory.pose`.
 
     Args:
@@ -34,14 +49,14 @@ def solve_pose(description: Record, memory: Record, has_near: bool, branch: int,
         memory: to work in, with the wanted T_base_tool, checked, and the joint values to stay near to.
         has_near: whether these count.
         branch: index of the branch wanted, or -1.
-        found: `(2 · dof + 5,)`, written: commanded and nominal joint values [rad or m], distance [m] and angle [rad]
+        out: `(2 · dof + 5,)`, written: commanded and nominal joint values [rad or m], distance [m] and angle [rad]
             from the pose, measure of the domain, status and branch.
     """
     form, chosen = description.closed_form, -1
     wanted = form.order[0] if branch < 0 else branch
     fill(memory.nominal, math.nan)
     if description.network.used:
-        _solve_by_network(description, memory, has_near, branch, wanted, found)
+        _solve_by_network(description, memory, has_near, branch, wanted, out)
         return
     if not within_reach(description, memory.pose):
         pass
@@ -56,14 +71,14 @@ def solve_pose(description: Record, memory: Record, has_near: bool, branch: int,
             chosen = recover(description, memory, wanted, branch < 0)
         if free:
             chosen = _continue(description, memory, chosen)
-    reached, status = finish(description, memory, has_near, chosen >= 0, found)
-    _write(description, memory, reached, status, wanted if chosen < 0 else chosen, found)
+    reached, status = finish(description, memory, has_near, chosen >= 0, out)
+    _write(description, memory, reached, status, wanted if chosen < 0 else chosen, out)
 
 
 @njit(error_model="numpy")
 @no_type_check
 def _solve_by_network(
-    description: Record, memory: Record, has_near: bool, branch: int, wanted: int, found: Array
+    description: Record, memory: Record, has_near: bool, branch: int, wanted: int, out: Array
 ) -> None:
     """The same where a network corrects the nominal joint values."""
     chosen, inside = choose_corrected(description, memory, has_near, branch, wanted)
@@ -71,24 +86,22 @@ def _solve_by_network(
     if numeric and _solve_without_branches(description, memory, has_near):
         copy(memory.solution, memory.nominal)
         chosen, inside = 0, add_correction(description, memory, has_near)
-    fill(found, math.nan)
+    fill(out, math.nan)
     status = UNREACHABLE
     if chosen >= 0:
-        status = finish_corrected(description, memory, chosen, inside, found)
-    _write(description, memory, chosen >= 0, status, wanted if chosen < 0 else chosen, found)
+        status = finish_corrected(description, memory, chosen, inside, out)
+    _write(description, memory, chosen >= 0, status, wanted if chosen < 0 else chosen, out)
 
 
 @njit(error_model="numpy")
 @no_type_check
-def _write(
-    description: Record, memory: Record, reached: bool, status: int, branch: int, found: Array
-) -> None:
+def _write(description: Record, memory: Record, reached: bool, status: int, branch: int, out: Array) -> None:
     """Write the joint values in memory, NaN where they do not reach the pose, the status and the branch."""
     dof = description.arms.dof
     for j in range(dof):
-        found[j] = memory.solution[j] if reached else math.nan
-        found[dof + j] = memory.nominal[j] if reached else math.nan
-    found[2 * dof + 3], found[2 * dof + 4] = status, branch
+        out[j] = memory.solution[j] if reached else math.nan
+        out[dof + j] = memory.nominal[j] if reached else math.nan
+    out[2 * dof + 3], out[2 * dof + 4] = status, branch
 
 
 @njit(error_model="numpy")
@@ -100,10 +113,10 @@ def _solve_in_order(description: Record, memory: Record, wanted: int) -> int:
     """
     arms, form, outside = description.arms, description.closed_form, -1
     first = form.order[0] if wanted < 0 else wanted
-    all_branches(arms, form, memory.pose, first, memory.wanted, memory.branches)
+    all_branches(arms, form, memory.pose, first, memory.rounding, memory.wanted, memory.branches)
     for place in range(form.branches if wanted < 0 else 1):
         if place == 1:
-            all_branches(arms, form, memory.pose, -1, memory.wanted, memory.branches)
+            all_branches(arms, form, memory.pose, -1, memory.rounding, memory.wanted, memory.branches)
         branch = form.order[place] if wanted < 0 else wanted
         if math.isnan(memory.branches[branch, 0]) or not _follow(description, memory, branch):
             continue
@@ -141,13 +154,15 @@ def _solve_nearest(description: Record, memory: Record) -> int:
     The nearest of the branches that reach the pose inside the limits is best, else of the others.
     """
     arms, form, others = description.arms, description.closed_form, memory.others
-    all_branches(arms, form, memory.pose, -1, memory.wanted, memory.branches)
+    all_branches(arms, form, memory.pose, -1, memory.rounding, memory.wanted, memory.branches)
     for index in range(form.branches):
         copy(memory.branches[index], others[index])
     best, best_rank, best_distance = -1, 2, math.inf
     while True:
         branch, distance = _nearest(description, memory)
-        if branch < 0 or (best_rank == 0 and math.sqrt(distance) - _MARGIN > math.sqrt(best_distance)):
+        if branch < 0 or (
+            best_rank == 0 and math.sqrt(distance) - LARGEST_CORRECTION > math.sqrt(best_distance)
+        ):
             break
         others[branch, 0] = math.nan
         if not _follow(description, memory, branch):
@@ -254,3 +269,59 @@ def _solve_without_branches(description: Record, memory: Record, has_near: bool)
         fill(memory.checked, math.nan)
         _solve_nominal(description, memory)
     return reached
+
+
+@njit(error_model="numpy")
+@no_type_check
+def finish(
+    description: Record, memory: Record, has_near: bool, reached: bool, out: Array
+) -> tuple[bool, int]:
+    """Choose the turns, write what is left of the error there and the share; whether it is reached, and the status."""
+    arms, q, place = description.arms, memory.solution, 2 * description.arms.dof
+    inside = False
+    if reached:
+        inside, reached = _choose_turns(description, memory, has_near)
+    if not reached:
+        out[place], out[place + 1], out[place + 2] = math.nan, math.nan, math.nan
+        return False, UNREACHABLE
+    fresh, share = True, memory.share
+    for j in range(arms.dof):
+        fresh = fresh and memory.checked[j] == q[j]
+    if not fresh:
+        share = move(description, memory, BLENDED if arms.hybrid else GEOMETRIC, q)
+        pose_error(memory.pose, memory.T, memory.R, memory.error)
+    e = memory.error
+    out[place] = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
+    out[place + 1] = math.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
+    out[place + 2] = 2 - share if arms.hybrid else math.nan
+    nearest_turn(arms, memory.nominal, q, False)
+    if not inside:
+        return True, OUTSIDE_LIMITS
+    reach = arms.reach[HYBRID if arms.hybrid else GEOMETRIC]
+    if is_singular(arms, reach, memory.J, SINGULAR_TOLERANCE, memory):
+        return True, SINGULAR
+    return True, OUTSIDE_DOMAIN if share < 1.0 else REACHED
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _choose_turns(description: Record, memory: Record, has_near: bool) -> tuple[bool, bool]:
+    """Bring joints into their limits and near to given values; whether they are inside, and still reach the pose."""
+    arms, q = description.arms, memory.solution
+    copy(q, memory.q)
+    inside = wrap_into_limits(arms, q)
+    if has_near:
+        nearest_turn(arms, q, memory.near, True)
+    turned = False
+    for j in range(arms.dof):
+        turned = turned or memory.q[j] != q[j]
+    if not turned or not arms.hybrid or description.correction.periodic:
+        return inside, True
+    copy(q, memory.q)
+    if not search(description, memory, memory.pose, memory.q):
+        return inside, False
+    nearest_turn(arms, memory.q, q, False)
+    copy(memory.q, q)
+    for j in range(arms.dof):
+        inside = inside and arms.limits[j, 0] - LIMIT_TOLERANCE <= q[j] <= arms.limits[j, 1] + LIMIT_TOLERANCE
+    return inside, True

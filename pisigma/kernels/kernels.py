@@ -5,8 +5,9 @@ from typing import Any, no_type_check
 
 from numba import carray, njit  # type: ignore[attr-defined]
 
-from pisigma.kernels.arrays import BLENDED
-from pisigma.kernels.codes import (
+from pisigma.kernels.arrays import (
+    BLENDED,
+    EVALUATE,
     EVERY_BRANCH,
     FINE,
     INVALID,
@@ -17,15 +18,18 @@ from pisigma.kernels.codes import (
     NOT_ORTHONORMAL,
     SOLVE,
 )
+from pisigma.kernels.chain import walk_many
 from pisigma.kernels.inverse import solve_pose
 from pisigma.kernels.motion import correct, covered, move
 from pisigma.kernels.rows import fill
+from pisigma.kinematics.tolerances import POSE_TOLERANCE, POSE_TOLERANCE_SINGLE, ROUNDINGS
 
 Array = Any
 Record = Any
 Pointer = Any
 
-_TOLERANCE = 1e-6
+_EPSILON, _EPSILON_SINGLE = 2.220446049250313e-16, 1.1920928955078125e-07
+"""Of float64 and float32."""
 
 
 @no_type_check
@@ -37,69 +41,111 @@ def run(
     T: Pointer,
     near: Pointer,
     near_rows: int,
+    approach: Pointer,
+    approach_rows: int,
     branch: int,
     mark: int,
-    found: Pointer,
+    single: int,
+    out: Pointer,
     count: int,
 ) -> int:
-    """Solve poses, or evaluate the arm at joint values; see `solve_poses` and `evaluate`.
+    """Solve poses, evaluate the arm at joint values, or only say where it stands and how it moves.
+
+    See `solve_poses`, `evaluate` and `chain.walk_many`.
 
     Args:
-        description: one struct, see `compiled.layout`.
+        description: one struct, see `kernels.layout`.
         memory: one struct to work in.
-        task: SOLVE or EVALUATE.
+        task: SOLVE, EVALUATE or FORWARD.
         rows: how many poses.
         T: `(rows, 4, 4)`: wanted poses to read, or poses to write.
-        near: `(near_rows, dof)`: joint values.
+        near: `(near_rows, dof)`: joint values [rad or m].
         near_rows: 0, 1 or as many as poses.
+        approach: `(approach_rows, dof)`: +1 or -1 for the side from which a joint comes, 0 where that is not stated.
+        approach_rows: 0, 1 or as many as poses.
         branch: which branch, or which arm to evaluate.
         mark: 1 to mark what is no pose, 0 to stop there.
-        found: `(rows, count, 2 · dof + 5)`, or `(rows, 7 · dof + 1)`, written.
-        count: how many solutions a pose gets.
+        single: 1 where the poses were rounded to float32, else 0.
+        out: written: `(rows, count, 2 · dof + 5)` to SOLVE, `(rows, 7 · dof + 1)` to EVALUATE, `(rows · count, 6, dof)`
+            FORWARD.
+        count: how many solutions a pose gets; for FORWARD 1 where Jacobians are wanted, else 0.
     """
     arm, work = carray(description, 1)[0], carray(memory, 1)[0]
     dof = arm.arms.dof
     poses, joints = carray(T, (rows, 4, 4)), carray(near, (near_rows, dof))
     if task == SOLVE:
-        solutions = carray(found, (rows, count, 2 * dof + 5))
-        return solve_poses(arm, work, poses, joints, branch, mark != 0, solutions)
-    return evaluate(arm, work, branch, joints, poses, carray(found, (rows, 7 * dof + 1)))
-
-
-@njit(error_model="numpy")
-@no_type_check
-def solve_poses(
-    description: Record, memory: Record, T: Array, near: Array, branch: int, mark: bool, found: Array
-) -> int:
-    """Solve poses, every one on as many branches as `found` has.
-
-    Gives -1, or `8 · row + what is wrong` with the first bad pose, if these are not to be marked.
-    """
-    dof, has_near = description.arms.dof, near.shape[0] > 0
-    for row in range(T.shape[0]):
-        wrong = _check_pose(T[row])
-        if has_near:
-            for j in range(dof):
-                memory.near[j] = near[row if near.shape[0] > 1 else 0, j]
-            if wrong == FINE:
-                wrong = _check_near(memory.near, dof)
-        if wrong != FINE and not mark:
-            return 8 * row + wrong
-        for i in range(4):
-            for k in range(4):
-                memory.pose[i, k] = T[row, i, k]
-        for place in range(found.shape[1]):
-            asked = place if branch == EVERY_BRANCH else branch
-            if wrong == FINE:
-                solve_pose(description, memory, has_near, asked, found[row, place])
-            else:
-                _mark(description, asked, found[row, place])
+        sides = carray(approach, (approach_rows, dof))
+        solutions = carray(out, (rows, count, 2 * dof + 5))
+        return solve_poses(arm, work, poses, joints, sides, branch, mark != 0, single != 0, solutions)
+    if task == EVALUATE:
+        sides = carray(approach, (approach_rows, dof))
+        return evaluate(arm, work, branch, joints, sides, poses, carray(out, (rows, 7 * dof + 1)))
+    walk_many(arm.arms, branch, work, joints, poses, carray(out, (rows * count, 6, dof)))
     return FINE
 
 
 @njit(error_model="numpy")
 @no_type_check
-def _check_pose(T: Array) -> int:
+def solve_poses(
+    description: Record,
+    memory: Record,
+    T: Array,
+    near: Array,
+    approach: Array,
+    branch: int,
+    mark: bool,
+    single: bool,
+    out: Array,
+) -> int:
+    """Solve poses, every one on as many branches as `out` has.
+
+    Gives -1, or `8 · row + what is wrong` with the first bad pose, if these are not to be marked.
+    """
+    dof, has_near = description.arms.dof, near.shape[0] > 0
+    tolerance = POSE_TOLERANCE_SINGLE if single else POSE_TOLERANCE
+    memory.rounding = ROUNDINGS * (_EPSILON_SINGLE if single else _EPSILON)
+    for row in range(T.shape[0]):
+        wrong = _check_pose(T[row], tolerance)
+        if has_near:
+            _take_row(near, row, memory.near, dof)
+            if wrong == FINE:
+                wrong = _check_near(memory.near, dof)
+        _take_approach(approach, row, memory.approach, dof)
+        if wrong != FINE and not mark:
+            return 8 * row + wrong
+        for i in range(4):
+            for k in range(4):
+                memory.pose[i, k] = T[row, i, k]
+        for index in range(out.shape[1]):
+            asked = index if branch == EVERY_BRANCH else branch
+            if wrong == FINE:
+                solve_pose(description, memory, has_near, asked, out[row, index])
+            else:
+                _mark(description, asked, out[row, index])
+    return FINE
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _take_row(values: Array, row: int, target: Array, dof: int) -> None:
+    """Copy the row of a pose, or the only one."""
+    for j in range(dof):
+        target[j] = values[row if values.shape[0] > 1 else 0, j]
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _take_approach(approach: Array, row: int, target: Array, dof: int) -> None:
+    """The same for approaches, which are all 0 where none is stated."""
+    if approach.shape[0] > 0:
+        _take_row(approach, row, target, dof)
+    else:
+        fill(target, 0.0)
+
+
+@njit(error_model="numpy")
+@no_type_check
+def _check_pose(T: Array, tolerance: float) -> int:
     """What is wrong with a matrix, in the order in which `se3.check_transforms` looks."""
     total = 0.0
     for i in range(4):
@@ -108,12 +154,12 @@ def _check_pose(T: Array) -> int:
     if total != 0.0:
         return NOT_FINITE
     for k in range(4):
-        if abs(T[3, k] - (1.0 if k == 3 else 0.0)) > _TOLERANCE:
+        if abs(T[3, k] - (1.0 if k == 3 else 0.0)) > tolerance:
             return LAST_ROW
     for i in range(3):
         for k in range(i + 1):
             product = T[0, i] * T[0, k] + T[1, i] * T[1, k] + T[2, i] * T[2, k]
-            if abs(product - (1.0 if i == k else 0.0)) > _TOLERANCE:
+            if abs(product - (1.0 if i == k else 0.0)) > tolerance:
                 return NOT_ORTHONORMAL
     x = T[1, 0] * T[2, 1] - T[2, 0] * T[1, 1]
     y = T[2, 0] * T[0, 1] - T[0, 0] * T[2, 1]
@@ -132,27 +178,30 @@ def _check_near(near: Array, dof: int) -> int:
 
 @njit(error_model="numpy")
 @no_type_check
-def _mark(description: Record, branch: int, found: Array) -> None:
+def _mark(description: Record, branch: int, out: Array) -> None:
     """Say that there is no pose to solve for."""
-    fill(found, math.nan)
-    found[found.shape[0] - 2] = INVALID
-    found[found.shape[0] - 1] = description.closed_form.order[0] if branch < 0 else branch
+    fill(out, math.nan)
+    out[out.shape[0] - 2] = INVALID
+    out[out.shape[0] - 1] = description.closed_form.order[0] if branch < 0 else branch
 
 
 @njit(error_model="numpy")
 @no_type_check
-def evaluate(description: Record, memory: Record, arm: int, q: Array, T: Array, found: Array) -> int:
+def evaluate(
+    description: Record, memory: Record, arm: int, q: Array, approach: Array, T: Array, out: Array
+) -> int:
     """Write poses at joint values, and in a row Jacobian, and correction and share of it of BLENDED; gives -1."""
     dof = description.arms.dof
     for row in range(q.shape[0]):
         for j in range(dof):
             memory.q[j] = q[row, j]
-        fill(found[row], 0.0)
+        _take_approach(approach, row, memory.approach, dof)
+        fill(out[row], 0.0)
         if arm == BLENDED:
             correct(description, memory, memory.q)
             for j in range(dof):
-                found[row, 6 * dof + j] = memory.delta[j]
-            found[row, 7 * dof] = covered(description, memory.q)[0]
+                out[row, 6 * dof + j] = memory.delta[j]
+            out[row, 7 * dof] = covered(description, memory.q)[0]
         move(description, memory, arm, memory.q)
         for k in range(4):
             for i in range(3):
@@ -160,5 +209,5 @@ def evaluate(description: Record, memory: Record, arm: int, q: Array, T: Array, 
             T[row, 3, k] = 1.0 if k == 3 else 0.0
         for i in range(6):
             for j in range(dof):
-                found[row, i * dof + j] = memory.J[i, j]
+                out[row, i * dof + j] = memory.J[i, j]
     return FINE

@@ -19,6 +19,9 @@ INPUTS = 2 * DOF
 GROUPS, SEEN, GROUP_INPUTS, SAMPLES, ENTRIES = 8, 512, 80, 2048, 2048 * 320
 """The largest numbers of groups of a network, inputs of all and of one, rows of a domain, and entries of these."""
 
+LANES = 16
+"""Poses whose forward kinematics is computed abreast."""
+
 _Field = tuple[str, Any, tuple[int, ...]]
 
 
@@ -104,6 +107,8 @@ MEMORY = np.dtype(
     _floats(
         pose=(4, 4),  # the wanted pose
         near=(DOF,),  # joint values to stay near to
+        approach=(DOF,),  # from which side every joint comes: +1 or -1, 0 where that is not stated
+        rounding=(),  # relative size of what counts as rounding of the wanted poses
         solution=(DOF,),  # joint values found
         nominal=(DOF,),  # those of the nominal arm
         axes=(DOF, 6),  # of the joints: direction and origin
@@ -135,6 +140,9 @@ MEMORY = np.dtype(
         kept=(DOF,),  # joint values outside their limits, in case there are no others
         checked=(DOF,),  # joint values that T, J, error and share belong to, NaN where they belong to none
         share=(),  # of the correction
+        lanes=(12, LANES),  # frames of many poses, entry by entry
+        lane_turns=(2, LANES),  # cosines and sines of a joint
+        lane_axes=(DOF, 6, LANES),  # directions and origins of the joints
         seen=(SEEN,),  # scaled inputs of a network
         angles=(3,),  # roll, pitch and yaw
         distance=(

@@ -1,6 +1,6 @@
-"""The compiled kernels as machine code in a file, which a new process loads without numba.
+"""The kernels as machine code of this processor, made by llvmlite from their intermediate code and kept in a file.
 
-numba takes a third of a second to import, and its own cache needs it. The kernels call nothing but the mathematical
+numba is not needed where the intermediate code comes with the package. The kernels call nothing but the mathematical
 functions of the C library, so their object code can be loaded by llvmlite alone.
 """
 
@@ -8,7 +8,7 @@ import ctypes
 import functools
 import hashlib
 import os
-import re
+import stat
 import tempfile
 import threading
 from collections.abc import Callable
@@ -18,27 +18,30 @@ from typing import Any
 import llvmlite  # type: ignore[import-untyped]
 import llvmlite.binding as llvm  # type: ignore[import-untyped]
 
-_ENTRY = "pisigma_run"
-_ARGUMENTS = "ppiippiiipi"
-"""Of `kernels.run`: p for a pointer, i for a number."""
-_ALLOWED = {
-    "acos",
-    "atan2",
-    "ceil",
-    "cos",
-    "fabs",
-    "floor",
-    "hypot",
-    "log",
-    "memcpy",
-    "memset",
-    "pow",
-    "sin",
-    "sqrt",
-}
+from pisigma.errors import ModelError
+from pisigma.kernels.build import ARGUMENTS, ENTRY, intermediate_code
+from pisigma.kernels.ready import read_ready, source_hash
+
+_ALLOWED = frozenset(
+    (
+        "acos",
+        "atan2",
+        "ceil",
+        "cos",
+        "fabs",
+        "floor",
+        "hypot",
+        "log",
+        "memcpy",
+        "memset",
+        "pow",
+        "sin",
+        "sqrt",
+    )
+)
 """Functions of the C library that every process has."""
-_PYTHON = ("__init__.py", "description_file.py", "solution.py", "solver.py")
-"""Files without kernels, and without anything that these know."""
+_OPTIONS = "speed 3, vectors, internal linkage"
+"""What `optimised_object` does, as far as the code depends on it; part of the key of kept code."""
 _lock = threading.Lock()
 _kept: list[Any] = []
 
@@ -46,7 +49,10 @@ _kept: list[Any] = []
 def load_kernels() -> Callable[..., int]:
     """The function `kernels.run`, on addresses and numbers; -1, or what `kernels.solve_poses` says.
 
-    It is compiled when it is first wanted on a machine, which takes about a minute, and read from a file afterwards.
+    Machine code is made when it is first wanted on a machine, in some seconds, and read from a file afterwards.
+
+    Raises:
+        ModelError: there is no intermediate code of the present sources, and numba, which makes it, is not installed.
     """
     with _lock:
         return _load()
@@ -57,20 +63,17 @@ def _load() -> Callable[..., int]:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     name = f"kernels-{_key()}.o"
-    code = next((found for folder in _folders() if (found := _read(folder / name)) is not None), None)
+    code = next((kept for folder in cache_folders() if (kept := read_code(folder / name)) is not None), None)
     if code is None:
-        code = _compile()
-        for folder in _folders():
-            if _write(folder / name, code):
-                break
-    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target_machine())
+        code = optimised_object(_intermediate_code(), _native_machine())
+        any(write_code(folder / name, code) for folder in cache_folders())
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _native_machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
     _kept.append(engine)
-    kinds = [ctypes.c_void_p if kind == "p" else ctypes.c_int64 for kind in _ARGUMENTS]
+    kinds = [ctypes.c_void_p if kind == "p" else ctypes.c_int64 for kind in ARGUMENTS]
     prototype = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *kinds)
-    native = prototype(engine.get_function_address(_ENTRY))
-    return functools.partial(_call, native)
+    return functools.partial(_call, prototype(engine.get_function_address(ENTRY)))
 
 
 def _call(native: Any, *arguments: int) -> int:
@@ -82,36 +85,104 @@ def _call(native: Any, *arguments: int) -> int:
 
 
 def _key() -> str:
-    """What the code depends on: the files of this package but those of Python, the compiler and the processor."""
+    """What the machine code depends on: sources, options, the versions of the compiler, and the processor."""
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob("*.py")):
-        digest.update(b"" if path.name in _PYTHON else path.read_bytes())
-    features = llvm.get_host_cpu_features().flatten()
-    for word in (llvmlite.__version__, llvm.get_process_triple(), llvm.get_host_cpu_name(), features):
+    for word in (
+        source_hash(),
+        _OPTIONS,
+        llvmlite.__version__,
+        str(llvm.llvm_version_info),
+        llvm.get_process_triple(),
+        llvm.get_host_cpu_name(),
+        llvm.get_host_cpu_features().flatten(),
+    ):
         digest.update(word.encode() + b"\0")
     return digest.hexdigest()[:16]
 
 
-def _folders() -> list[Path]:
-    """Where machine code is kept: beside the package, or where that is not allowed with the user's other caches."""
-    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return [Path(__file__).parent / "__pycache__", Path(cache) / "pisigma"]
-
-
-def _read(path: Path) -> bytes | None:
-    """The code in a file, None where there is none or it is damaged."""
+def _intermediate_code() -> str:
+    """What comes with the package, where it is of the present sources; else what numba makes."""
+    ready = read_ready()
+    if ready is not None:
+        return ready
     try:
-        content = path.read_bytes()
+        return intermediate_code()
+    except ImportError:
+        raise ModelError(
+            "the package holds no compiled inverse kinematics of its present sources; install pisigma[compile], which "
+            "makes it, or go without, which is some hundred times slower."
+        ) from None
+
+
+def _native_machine() -> Any:
+    """The processor that this process runs on."""
+    return target_machine(
+        llvm.get_process_triple(), llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    )
+
+
+def target_machine(triple: str, cpu: str = "", features: str = "") -> Any:
+    """LLVM's description of a processor."""
+    target = llvm.Target.from_triple(triple)
+    return target.create_target_machine(
+        opt=3, jit=True, cpu=cpu, features=features, reloc="default", codemodel="jitdefault"
+    )
+
+
+def optimised_object(code: str, machine: Any) -> bytes:
+    """Object code of intermediate code: what is called, optimised as one program, with vectors."""
+    module = llvm.parse_assembly(code)
+    module.triple, module.data_layout = machine.triple, str(machine.target_data)
+    for item in [*module.functions, *module.global_variables]:
+        if not item.is_declaration and item.name != ENTRY:
+            item.linkage = llvm.Linkage.internal
+    options = llvm.create_pipeline_tuning_options(speed_level=3)
+    options.slp_vectorization = True
+    options.loop_vectorization = True
+    builder = llvm.create_pass_builder(machine, options)
+    builder.getModulePassManager().run(module, builder)
+    called = {item.name for item in module.functions if item.is_declaration}
+    foreign = {name for name in called if not name.startswith("llvm.") and name not in _ALLOWED}
+    assert not foreign, f"the kernels call {sorted(foreign)}, which only numba knows"
+    code_of_machine: bytes = machine.emit_object(module)
+    return code_of_machine
+
+
+def cache_folders() -> list[Path]:
+    """Where machine code is kept: beside the package, or with the user's other caches where that is not possible.
+
+    `XDG_CACHE_HOME` counts where it is an absolute path, as its specification says; without a home there is no cache
+    of the user.
+    """
+    folders = [Path(__file__).parent / "__pycache__"]
+    stated = os.environ.get("XDG_CACHE_HOME", "")
+    try:
+        cache = Path(stated) if os.path.isabs(stated) else Path.home() / ".cache"
+    except RuntimeError:
+        return folders
+    return [*folders, cache / "pisigma"] if cache.is_absolute() else folders
+
+
+def read_code(path: Path) -> bytes | None:
+    """The code in a file; None where there is none, it is damaged, or somebody else could have written it."""
+    try:
+        if not _trusted(os.stat(path.parent)):
+            return None
+        with open(os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0)), "rb") as stream:
+            status = os.fstat(stream.fileno())
+            content = stream.read() if stat.S_ISREG(status.st_mode) and _trusted(status) else b""
     except OSError:
         return None
     code = content[32:]
-    return code if hashlib.sha256(code).digest() == content[:32] else None
+    return code if code and hashlib.sha256(code).digest() == content[:32] else None
 
 
-def _write(path: Path, code: bytes) -> bool:
-    """Write a file whole or not at all; whether that succeeded."""
+def write_code(path: Path, code: bytes) -> bool:
+    """Write a file whole or not at all, in folders that only the user can enter; whether that succeeded."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
+        _make_private(path.parent)
+        if not _trusted(os.stat(path.parent)):
+            return False
         with tempfile.NamedTemporaryFile(dir=path.parent, delete=False) as stream:
             stream.write(hashlib.sha256(code).digest() + code)
         os.chmod(stream.name, 0o644)
@@ -121,51 +192,16 @@ def _write(path: Path, code: bytes) -> bool:
     return True
 
 
-def _target_machine() -> Any:
-    target = llvm.Target.from_triple(llvm.get_process_triple())
-    return target.create_target_machine(
-        opt=3,
-        jit=True,
-        cpu=llvm.get_host_cpu_name(),
-        features=llvm.get_host_cpu_features().flatten(),
-        reloc="default",
-        codemodel="jitdefault",
-    )
+def _make_private(folder: Path) -> None:
+    """Make a folder, and those above it that are missing, which only the user can enter."""
+    if not folder.is_dir():
+        if folder.parent != folder:
+            _make_private(folder.parent)
+        folder.mkdir(mode=0o700, exist_ok=True)
 
 
-def _compile() -> bytes:
-    """Have numba compile the kernels, and optimise what is called as one program, with vectors."""
-    text, entry = _intermediate_code()
-    module = llvm.parse_assembly(text.replace(entry, _ENTRY))
-    for item in [*module.functions, *module.global_variables]:
-        if not item.is_declaration and item.name != _ENTRY:
-            item.linkage = llvm.Linkage.internal
-    machine = _target_machine()
-    options = llvm.create_pipeline_tuning_options(speed_level=3)
-    options.slp_vectorization = True
-    options.loop_vectorization = True
-    builder = llvm.create_pass_builder(machine, options)
-    builder.getModulePassManager().run(module, builder)
-    called = {item.name for item in module.functions if item.is_declaration}
-    foreign = {name for name in called if not name.startswith("llvm.") and name not in _ALLOWED}
-    assert not foreign, f"the kernels call {sorted(foreign)}, which only numba knows"
-    code: bytes = machine.emit_object(module)
-    return code
-
-
-def _intermediate_code() -> tuple[str, str]:
-    """What numba makes of the kernels, and the name of the entry in it."""
-    from numba import cfunc, from_dtype, types
-
-    from pisigma.kernels.kernels import run
-    from pisigma.kernels.layout import DESCRIPTION, MEMORY
-
-    structs = iter((from_dtype(DESCRIPTION), from_dtype(MEMORY)))
-    arguments = []
-    for kind in _ARGUMENTS:
-        pointed = next(structs, types.float64) if kind == "p" else None
-        arguments.append(types.CPointer(pointed) if pointed else types.int64)  # type: ignore[no-untyped-call]
-    text: str = cfunc(types.int64(*arguments))(run).inspect_llvm()
-    match = re.search(r"@(cfunc\.)([\w.$]+)\(", text)
-    assert match is not None
-    return text, match[2]
+def _trusted(status: os.stat_result) -> bool:
+    """Whether a file or folder belongs to the user or root, and nobody else can write it."""
+    if not hasattr(os, "geteuid"):  # Windows, where the folders of a user are closed to others
+        return True
+    return status.st_uid in (0, os.geteuid()) and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)

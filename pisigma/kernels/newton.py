@@ -11,18 +11,22 @@ from pisigma.kernels.joint_correction import series_slope
 from pisigma.kernels.motion import correct, move
 from pisigma.kernels.rotations import pose_error
 from pisigma.kernels.rows import copy, copy_rows, fill
+from pisigma.kinematics.tolerances import (
+    ACCEPTED,
+    DAMPING_DOWN,
+    DAMPING_UP,
+    FIRST_DAMPING,
+    HYBRID_TOLERANCE,
+    ITERATIONS,
+    LEAST_DAMPING,
+    MOST_DAMPING,
+    NEARLY,
+    TOLERANCE,
+)
 
 Array = Any
 Record = Any
 
-TOLERANCE, HYBRID_TOLERANCE = 1e-13, 1e-12
-"""[m and rad] Residuals that iteration of an arm and of a hybrid arm comes below."""
-ACCEPTED = 1e-11
-"""[m and rad] Residuals that will do where rounding stops the iteration earlier."""
-NEARLY = 0.01
-"""Share of the reach, and angle [rad]: a pose that the geometric arm misses by less the hybrid one may take."""
-_ITERATIONS = 100
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 0.1, 1e-6, 1e12
 _CLOSE, _LAST, _SETTLED = 0.05, 1e-15, 3e-12
 """Squared errors [reach or rad]: from _CLOSE**2 on quick steps are tried; below _LAST one more step is exact.
 _SETTLED: joint values [rad or m] move less after a step that is the last one."""
@@ -55,9 +59,9 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
     _steepen(description, memory, arm, share)
     pose_error(T, memory.T, memory.R, memory.best)
     copy_rows(memory.J, memory.J_best)
-    old, damping = scaled_square(reach, memory.best), _FIRST_DAMPING
-    for _ in range(_ITERATIONS):
-        if _within(memory.best, tolerance, tolerance) or damping > _MOST_DAMPING:
+    old, damping = scaled_square(reach, memory.best), FIRST_DAMPING
+    for _ in range(ITERATIONS):
+        if _within(memory.best, tolerance, tolerance) or damping > MOST_DAMPING:
             break
         possible = damped_step(arms, reach, memory.J_best, memory.best, damping, memory)
         new = math.inf
@@ -73,9 +77,9 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
             copy(memory.trial, q)
             copy(memory.error, memory.best)
             copy_rows(memory.J, memory.J_best)
-            damping = max(damping * 0.2, _LEAST_DAMPING)
+            damping = max(damping * DAMPING_DOWN, LEAST_DAMPING)
         else:
-            damping *= 8.0
+            damping *= DAMPING_UP
 
 
 @njit(error_model="numpy")
@@ -178,7 +182,7 @@ def _converge(description: Record, memory: Record, arm: int, T: Array, q: Array)
             return square < 1e-26
         if square < 1e-30:
             return True
-        if not damped_step(arms, reach, memory.J, memory.error, _FIRST_DAMPING, memory):
+        if not damped_step(arms, reach, memory.J, memory.error, FIRST_DAMPING, memory):
             return False
         for j in range(dof):
             q[j] += memory.step[j]

@@ -11,14 +11,10 @@ from pisigma.kernels.closed_form import all_branches
 from pisigma.kernels.newton import search
 from pisigma.kernels.rotations import wrap
 from pisigma.kernels.rows import copy, fill
+from pisigma.kinematics.tolerances import ATTEMPTS, PULL, REACH_ROUNDING
 
 Array = Any
 Record = Any
-
-ATTEMPTS, MORE_ATTEMPTS = 4, 128
-"""Stored starts that are tried, nearest first; the latter number on arms without closed form."""
-PULL = 0.02
-"""Share of the reach by which a pose beyond the nominal workspace is drawn towards a stored one."""
 
 
 @njit(error_model="numpy")
@@ -27,7 +23,7 @@ def within_reach(description: Record, T: Array) -> bool:
     """Whether a pose is not farther away than the robot is long, whatever its joints do."""
     base, reach = description.arms.ends[GEOMETRIC, 0], description.arms.reach[GEOMETRIC]
     x, y, z = T[0, 3] - base[0, 3], T[1, 3] - base[1, 3], T[2, 3] - base[2, 3]
-    return math.sqrt(x * x + y * y + z * z) <= reach * (1 + 1e-9)
+    return math.sqrt(x * x + y * y + z * z) <= reach * (1 + REACH_ROUNDING)
 
 
 @njit(error_model="numpy")
@@ -66,14 +62,14 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
         any_branch: whether another will do.
 
     Returns:
-        Index of the branch on which they lie, -1 where nothing was found.
+        Index of the branch on which they lie, -1 where nothing was out.
     """
     form, starts, arms, drawn = description.closed_form, description.starts, description.arms, memory.others
     if starts.count == 0:
         return -1
     count = nearest_starts(description, memory, memory.pose, ATTEMPTS)
     _draw(description, memory.pose, memory.nearest[0], memory.drawn)
-    all_branches(arms, form, memory.drawn, -1, memory.wanted, drawn)
+    all_branches(arms, form, memory.drawn, -1, memory.rounding, memory.wanted, drawn)
     for attempt in range(1 + form.branches + count if any_branch else 1):
         place = branch if attempt == 0 else attempt - 1
         if attempt > form.branches:
@@ -112,7 +108,9 @@ def branch_of(description: Record, memory: Record, q: Array) -> int:
     """Index of the nominal arm's branch that is nearest to joint values."""
     walk(description.arms, NOMINAL, q, memory.axes, memory.T)
     every = memory.others
-    all_branches(description.arms, description.closed_form, memory.T, -1, memory.wanted, every)
+    all_branches(
+        description.arms, description.closed_form, memory.T, -1, memory.rounding, memory.wanted, every
+    )
     nearest, least = 0, math.inf
     for branch in range(description.closed_form.branches):
         total = 0.0

@@ -10,17 +10,19 @@ from typing import Any
 import numpy as np
 
 from pisigma.errors import PoseError, nearest_choice
-from pisigma.kernels.arrays import BLENDED, GEOMETRIC, Description
-from pisigma.kernels.codes import (
+from pisigma.kernels.arrays import (
     ANY_BRANCH,
+    BLENDED,
     EVALUATE,
     EVERY_BRANCH,
+    GEOMETRIC,
     LAST_ROW,
     LEFT_HANDED,
     NEAR_NOT_FINITE,
     NOT_FINITE,
     NOT_ORTHONORMAL,
     SOLVE,
+    Description,
 )
 from pisigma.kernels.description_file import read_description
 from pisigma.kernels.layout import make_memory, pack
@@ -208,8 +210,11 @@ class CompiledIK:
             _address(T) + start * 128,
             beside,
             rows,
+            beside,
+            0,
             branch,
             mark,
+            0,
             _address(found) + start * found.strides[0],
             found.shape[1],
         )

@@ -1,0 +1,56 @@
+"""The kernels' intermediate code that comes with the package, and the hash that ties it to their sources."""
+
+import hashlib
+import json
+import re
+import zlib
+from pathlib import Path
+
+FILE = Path(__file__).parent / "kernels.ll.zlib"
+"""A line of JSON and the code as compressed text; `python -m pisigma.kernels.build` writes it."""
+
+_PYTHON = frozenset(
+    ("__init__.py", "array_kinematics.py", "build.py", "description_file.py", "machine_code.py", "ready.py")
+)
+"""Files of this folder without kernels, and without anything that these know."""
+_SHARED = ("kinematics/status.py", "kinematics/tolerances.py")
+"""Files of other folders that kernels take constants from."""
+_NO_CODE = re.compile(rb'"""[\s\S]*?"""|#[^\n]*|^[ \t]*\n', re.MULTILINE)
+
+
+def source_files() -> list[Path]:
+    """The files that the kernels are made from."""
+    package = Path(__file__).parent.parent
+    kernels = sorted(path for path in (package / "kernels").glob("*.py") if path.name not in _PYTHON)
+    return [*kernels, *(package / name for name in _SHARED)]
+
+
+def source_hash() -> str:
+    """SHA-256 of the sources without docstrings, comments and empty lines."""
+    digest = hashlib.sha256()
+    for path in source_files():
+        lines = _NO_CODE.sub(b"", path.read_bytes()).split(b"\n")
+        digest.update(b"\n".join(stripped for line in lines if (stripped := line.rstrip())) + b"\0")
+    return digest.hexdigest()
+
+
+def write_ready(code: str, **made_with: str) -> None:
+    """Write the intermediate code of the present sources.
+
+    Args:
+        code: text of LLVM.
+        made_with: versions of the compilers that made it.
+    """
+    header = json.dumps({"sources": source_hash(), **made_with}, sort_keys=True)
+    FILE.write_bytes(header.encode() + b"\n" + zlib.compress(code.encode(), 9))
+
+
+def read_ready() -> str | None:
+    """The intermediate code; None where there is none, it is damaged, or the sources have changed since."""
+    try:
+        header, _, content = FILE.read_bytes().partition(b"\n")
+        if json.loads(header)["sources"] != source_hash():
+            return None
+        return zlib.decompress(content).decode()
+    except (OSError, ValueError, KeyError, TypeError, zlib.error):
+        return None
