@@ -15,6 +15,8 @@ ARGUMENTS = "ppiippipiiiipi"
 """Of `kernels.run`: p for a pointer, i for a number."""
 
 _MACHINE = re.compile(r"^target (?:triple|datalayout) = .*\n", re.MULTILINE)
+_NO_PROCESSOR = {"CPU_NAME": "generic", "CPU_FEATURES": "", "LOOP_VECTORIZE": 0, "SLP_VECTORIZE": 0}
+"""Settings of numba."""
 _NEWER = re.compile(r" captures\([^)]*\)| nocreateundeforpoison| memory\([^)]*(?:errnomem|target_mem)[^)]*\)")
 """Words that LLVM 20, the oldest that is to read the code, does not know; they only help to optimise."""
 _LIFETIME = re.compile(r"^.*@llvm\.lifetime\..*\n", re.MULTILINE)
@@ -31,8 +33,8 @@ def intermediate_code() -> str:
     """
     from numba import cfunc, config, from_dtype, types
 
-    config.CPU_NAME, config.CPU_FEATURES = "generic", ""
-    config.LOOP_VECTORIZE = config.SLP_VECTORIZE = 0
+    for name, value in _NO_PROCESSOR.items():
+        setattr(config, name, value)
 
     from pisigma.kernels.kernels import run
     from pisigma.kernels.layout import DESCRIPTION, MEMORY
