@@ -9,7 +9,7 @@ from testing.closeness import assert_close
 from testing.models import no_type_checker
 
 import pisigma
-from pisigma.judging.joint_statistics import JointStatistics
+from pisigma.judging.pose_statistics import JointStatistics
 from pisigma.model.folder.model_folder import load_model
 from pisigma.recipes.recipe import SimulatedData, read_recipe, recipe_hash
 from pisigma.recipes.recipe_data import simulate_held_out, simulate_training

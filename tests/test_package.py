@@ -51,7 +51,6 @@ LAYERS = (
 
 NOT_YET = (
     ("judging/cross_validation.py", "pisigma.recipes.recipe"),
-    ("judging/acceptance.py", "pisigma.reporting.tables"),
     ("judging/cross_validation.py", "pisigma.workflow.run"),
     ("model/geometric_model.py", "pisigma.inverse.identified_arm"),
     ("reporting/card.py", "pisigma.workflow.run"),
@@ -60,7 +59,6 @@ NOT_YET = (
     ("reporting/distilled_report.py", "pisigma.workflow.solved_poses"),
     ("reporting/training_report.py", "pisigma.workflow.run"),
     ("training/patterns.py", "pisigma.recipes.recipe"),
-    ("verification/verification.py", "pisigma.reporting.comparison_report"),
 )
 """Imports that still run upwards after files moved; to be emptied."""
 

@@ -1,9 +1,12 @@
-"""`pisigma verify`: whether a correction is active, told from new measurements."""
+"""`pisigma verify`: whether a correction is active and right, judged from new measurements."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+if TYPE_CHECKING:
+    from pisigma.workflow.verify import Verification
 
 
 def verify(
@@ -17,7 +20,7 @@ def verify(
     ] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Tell whether new measurements are explained better by the corrected model than by the nominal robot.
+    """Say whether new measurements are explained better by the corrected model than by the nominal robot.
 
     Where errors are large, the usual setup faults that explain them are named: another frame or tool, units, order,
     signs or zeros of the joints, a correction that was applied twice or not at all. Rows of the set "train" are
@@ -26,47 +29,22 @@ def verify(
     from pisigma.cli.output import print_json
     from pisigma.cli.progress import progress_of
     from pisigma.errors import AcceptanceError
-    from pisigma.model.folder.model_folder import load_model
-    from pisigma.verification import verification
+    from pisigma.workflow.verify import VerificationSettings
+    from pisigma.workflow.verify import verify as run
 
-    loaded = load_model(model)
-    measurements = verification.read_for_verification(data, loaded)
-    with progress_of(f"verifying {model}") as tell:
-        tell(f"{measurements.rows} rows")
-        found = verification.verify(loaded, measurements, fit_frame=fit_frame)
-    result: dict[str, Any] = {
-        "model": str(model),
-        "data": str(data),
-        "rows": measurements.rows,
-        "frame_fitted": fit_frame,
-        "explained_better": found.verdict == "better",
-        "verdict": found.verdict,
-        "sentence": found.sentence,
-        "ratio": found.ratio if found.ratio == found.ratio else None,
-        "better_share": found.better_share,
-        **found.comparison,
-        "setup_faults": [setup_fault.in_file_units() for setup_fault in found.setup_faults],
-        "remarks": list(found.remarks),
-    }
+    with progress_of(f"verifying {model}"):
+        verification = run(model, data, VerificationSettings(fit_frame))
     if as_json:
-        print_json(result)
+        print_json(verification.to_json())
     else:
-        _print(result)
-    if found.verdict != "better":
-        raise AcceptanceError(found.sentence)
+        _print(verification)
+    if not verification.accepted:
+        raise AcceptanceError(verification.sentence)
 
 
-def _print(result: dict[str, Any]) -> None:
-    from pisigma.cli.output import print_table
-    from pisigma.reporting.comparison_tables import comparison_table, difference_table
+def _print(verification: "Verification") -> None:
+    from pisigma.cli.evaluate import print_comparison, print_lines
 
-    confidence = f"{100 * result['bootstrap']['confidence']:.0f} %"
-    rows = f"{result['rows_compared']} rows ({result['configurations']} configurations) of {result['data']}"
-    print_table(f"errors of {rows}; in brackets {confidence} confidence", *comparison_table(result))
-    print_table("difference to nominal on the same rows, below 0 is better", *difference_table(result))
-    for setup_fault in result["setup_faults"]:
-        typer.echo(setup_fault["sentence"])
-    for remark in result["remarks"]:
-        typer.echo(remark)
-    if result["explained_better"]:
-        typer.echo(result["sentence"])
+    print_lines([verification.sentence])
+    print_comparison(verification.comparison, verification.data)
+    print_lines([*(fault.sentence for fault in verification.setup_faults), *verification.warnings])

@@ -1,102 +1,168 @@
-"""Any number of models on the same measured rows."""
+"""Any number of models on the same measured rows: their errors, confidence intervals and differences."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError
-from pisigma.judging.bootstrap import Bootstrap, Statistics
-from pisigma.judging.moved_frames import poses_in_fitted_frames
-from pisigma.judging.paired_comparison import PairedComparison, paired_comparisons
-from pisigma.judging.pose_statistics import ErrorVectors
+from pisigma.judging.bootstrap import STATISTICS, Bootstrap, Intervals, statistics
+from pisigma.judging.frame_fits import poses_in_fitted_frames
+from pisigma.judging.pose_statistics import ErrorVectors, axis_statistics, error_statistics
+from pisigma.judging.rank_tests import SignedRank, signed_rank
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import poses_of_rows
 
+Interval = tuple[float, float]
+"""Lower and upper end."""
 
-@dataclass(frozen=True, eq=False)
-class ModelErrors:
-    """Errors of measured rows under one model.
+UNITS = {"position": ("mm", 1e3), "orientation": ("deg", float(np.rad2deg(1.0)))}
+"""Of every quantity the unit of tables and files, and what an SI value is multiplied by."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Errors of a model minus those of the first model on the same rows; below 0 where the model is better.
 
     Attributes:
-        name: what the model is called.
-        vectors: errors of every row; NaN where one of the compared models predicts nothing.
-        not_predicted: rows with a measured position for which this model predicts nothing.
-        inside: per row, whether it is inside the model's domain; None where the model knows none.
+        statistics: by name ("mean", "rms", "p95") the difference [mm or deg].
+        intervals: by name its confidence interval; None where there is one configuration only.
+        test: Wilcoxon's test of the configurations' mean differences.
+        better_share: share of the configurations in which the model's mean error is smaller.
     """
 
-    name: str
-    vectors: ErrorVectors
-    not_predicted: int
-    inside: Bool[Tensor, " rows"] | None
+    statistics: Mapping[str, float]
+    intervals: Mapping[str, Interval | None]
+    test: SignedRank
+    better_share: float
+
+    def to_json(self, unit: str) -> dict[str, object]:
+        """Return the figures as plain values, the unit in their names."""
+        found: dict[str, object] = {}
+        for name, value in self.statistics.items():
+            interval = self.intervals[name]
+            found[f"{name}_{unit}"] = value
+            found[f"{name}_{unit}_interval"] = None if interval is None else list(interval)
+        return found | {"better_share": self.better_share, "wilcoxon": asdict(self.test)}
 
 
-@dataclass(frozen=True, eq=False)
-class Compared:
-    """One quantity, position or orientation, of all models on the rows that all of them predict.
+@dataclass(frozen=True)
+class QuantityErrors:
+    """Errors of one quantity under one model, in the unit of tables and files.
 
     Attributes:
-        unit: "mm" or "deg", for tables and files.
-        errors: lengths or angles [m or rad], one line a model.
-        group: number of every row's configuration, from 0.
-        bootstrap: draws the configurations.
+        unit: "mm" of positions, "deg" of orientations.
+        statistics: by name ("rms", "mean", "p95", "max") of the errors' sizes.
+        intervals: confidence intervals of "mean", "rms" and "p95"; None where there is one configuration only.
+        axes: by axis of the frame "mean" of the signed errors and "rms", "p95", "max" of their sizes; empty where no
+            row has the position too.
+        inside: `statistics` of the rows inside the model's domain; empty where there are none or it knows no domain.
+        outside: the same of the rows outside it.
+        difference: to the first model; None of the first.
     """
 
     unit: str
-    errors: Float64[Tensor, "models rows"]
-    group: Int64[Tensor, " rows"]
-    bootstrap: Bootstrap
+    statistics: Mapping[str, float]
+    intervals: Mapping[str, Interval | None]
+    axes: Mapping[str, Mapping[str, float]]
+    inside: Mapping[str, float]
+    outside: Mapping[str, float]
+    difference: Difference | None
+
+
+@dataclass(frozen=True)
+class ModelFigures:
+    """Everything that is said of one of the compared models.
+
+    Attributes:
+        name: what the model is called.
+        rows_not_predicted: rows with a measured position for which this model predicts nothing.
+        position: errors of positions.
+        orientation: errors of orientations; None where none was measured.
+        rows_inside: compared rows inside the model's domain; None where it knows no domain.
+        rows_outside: the same outside it.
+    """
+
+    name: str
+    rows_not_predicted: int
+    position: QuantityErrors
+    orientation: QuantityErrors | None
+    rows_inside: int | None
+    rows_outside: int | None
 
     @property
-    def configurations(self) -> int:
-        """Number of different configurations."""
-        return int(self.group.max()) + 1
+    def quantities(self) -> dict[str, QuantityErrors]:
+        """Errors of "position" and, where measured, of "orientation"."""
+        both = {"position": self.position, "orientation": self.orientation}
+        return {name: errors for name, errors in both.items() if errors is not None}
 
-    @cached_property
-    def resampled(self) -> Statistics:
-        """Statistics of every resample."""
-        return self.bootstrap.statistics(self.errors, self.group)
+    @property
+    def statistics_in_file_units(self) -> dict[str, float]:
+        """Statistics of all quantities, such as "rms_mm" and "max_deg"."""
+        return _with_units(list(self.quantities.values()), "statistics")
 
-    def intervals(self) -> dict[str, Float64[Tensor, "models 2"]]:
-        """Confidence intervals of mean, RMS and 95 % quantile [m or rad]."""
-        return {
-            name: self.bootstrap.intervals(values, self.configurations)
-            for name, values in self.resampled.items()
+    def to_json(self) -> dict[str, object]:
+        """Return the figures as plain values; names end with the unit."""
+        errors = list(self.quantities.values())
+        values: dict[str, object] = {"name": self.name, "rows_not_predicted": self.rows_not_predicted}
+        values |= self.statistics_in_file_units
+        values["intervals"] = {
+            f"{name}_{one.unit}": None if interval is None else list(interval)
+            for one in errors
+            for name, interval in one.intervals.items()
         }
+        values["axes"] = {
+            axis: {f"{name}_{one.unit}": value for one in errors for name, value in one.axes[axis].items()}
+            for axis in self.position.axes
+        }
+        for where, rows in (("inside", self.rows_inside), ("outside", self.rows_outside)):
+            if rows is not None:
+                values[f"{where}_domain"] = {"rows": rows, **_with_units(errors, where)} if rows else None
+        if self.position.difference is not None:
+            values["difference_to_first"] = {
+                quantity: one.difference.to_json(one.unit)
+                for quantity, one in self.quantities.items()
+                if one.difference is not None
+            }
+        return values
 
-    def to_first(self) -> tuple[PairedComparison, ...]:
-        """Every model against the first."""
-        return paired_comparisons(self.errors, self.group, self.bootstrap, self.resampled)
 
-
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class ModelComparison:
     """Models on the same rows.
 
     Attributes:
         models: in the order in which they were given.
-        position: of the rows with a measured position.
-        orientation: of the rows with a measured orientation; None where there is none.
-        unmeasured: rows that hold no position.
+        rows: rows whose positions are compared.
+        rows_without_position: rows that hold no position.
+        configurations: number of different configurations of these rows.
+        bootstrap: how the intervals were computed.
     """
 
-    models: tuple[ModelErrors, ...]
-    position: Compared
-    orientation: Compared | None
-    unmeasured: int
+    models: tuple[ModelFigures, ...]
+    rows: int
+    rows_without_position: int
+    configurations: int
+    bootstrap: Bootstrap
 
-    @property
-    def rows(self) -> int:
-        """Rows whose positions are compared."""
-        return self.position.errors.shape[1]
+    def to_json(self) -> dict[str, object]:
+        """Return the comparison as plain values."""
+        return {
+            "rows_compared": self.rows,
+            "rows_without_position": self.rows_without_position,
+            "configurations": self.configurations,
+            "bootstrap": asdict(self.bootstrap),
+            "models": [model.to_json() for model in self.models],
+        }
 
 
+@torch.no_grad()
 def compare_models(
     models: Mapping[str, CalibratedModel],
     measurements: Measurements,
@@ -108,7 +174,7 @@ def compare_models(
     Args:
         models: by name, one or more.
         measurements: the rows, in the frames that the models were fitted in.
-        bootstrap: how confidence intervals are found; `Bootstrap()` where none is given.
+        bootstrap: how confidence intervals are computed. None: `Bootstrap()`.
         fit_frame: fit the frames anew, for every model; see `poses_in_fitted_frames`.
 
     Raises:
@@ -118,39 +184,50 @@ def compare_models(
     """
     bootstrap = bootstrap or Bootstrap()
     predict = poses_in_fitted_frames if fit_frame else poses_of_rows
-    found = {
+    vectors = {
         name: ErrorVectors.between(measurements, predict(model, measurements))
         for name, model in models.items()
     }
     assert measurements.position is not None  # or there were no errors
     measured = torch.isfinite(measurements.position).all(-1)
-    predicted = {name: torch.isfinite(errors.position).all(-1) for name, errors in found.items()}
+    predicted = {name: torch.isfinite(errors.position).all(-1) for name, errors in vectors.items()}
     common = torch.stack(list(predicted.values())).all(0)
     if not common.any():
         raise MeasurementError(
-            f"{measurements.source}: there is no row with a measured position that {', '.join(found)} predict; give "
+            f"{measurements.source}: there is no row with a measured position that {', '.join(models)} predict; give "
             "rows nearer to what was calibrated with."
         )
+    compared = [errors.only(common) for errors in vectors.values()]
+    domains = [inside_domain(model, measurements) for model in models.values()]
     group = groups_to_keep_whole(measurements)
-    judged = tuple(
-        ModelErrors(
-            name,
-            found[name].only(common),
-            int((measured & ~predicted[name]).sum()),
-            inside_domain(model, measurements),
-        )
-        for name, model in models.items()
+    positions = _quantity("position", [errors.position for errors in compared], domains, group, bootstrap)
+    turns = [errors.rotation for errors in compared if errors.rotation is not None]
+    oriented = bool(turns) and bool(torch.isfinite(turns[0]).any())
+    orientations = (
+        _quantity("orientation", turns, domains, group, bootstrap) if oriented else [None] * len(models)
     )
-    sizes = [errors.vectors.sizes for errors in judged]
-    position = _compared("mm", [size.position for size in sizes], group, bootstrap)
-    angles = [size.rotation for size in sizes if size.rotation is not None]
-    turned = bool(angles) and bool(torch.isfinite(angles[0]).any())
-    orientation = _compared("deg", angles, group, bootstrap) if turned else None
-    return ModelComparison(judged, position, orientation, int((~measured).sum()))
+    figures = [
+        ModelFigures(
+            name=name,
+            rows_not_predicted=int((measured & ~predicted[name]).sum()),
+            position=position,
+            orientation=orientation,
+            rows_inside=None if inside is None else int((common & inside).sum()),
+            rows_outside=None if inside is None else int((common & ~inside).sum()),
+        )
+        for name, position, orientation, inside in zip(models, positions, orientations, domains, strict=True)
+    ]
+    return ModelComparison(
+        models=tuple(figures),
+        rows=int(common.sum()),
+        rows_without_position=int((~measured).sum()),
+        configurations=len(set(group[common].tolist())),
+        bootstrap=bootstrap,
+    )
 
 
 def inside_domain(model: CalibratedModel, measurements: Measurements) -> Bool[Tensor, " rows"] | None:
-    """Whether rows are inside a model's domain: where its correction was learned and is in force in full.
+    """Say which rows are inside a model's domain: where its correction was learned and is in force in full.
 
     Returns:
         None where the model knows no domain, as geometric calibrations do not.
@@ -161,16 +238,70 @@ def inside_domain(model: CalibratedModel, measurements: Measurements) -> Bool[Te
         return None
     with torch.no_grad():
         q = model.nominal_joints(measurements.q)
-        known = torch.isfinite(q).all(-1)
-        at = torch.where(known[:, None], q, 0.0)
+        finite = torch.isfinite(q).all(-1)
+        at = torch.where(finite[:, None], q, 0.0)
         scaled = model.network.scaled_inputs(forward_kinematics(model.robot, at), at)
-        return known & model.domain.contains(scaled)
+        return finite & model.domain.contains(scaled)
 
 
-def _compared(
-    unit: str, errors: list[Float64[Tensor, " rows"]], group: Int64[Tensor, " rows"], bootstrap: Bootstrap
-) -> Compared:
-    stacked = torch.stack(errors)
-    there = torch.isfinite(stacked).all(0)
-    _, number = torch.unique(group[there], return_inverse=True)
-    return Compared(unit, stacked[:, there], number, bootstrap)
+def _quantity(
+    quantity: str,
+    vectors: Sequence[Float64[Tensor, "rows 3"]],
+    domains: Sequence[Bool[Tensor, " rows"] | None],
+    group: Int64[Tensor, " rows"],
+    bootstrap: Bootstrap,
+) -> list[QuantityErrors]:
+    """Compute the figures of one quantity of all models on the rows that have it under all of them."""
+    unit, factor = UNITS[quantity]
+    stacked = torch.stack(list(vectors)) * factor
+    there = torch.isfinite(stacked).all(-1).all(0)
+    sizes = stacked.norm(dim=-1)[:, there].numpy()
+    index = torch.unique(group[there], return_inverse=True)[1].numpy()
+    intervals = bootstrap.intervals(sizes, index)
+    differences = _differences(sizes, index, intervals)
+    figures = []
+    for number, (errors, inside) in enumerate(zip(stacked[:, there], domains, strict=True)):
+        parts = (None, None) if inside is None else (inside[there], ~inside[there])
+        figures.append(
+            QuantityErrors(
+                unit=unit,
+                statistics=error_statistics(errors.norm(dim=-1)),
+                intervals=_by_name(intervals.value[:, number]),
+                axes={axis: axis_statistics(along) for axis, along in zip("xyz", errors.T, strict=True)},
+                inside=_some(errors, parts[0]),
+                outside=_some(errors, parts[1]),
+                difference=differences[number] if number else None,
+            )
+        )
+    return figures
+
+
+def _differences(
+    sizes: Float64[np.ndarray, "models rows"], group: Int64[np.ndarray, " rows"], intervals: Intervals
+) -> list[Difference]:
+    """Compare every model with the first, the first with itself too."""
+    values = statistics(sizes)
+    means = np.stack([np.bincount(group, row) for row in sizes]) / np.bincount(group)
+    return [
+        Difference(
+            statistics=dict(zip(STATISTICS, (values[:, model] - values[:, 0]).tolist(), strict=True)),
+            intervals=_by_name(intervals.difference[:, model]),
+            test=signed_rank(mean - means[0]),
+            better_share=float((mean < means[0]).mean()),
+        )
+        for model, mean in enumerate(means)
+    ]
+
+
+def _by_name(ends: Float64[np.ndarray, "statistics 2"]) -> dict[str, Interval | None]:
+    pairs = [None if np.isnan(low) else (float(low), float(high)) for low, high in ends]
+    return dict(zip(STATISTICS, pairs, strict=True))
+
+
+def _some(errors: Float64[Tensor, "rows 3"], rows: Bool[Tensor, " rows"] | None) -> dict[str, float]:
+    """Compute the statistics of some rows; nothing where there are none."""
+    return {} if rows is None or not bool(rows.any()) else error_statistics(errors[rows].norm(dim=-1))
+
+
+def _with_units(errors: Sequence[QuantityErrors], name: str) -> dict[str, float]:
+    return {f"{key}_{one.unit}": value for one in errors for key, value in getattr(one, name).items()}

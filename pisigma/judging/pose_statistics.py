@@ -1,8 +1,9 @@
-"""Position and orientation errors of measured rows under a model, and their statistics."""
+"""Errors of measured poses and of joints under a model, and their statistics."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
@@ -60,17 +61,6 @@ class ErrorVectors:
         return ErrorVectors(
             position, None if self.rotation is None else torch.where(chosen, self.rotation, torch.nan)
         )
-
-    def axes_in_file_units(self) -> dict[str, dict[str, float]]:
-        """Per axis of the frame the figures of `axis_statistics` in mm and, where measured, in deg."""
-        found = {}
-        for index, axis in enumerate("xyz"):
-            along = axis_statistics(self.position[:, index])
-            found[axis] = {f"{name}_mm": value * 1e3 for name, value in along.items()}
-            if self.rotation is not None and torch.isfinite(self.rotation).any():
-                about = axis_statistics(torch.rad2deg(self.rotation[:, index]))
-                found[axis] |= {f"{name}_deg": value for name, value in about.items()}
-        return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,3 +175,32 @@ def compare_on(model: CalibratedModel, measurements: Measurements) -> Comparison
         for poses in (nominal_poses_of_rows, poses_of_rows)
     )
     return Comparison.of(nominal, corrected)
+
+
+@dataclass(frozen=True)
+class JointStatistics:
+    """Of the absolute error of one joint (Jeong et al. 1998, Tables 1 and 2) [rad or m].
+
+    Attributes:
+        average: mean of the absolute error.
+        deviation: standard deviation of the absolute error, over all rows (divided by n, as the paper's
+            figures are).
+        maximum: largest absolute error.
+    """
+
+    average: float
+    deviation: float
+    maximum: float
+
+    @staticmethod
+    def of(errors: Float64[Tensor, " rows"]) -> "JointStatistics":
+        """Statistics of the errors of one joint."""
+        absolute = errors.abs()
+        return JointStatistics(
+            float(absolute.mean()), float(absolute.std(correction=0)), float(absolute.max())
+        )
+
+    def in_file_units(self, revolute: bool) -> dict[str, float]:
+        """The figures in degrees or millimetres, with the unit in the names."""
+        unit, factor = ("deg", float(np.rad2deg(1.0))) if revolute else ("mm", 1e3)
+        return {f"{name}_{unit}": value * factor for name, value in asdict(self).items()}

@@ -1,82 +1,111 @@
 """A comparison of models as tables for people."""
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
+from dataclasses import dataclass
 
+from pisigma.judging.model_comparison import Difference, Interval, ModelComparison, QuantityErrors
 from pisigma.reporting.tables import figure_text
 
-Table = tuple[list[str], list[tuple[str, ...]]]
-"""Names of the columns, and rows."""
-
-_QUANTITIES = (("position", "mm"), ("orientation", "deg"))
 _SHOWN = (("rms", "RMS"), ("mean", "mean"), ("p95", "95 %"), ("max", "maximum"))
 _NONE = "-"
 
 
-def comparison_table(report: Mapping[str, Any]) -> Table:
-    """One column per model, one row per figure, with the confidence interval where there is one.
+@dataclass(frozen=True)
+class ModelTable:
+    """A table with one column per model.
 
-    Args:
-        report: from `pisigma.reporting.comparison_report.report_comparison`.
+    Attributes:
+        title: what it shows.
+        models: heads of the columns.
+        lines: per line what it is, and a cell per model.
     """
-    models = report["models"]
-    rows = []
-    for quantity, unit in _QUANTITIES:
-        if f"rms_{unit}" in models[0]:
-            for key, shown in _SHOWN:
-                cells = (_with_interval(model, f"{key}_{unit}") for model in models)
-                rows.append((f"{quantity}, {shown}", unit, *cells))
-            word = "along" if quantity == "position" else "about"
-            for axis in "xyz":
-                cells = (figure_text(model["axes"][axis][f"rms_{unit}"]) for model in models)
-                rows.append((f"{quantity}, RMS {word} {axis}", unit, *cells))
-    rows += _domain_rows(models)
-    return ["error", "unit", *(model["name"] for model in models)], rows
+
+    title: str
+    models: tuple[str, ...]
+    lines: tuple[tuple[str, tuple[str, ...]], ...]
+
+    def fitting(self, width: int) -> list[tuple[list[str], list[tuple[str, ...]]]]:
+        """Give heads and rows, as several tables one below the other where the models do not fit a width."""
+        label = max(len(line) for line, _ in self.lines)
+        cells = [
+            max(map(len, column)) for column in zip(self.models, *(c for _, c in self.lines), strict=True)
+        ]
+        blocks: list[list[int]] = [[]]
+        for number, size in enumerate(cells):
+            if blocks[-1] and label + sum(cells[k] + 2 for k in blocks[-1]) + size + 4 > width:
+                blocks.append([])
+            blocks[-1].append(number)
+        return [
+            (
+                ["", *(self.models[k] for k in block)],
+                [(line, *(texts[k] for k in block)) for line, texts in self.lines],
+            )
+            for block in blocks
+        ]
 
 
-def difference_table(report: Mapping[str, Any]) -> Table:
-    """One row per quantity and model from the second on: differences to the first, with intervals and Wilcoxon's p."""
-    rows = []
-    for model in report["models"][1:]:
-        for quantity, unit in _QUANTITIES:
-            found = model["difference_to_first"].get(quantity)
-            if found is not None:
+def error_table(comparison: ModelComparison) -> ModelTable:
+    """Make a table of the errors of every model, with confidence intervals where there are some."""
+    models = comparison.models
+    lines: list[tuple[str, tuple[str, ...]]] = []
+    confidence = _confidence(comparison)
+    for quantity, first in models[0].quantities.items():
+        errors = [model.quantities[quantity] for model in models]
+        for key, shown in _SHOWN:
+            values = tuple(figure_text(one.statistics[key]) for one in errors)
+            lines.append((f"{quantity}, {shown} [{first.unit}]", values))
+            if first.intervals.get(key) is not None:
+                lines.append((confidence, tuple(_interval(one.intervals[key]) for one in errors)))
+        word = "along" if quantity == "position" else "about"
+        for axis in "xyz":
+            values = tuple(figure_text(one.axes[axis]["rms"]) for one in errors)
+            lines.append((f"{quantity}, RMS {word} {axis} [{first.unit}]", values))
+    if any(model.rows_outside for model in models):
+        for quantity, first in models[0].quantities.items():
+            for where in ("inside", "outside"):
                 cells = (
-                    _figure_and_interval(found[f"{key}_{unit}"], found[f"{key}_{unit}_interval"])
-                    for key in ("mean", "rms")
+                    _domain(getattr(model.quantities[quantity], where), getattr(model, f"rows_{where}"))
+                    for model in models
                 )
-                better = f"{100 * found['better_share']:.0f} %"
-                rows.append((model["name"], quantity, unit, *cells, better, _p(found["wilcoxon"]["p"])))
-    return ["model", "error", "unit", "mean", "RMS", "better in", "p"], rows
+                lines.append((f"{quantity}, RMS {where} its domain [{first.unit}]", tuple(cells)))
+    title = f"Errors of {comparison.rows} rows ({comparison.configurations} configurations)"
+    return ModelTable(title, tuple(model.name for model in models), tuple(lines))
 
 
-def _domain_rows(models: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """RMS inside and outside the domain, where a model has rows outside of it."""
-    if all(model.get("outside_domain") is None for model in models):
-        return []
-    rows = []
-    for quantity, unit in _QUANTITIES:
-        if f"rms_{unit}" in models[0]:
-            for key, shown in (("inside_domain", "inside"), ("outside_domain", "outside")):
-                cells = (_part_text(model.get(key), f"rms_{unit}") for model in models)
-                rows.append((f"{quantity}, RMS {shown} its domain", unit, *cells))
-    return rows
+def difference_table(comparison: ModelComparison) -> ModelTable:
+    """Make a table of the differences of every later model to the first, with intervals and Wilcoxon's p."""
+    first, *others = comparison.models
+    lines: list[tuple[str, tuple[str, ...]]] = []
+    confidence = _confidence(comparison)
+    for quantity, errors in first.quantities.items():
+        differences = [_difference(model.quantities[quantity]) for model in others]
+        for key, shown in (("mean", "mean"), ("rms", "RMS")):
+            values = tuple(figure_text(one.statistics[key]) for one in differences)
+            lines.append((f"{quantity}, {shown} [{errors.unit}]", values))
+            if differences[0].intervals[key] is not None:
+                lines.append((confidence, tuple(_interval(one.intervals[key]) for one in differences)))
+        shares = tuple(f"{100 * one.better_share:.0f} %" for one in differences)
+        lines.append((f"{quantity}, better in", shares))
+        lines.append((f"{quantity}, Wilcoxon's p", tuple(_p(one.test.p) for one in differences)))
+    title = f"Differences to {first.name}, below 0 is better, on the same rows"
+    return ModelTable(title, tuple(model.name for model in others), tuple(lines))
 
 
-def _part_text(part: Mapping[str, Any] | None, name: str) -> str:
-    if part is None or name not in part:
-        return _NONE
-    return f"{figure_text(part[name])} ({part['rows']} rows)"
+def _difference(errors: QuantityErrors) -> Difference:
+    assert errors.difference is not None  # only the first model has none
+    return errors.difference
 
 
-def _with_interval(model: Mapping[str, Any], name: str) -> str:
-    return _figure_and_interval(model[name], model["intervals"].get(name))
+def _confidence(comparison: ModelComparison) -> str:
+    return f"  {100 * comparison.bootstrap.confidence:.0f} % confidence"
 
 
-def _figure_and_interval(value: float, interval: Sequence[float] | None) -> str:
-    if interval is None:
-        return figure_text(value)
-    return f"{figure_text(value)} [{', '.join(f'{end:.3g}' for end in interval)}]"
+def _domain(statistics: Mapping[str, float], rows: int | None) -> str:
+    return f"{figure_text(statistics['rms'])} ({rows} rows)" if statistics else _NONE
+
+
+def _interval(interval: Interval | None) -> str:
+    return _NONE if interval is None else f"[{interval[0]:.3g}, {interval[1]:.3g}]"
 
 
 def _p(value: float) -> str:

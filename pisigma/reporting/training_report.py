@@ -4,8 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from pisigma.judging.cross_validation import CrossValidation
-from pisigma.judging.joint_statistics import JointStatistics
-from pisigma.judging.pose_statistics import compare_on
+from pisigma.judging.pose_statistics import JointStatistics, compare_on
 from pisigma.measurement.dataset import Measurements
 from pisigma.recipes.recipe import Recipe
 from pisigma.workflow.run import JointErrors, TrainingRun

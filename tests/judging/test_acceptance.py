@@ -1,9 +1,9 @@
 """Limits of an acceptance test."""
 
 import pytest
+from pisigma.judging.acceptance import Limits
 
 from pisigma.errors import MeasurementError
-from pisigma.judging.acceptance import Limits
 
 MODEL = {
     "name": "arm",

@@ -20,7 +20,6 @@ from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
-from pisigma.reporting.comparison_report import report_comparison
 from pisigma.robot import Robot
 from pisigma.se3 import invert, rotation_vector, transform_from_xyzrpy
 
@@ -52,7 +51,7 @@ def unseen():
 def test_figures_agree_with_numpy(arm, unseen):
     _, model = arm
     models = {"drawn": nominal_model(model, True), "own": model}
-    report = report_comparison(compare_models(models, unseen, Bootstrap(50)))
+    report = compare_models(models, unseen, Bootstrap(50)).to_json()
     assert (report["rows_compared"], report["rows_without_position"]) == (118, 2)
     assert report["configurations"] == 60
     for found, one in zip(report["models"], models.values(), strict=True):
@@ -128,9 +127,9 @@ def test_nominal_of_several_frames_and_targets():
     nominal = nominal_model(model, False)
     assert (set(nominal.bases), set(nominal.tools)) == ({"floor", "wall"}, {"A", "B"})
     found = compare_models({"nominal": nominal, "geometric": model}, rows, Bootstrap(20))
-    sizes = [float(errors.square().mean().sqrt()) for errors in found.position.errors]
-    assert 1e-4 < sizes[0] < 1e-2
-    assert sizes[1] < 1e-5
+    sizes = [figures.position.statistics["rms"] for figures in found.models]
+    assert 0.1 < sizes[0] < 10
+    assert sizes[1] < 0.01
 
 
 def test_a_model_with_nominal_geometry_has_its_base_and_tool():
@@ -154,7 +153,7 @@ def test_inside_and_outside_of_a_hybrid():
     inside = inside_domain(model, rows)
     assert torch.equal(inside, model.hybrid.coverage.beyond(q).amax(-1) == 0)
     assert 0 < int(inside.sum()) < 200
-    report = report_comparison(compare_models({"kiro4": model}, rows, Bootstrap(20)))["models"][0]
+    report = compare_models({"kiro4": model}, rows, Bootstrap(20)).to_json()["models"][0]
     errors = 1e3 * (rows.position - model.forward(q)[:, :3, 3]).norm(dim=-1).numpy()
     for name, part in (("inside_domain", inside.numpy()), ("outside_domain", ~inside.numpy())):
         assert report[name]["rows"] == part.sum()
@@ -183,10 +182,12 @@ def test_rows_that_one_does_not_predict_count_for_none():
     rows = Measurements(q=q, position=model.forward(q)[:, :3, 3])
     found = compare_models({"good": model, "steep": steep}, rows, Bootstrap(20))
     good, bad = found.models
-    assert good.not_predicted == 0
-    assert 0 < bad.not_predicted < 80
-    assert found.rows == 80 - bad.not_predicted
-    assert torch.equal(good.vectors.position.isnan(), bad.vectors.position.isnan())
+    assert good.rows_not_predicted == 0
+    assert 0 < bad.rows_not_predicted < 80
+    assert found.rows == 80 - bad.rows_not_predicted
+    errors = (rows.position - poses_of_rows(model, rows)[:, :3, 3]).norm(dim=-1)
+    predicted = poses_of_rows(steep, rows).isfinite().all(-1).all(-1)
+    assert_close(good.position.statistics["mean"], 1e3 * float(errors[predicted].mean()), atol=1e-12)
 
 
 def test_nothing_to_compare_is_said(arm):
@@ -199,3 +200,43 @@ def test_nothing_to_compare_is_said(arm):
         )
     with pytest.raises(MeasurementError, match="there is no row with a measured position that m predict"):
         compare_models({"m": model}, Measurements(q=q, position=torch.full((3, 3), torch.nan).double()))
+
+
+def compared(better: np.ndarray, worse: np.ndarray, bootstrap: Bootstrap, repeats: int = 1):
+    """Compare two models whose position errors along x are these [m]; configurations are measured several times."""
+    count = len(worse)
+    still = hand_made_model("kiro4", scale=0.0)
+    q = joints_around("kiro4", count // repeats, seed=1).repeat_interleave(repeats, 0)
+    T = forward_kinematics(still.robot, q)
+    rows = Measurements(
+        q=q, position=T[:, :3, 3] + torch.from_numpy(worse)[:, None] * torch.tensor([1.0, 0, 0])
+    )
+    shift = float(worse[0] - better[0])
+    base = still.robot.base.copy()
+    base[0] += shift
+    shifted = replace(still, robot=still.robot.with_geometry(base=base))
+    return compare_models({"first": still, "second": shifted}, rows, bootstrap)
+
+
+def test_differences_are_paired():
+    """A micrometre less on every row shows, however much rows differ; and equal models differ by nothing."""
+    worse = np.random.default_rng(0).gamma(3.0, 1e-4, 100) + 1e-5
+    found = compared(worse - 1e-6, worse, Bootstrap(100), repeats=2)
+    assert found.configurations == 50
+    difference = found.models[1].position.difference
+    assert_close(difference.statistics["mean"], -1e-3, rtol=1e-6)
+    assert difference.intervals["mean"][1] < 0
+    assert difference.better_share == 1.0
+    assert difference.test.pairs == 50
+    assert difference.test.p < 1e-8
+    same = compared(worse, worse, Bootstrap(100)).models[1].position.difference
+    assert same.intervals["rms"] == (0.0, 0.0)
+    assert (same.better_share, same.test.p) == (0.0, 1.0)
+    assert same.to_json("mm")["mean_mm_interval"] == [0.0, 0.0]
+
+
+def test_one_configuration_has_no_interval():
+    worse = np.random.default_rng(0).gamma(3.0, 1e-4, 6)
+    found = compared(worse, worse, Bootstrap(10), repeats=6)
+    assert found.models[0].position.intervals == {"mean": None, "rms": None, "p95": None}
+    assert found.to_json()["models"][1]["difference_to_first"]["position"]["mean_mm_interval"] is None

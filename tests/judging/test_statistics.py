@@ -9,10 +9,10 @@ from testing.closeness import assert_close
 from testing.models import hand_made_model, joints_around
 
 from pisigma.errors import MeasurementError
-from pisigma.judging.joint_statistics import JointStatistics
 from pisigma.judging.pose_statistics import (
     Comparison,
     ErrorVectors,
+    JointStatistics,
     PoseErrors,
     axis_statistics,
     compare_on,
@@ -115,14 +115,12 @@ def test_error_vectors_are_measured_minus_expected_along_the_axes(generator):
     errors = ErrorVectors.between(measured(moved, q), T)
     assert_close(errors.position, shift, atol=1e-12)
     assert_close(errors.rotation, turn, atol=1e-9)
-    figures = errors.axes_in_file_units()
-    for index, axis in enumerate("xyz"):
-        along, about = 1e3 * shift[:, index].numpy(), np.rad2deg(turn[:, index].numpy())
-        for values, unit in ((along, "mm"), (about, "deg")):
-            assert_close(figures[axis][f"mean_{unit}"], values.mean(), atol=1e-6)
-            assert_close(figures[axis][f"rms_{unit}"], np.sqrt((values**2).mean()), rtol=1e-8)
-            assert_close(figures[axis][f"p95_{unit}"], np.quantile(np.abs(values), 0.95), rtol=1e-8)
-            assert_close(figures[axis][f"max_{unit}"], np.abs(values).max(), rtol=1e-8)
+    for index in range(3):
+        figures, values = axis_statistics(errors.position[:, index]), shift[:, index].numpy()
+        assert_close(figures["mean"], values.mean(), atol=1e-9)
+        assert_close(figures["rms"], np.sqrt((values**2).mean()), rtol=1e-8)
+        assert_close(figures["p95"], np.quantile(np.abs(values), 0.95), rtol=1e-8)
+        assert_close(figures["max"], np.abs(values).max(), rtol=1e-8)
     some = errors.only(torch.tensor([True, False] * 3))
     assert torch.equal(some.sizes.position.isnan(), torch.tensor([False, True] * 3))
     assert torch.equal(some.sizes.rotation.isnan(), torch.tensor([False, True] * 3))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.judging.rank_tests import SIGNIFICANT, chance_text, groups_differ, rank_correlation
+from pisigma.judging.rank_tests import SIGNIFICANT, groups_differ, rank_correlation
 from pisigma.measurement.conditions import CONDITIONS, conditions_of
 from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.reporting.page.judged_rows import JudgedRows
@@ -211,3 +211,8 @@ def _over_condition(title: str, own: str, values: np.ndarray, errors: np.ndarray
         return f"No dependence on {title} beyond chance ({span}; rank correlation {r:.2f}, {chance_text(chance)})."
     grows = "grows" if r > 0 else "falls"
     return f"The error {grows} with {title} ({span}; rank correlation {r:.2f}, {chance_text(chance)})."
+
+
+def chance_text(probability: float) -> str:
+    """A probability in words, such as "p = 0.02"."""
+    return "p < 1e-12" if probability < 1e-12 else f"p = {probability:.2g}"

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from testing.closeness import assert_close
 
 from pisigma.errors import MeasurementError
-from pisigma.judging.iso9283.drift import accuracy_drift, repeatability_drift
 from pisigma.judging.iso9283.pose import (
+    accuracy_drift,
     angular_deviations,
     barycentre,
     directional_orientation_variation,
@@ -19,6 +19,7 @@ from pisigma.judging.iso9283.pose import (
     orientation_repeatability,
     position_accuracy,
     position_repeatability,
+    repeatability_drift,
 )
 from pisigma.se3 import rotation_from_vector
 

@@ -1,0 +1,319 @@
+"""Evaluate models on measurements that they were not trained on, and accept them or not."""
+
+import math
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import torch
+
+from pisigma.errors import MeasurementError, ModelError
+from pisigma.judging.bootstrap import Bootstrap
+from pisigma.judging.frame_fits import FRAMES_FITTED
+from pisigma.judging.model_comparison import ModelComparison, ModelFigures, compare_models
+from pisigma.judging.reference_models import geometric_model, nominal_model
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import load_model
+from pisigma.reporting.tables import figure_text
+
+REFERENCES = ("nominal", "geometric")
+"""Names of what a model is compared with: the robot as drawn, and the geometry under a hybrid. Neither has to meet
+limits."""
+
+ModelSource = str | os.PathLike[str] | CalibratedModel
+"""A model, its folder, or one of `REFERENCES`."""
+
+_LIMITED = {
+    "mean_mm": ("max-mean-mm", "mean position error"),
+    "p95_mm": ("max-p95-mm", "95 % quantile of the position error"),
+    "max_mm": ("max-mm", "largest position error"),
+    "mean_deg": ("max-mean-deg", "mean orientation error"),
+}
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Largest errors that are accepted; None where there is no limit.
+
+    Attributes:
+        mean_mm: of the mean position error.
+        p95_mm: of the position error that 95 % of the rows stay below.
+        max_mm: of the largest position error.
+        mean_deg: of the mean orientation error.
+    """
+
+    mean_mm: float | None = None
+    p95_mm: float | None = None
+    max_mm: float | None = None
+    mean_deg: float | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse limits that no figure could be held against."""
+        for name, limit in self.stated.items():
+            if not (limit > 0 and math.isfinite(limit)):
+                raise MeasurementError(f"--{_LIMITED[name][0]} {limit:g}: a limit above 0 was wanted.")
+
+    @property
+    def stated(self) -> dict[str, float]:
+        """The limits that there are, by name."""
+        return {name: limit for name, limit in asdict(self).items() if limit is not None}
+
+    def missed_by(self, model: ModelFigures) -> list[str]:
+        """Say which limits a model misses, in sentences without their ends; nothing where it meets all.
+
+        A model that predicts nothing for a row meets no limit.
+
+        Raises:
+            MeasurementError: there is a limit on the orientation, but none was measured.
+        """
+        sentences = []
+        for key, limit in self.stated.items():
+            option, what = _LIMITED[key]
+            statistic, unit = key.split("_")
+            errors = model.position if unit == "mm" else model.orientation
+            if errors is None:
+                raise MeasurementError(
+                    f"--{option} {limit:g}: no orientations were measured; leave the limit out or give poses."
+                )
+            value = errors.statistics[statistic]
+            if not value <= limit:
+                text = figure_text(value) if figure_text(value) != figure_text(limit) else value
+                sentences.append(
+                    f"the {what} of {model.name} is {text} {unit}, --{option} allows {limit:g} {unit}"
+                )
+        if self.stated and model.rows_not_predicted:
+            sentences.append(f"{model.name} predicts nothing for {model.rows_not_predicted} of the rows")
+        return sentences
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """How models are evaluated.
+
+    Attributes:
+        limits: that every model, but no reference, has to meet.
+        fit_frame: fit the frames of the rows anew, as after the sensor was moved.
+        bootstrap: how confidence intervals are computed.
+    """
+
+    limits: Limits = field(default_factory=Limits)
+    fit_frame: bool = False
+    bootstrap: Bootstrap = field(default_factory=Bootstrap)
+
+
+@dataclass(frozen=True)
+class EvaluatedModel:
+    """What an evaluated model is, beside its figures.
+
+    Attributes:
+        model: its folder, or its name.
+        kind: of model.
+        trained_on: whether the rows are those that it was made of.
+    """
+
+    model: str
+    kind: str
+    trained_on: bool
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Models compared on the same rows.
+
+    Attributes:
+        data: file of the rows.
+        rows: number of rows that were judged.
+        settings: how.
+        comparison: figures of every model, with confidence intervals and differences to the first.
+        evaluated: by name in the comparison, what each model is; references are not among them.
+        missed: limits that are missed, in sentences without their ends.
+        warnings: what else should be known, in sentences.
+        seconds: that it took.
+    """
+
+    data: str
+    rows: int
+    settings: EvaluationSettings
+    comparison: ModelComparison
+    evaluated: Mapping[str, EvaluatedModel]
+    missed: tuple[str, ...]
+    warnings: tuple[str, ...]
+    seconds: float
+
+    @property
+    def models(self) -> tuple[ModelFigures, ...]:
+        """Figures of every model, in the order in which they were given."""
+        return self.comparison.models
+
+    @property
+    def accepted(self) -> bool:
+        """Whether every model meets every limit; true where there is none."""
+        return not self.missed
+
+    def to_json(self) -> dict[str, object]:
+        """Return everything as plain values: the result of `pisigma evaluate --json`."""
+        comparison = self.comparison.to_json()
+        comparison["models"] = [
+            model.to_json() | (asdict(self.evaluated[model.name]) if model.name in self.evaluated else {})
+            for model in self.models
+        ]
+        values: dict[str, object] = {
+            "data": self.data,
+            "rows": self.rows,
+            "frame_fitted": self.settings.fit_frame,
+            **comparison,
+        }
+        if stated := self.settings.limits.stated:
+            values |= {"limits": stated, "accepted": self.accepted, "missed": list(self.missed)}
+        return values | self._single() | {"warnings": list(self.warnings), "seconds": self.seconds}
+
+    def _single(self) -> dict[str, object]:
+        """Repeat the figures of a single model beside nominal, so that programs need not search for them."""
+        if len(self.models) != 2 or len(self.evaluated) != 1 or self.models[0].name != "nominal":
+            return {}
+        model, what = self.models[1], self.evaluated[self.models[1].name]
+        nominal, corrected = (one.statistics_in_file_units for one in self.models)
+        return {
+            "model": what.model,
+            "rows_not_predicted": model.rows_not_predicted,
+            "trained_on": what.trained_on,
+            "nominal": nominal,
+            "corrected": corrected,
+        }
+
+
+def evaluate(
+    models: ModelSource | Sequence[ModelSource],
+    data: str | os.PathLike[str] | Measurements,
+    settings: EvaluationSettings | None = None,
+) -> Evaluation:
+    """Compare models on measurements, with confidence intervals, and hold them against limits.
+
+    Args:
+        models: one or several folders or models, and the words "nominal" (the robot as drawn, base and tool fitted)
+            and "geometric" (what a hybrid builds upon) of the first that has it. A single model is compared with
+            nominal.
+        data: measurements, or their file, in the frames that the models were fitted in. Where rows are marked, only
+            those of the set "test" are judged.
+        settings: how. None: no limits, 2000 resamples.
+
+    Raises:
+        ModelError: a folder cannot be used, or no model is given.
+        MeasurementError: the rows cannot be used, or no row can be compared.
+        PoseError: the joint values do not fit a robot.
+    """
+    settings, begin = settings or EvaluationSettings(), time.perf_counter()
+    sources = _labelled([models] if isinstance(models, str | os.PathLike | CalibratedModel) else list(models))
+    loaded = _load(sources)
+    everything = data
+    if not isinstance(everything, Measurements):
+        everything = Measurements.read_csv(everything, next(iter(loaded.values())).robot)
+    rows = test_rows(everything)
+    compared = _with_references(list(sources), loaded, rows.rotation is not None)
+    comparison = compare_models(compared, rows, settings.bootstrap, settings.fit_frame)
+    hashes = everything.content_hash(), rows.content_hash()
+    evaluated = {
+        label: EvaluatedModel(_text(sources[label]), model.kind, model.provenance.data_sha256 in hashes)
+        for label, model in loaded.items()
+    }
+    judged = [figures for figures in comparison.models if figures.name in evaluated]
+    return Evaluation(
+        data=everything.source,
+        rows=rows.rows,
+        settings=settings,
+        comparison=comparison,
+        evaluated=evaluated,
+        missed=tuple(sentence for figures in judged for sentence in settings.limits.missed_by(figures)),
+        warnings=tuple(_warnings(comparison, evaluated, settings.fit_frame)),
+        seconds=time.perf_counter() - begin,
+    )
+
+
+def test_rows(measurements: Measurements) -> Measurements:
+    """Select the rows that are marked as test; all where none is marked.
+
+    Raises:
+        MeasurementError: all rows are marked as train.
+    """
+    if measurements.split is None:
+        return measurements
+    test = torch.tensor([name == "test" for name in measurements.split])
+    if not test.any():
+        raise MeasurementError(
+            f"{measurements.source}: column 'set' marks all rows as 'train'; mark some as 'test' or remove the column."
+        )
+    return measurements.select(test)
+
+
+def _text(source: ModelSource) -> str:
+    return source.name if isinstance(source, CalibratedModel) else os.fspath(source)
+
+
+def _labelled(sources: Sequence[ModelSource]) -> dict[str, ModelSource]:
+    """Name models for tables: by the folder's last name, or by all that was given where two have the same.
+
+    Raises:
+        ModelError: a model is given twice.
+    """
+    texts = [_text(source) for source in sources]
+    twice = next((text for text in texts if texts.count(text) > 1), None)
+    if twice is not None:
+        raise ModelError(f"{twice} is given twice; give every model once.")
+    short = [text if text in REFERENCES else Path(text).resolve().name for text in texts]
+    taken = [*short, *(name for name in REFERENCES if name not in texts)]
+    labels = [name if taken.count(name) == 1 else text for name, text in zip(short, texts, strict=True)]
+    return dict(zip(labels, sources, strict=True))
+
+
+def _load(sources: Mapping[str, ModelSource]) -> dict[str, CalibratedModel]:
+    """Load all models but the references."""
+    loaded = {
+        label: source if isinstance(source, CalibratedModel) else load_model(source)
+        for label, source in sources.items()
+        if source not in REFERENCES
+    }
+    if not loaded:
+        raise ModelError(
+            f"'{' '.join(sources)}' is not enough, as it is derived from a model; give a model folder besides (a "
+            f"folder of that name as ./{next(iter(sources), 'model')})."
+        )
+    return loaded
+
+
+def _with_references(
+    labels: Sequence[str], loaded: Mapping[str, CalibratedModel], turned: bool
+) -> dict[str, CalibratedModel]:
+    """Add the references to the models, in the order in which they were given; nominal before a single one."""
+    first = next(iter(loaded.values()))
+    identified = next((model for model in loaded.values() if model.calibrated is not None), first)
+    models = {}
+    for label in ["nominal", *labels] if len(labels) == 1 else labels:
+        if label in loaded:
+            models[label] = loaded[label]
+        else:
+            models[label] = (
+                nominal_model(first, turned) if label == "nominal" else geometric_model(identified)
+            )
+    return models
+
+
+def _warnings(
+    comparison: ModelComparison, evaluated: Mapping[str, EvaluatedModel], fit_frame: bool
+) -> list[str]:
+    warnings = [FRAMES_FITTED] if fit_frame else []
+    if comparison.rows_without_position:
+        warnings.append(f"{comparison.rows_without_position} rows hold no position and are not judged.")
+    for model in comparison.models:
+        if model.rows_not_predicted:
+            warnings.append(
+                f"{model.rows_not_predicted} rows lie so far outside the domain of {model.name} that it predicts "
+                "nothing; they are left out for all models."
+            )
+        if model.name in evaluated and evaluated[model.name].trained_on:
+            warnings.append(
+                f"{model.name} was trained on these rows, so its figures say nothing about other poses."
+            )
+    return warnings

@@ -1,0 +1,277 @@
+"""Verify whether new measurements are explained better by the corrected model than by the nominal robot."""
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+import torch
+
+from pisigma.judging.bootstrap import Bootstrap
+from pisigma.judging.frame_fits import FRAMES_FITTED
+from pisigma.judging.model_comparison import ModelComparison, QuantityErrors, compare_models
+from pisigma.judging.reference_models import geometric_model, nominal_model
+from pisigma.measurement.csv.rows import LIMIT_TOLERANCE
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import load_model
+from pisigma.verification.setup_faults import PLAUSIBLE_SHARE, SetupFault, find_setup_faults, length_text
+from pisigma.workflow.evaluate import test_rows
+
+FEWEST_CONFIGURATIONS = 6
+"""With fewer different joint values nothing is concluded."""
+MOST_DRAWN = 2 * 10**7
+"""Numbers drawn for confidence intervals at most; of many rows fewer resamples are enough."""
+RESAMPLES = (200, 2000)
+
+NOMINAL, GEOMETRIC, CORRECTED = "nominal", "geometric", "corrected"
+
+HALVED = 0.5
+"""Where a setup fault is found, errors must at least be halved for the corrected model to count as better."""
+
+Verdict = Literal["better", "not_better", "undecided", "setup_fault", "implausible"]
+
+_BEGIN: dict[Verdict, str] = {
+    "better": "The corrected model explains these measurements better than the nominal robot",
+    "not_better": "The nominal robot explains these measurements at least as well as the corrected model",
+    "undecided": "These measurements do not show whether the corrected model or the nominal robot is nearer",
+    "implausible": "These measurements do not show whether the correction is right, as their errors are too large to "
+    "be those of a calibration",
+}
+
+
+@dataclass(frozen=True)
+class VerificationSettings:
+    """How a model is verified.
+
+    Attributes:
+        fit_frame: fit the frames anew, as after the sensor was moved; then any frame will do.
+        seed: of the resamples for confidence intervals.
+    """
+
+    fit_frame: bool = False
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Verification:
+    """What new measurements say about a model.
+
+    Attributes:
+        model: its folder, or its name.
+        data: file of the rows.
+        rows: number of rows that were judged.
+        settings: how.
+        verdict: "better" where the corrected model explains the rows better than the nominal robot, which the
+            confidence interval of the mean difference has to show; "undecided" where it shows nothing; "setup_fault"
+            where a setup fault explains the errors, so that neither counts; "implausible" where they are too large
+            for a calibration and nothing explains them.
+        sentence: the verdict with figures.
+        ratio: mean position error of the corrected model over that of the nominal robot; NaN where that is 0.
+        better_share: share of the configurations in which the corrected model is nearer.
+        comparison: figures of "nominal", "geometric" (of a hybrid) and "corrected".
+        setup_faults: what explains large errors.
+        warnings: what else should be known, each a sentence.
+        seconds: that it took.
+    """
+
+    model: str
+    data: str
+    rows: int
+    settings: VerificationSettings
+    verdict: Verdict
+    sentence: str
+    ratio: float
+    better_share: float
+    comparison: ModelComparison
+    setup_faults: tuple[SetupFault, ...]
+    warnings: tuple[str, ...]
+    seconds: float
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the corrected model explains the measurements better."""
+        return self.verdict == "better"
+
+    def to_json(self) -> dict[str, object]:
+        """Return everything as plain values: the result of `pisigma verify --json`."""
+        return {
+            "model": self.model,
+            "data": self.data,
+            "rows": self.rows,
+            "frame_fitted": self.settings.fit_frame,
+            "explained_better": self.accepted,
+            "verdict": self.verdict,
+            "sentence": self.sentence,
+            "ratio": None if np.isnan(self.ratio) else self.ratio,
+            "better_share": self.better_share,
+            **self.comparison.to_json(),
+            "setup_faults": [fault.to_json() for fault in self.setup_faults],
+            "warnings": list(self.warnings),
+            "seconds": self.seconds,
+        }
+
+
+def read_for_verification(path: str | os.PathLike[str], model: CalibratedModel) -> Measurements:
+    """Read measurements whose joint values may lie outside the limits, as those of swapped columns do.
+
+    Rows of the set "train" are left out where the file has a column "set".
+
+    Raises:
+        MeasurementError: the file cannot be used, or its column `set` leaves no row for tests.
+    """
+    rows = tuple(replace(row, lower=-np.inf, upper=np.inf) for row in model.robot.rows)
+    return test_rows(Measurements.read_csv(path, replace(model.robot, rows=rows)))
+
+
+def verify(
+    model: str | os.PathLike[str] | CalibratedModel,
+    data: str | os.PathLike[str] | Measurements,
+    settings: VerificationSettings | None = None,
+) -> Verification:
+    """Judge whether a correction is active and right, and what is wrong with the setup where errors are large.
+
+    Args:
+        model: the model or its folder.
+        data: new rows with positions, or their file, in frames and of targets that the model has.
+        settings: how. None: `VerificationSettings()`.
+
+    Raises:
+        MeasurementError: the file cannot be used, or no positions were measured, or in a frame or of a target that the
+            model lacks.
+        ModelError: the folder cannot be used, or the model does not keep enough joint values to fit base and tool of
+            the nominal robot.
+        PoseError: the joint values do not fit the robot.
+    """
+    settings, begin = settings or VerificationSettings(), time.perf_counter()
+    loaded = model if isinstance(model, CalibratedModel) else load_model(model)
+    rows = data if isinstance(data, Measurements) else read_for_verification(data, loaded)
+    models = {NOMINAL: nominal_model(loaded, rows.rotation is not None)}
+    if loaded.hybrid is not None:
+        models[GEOMETRIC] = geometric_model(loaded)
+    models[CORRECTED] = loaded
+    resamples = int(np.clip(MOST_DRAWN // max(rows.rows, 1), *RESAMPLES))
+    comparison = compare_models(models, rows, Bootstrap(resamples, settings.seed), settings.fit_frame)
+    faults = _setup_faults(loaded, models[NOMINAL], rows, settings.fit_frame)
+    nominal, corrected = comparison.models[0].position, comparison.models[-1].position
+    mean = nominal.statistics["mean"]
+    ratio = corrected.statistics["mean"] / mean if mean > 0 else float("nan")
+    difference = corrected.difference
+    assert difference is not None  # it is not the first
+    verdict = _verdict(loaded, comparison, ratio, faults)
+    return Verification(
+        model=loaded.name if isinstance(model, CalibratedModel) else os.fspath(model),
+        data=rows.source,
+        rows=rows.rows,
+        settings=settings,
+        verdict=verdict,
+        sentence=_sentence(verdict, comparison, ratio, faults),
+        ratio=ratio,
+        better_share=difference.better_share,
+        comparison=comparison,
+        setup_faults=faults,
+        warnings=(
+            *_warnings(loaded, rows, comparison, faults),
+            *([FRAMES_FITTED] if settings.fit_frame else []),
+        ),
+        seconds=time.perf_counter() - begin,
+    )
+
+
+@torch.no_grad()
+def _setup_faults(
+    model: CalibratedModel, nominal: CalibratedModel, rows: Measurements, fit_frame: bool
+) -> tuple[SetupFault, ...]:
+    """Find setup faults; a moved frame is none where frames are fitted anew."""
+    if fit_frame:
+        rows = replace(rows, frame=(next(iter(model.bases), ""),) * rows.rows)
+    faults = find_setup_faults(model, nominal, rows)
+    return tuple(fault for fault in faults if not (fit_frame and fault.kinds == ("frame",)))
+
+
+def _interval(corrected: QuantityErrors) -> tuple[float, float] | None:
+    """Return the confidence interval of the mean difference to the nominal robot [mm]."""
+    assert corrected.difference is not None
+    return corrected.difference.intervals["mean"]
+
+
+def _verdict(
+    model: CalibratedModel, comparison: ModelComparison, ratio: float, faults: Sequence[SetupFault]
+) -> Verdict:
+    corrected = comparison.models[-1].position
+    smaller = min(comparison.models[0].position.statistics["rms"], corrected.statistics["rms"]) * 1e-3
+    too_large = smaller > PLAUSIBLE_SHARE * model.robot.reach > 0
+    interval = _interval(corrected)
+    verdict: Verdict = "undecided"
+    if comparison.configurations >= FEWEST_CONFIGURATIONS and interval is not None:
+        low, high = interval
+        if high < 0:
+            verdict = "better"
+        elif low > 0 or low == high == 0:
+            verdict = "not_better"
+    if faults and (too_large or (verdict != "not_better" and not ratio <= HALVED)):
+        return "setup_fault"
+    return "implausible" if too_large else verdict
+
+
+def _sentence(
+    verdict: Verdict, comparison: ModelComparison, ratio: float, faults: Sequence[SetupFault]
+) -> str:
+    nominal, corrected = comparison.models[0].position, comparison.models[-1].position
+    means = [length_text(model.statistics["mean"] / 1e3) for model in (corrected, nominal)]
+    figures = f"the mean error is {means[0]} instead of {means[1]}"
+    if np.isfinite(ratio):
+        figures += f" (ratio {ratio:.3g})"
+    if verdict == "setup_fault":
+        fault = next((fault for fault in faults if np.isfinite(fault.after_nominal)), None)
+        if fault is not None:
+            after = [length_text(length) for length in (fault.after, fault.after_nominal)]
+            figures += f"; with this set right, the errors are {after[0]} RMS instead of {after[1]}"
+        clauses = ", or ".join(dict.fromkeys(fault.clause for fault in faults))
+        return (
+            f"{clauses[:1].upper()}{clauses[1:]}, so these measurements do not show whether the correction is right: "
+            f"{figures}."
+        )
+    begin, count = _BEGIN[verdict], comparison.configurations
+    interval, difference = _interval(corrected), corrected.difference
+    if verdict == "implausible":
+        return f"{begin}: {figures}."
+    if count < FEWEST_CONFIGURATIONS or interval is None or difference is None:
+        return f"{begin}: {figures}, but {FEWEST_CONFIGURATIONS} or more different joint values are needed."
+    return (
+        f"{begin}: {figures}, it differs by {interval[0]:.3g} to {interval[1]:.3g} mm with "
+        f"{comparison.bootstrap.confidence:.0%} confidence, and it is smaller in {difference.better_share:.0%} of "
+        f"{count} configurations."
+    )
+
+
+def _warnings(
+    model: CalibratedModel, rows: Measurements, comparison: ModelComparison, faults: Sequence[SetupFault]
+) -> list[str]:
+    warnings = []
+    lower, upper = torch.from_numpy(model.robot.limits).unbind(1)
+    outside = ((rows.q < lower - LIMIT_TOLERANCE) | (rows.q > upper + LIMIT_TOLERANCE)).any(1)
+    if bool(outside.any()):
+        first = int(outside.nonzero()[0, 0])
+        warnings.append(
+            f"{int(outside.sum())} of {rows.rows} rows, the first in {rows.place(first)}, have joint values outside "
+            f"the limits of robot '{model.robot.name}'."
+        )
+    if model.provenance.data_sha256 == rows.content_hash():
+        warnings.append("The model was fitted to these rows: the figures say nothing about other poses.")
+    corrected = comparison.models[-1]
+    if corrected.rows_not_predicted:
+        warnings.append(
+            f"{corrected.rows_not_predicted} rows lie so far outside the domain that nothing is predicted; they do "
+            "not count."
+        )
+    limit = PLAUSIBLE_SHARE * model.robot.reach
+    if not faults and corrected.position.statistics["rms"] * 1e-3 > limit:
+        warnings.append(
+            f"Errors of more than {limit * 1e3:.3g} mm are no calibration errors, but no usual setup fault (frame, "
+            "tool, units, order, signs and zeros of the joints, correction applied twice or not at all) explains them; "
+            "check whether this robot was measured, and whether the rows belong together."
+        )
+    return warnings
