@@ -58,7 +58,6 @@ NOT_YET = (
     ("reporting/distilled_report.py", "pisigma.workflow.distillation"),
     ("reporting/distilled_report.py", "pisigma.workflow.solved_poses"),
     ("reporting/training_report.py", "pisigma.workflow.run"),
-    ("training/patterns.py", "pisigma.recipes.recipe"),
 )
 """Imports that still run upwards after files moved; to be emptied."""
 

@@ -41,6 +41,8 @@ def train(
         from pisigma.cli.train_hybrid import train_hybrid
 
         return train_hybrid(stated, recipe, data, out, resume, as_json)
+    import shutil
+
     from pisigma.cli.output import print_json
     from pisigma.model.folder.model_folder import save_model
     from pisigma.model.folder.staging import check_replaceable, staged_folder
@@ -48,20 +50,19 @@ def train(
     from pisigma.recipes.recipe_data import load_measurements, split_sets
     from pisigma.reporting.card import write_card
     from pisigma.reporting.training_report import report_training
-    from pisigma.training.checkpoints import checkpoint_folder, discard_checkpoints
     from pisigma.workflow.run import RunOptions, train_recipe
 
     folder = out or Path("runs") / stated.name
     check_replaceable(folder)
     measurements, test = split_sets(load_measurements(stated, data))
-    checkpoints = checkpoint_folder(folder)
+    checkpoints = folder.parent / f".{folder.name}.training"
     run = train_recipe(stated, measurements, RunOptions(checkpoints, resume, True, recipe_hash(recipe)))
     report = report_training(stated, run, _cross_validate(stated, measurements), test)
     command = shlex.join(["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])])
     with staged_folder(folder) as scratch:
         save_model(replace(run.model, metrics=report), scratch)
         write_card(stated, command, run, report, scratch)
-    discard_checkpoints(checkpoints)
+    shutil.rmtree(checkpoints, ignore_errors=True)
     result = {"model": str(folder), "seconds": round(time.perf_counter() - started, 3), **report}
     if as_json:
         print_json(result)

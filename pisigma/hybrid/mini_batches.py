@@ -22,7 +22,8 @@ from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.result_assembly import SolvedCalibration
 
 if TYPE_CHECKING:
-    from pisigma.training.mini_batches import BatchSchedule, Checkpoints
+    from pisigma.training.mini_batches import BatchSchedule
+    from pisigma.training.trainer import Checkpoints
 
 MANY_ROWS = 100_000
 """From so many rows on, mini-batches: the normal equations of a thousand unknowns would take minutes."""
@@ -82,7 +83,7 @@ def batch_checkpoints(folder: Path, identity: str, resume: bool) -> "Checkpoints
         TrainingError: there is no checkpoint of these settings and data to resume.
         OutputError: the folder cannot be written.
     """
-    from pisigma.training.mini_batches import Checkpoints
+    from pisigma.training.trainer import Checkpoints
 
     checkpoints = Checkpoints(folder, hashlib.sha256(identity.encode()).hexdigest(), resume)
     checkpoints.prepare()

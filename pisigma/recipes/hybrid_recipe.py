@@ -13,7 +13,7 @@ from pisigma.recipes.recipe_checks import Check, where_checks
 from pisigma.robot.description import Robot
 from pisigma.simulation.measure import SimulatedMeasurements
 from pisigma.simulation.true_robot import TrueRobot
-from pisigma.training.fit_sections import Seed
+from pisigma.training.sections import Seed
 from pisigma.yaml_file import Section
 
 Part = TypeVar("Part", bound=Section)

@@ -6,27 +6,14 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
-from pydantic import AfterValidator, Field, NonNegativeFloat
+from pydantic import Field, NonNegativeFloat
 
 from pisigma.errors import RecipeError
 from pisigma.recipes.recipe_checks import check_fit, inverse_checks
 from pisigma.simulation.measure import SimulatedMeasurements
 from pisigma.simulation.true_robot import ErrorSource
-from pisigma.training.fit_sections import FitSection, Seed
+from pisigma.training.sections import FitSection, NetworkSection, Seed
 from pisigma.yaml_file import Section, read_yaml
-
-_Row = tuple[float, float, float]
-
-
-def _check_rotation(rows: tuple[_Row, _Row, _Row]) -> tuple[_Row, _Row, _Row]:
-    R = np.array(rows, dtype=np.float64)
-    if np.abs(R @ R.T - np.eye(3)).max() > 1e-6 or np.linalg.det(R) < 0:
-        raise ValueError("the three rows are no rotation; give an orthonormal, right-handed matrix")
-    return rows
-
-
-Rotation = Annotated[tuple[_Row, _Row, _Row], AfterValidator(_check_rotation)]
 
 
 class SimulatedData(Section):
@@ -57,23 +44,6 @@ class MeasuredData(Section):
     kind: Literal["measured"]
     folds: Annotated[int, Field(ge=2)] = 5
     seed: Seed = 0
-
-
-class NetworkSection(Section):
-    """One group of joints whose corrections see the same inputs. See `pisigma.network.inputs.Inputs`.
-
-    Attributes:
-        joints: names of the joints.
-        inputs: names of the inputs.
-        orders: summing units of every product unit; `[3]` is the paper's network, `[1, 2, 3]` a ridge
-            polynomial.
-        reference: rotation from which roll, pitch and yaw are counted, as three rows.
-    """
-
-    joints: Annotated[tuple[str, ...], Field(min_length=1)]
-    inputs: Annotated[tuple[str, ...], Field(min_length=1)]
-    orders: Annotated[tuple[Annotated[int, Field(ge=1, le=20)], ...], Field(min_length=1, max_length=20)]
-    reference: Rotation = ((1, 0, 0), (0, 1, 0), (0, 0, 1))
 
 
 class SingularRows(Section):

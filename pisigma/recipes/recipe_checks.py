@@ -15,7 +15,7 @@ from pisigma.robot.description import Robot
 from pisigma.simulation.measure import SimulatedMeasurements
 from pisigma.simulation.poses import JointsRandom
 from pisigma.simulation.true_robot import TrueRobot
-from pisigma.training.fit_sections import GradientDescentSection
+from pisigma.training.sections import GradientDescentSection
 from pisigma.yaml_file import line_of
 
 if TYPE_CHECKING:

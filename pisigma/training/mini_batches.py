@@ -3,7 +3,6 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import lightning
@@ -12,14 +11,7 @@ from jaxtyping import Float64
 from torch import Tensor, nn
 
 from pisigma.errors import TrainingError
-from pisigma.training.checkpoint_writer import CheckpointWriter
-from pisigma.training.checkpoints import (
-    FINGERPRINT,
-    discard_checkpoints,
-    find_checkpoint,
-    prepare_checkpoints,
-)
-from pisigma.training.trainer import train
+from pisigma.training.trainer import Checkpoints, train
 
 FINAL_RATE = 0.1
 """The learning rate falls along a cosine to this share of what it begins with."""
@@ -60,33 +52,6 @@ class BatchSchedule:
         return FINAL_RATE + (1 - FINAL_RATE) * (1 + math.cos(math.pi * done)) / 2
 
 
-@dataclass(frozen=True)
-class Checkpoints:
-    """Where checkpoints of a training are kept.
-
-    Attributes:
-        folder: for the checkpoints; it is removed when the training is done.
-        fingerprint: says what settings and data a checkpoint belongs to.
-        resume: go on from the checkpoint there, instead of from the start.
-    """
-
-    folder: Path
-    fingerprint: str
-    resume: bool = False
-
-    def prepare(self) -> None:
-        """Make the folder; or, to resume, look for the checkpoint there.
-
-        Raises:
-            TrainingError: there is no checkpoint of these settings and data to resume.
-            OutputError: the folder cannot be written.
-        """
-        if self.resume:
-            find_checkpoint(self.folder, self.fingerprint)
-        else:
-            prepare_checkpoints(self.folder)
-
-
 def minimise_in_batches(
     cost: BatchCost,
     unknowns: int,
@@ -106,18 +71,10 @@ def minimise_in_batches(
     Raises:
         TrainingError: the training diverged, or the checkpoint to resume is of something else.
     """
-    module = _BatchTraining(
-        cost, unknowns, schedule, progress, checkpoints.fingerprint if checkpoints else ""
-    )
-    callbacks: list[lightning.Callback] = []
-    start = None
+    module = _BatchTraining(cost, unknowns, schedule, progress)
+    train(module, range(schedule.batches), schedule.epochs, checkpoints=checkpoints)
     if checkpoints is not None:
-        callbacks.append(CheckpointWriter(checkpoints.folder, schedule.epochs))
-        if checkpoints.resume:
-            start, _ = find_checkpoint(checkpoints.folder, checkpoints.fingerprint)
-    train(module, range(schedule.batches), schedule.epochs, callbacks, start)
-    if checkpoints is not None:
-        discard_checkpoints(checkpoints.folder)
+        checkpoints.discard()
     return module.average.detach()
 
 
@@ -141,10 +98,9 @@ class _BatchTraining(lightning.LightningModule):
         unknowns: int,
         schedule: BatchSchedule,
         progress: Callable[[str], None],
-        fingerprint: str,
     ) -> None:
         super().__init__()
-        self.cost, self.schedule, self.progress, self.fingerprint = cost, schedule, progress, fingerprint
+        self.cost, self.schedule, self.progress = cost, schedule, progress
         nothing = torch.zeros(unknowns, dtype=torch.float64)
         self.z = nn.Parameter(nothing.clone())
         self.register_buffer("average", nothing.clone())
@@ -186,7 +142,3 @@ class _BatchTraining(lightning.LightningModule):
             f"mini-batches, epoch {self.current_epoch + 1} of {self.schedule.epochs}, residuals {misfit:.3f} times "
             "the noise"
         )
-
-    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Say what the checkpoint belongs to."""
-        checkpoint[FINGERPRINT] = self.fingerprint

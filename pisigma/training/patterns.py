@@ -11,10 +11,10 @@ from pisigma.errors import IdentificationError
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
 from pisigma.network.pi_sigma import PiSigma
-from pisigma.recipes.recipe import NetworkSection
 from pisigma.robot.description import Robot
 from pisigma.training.levenberg_marquardt import Patterns
 from pisigma.training.pairs import TrainingPairs
+from pisigma.training.sections import NetworkSection
 
 TARGET_RANGE = 1.25
 """Products start near 1, so targets are scaled to [0, 1.25]: the start lies among them, and no product has to

@@ -1,62 +1,185 @@
-"""Lightning's trainer as we use it: on the CPU, on one thread, silent, and Ctrl-C arrives."""
+"""Lightning's trainer as pisigma uses it: on the CPU, on one thread, with checkpoints, and silent on stdout."""
 
 import logging
+import os
+import pickle
+import shutil
 import signal
+import sys
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import lightning
 import torch
+from lightning.pytorch.callbacks import ModelCheckpoint, RichProgressBar
+from lightning.pytorch.loggers import CSVLogger, Logger, TensorBoardLogger
+
+from pisigma.errors import OutputError, TrainingError
+
+SAVED = 20
+"""How often a whole training is saved."""
+
+_NAME = "last"
+_FINGERPRINT = "pisigma_fingerprint"
 
 _HARMLESS = (
     "does not have many workers",
-    "will run with no optimizer",
     "isinstance.treespec",
     "Trainer already configured",
+    "Checkpoint directory .* exists and is not empty",
+    "Experiment logs directory .* exists and is not empty",
+    "smaller than the logging interval",
 )
+
+
+@dataclass(frozen=True)
+class Checkpoints:
+    """Where the checkpoints of a training are kept.
+
+    Attributes:
+        folder: for the checkpoints.
+        fingerprint: says what settings and data a checkpoint belongs to.
+        resume: go on from the checkpoint there, instead of from the start.
+    """
+
+    folder: Path
+    fingerprint: str
+    resume: bool = False
+
+    @property
+    def file(self) -> Path:
+        """The last checkpoint."""
+        return self.folder / f"{_NAME}.ckpt"
+
+    def prepare(self) -> None:
+        """Make the folder without an older checkpoint; or, to resume, check the checkpoint there.
+
+        Raises:
+            TrainingError: there is no checkpoint to resume, it is damaged, or it is of other settings or data.
+            OutputError: the folder cannot be written.
+        """
+        if self.resume:
+            self._check()
+            return
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self.file.unlink(missing_ok=True)
+        except OSError as problem:
+            raise OutputError(
+                f"{self.folder}: cannot be written ({problem.strerror}); choose another --out."
+            ) from None
+
+    def discard(self) -> None:
+        """Remove the folder of a training that is done."""
+        shutil.rmtree(self.folder, ignore_errors=True)
+
+    def _check(self) -> None:
+        if not self.file.is_file():
+            raise TrainingError(
+                f"{self.folder}: there is no interrupted training to resume; run without --resume."
+            )
+        try:
+            fingerprint = torch.load(self.file, map_location="cpu", weights_only=True)[_FINGERPRINT]
+        except (OSError, EOFError, RuntimeError, KeyError, TypeError, ValueError, pickle.UnpicklingError):
+            raise TrainingError(
+                f"{self.file}: is no whole checkpoint of pisigma; run without --resume."
+            ) from None
+        if fingerprint != self.fingerprint:
+            raise TrainingError(
+                f"{self.folder}: the interrupted training there is of another recipe or other data; "
+                "run without --resume to start afresh, or choose another --out."
+            )
+
+
+class _Fingerprint(lightning.Callback):
+    """Writes into every checkpoint what settings and data it belongs to."""
+
+    def __init__(self, fingerprint: str) -> None:
+        self._fingerprint = fingerprint
+
+    def on_save_checkpoint(
+        self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, checkpoint: dict[str, Any]
+    ) -> None:
+        checkpoint[_FINGERPRINT] = self._fingerprint
 
 
 def train(
     module: lightning.LightningModule,
     data: Any,
     epochs: int,
-    callbacks: Sequence[lightning.Callback],
-    checkpoint: Path | None,
+    *,
+    checkpoints: Checkpoints | None = None,
+    show_progress: bool = False,
+    logs: Path | None = None,
 ) -> None:
     """Train a module in place.
 
     Args:
         module: to train.
         data: a `LightningDataModule`, or what gives the batches of an epoch.
-        epochs: to train.
-        callbacks: called on the way.
-        checkpoint: to go on from; None starts afresh.
+        epochs: to train at most; about `SAVED` times, and at the end, a checkpoint is written.
+        checkpoints: where they are kept; None keeps none.
+        show_progress: draw Lightning's bar on stderr, if that is a terminal.
+        logs: folder for Lightning's logs: `metrics.csv`, and TensorBoard's events where it is installed.
 
     Raises:
-        KeyboardInterrupt: the user had enough.
+        TrainingError: there is no checkpoint of these settings and data to resume.
+        OutputError: the folder of the checkpoints cannot be written.
+        KeyboardInterrupt: the user pressed Ctrl-C.
     """
+    callbacks: list[lightning.Callback] = []
+    if checkpoints is not None:
+        checkpoints.prepare()
+        callbacks += [_Fingerprint(checkpoints.fingerprint), _saving(checkpoints.folder, epochs)]
+    bar = show_progress and sys.stderr.isatty()
+    if bar:
+        callbacks.append(RichProgressBar(refresh_rate=10, console_kwargs={"stderr": True}))
     with _one_thread(), _quiet(), _keyboard_interrupts():
         trainer = lightning.Trainer(
             max_epochs=epochs,
             accelerator="cpu",
             devices=1,
-            logger=False,
-            callbacks=list(callbacks),
-            enable_checkpointing=False,
-            enable_progress_bar=False,
+            logger=_loggers(logs) or False,
+            log_every_n_steps=1,
+            callbacks=callbacks,
+            enable_checkpointing=checkpoints is not None,
+            enable_progress_bar=bar,
             enable_model_summary=False,
             use_distributed_sampler=False,
         )
+        resumed = checkpoints.file if checkpoints is not None and checkpoints.resume else None
         if isinstance(data, lightning.LightningDataModule):
-            trainer.fit(module, datamodule=data, ckpt_path=checkpoint)
+            trainer.fit(module, datamodule=data, ckpt_path=resumed)
         else:
-            trainer.fit(module, data, ckpt_path=checkpoint)
+            trainer.fit(module, data, ckpt_path=resumed)
         if trainer.interrupted:
             raise KeyboardInterrupt
+
+
+def _saving(folder: Path, epochs: int) -> ModelCheckpoint:
+    """Replaces the last checkpoint at even distances; Lightning renames a whole file into its place."""
+    return ModelCheckpoint(
+        dirpath=folder,
+        filename=_NAME,
+        every_n_epochs=max(1, epochs // SAVED),
+        save_on_train_epoch_end=True,
+        enable_version_counter=False,
+    )
+
+
+def _loggers(folder: Path | None) -> list[Logger]:
+    if folder is None:
+        return []
+    loggers: list[Logger] = [CSVLogger(os.fspath(folder), name="", version="")]
+    if find_spec("tensorboard") or find_spec("tensorboardX"):
+        loggers.append(TensorBoardLogger(os.fspath(folder), name="", version=""))
+    return loggers
 
 
 @contextmanager

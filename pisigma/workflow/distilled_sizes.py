@@ -12,12 +12,11 @@ from pisigma.joint_correction.features import FourierSeries
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.pi_sigma import PiSigma
-from pisigma.recipes.recipe import NetworkSection
 from pisigma.robot.description import Robot
-from pisigma.training.fit_sections import LevenbergMarquardtSection
-from pisigma.training.fitting import fit_networks
+from pisigma.training.networks import fit_networks
 from pisigma.training.pairs import TrainingPairs
 from pisigma.training.patterns import build_network, build_patterns
+from pisigma.training.sections import LevenbergMarquardtSection, NetworkSection
 
 VALIDATION_SHARE = 0.1
 

@@ -19,10 +19,11 @@ from pisigma.model.stored_starts import spread_rows
 from pisigma.recipes.recipe import MeasuredData, Recipe, SimulatedData
 from pisigma.recipes.recipe_data import simulate_held_out, split_sets
 from pisigma.robot.description import Robot
-from pisigma.training.fit_sections import LevenbergMarquardtSection
-from pisigma.training.fitting import TrainingHistory, fit_networks
+from pisigma.training.networks import TrainingHistory, fit_networks
 from pisigma.training.pairs import TrainingPairs, build_pairs
 from pisigma.training.patterns import build_network, build_patterns
+from pisigma.training.sections import LevenbergMarquardtSection
+from pisigma.training.trainer import Checkpoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,10 +109,7 @@ def train_recipe(
         patterns,
         [section.joints for section in recipe.network],
         recipe.fit,
-        title=recipe.name,
-        checkpoints=options.checkpoints,
-        fingerprint=f"{recipe.model_dump_json()}|{measurements.content_hash()}",
-        resume=options.resume,
+        checkpoints=_checkpoints(recipe, measurements, options),
         show_progress=options.show_progress,
     )
     network.requires_grad_(False)
@@ -128,6 +126,13 @@ def train_recipe(
     )
     other = joint_errors(model, held_out) if held_out else None
     return TrainingRun(model, history, pairs, joint_errors(model, pairs), other, measurements)
+
+
+def _checkpoints(recipe: Recipe, measurements: Measurements, options: RunOptions) -> Checkpoints | None:
+    if options.checkpoints is None:
+        return None
+    fingerprint = f"{recipe.model_dump_json()}|{measurements.content_hash()}"
+    return Checkpoints(options.checkpoints, fingerprint, options.resume)
 
 
 def check_one_pose(measurements: Measurements) -> None:

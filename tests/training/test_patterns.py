@@ -7,12 +7,11 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.errors import IdentificationError
-from pisigma.recipes.recipe import NetworkSection
 from pisigma.robot import Robot
-from pisigma.training.fit_sections import GradientDescentSection, LevenbergMarquardtSection
-from pisigma.training.fitting import fit_networks
+from pisigma.training.networks import fit_networks
 from pisigma.training.pairs import TrainingPairs
 from pisigma.training.patterns import TARGET_RANGE, build_network, build_patterns
+from pisigma.training.sections import GradientDescentSection, LevenbergMarquardtSection, NetworkSection
 
 SECTION = NetworkSection(joints=("theta_1", "theta_2"), inputs=("x", "sin(theta_1)"), orders=(2,))
 

@@ -8,25 +8,22 @@ import sys
 import time
 from pathlib import Path
 
-import pytest
 from testing.closeness import assert_close
 
-from pisigma.errors import OutputError, TrainingError
 from pisigma.recipes.recipe import read_recipe
 from pisigma.recipes.recipe_data import load_measurements
-from pisigma.training.checkpoints import find_checkpoint, prepare_checkpoints
 from pisigma.workflow.run import RunOptions, train_recipe
 
 # Slow enough to be caught in the middle: every epoch waits, the last ones for long, which changes no number.
 SLOW = """
 import sys, time
-from pisigma.training.lightning_module import PiSigmaTraining
-step = PiSigmaTraining.training_step
+from pisigma.training.networks import NetworkTraining
+step = NetworkTraining.training_step
 def slow(self, batch, batch_idx):
-    time.sleep(WAIT if self.current_epoch < 40 else 100 * WAIT)
+    time.sleep(WAIT if int(self.epochs_done) < 40 else 100 * WAIT)
     return step(self, batch, batch_idx)
 WAIT = float(sys.argv.pop(1))
-PiSigmaTraining.training_step = slow
+NetworkTraining.training_step = slow
 from pisigma.cli.main import run
 run()
 """
@@ -42,11 +39,6 @@ DEFAULT = (
 
 def command(wait: float, *arguments: str) -> list[str]:
     return [sys.executable, "-c", SLOW, str(wait), *arguments]
-
-
-def train(cwd: Path, recipe: Path, *options: str, wait: float = 0.0) -> subprocess.CompletedProcess[str]:
-    arguments = command(wait, "train", str(recipe), "--out", "model", "--json", *options)
-    return subprocess.run(arguments, cwd=cwd, capture_output=True, text=True, check=False, env=environment())
 
 
 def environment() -> dict[str, str]:
@@ -85,19 +77,23 @@ def kill_after_a_checkpoint(folder: Path, recipe: Path) -> None:
     assert [entry.name for entry in folder.iterdir()] == [".model.training"]
 
 
-def test_killed_and_resumed_gives_the_same_model_folder(write_recipe, tmp_path):
+def test_ctrl_c_leaves_only_the_checkpoints_and_resumes_to_the_same_model_folder(run, write_recipe, tmp_path):
     recipe = write_recipe(*PAPER)
     whole, broken = tmp_path / "whole", tmp_path / "broken"
-    whole.mkdir()
-    done = train(whole, recipe)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout)["model"] == "model"
-    assert [entry.name for entry in whole.iterdir()] == ["model"]  # no lightning_logs, no checkpoints
+    broken.mkdir()
+    process = start_and_wait_for_a_checkpoint(broken, recipe)
+    process.send_signal(signal.SIGINT)
+    output, complaint = process.communicate()
+    assert process.returncode == 130, complaint.decode()
+    assert output == b""
+    assert b"Traceback" not in complaint
+    assert [entry.name for entry in broken.iterdir()] == [".model.training"]
 
-    kill_after_a_checkpoint(broken, recipe)
-    resumed = train(broken, recipe, "--resume")
-    assert resumed.returncode == 0, resumed.stderr
-    assert [entry.name for entry in broken.iterdir()] == ["model"]
+    for folder, options in ((whole, ()), (broken, ("--resume",))):
+        result = run("train", recipe, "--out", folder / "model", "--json", *options)
+        assert result.exit_code == 0, result.output
+        assert json.loads(result.stdout)["model"] == str(folder / "model")
+        assert [entry.name for entry in folder.iterdir()] == ["model"]  # no lightning_logs, no checkpoints
     for name in ("model.safetensors", "energy.csv"):
         assert (broken / "model" / name).read_bytes() == (whole / "model" / name).read_bytes()
 
@@ -113,34 +109,3 @@ def test_killed_and_resumed_levenberg_marquardt_gives_the_same_weights(write_rec
     assert_close(resumed.history.energies, whole.history.energies, atol=0)
     for name, value in whole.model.network.state_dict().items():
         assert_close(resumed.model.network.state_dict()[name], value, atol=0)
-
-
-def test_ctrl_c_leaves_only_the_checkpoints(write_recipe, tmp_path):
-    recipe = write_recipe(*PAPER)
-    folder = tmp_path / "work"
-    folder.mkdir()
-    process = start_and_wait_for_a_checkpoint(folder, recipe)
-    process.send_signal(signal.SIGINT)
-    output, complaint = process.communicate()
-    assert process.returncode == 130, complaint.decode()
-    assert output == b""
-    assert b"Traceback" not in complaint
-    assert [entry.name for entry in folder.iterdir()] == [".model.training"]
-
-
-def test_resuming_nothing_or_something_else_is_refused(tmp_path):
-    with pytest.raises(TrainingError, match="no interrupted training to resume; run without --resume"):
-        find_checkpoint(tmp_path, "a")
-    (tmp_path / "last.ckpt").write_bytes(b"no checkpoint")
-    with pytest.raises(TrainingError, match="no whole checkpoint"):
-        find_checkpoint(tmp_path, "a")
-
-
-def test_a_folder_that_cannot_be_made_is_refused_and_old_checkpoints_go(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot be written"):
-        prepare_checkpoints(tmp_path / "file" / "checkpoints")
-    (tmp_path / "last.ckpt").write_text("")
-    (tmp_path / "mine.txt").write_text("")
-    prepare_checkpoints(tmp_path)
-    assert [entry.name for entry in sorted(tmp_path.iterdir())] == ["file", "mine.txt"]

@@ -1,5 +1,6 @@
 """Training with Lightning: seeds, independent outputs, divergence, resuming at the end, silence."""
 
+import csv
 import dataclasses
 
 import pytest
@@ -9,18 +10,20 @@ from testing.closeness import assert_close
 from pisigma.errors import TrainingError
 from pisigma.network.energy import energy_gradient
 from pisigma.network.pi_sigma import PiSigma
-from pisigma.training.fit_sections import GradientDescentSection, LevenbergMarquardtSection
-from pisigma.training.fitting import fit_networks
-from pisigma.training.gradient_descent import GradientDescent, set_gradient
 from pisigma.training.levenberg_marquardt import Patterns
-from pisigma.training.lightning_module import PiSigmaTraining
+from pisigma.training.networks import GradientDescent, NetworkTraining, SolverSteps, fit_networks
+from pisigma.training.sections import GradientDescentSection, LevenbergMarquardtSection, MiniBatchSection
+from pisigma.training.trainer import Checkpoints
 
 NAMES = ["a", "b"]
 DESCENT = GradientDescentSection(
-    method="gradient_descent", learning_rate={"a": 0.02, "b": 0.01}, epochs=40, spread=0.2
+    method="gradient_descent", learning_rate={"a": 0.02, "b": 0.01}, epochs=50, spread=0.2
 )
 SQUARES = LevenbergMarquardtSection(method="levenberg_marquardt", epochs=12, starts=2)
-BOTH = pytest.mark.parametrize("fit", [DESCENT, SQUARES], ids=["gradient_descent", "levenberg_marquardt"])
+BATCHES = MiniBatchSection(method="mini_batches", batch_rows=8, epochs=10, learning_rate=0.05)
+METHODS = [DESCENT, SQUARES, BATCHES]
+ALL = pytest.mark.parametrize("fit", METHODS, ids=[fit.method for fit in METHODS])
+BOTH = pytest.mark.parametrize("fit", METHODS[:2], ids=[fit.method for fit in METHODS[:2]])
 
 
 @pytest.fixture
@@ -36,7 +39,7 @@ def fit_one(data: Patterns, fit, **options) -> tuple[PiSigma, torch.Tensor]:
     return network, history.energies
 
 
-@BOTH
+@ALL
 def test_a_seed_repeats_exactly_and_another_differs(data, fit):
     first, energies = fit_one(data, fit)
     second, again = fit_one(data, fit)
@@ -67,7 +70,7 @@ def test_gradient_descent_is_the_papers_rule(data):
     network = PiSigma(2, 2, (2,), fixed_product=0.5)
     network.initialise(0.2, torch.Generator().manual_seed(0))
     energies = []
-    for _ in range(40):
+    for _ in range(50):
         E, by_weight, by_bias = energy_gradient(network, data.x, data.d)
         energies.append(E)
         with torch.no_grad():
@@ -85,20 +88,18 @@ def test_gradient_descent_is_the_papers_rule(data):
 def test_no_optimiser_sees_the_fixed_weights_and_they_stay(data, fit):
     network, _ = fit_one(data, fit)
     assert_close(network.fixed, torch.full((2, 2), 0.5**0.5, dtype=torch.float64), atol=0)
-    module = PiSigmaTraining([network], fit, [NAMES])
+    module = NetworkTraining([network], fit, [NAMES])
     assert {name for name, _ in module.named_parameters()} == {"networks.0.weight", "networks.0.bias"}
     optimiser = module.configure_optimizers()
-    if fit is SQUARES:
-        assert optimiser is None
-    else:
-        seen = [p.data_ptr() for group in optimiser.param_groups for p in group["params"]]
-        assert seen == [network.weight.data_ptr(), network.bias.data_ptr()]
+    assert isinstance(optimiser, SolverSteps if fit is SQUARES else GradientDescent)
+    parameters = [p.data_ptr() for group in optimiser.param_groups for p in group["params"]]
+    assert parameters == [network.weight.data_ptr(), network.bias.data_ptr()]
 
 
 def test_an_optimiser_step_follows_the_rates(data):
     network = PiSigma(2, 2, (1,))
     before = network.bias.detach().clone()
-    set_gradient(network, data.x, data.d)
+    _, network.weight.grad, network.bias.grad = energy_gradient(network, data.x, data.d)
     GradientDescent([network], [torch.tensor([0.0, 2.0], dtype=torch.float64)]).step()
     assert_close(network.bias[0], before[0], atol=0)
     assert_close(network.bias[1], before[1] - 2 * network.bias.grad[1], rtol=1e-15)
@@ -118,7 +119,7 @@ def test_a_last_step_that_diverges_is_told_too(data):
         fit_one(scaled, fit)
 
 
-@BOTH
+@ALL
 @pytest.mark.parametrize("part", ["x", "d"])
 def test_patterns_that_are_not_finite_are_refused(data, fit, part):
     values = getattr(data, part).clone()
@@ -127,25 +128,25 @@ def test_patterns_that_are_not_finite_are_refused(data, fit, part):
         fit_one(dataclasses.replace(data, **{part: values}), fit)
 
 
-@BOTH
+@ALL
 def test_resuming_a_training_that_had_ended_gives_the_same(data, fit, tmp_path):
     fit = fit.model_copy(update={"epochs": 20})
-    first, energies = fit_one(data, fit, checkpoints=tmp_path, fingerprint="f")
-    second, again = fit_one(data, fit, checkpoints=tmp_path, fingerprint="f", resume=True)
+    first, energies = fit_one(data, fit, checkpoints=Checkpoints(tmp_path, "f"))
+    second, again = fit_one(data, fit, checkpoints=Checkpoints(tmp_path, "f", resume=True))
     assert_close(again, energies, atol=0)
     assert_close(second.weight, first.weight, atol=0)
     assert_close(second.bias, first.bias, atol=0)
     with pytest.raises(TrainingError, match=r"of another recipe or other data"):
-        fit_one(data, fit, checkpoints=tmp_path, fingerprint="g", resume=True)
+        fit_one(data, fit, checkpoints=Checkpoints(tmp_path, "g", resume=True))
 
 
-def test_nothing_goes_to_stdout_or_to_the_working_folder(data, tmp_path, monkeypatch, capfd):
+def test_nothing_is_printed_without_a_terminal_or_written_to_the_working_folder(
+    data, tmp_path, monkeypatch, capfd
+):
     monkeypatch.chdir(tmp_path)
-    fit_one(data, DESCENT, show_progress=True, title="bar")
+    fit_one(data, DESCENT, show_progress=True)
     captured = capfd.readouterr()
-    assert captured.out == ""
-    assert "bar" in captured.err
-    assert "Lightning" not in captured.err
+    assert (captured.out, captured.err) == ("", "")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -157,3 +158,54 @@ def test_threads_are_given_back(data):
         assert torch.get_num_threads() == 2
     finally:
         torch.set_num_threads(before)
+
+
+def interrupt_after(epochs: int, monkeypatch) -> None:
+    """Press Ctrl-C, in effect, when so many epochs are done."""
+    step = NetworkTraining.training_step
+
+    def interrupting(self, batch, batch_idx):
+        if int(self.epochs_done) == epochs:
+            raise KeyboardInterrupt
+        return step(self, batch, batch_idx)
+
+    monkeypatch.setattr(NetworkTraining, "training_step", interrupting)
+
+
+@ALL
+def test_an_interrupted_training_resumes_to_the_same(data, fit, tmp_path, monkeypatch):
+    whole, energies = fit_one(data, fit)
+    checkpoints = Checkpoints(tmp_path, "f")
+    with monkeypatch.context() as patch:
+        interrupt_after(6, patch)
+        with pytest.raises(KeyboardInterrupt):
+            fit_one(data, fit, checkpoints=checkpoints)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["last.ckpt"]
+    network = PiSigma(2, 2, (2,), fixed_product=0.5)
+    checkpoints = dataclasses.replace(checkpoints, resume=True)
+    history = fit_networks([network], [data], [NAMES], fit, checkpoints=checkpoints)
+    assert 0 < history.resumed_from <= 6
+    assert_close(history.energies, energies, atol=0)
+    assert_close(network.weight, whole.weight, atol=0)
+    assert_close(network.bias, whole.bias, atol=0)
+
+
+@pytest.mark.parametrize("optimiser", ["adam", "adamw", "sgd"])
+def test_mini_batches_come_near_the_least_squares(generator, optimiser):
+    x = 2 * torch.rand(400, 2, generator=generator, dtype=torch.float64) - 1
+    d = 0.05 * (1 + 0.4 * x[:, :1]) * torch.stack([1 + 0.3 * x[:, 1], 1 - 0.2 * x[:, 1]], 1)
+    exact = Patterns(x, d, torch.zeros(400, dtype=torch.bool))
+    rate = 0.5 if optimiser == "sgd" else 0.05
+    fit = MiniBatchSection(
+        method="mini_batches", batch_rows=50, epochs=80, learning_rate=rate, optimiser=optimiser
+    )
+    network = PiSigma(2, 2, (2,), fixed_product=0.05)
+    energies = fit_networks([network], [exact], [NAMES], fit).energies
+    assert energies.shape == (80, 2)
+    assert float((energies[-1] / energies[0]).max()) < 1e-3
+
+
+def test_logs_are_lightnings_and_hold_every_epoch(data, tmp_path):
+    _, energies = fit_one(data, BATCHES, logs=tmp_path)
+    rows = list(csv.DictReader((tmp_path / "metrics.csv").read_text().splitlines()))
+    assert_close([float(row["energy_b"]) for row in rows], energies[:, 1], rtol=1e-6)
