@@ -24,7 +24,8 @@ from scipy.optimize import least_squares
 from pisigma.hybrid.arms import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
 from pisigma.inverse.torch_ik import TorchIK
-from pisigma.joint_correction.features import FourierSeries, GravityTorques
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel

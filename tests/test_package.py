@@ -31,6 +31,7 @@ LAYERS = (
     "measurement",
     "simulation",
     "network",
+    "onnx",
     "joint_correction",
     "training",
     "sensors",

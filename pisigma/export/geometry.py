@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 from pisigma import __version__
-from pisigma.joint_correction.features import ConditionFeatures
+from pisigma.joint_correction.conditions import learned_conditions
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
 
@@ -50,13 +50,8 @@ def frame_remarks(model: CalibratedModel) -> tuple[str, ...]:
 
 def condition_remarks(model: CalibratedModel) -> tuple[str, ...]:
     """A sentence on the payload and temperature that joint values are for, where the model learned what these do."""
-    own = () if model.hybrid is None else model.hybrid.correction.features
-    usual = {
-        name: mean
-        for chosen in own
-        if isinstance(chosen, ConditionFeatures)
-        for name, mean in zip(chosen.names, chosen.mean, strict=True)
-    }
+    learned = None if model.hybrid is None else learned_conditions(model.hybrid.correction)
+    usual = {} if learned is None else dict(zip(learned.names, learned.mean, strict=True))
     given = [f"{name} {value:g}" for name, value in model.conditions.items()]
     given += [f"{name} {mean:.4g} (usual)" for name, mean in usual.items()]
     return (f"Made for {' and '.join(given)}.",) if given else ()

@@ -4,13 +4,13 @@ import json
 from typing import Any
 
 from pisigma.errors import ModelError
-from pisigma.export.onnx_graph import OnnxGraph, import_onnx
 from pisigma.export.onnx_joint_correction import add_joint_correction, add_share
 from pisigma.export.onnx_network import add_network, needs_pose
 from pisigma.hybrid.arms import HybridArm
-from pisigma.joint_correction.features import ConditionFeatures
+from pisigma.joint_correction.conditions import learned_conditions
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.network.correction_network import CorrectionNetwork
+from pisigma.onnx.graph import OnnxGraph, import_onnx
 
 FORWARD = "forward_joint_correction"
 INVERSE = "inverse_joint_correction"
@@ -119,10 +119,10 @@ def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, s
         "branches": list(model.branches),
         "domain": _domain(model),
     }
-    if model.network is None and model.hybrid is not None:
-        for features in model.hybrid.correction.features:
-            if isinstance(features, ConditionFeatures):
-                values["usual_conditions"] = dict(zip(features.names, features.mean, strict=True))
+    arm = model.hybrid if model.network is None else None
+    learned = None if arm is None else learned_conditions(arm.correction)
+    if learned is not None:
+        values["usual_conditions"] = dict(zip(learned.names, learned.mean, strict=True))
     return {key: value if isinstance(value, str) else json.dumps(value) for key, value in values.items()}
 
 

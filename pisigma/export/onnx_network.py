@@ -4,10 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pisigma.export.onnx_graph import OnnxGraph
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import POSE_INPUTS
 from pisigma.network.pi_sigma import PiSigma
+from pisigma.onnx.chain import add_roll_pitch_yaw
+from pisigma.onnx.graph import OnnxGraph
 
 
 def needs_pose(network: CorrectionNetwork) -> bool:
@@ -31,20 +32,6 @@ def add_network(graph: OnnxGraph, network: CorrectionNetwork, q: str, T: str | N
         joints += group.joints
     every = outputs[0] if len(outputs) == 1 else graph.node("Concat", *outputs, axis=1)
     return graph.node("MatMul", every, np.eye(network.dof)[joints])
-
-
-def add_roll_pitch_yaw(graph: OnnxGraph, cells: str) -> list[str]:
-    """Roll, pitch, yaw of rotations `(batch, 9)`, each `(batch, 1)`; see `pisigma.se3.rpy_from_rotation`."""
-    node = graph.node
-    entry = {(i, j): graph.column(cells, 3 * i + j) for i in range(3) for j in range(3)}
-    square = node("Add", *(node("Mul", entry[i, 0], entry[i, 0]) for i in range(2)))
-    regular = node("Greater", square, 1e-24)
-    horizontal = node("Where", regular, node("Sqrt", square), 0.0)
-    pitch = graph.angle(node("Neg", entry[2, 0]), horizontal)
-    sine = node("Where", regular, entry[1, 0], node("Neg", entry[0, 1]))
-    roll = graph.angle(sine, node("Where", regular, entry[0, 0], entry[1, 1]))
-    yaw = graph.angle(node("Where", regular, entry[2, 1], 0.0), node("Where", regular, entry[2, 2], 1.0))
-    return [roll, pitch, yaw]
 
 
 def _add_group(graph: OnnxGraph, group: JointGroup, net: PiSigma, q: str, T: str | None) -> str:

@@ -15,7 +15,7 @@ from pisigma.hybrid.product_search import best_products
 from pisigma.hybrid.refinement import refine, with_held_factors
 from pisigma.hybrid.result import HybridResult, LearnedPart
 from pisigma.hybrid.rows import Rows
-from pisigma.hybrid.search import LARGEST_EFFECTIVE_SHARE, Additive, Search, described
+from pisigma.hybrid.search import LARGEST_EFFECTIVE_SHARE, Additive, Search
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
@@ -24,20 +24,13 @@ from pisigma.identification.problem.noise import view_of
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.user_coordinates import identified_geometry
 from pisigma.identification.result_assembly import SolvedCalibration
-from pisigma.joint_correction.features import (
-    AbstractFeatures,
-    ConditionFeatures,
-    FourierSeries,
-    GravityTorques,
-    SharedFeatures,
-)
+from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions
+from pisigma.joint_correction.registry import FEATURES, feature_named
 from pisigma.measurement.conditions import stated_conditions
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.robot.description import Robot
 
-FEATURES = ("series", "gravity", "conditions", *SharedFeatures.CHOICES)
-"""Features that may be chosen."""
 SEARCHED_ROWS = 4_000
 """Features and product units are chosen on so many rows at most; everything is fitted to all in the end."""
 
@@ -52,7 +45,7 @@ class HybridCalibrator:
 
     Attributes:
         geometric: the geometric calibrator, whose robot, sensors, priors and loss are used.
-        features: of the unit of order 1 that are tried, of `FEATURES`.
+        features: of the unit of order 1 that are tried, by the names of `joint_correction.registry.FEATURES`.
         harmonics: of the Fourier series, tried in this order.
         orders: numbers of factors of product units, tried in this order; none for an additive correction.
         gravity: direction in which things fall, in the frame of the robot's first row.
@@ -61,7 +54,7 @@ class HybridCalibrator:
     """
 
     geometric: GeometricCalibrator
-    features: tuple[str, ...] = ("gravity", "conditions", "series")
+    features: tuple[str, ...] = ("gravity", "conditions", "backlash", "series")
     harmonics: tuple[int, ...] = (8, 24, 56, 110)
     orders: tuple[tuple[int, ...], ...] = ((2,), (2, 2), (2, 2, 2, 2))
     gravity: tuple[float, float, float] = (0.0, 0.0, -1.0)
@@ -191,7 +184,7 @@ class HybridCalibrator:
             effective=refined.effective,
             rounds=refined.rounds,
         )
-        names = [described(chosen) for chosen in features]
+        names = [feature.label for feature in features]
         names += [f"product units of orders {orders}"] if orders else []
         share = [trial.left_out for trial in trials if trial.kept][-1]
         verdict = (
@@ -230,34 +223,37 @@ class HybridCalibrator:
             (here.point - problem.nominal)[problem.active],
             groups_of_equal_joints(problem.q),
         )
-        series, others = self._features(solved, rows.configurations)
-        largest = [*others, *series[-1:]]
+        growing, others = self._features(solved, rows)
+        largest = [*others, *growing[-1:]]
         search = Search(rows, view.noise, view.prior_scale, largest, progress)
-        additive = search.best_additive(series, others)
+        additive = search.best_additive(growing, others)
         additive, orders = best_products(search, additive, self.orders)
         return search, additive, orders
 
     def _features(
-        self, solved: SolvedCalibration, configurations: int
-    ) -> tuple[list[FourierSeries], list[AbstractFeatures]]:
-        """Series of ever more harmonics, not many more than there are joint values; and the other features."""
-        robot = self.geometric.robot
-        series: list[FourierSeries] = []
-        others: list[AbstractFeatures] = []
+        self, solved: SolvedCalibration, rows: Rows
+    ) -> tuple[list[AbstractFeature], list[AbstractFeature]]:
+        """What is tried: ever larger features of one name, and one feature each of the other names.
+
+        Raises:
+            IdentificationError: two features would be tried in several sizes.
+        """
+        varying = stated_conditions(solved.setup.measurements)
+        options = FeatureOptions(self.harmonics, self.gravity, rows.configurations, varying)
+        growing: list[AbstractFeature] = []
+        others: list[AbstractFeature] = []
         for name in self.features:
-            if name == "series":
-                most = max(2 * configurations, min(self.harmonics))
-                series = [FourierSeries(robot, k) for k in self.harmonics if k <= most]
-            elif name == "gravity":
-                others.append(GravityTorques(robot, self.gravity))
-            elif name == "conditions":
-                values, names = solved.problem.conditions, stated_conditions(solved.setup.measurements)
-                if values is not None:
-                    mean, spread = values.mean(0).tolist(), values.std(0).tolist()
-                    others.append(ConditionFeatures(robot, names, mean, spread, self.gravity))
+            tried = feature_named(name).candidates(self.geometric.robot, options, solved.problem.state)
+            if not any(feature.size for feature in tried):
+                others += tried
+            elif growing:
+                raise IdentificationError(
+                    f"features: '{growing[0].name}' and '{name}' both come in several sizes, but one such feature can "
+                    "be tried at a time; leave one out."
+                )
             else:
-                others.append(SharedFeatures(robot, name))
-        return series, others
+                growing += tried
+        return growing, others
 
 
 def _geometric_alone(solved: SolvedCalibration, search: Search, verdict: str) -> HybridResult:

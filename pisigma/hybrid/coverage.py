@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
-from pisigma.joint_correction.features import turning_rate
+from pisigma.joint_correction.feature import turning_rate
 from pisigma.robot.description import Robot
 
 LARGEST_GAP = math.radians(60)

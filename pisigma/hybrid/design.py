@@ -10,7 +10,7 @@ from torch import Tensor
 from pisigma.hybrid.evidence import FIRST_SIZE, GaussianPrior, Sums
 from pisigma.hybrid.sensor_values import SensorValues
 from pisigma.identification.problem.problem import CalibrationProblem
-from pisigma.joint_correction.features import AbstractFeatures
+from pisigma.joint_correction.feature import AbstractFeature
 
 CHUNK = 1_024
 """Rows whose columns are in memory at a time."""
@@ -26,7 +26,7 @@ class Design:
     """
 
     problem: CalibrationProblem
-    features: tuple[AbstractFeatures, ...]
+    features: tuple[AbstractFeature, ...]
 
     @property
     def active(self) -> int:
@@ -89,21 +89,18 @@ class Design:
         counts = [len(chosen.group_names) for chosen in self.features]
         return [classes + sum(counts[:k]) for k in range(len(counts))]
 
-    def places(self, features: Sequence[AbstractFeatures]) -> Int64[Tensor, " chosen"]:
+    def places(self, features: Sequence[AbstractFeature]) -> Int64[Tensor, " chosen"]:
         """Where the unknowns stand that a design with some of the features has.
 
-        A Fourier series with fewer harmonics than the one here counts as a part of it.
+        A smaller feature than the one of its name here, such as a series of fewer harmonics, counts as a part of it.
         """
         chosen = [torch.arange(self.active)]
         for wanted in features:
             number = next(k for k, own in enumerate(self.features) if own.name == wanted.name)
             own, start = self.features[number], self.stretch(number).start
             place = torch.cumsum(own.used.flatten(), 0).view(own.used.shape) - 1 + start
-            if wanted.count == own.count:
-                chosen.append(place[own.used])
-            else:  # sines first, then cosines
-                half, whole = wanted.count // 2, own.count // 2
-                chosen.append(torch.cat([place[:, :half], place[:, whole : whole + half]], 1).flatten())
+            columns = wanted.places_in(own)
+            chosen.append(place.gather(1, columns)[own.used.gather(1, columns)])
         return torch.cat(chosen)
 
 

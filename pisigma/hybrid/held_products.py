@@ -6,7 +6,8 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from pisigma.joint_correction.features import AbstractFeatures, unit_inputs
+from pisigma.joint_correction.feature import AbstractFeature, unit_inputs
+from pisigma.measurement.conditions import JointState
 from pisigma.network.pi_sigma import sum_of_products
 from pisigma.robot.description import Robot
 
@@ -14,7 +15,7 @@ Factors = Float64[Tensor, "dof factors inputs"]
 """Weights of every factor of every joint's product units, the bias first."""
 
 
-class HeldProducts(AbstractFeatures):
+class HeldProducts(AbstractFeature):
     """Columns `Π_{others} h · [1, φ]` of the free factor of every unit: asynchronous learning, solved exactly.
 
     Attributes:
@@ -30,21 +31,21 @@ class HeldProducts(AbstractFeatures):
         self, robot: Robot, orders: Sequence[int], factors: Float64[Tensor, "dof factors inputs"], turn: int
     ) -> None:
         """Hold all factors but those whose turn it is: factor `turn` modulo its unit's order."""
+        super().__init__(robot)
         self.orders = tuple(orders)
         self.factors = factors
         self.turn = turn
         starts = [sum(orders[:u]) for u in range(len(orders))]
         self.free = tuple(start + turn % order for start, order in zip(starts, orders, strict=True))
-        self._robot = robot
         dof, inputs = factors.shape[0], factors.shape[2]
         self.used = torch.ones(dof, len(orders) * inputs, dtype=torch.bool)
         self.group = torch.arange(dof)[:, None].expand(self.used.shape)
         self.group_names = tuple(f"products, {joint.name}" for joint in robot.joints)
 
-    def columns(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof columns"]:
+    def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """The inputs of the free factors times what the held ones come to."""
-        x = with_bias(self._robot, q)
-        held = torch.einsum("...i,jsi->...js", x, self.factors.to(q))
+        x = with_bias(self.robot, state.q)
+        held = torch.einsum("...i,jsi->...js", x, self.factors.to(x))
         parts = []
         start = 0
         for order, free in zip(self.orders, self.free, strict=True):
@@ -64,13 +65,14 @@ class HeldProducts(AbstractFeatures):
         return found
 
 
-class InputPairs(AbstractFeatures):
+class InputPairs(AbstractFeature):
     """Products of two inputs of different joints: from their weights the product units start."""
 
     name = "pairs"
 
     def __init__(self, robot: Robot) -> None:
         """All pairs of inputs that do not belong to the same joint."""
+        super().__init__(robot)
         turning = [j for j, turns in enumerate(robot.revolute) if turns]
         sliding = [j for j, turns in enumerate(robot.revolute) if not turns]
         joint = [*turning, *turning, *sliding]
@@ -78,15 +80,14 @@ class InputPairs(AbstractFeatures):
             (a, b) for a in range(len(joint)) for b in range(a + 1, len(joint)) if joint[a] != joint[b]
         )
         self.inputs = len(joint)
-        self._robot = robot
         self.used = torch.ones(robot.dof, len(self.pairs), dtype=torch.bool)
         self.group = torch.arange(robot.dof)[:, None].expand(self.used.shape)
         self.group_names = tuple(f"pairs, {row.name}" for row in robot.joints)
 
-    def columns(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof columns"]:
+    def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """The products."""
-        phi = unit_inputs(self._robot, q)
-        first, second = (torch.tensor(side, device=q.device) for side in zip(*self.pairs, strict=True))
+        phi = unit_inputs(self.robot, state.q)
+        first, second = (torch.tensor(side, device=phi.device) for side in zip(*self.pairs, strict=True))
         values = phi.index_select(-1, first) * phi.index_select(-1, second)
         return values.unsqueeze(-2).expand(*values.shape[:-1], len(self.used), values.shape[-1])
 
@@ -117,7 +118,7 @@ class InputPairs(AbstractFeatures):
         return found
 
 
-def with_bias(robot: Robot, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch inputs"]:
+def with_bias(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch inputs"]:
     """1, and the inputs of the product units."""
     phi = unit_inputs(robot, q)
     return torch.cat([torch.ones_like(phi[..., :1]), phi], -1)

@@ -71,10 +71,10 @@ def best_products(
     fewer = [
         other
         for other in search.fitted
-        if 0 < other.harmonics < additive.harmonics
+        if 0 < other.size < additive.size
         and {c.name for c in other.design.features} == {c.name for c in additive.design.features}
     ]
-    for other in sorted(fewer, key=lambda one: -one.harmonics):
+    for other in sorted(fewer, key=lambda one: -one.size):
         square, better = _judged(search, other, _folds(search, other), best, least / BETTER**2, (last, first))
         if not better:
             break

@@ -11,7 +11,7 @@ from pisigma.hybrid.design import Design, weighted_columns
 from pisigma.hybrid.evidence import GaussianPrior, Posterior, Sums, maximise_evidence
 from pisigma.hybrid.held_products import HeldProducts, InputPairs, normalised
 from pisigma.hybrid.sensor_values import SensorValues
-from pisigma.joint_correction.features import AbstractFeatures
+from pisigma.joint_correction.feature import AbstractFeature
 
 ROUNDS = 12
 """Alternations; every factor of a unit of order 2 is solved six times."""
@@ -130,7 +130,7 @@ class ProductFit:
         self._square = max(square - float(self._seen.square().sum()), 0.0)
 
     def _reduced(
-        self, features: AbstractFeatures, prior: GaussianPrior | None, iterations: int
+        self, features: AbstractFeature, prior: GaussianPrior | None, iterations: int
     ) -> tuple[Float64[Tensor, " weights"], GaussianPrior, Float64[Tensor, "unknowns weights"]]:
         """Weights of one more choice of features, their prior, and their columns' part in those taken out."""
         size = int(features.used.sum())
@@ -164,7 +164,7 @@ class ProductFit:
         return Posterior(x, x.new_zeros((0, 0)), float("nan"), joined, self._noise, 0)
 
     def _whole(
-        self, features: AbstractFeatures, prior: GaussianPrior | None, iterations: int
+        self, features: AbstractFeature, prior: GaussianPrior | None, iterations: int
     ) -> FittedProducts:
         """Solve for everything, with noise and all prior sizes."""
         design = self._with(features)
@@ -190,10 +190,10 @@ class ProductFit:
         chosen = prior.select(kept)
         return replace(chosen, sizes=chosen.sizes[: len(self._prior.sizes)])
 
-    def _with(self, features: AbstractFeatures) -> Design:
+    def _with(self, features: AbstractFeature) -> Design:
         return replace(self.design, features=(*self.design.features, features))
 
-    def _columns(self, features: AbstractFeatures, sensor: int) -> Float64[Tensor, "values weights"]:
+    def _columns(self, features: AbstractFeature, sensor: int) -> Float64[Tensor, "values weights"]:
         """Weighted columns of one more choice of features."""
         values = self.values[sensor]
         columns = values.feature_columns(features, self.design.problem.state, slice(None))
@@ -203,7 +203,7 @@ class ProductFit:
         solved: Tensor = torch.linalg.solve_triangular(self._root, right, upper=False)
         return solved
 
-    def _extended(self, features: AbstractFeatures) -> Sums:
+    def _extended(self, features: AbstractFeature) -> Sums:
         """Normal equations with the columns of more features behind the others."""
         old = self.design.unknowns
         parts, descents = [], []

@@ -8,7 +8,7 @@ from pisigma.hybrid.design import Design, sum_up
 from pisigma.hybrid.evidence import Posterior, Sums, effective_share, maximise_evidence
 from pisigma.hybrid.left_out import left_out
 from pisigma.hybrid.rows import Rows
-from pisigma.joint_correction.features import AbstractFeatures, FourierSeries
+from pisigma.joint_correction.feature import AbstractFeature
 
 LEVEL = 1.03
 """Features that the evidence is for are kept unless the left-out RMS rises above so many times what it was."""
@@ -19,7 +19,7 @@ LARGEST_EFFECTIVE_SHARE = 0.75
 ROUGHLY = 0.1
 """While features are chosen, a log evidence that rises by less has settled."""
 FAILURES = 3
-"""Series that do not help before no more harmonics are tried."""
+"""Sizes that do not help before no larger ones are tried."""
 
 Progress = Callable[[str], None]
 
@@ -62,12 +62,12 @@ class Additive:
     @property
     def name(self) -> str:
         """What it has, in a table."""
-        return " + ".join(described(chosen) for chosen in self.design.features) or "geometry"
+        return " + ".join(chosen.label for chosen in self.design.features) or "geometry"
 
     @property
-    def harmonics(self) -> int:
-        """Of its Fourier series; 0 without one."""
-        return sum(c.harmonics for c in self.design.features if isinstance(c, FourierSeries))
+    def size(self) -> int:
+        """Of its feature that was tried in several sizes, such as its number of harmonics; 0 without one."""
+        return sum(feature.size for feature in self.design.features)
 
 
 class Search:
@@ -78,7 +78,7 @@ class Search:
         rows: Rows,
         noise: tuple[float, ...],
         prior_scale: Sequence[float],
-        largest: Sequence[AbstractFeatures],
+        largest: Sequence[AbstractFeature],
         progress: Progress,
     ) -> None:
         """Sum up the normal equations of the largest unit of order 1.
@@ -87,7 +87,7 @@ class Search:
             rows: to fit to.
             noise: of the geometric calibration, per sensor.
             prior_scale: prior sizes of the geometric calibration.
-            largest: all features that may be tried, series with all its harmonics.
+            largest: all features that may be tried, those that are tried in several sizes in the largest.
             progress: called with what is being tried.
         """
         self.rows, self.noise, self.prior_scale = rows, noise, prior_scale
@@ -99,7 +99,7 @@ class Search:
         self.fitted: list[Additive] = []
         self.geometry = self.additive(())
 
-    def additive(self, features: Sequence[AbstractFeatures], near: Additive | None = None) -> Additive:
+    def additive(self, features: Sequence[AbstractFeature], near: Additive | None = None) -> Additive:
         """Fit geometry and a unit of order 1, from the noise of another fit."""
         places = self._largest.places(features)
         design = Design(self.rows.problem, tuple(features))
@@ -137,37 +137,39 @@ class Search:
             )
         )
 
-    def best_additive(self, series: Sequence[FourierSeries], others: Sequence[AbstractFeatures]) -> Additive:
-        """Geometry alone, then other features, then ever more harmonics, as long as it gets better."""
+    def best_additive(
+        self, growing: Sequence[AbstractFeature], others: Sequence[AbstractFeature]
+    ) -> Additive:
+        """Geometry alone, then other features, then ever larger ones, as long as it gets better."""
         began = time.monotonic()
         best = self.geometry
         rms = self.left_out_rms(best.design, best.posterior)
         self.note("geometry", best.design, best.posterior, rms, began, True)
-        without: list[AbstractFeatures] = []
+        without: list[AbstractFeature] = []
         for chosen in others:
             best, rms, better = self._tried([*without, chosen], best, rms)
             if better:
                 without.append(chosen)
-        with_series: list[AbstractFeatures] = list(without)
+        with_growing: list[AbstractFeature] = list(without)
         failures = 0
-        for chosen in series:
+        for chosen in growing:
             best, rms, better = self._tried([*without, chosen], best, rms)
             failures = 0 if better else failures + 1
             if better:
-                with_series = [*without, chosen]
+                with_growing = [*without, chosen]
             elif failures == FAILURES:
                 break
         for chosen in others:
-            if chosen not in with_series and len(with_series) > len(without):
-                best, rms, better = self._tried([chosen, *with_series], best, rms)
-                with_series = [chosen, *with_series] if better else with_series
+            if chosen not in with_growing and len(with_growing) > len(without):
+                best, rms, better = self._tried([chosen, *with_growing], best, rms)
+                with_growing = [chosen, *with_growing] if better else with_growing
         return best
 
     def _tried(
-        self, features: Sequence[AbstractFeatures], best: Additive, rms: float
+        self, features: Sequence[AbstractFeature], best: Additive, rms: float
     ) -> tuple[Additive, float, bool]:
         """The better of a new unit of order 1 and the best so far, by evidence and by left-out rows."""
-        self.progress(" + ".join(described(chosen) for chosen in features))
+        self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()
         found = self.additive(features, best)
         own = self.left_out_rms(found.design, found.posterior)
@@ -179,10 +181,3 @@ class Search:
         )
         self.note(found.name, found.design, found.posterior, own, began, better)
         return (found, own, True) if better else (best, rms, False)
-
-
-def described(features: AbstractFeatures) -> str:
-    """A choice of features in a table."""
-    if isinstance(features, FourierSeries):
-        return f"series {features.harmonics}"
-    return features.name

@@ -10,10 +10,11 @@ from torch import Tensor
 from pisigma.identification.problem.noise import renumbered
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.problem.problem import CalibrationProblem
-from pisigma.joint_correction.features import AbstractFeatures
+from pisigma.joint_correction.feature import AbstractFeature
+from pisigma.measurement.conditions import JointState
 
-Shift = Callable[[Tensor], Tensor]
-"""Joint corrections [rad or m] as a function of joint values and, behind them, conditions."""
+Shift = Callable[[JointState], Tensor]
+"""Joint corrections [rad or m] as a function of joint values and what is stated beside them."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,13 +46,13 @@ class SensorValues:
     other_joints: Float64[Tensor, "seen components dof"] | None = None
 
     def feature_columns(
-        self, chosen: AbstractFeatures, state: Float64[Tensor, "rows state"], rows: slice
+        self, chosen: AbstractFeature, state: JointState, rows: slice
     ) -> Float64[Tensor, "seen components weights"]:
         """Derivative of the predicted values by the weights of the used columns of some features.
 
         Args:
             chosen: the features.
-            state: joint values and conditions of all rows of the problem.
+            state: of all rows of the problem.
             rows: which of the seen rows.
         """
         used = chosen.used.flatten()

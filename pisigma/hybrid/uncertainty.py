@@ -14,9 +14,9 @@ from pisigma.hybrid.rows import Rows
 from pisigma.hybrid.sensor_values import joint_columns
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.problem.user_coordinates import IdentifiedGeometry
-from pisigma.joint_correction.features import AbstractFeatures, ConditionFeatures
+from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.kinematics.parameter_jacobian import identification_jacobian
-from pisigma.measurement.conditions import with_conditions
+from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.sensors.building import numbers_of
 
@@ -47,7 +47,7 @@ class PositionUncertainty:
 
     space: ParameterSpace
     geometry: IdentifiedGeometry
-    features: tuple[AbstractFeatures, ...]
+    features: tuple[AbstractFeature, ...]
     root: Float64[Tensor, "unknowns directions"]
     prior_scale: float
 
@@ -60,8 +60,7 @@ class PositionUncertainty:
             measurements: joint values, frames and targets.
             q_moved: the joint values with their corrections.
         """
-        names = next((c.names for c in self.features if isinstance(c, ConditionFeatures)), ())
-        state = with_conditions(measurements, names)
+        state = JointState.of(measurements)
         frame = numbers_of(measurements.frame, self.space.frames, measurements.rows)
         target = numbers_of(measurements.target, self.space.targets, measurements.rows)
         found = torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
@@ -73,7 +72,7 @@ class PositionUncertainty:
         return found
 
     def _of_rows(
-        self, state: Tensor, q_moved: Float64[Tensor, "rows dof"], frame: int, target: int
+        self, state: JointState, q_moved: Float64[Tensor, "rows dof"], frame: int, target: int
     ) -> Float64[Tensor, "rows 3"]:
         space = self.space
         base, tool = list(self.geometry.bases.values())[frame], list(self.geometry.tools.values())[target]
@@ -87,7 +86,7 @@ class PositionUncertainty:
         columns[..., len(space.parameters) :] = self._weight_columns(J, state)
         return (columns @ self.root).square().sum(-1).sqrt()
 
-    def _weight_columns(self, J: Tensor, state: Tensor) -> Float64[Tensor, "rows 3 weights"]:
+    def _weight_columns(self, J: Tensor, state: JointState) -> Float64[Tensor, "rows 3 weights"]:
         joints = J[..., joint_columns(self.space)] * J.new_tensor(self.space.robot.directions)
         blocks = [joints[..., :0]]
         for chosen in self.features:

@@ -12,8 +12,9 @@ from pisigma.hybrid.evidence import Posterior
 from pisigma.hybrid.held_products import HeldProducts, normalised
 from pisigma.hybrid.refinement import Refined, with_held_factors
 from pisigma.hybrid.uncertainty import covariance_root
-from pisigma.joint_correction.features import AbstractFeatures
+from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.measurement.conditions import JointState
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,10 +63,8 @@ class WhitenedUnknowns:
         """The unknowns x."""
         return self.start + self.root @ z
 
-    def shift(
-        self, x: Float64[Tensor, " unknowns"], state: Float64[Tensor, "rows state"]
-    ) -> Float64[Tensor, "rows dof"]:
-        """Joint corrections [rad or m] at joint values and conditions, to be derived by x."""
+    def shift(self, x: Float64[Tensor, " unknowns"], state: JointState) -> Float64[Tensor, "rows dof"]:
+        """Joint corrections [rad or m] of rows, to be derived by x."""
         weights = {}
         for number, chosen in enumerate(self._additive):
             none = torch.zeros(chosen.used.shape).to(x)
@@ -108,6 +107,6 @@ class WhitenedUnknowns:
         return design, replace(self.posterior, x=x)
 
     @property
-    def _additive(self) -> tuple[AbstractFeatures, ...]:
+    def _additive(self) -> tuple[AbstractFeature, ...]:
         """Features of the unit of order 1."""
         return self.design.features[:-1] if self.held else self.design.features

@@ -54,7 +54,7 @@ class FastModel:
     def periodic(self) -> bool:
         """Whether the joint correction is the same on all turns."""
         hybrid = self.identified.hybrid
-        return hybrid is None or all(features.periodic for features in hybrid.correction.features)
+        return hybrid is None or hybrid.correction.is_periodic
 
 
 def follow(

@@ -83,7 +83,7 @@ class Finishing:
         """Solve again on the turns to command where a correction is not the same on all turns."""
         hybrid = self._model.hybrid
         assert hybrid is not None
-        if all(features.periodic for features in hybrid.correction.features):
+        if hybrid.correction.is_periodic:
             return q, inside
         flat = q.reshape(-1, 1, q.shape[-1])
         found, status = search(self._geometric, T.reshape(-1, 4, 4), flat, self._motion)

@@ -6,18 +6,16 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pisigma.joint_correction.features import (
-    AbstractFeatures,
-    ConditionFeatures,
-    FourierSeries,
-    GravityTorques,
-    SharedFeatures,
-    turning_rate,
-)
+from pisigma.joint_correction.conditions import ConditionFeatures
+from pisigma.joint_correction.feature import AbstractFeature, turning_rate
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.series_evaluation import SeriesTable
+from pisigma.joint_correction.shared_features import SinesCosines
 from pisigma.kinematics.components import Vector, add_product, product
 from pisigma.kinematics.forward import Geometry, iterate_rows
+from pisigma.measurement.conditions import JointState
 from pisigma.network.pi_sigma import sum_of_products
 from pisigma.robot.description import Robot
 
@@ -36,19 +34,19 @@ class BatchedCorrection:
         self._rate = torch.from_numpy(turning_rate(correction.robot))[:, None]
         self._series: list[SeriesTable] = []
         self._gravity: list[BatchedTorques] = []
-        self._others: list[tuple[AbstractFeatures, Tensor]] = []
+        self._others: list[tuple[AbstractFeature, Tensor]] = []
         inputs = correction.weight.shape[-1]
         self._units = torch.zeros(self._robot.dof, inputs, dtype=torch.float64)
         self._angles_only = all(self._robot.revolute)
         for features, parameter in zip(correction.features, correction.linear, strict=True):
             self._add(features, parameter.detach().double())
 
-    def _add(self, features: AbstractFeatures, weight: Tensor) -> None:
+    def _add(self, features: AbstractFeature, weight: Tensor) -> None:
         if isinstance(features, FourierSeries):
             self._series.append(SeriesTable(*torch.split(weight, features.harmonics, 1)))
         elif isinstance(features, GravityTorques):
             self._gravity.append(BatchedTorques(self._robot, features, weight))
-        elif isinstance(features, SharedFeatures) and features.name == "sin_cos" and self._angles_only:
+        elif isinstance(features, SinesCosines) and self._angles_only:
             self._units += weight
         elif not isinstance(features, ConditionFeatures):  # which are 0 under the usual conditions
             self._others.append((features, weight))
@@ -69,7 +67,7 @@ class BatchedCorrection:
         for torques in self._gravity:
             total = total + torques(q)
         for features, weight in self._others:
-            total = total + (features.columns(q.T) * weight).sum(-1).T
+            total = total + (features.columns(JointState(q.T)) * weight).sum(-1).T
         if self._angles_only:
             return self._with_units(total, torch.cat([sine, cosine])), steep
         if self._correction.orders:

@@ -6,15 +6,15 @@ import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from pisigma.joint_correction.features import AbstractFeatures, ConditionFeatures, unit_inputs
-from pisigma.measurement.conditions import with_conditions
+from pisigma.joint_correction.feature import AbstractFeature, unit_inputs
+from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.network.pi_sigma import sum_of_products, weigh_sums
 from pisigma.robot.description import Robot
 
 
 class JointCorrection(nn.Module):
-    """Δ_j(q) [rad or m]: a unit of order 1 on chosen features, and product units on sines and cosines.
+    """Δ_j(q) [rad or m]: a unit of order 1 on some features, and product units on sines and cosines.
 
     For every joint j, with features f and φ = `unit_inputs` of all joints::
 
@@ -27,7 +27,7 @@ class JointCorrection(nn.Module):
         robot: the nominal robot.
         features: of the unit of order 1.
         orders: number of factors of every product unit; none for an additive correction.
-        linear: per choice of features `(dof, columns)` weights.
+        linear: per feature `(dof, columns)` weights.
         weight: `(dof, factors, inputs)`: v.
         bias: `(dof, factors)`: b.
         fixed: `(dof, factors)`: ones.
@@ -37,9 +37,7 @@ class JointCorrection(nn.Module):
     bias: nn.Parameter
     fixed: Tensor
 
-    def __init__(
-        self, robot: Robot, features: Sequence[AbstractFeatures], orders: Sequence[int] = ()
-    ) -> None:
+    def __init__(self, robot: Robot, features: Sequence[AbstractFeature], orders: Sequence[int] = ()) -> None:
         """Build a correction that is 0 until its weights are set.
 
         Raises:
@@ -51,7 +49,7 @@ class JointCorrection(nn.Module):
         self.robot = robot
         self.features = tuple(features)
         self.orders = tuple(orders)
-        zeros = [torch.zeros(chosen.used.shape, dtype=torch.float64) for chosen in features]
+        zeros = [torch.zeros(feature.used.shape, dtype=torch.float64) for feature in features]
         self.linear = nn.ParameterList([nn.Parameter(values) for values in zeros])
         factors = sum(orders)
         inputs = unit_inputs(robot, torch.zeros(robot.dof, dtype=torch.float64)).shape[-1]
@@ -60,31 +58,37 @@ class JointCorrection(nn.Module):
         self.register_buffer("fixed", torch.ones(robot.dof, factors, dtype=torch.float64))
 
     @property
-    def conditions(self) -> tuple[str, ...]:
-        """Names of the conditions, besides the joint values, that it depends on."""
-        return next((c.names for c in self.features if isinstance(c, ConditionFeatures)), ())
+    def reads(self) -> tuple[str, ...]:
+        """What it depends on beside the joint values, by the names of `JointState.stated`."""
+        return tuple(dict.fromkeys(name for feature in self.features for name in feature.reads))
+
+    @property
+    def is_periodic(self) -> bool:
+        """Whether it is the same on all turns of revolute joints."""
+        pairs = zip(self.features, self.linear, strict=True)
+        return all(feature.is_periodic(weight.detach().cpu().numpy()) for feature, weight in pairs)
 
     def of_rows(self, measurements: Measurements) -> Float[Tensor, "rows dof"]:
-        """Corrections under the conditions of measured rows; where a row states none, under the usual ones."""
-        found: Tensor = self(with_conditions(measurements, self.conditions))
-        return found
+        """Corrections with what measured rows state; where a row does not state it, under the usual conditions."""
+        delta: Tensor = self(JointState.of(measurements))
+        return delta
 
-    def forward(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof"]:
+    def forward(self, q: Float[Tensor, "*batch dof"] | JointState) -> Float[Tensor, "*batch dof"]:
         """Corrections to add to joint values [rad or m].
 
         Args:
-            q: joint values [rad or m], and behind them `conditions`; without these they are as usual when
-                it was fitted.
+            q: joint values [rad or m], under the usual conditions and in the middle of all play; or with what is
+                stated beside them.
         """
-        total = torch.zeros_like(q[..., : self.robot.dof])
-        for chosen, weight in zip(self.features, self.linear, strict=True):
-            total = total + (chosen.columns(q) * weight.to(q)).sum(-1)
+        state = q if isinstance(q, JointState) else JointState(q)
+        total = torch.zeros_like(state.q)
+        for feature, weight in zip(self.features, self.linear, strict=True):
+            total = total + (feature.columns(state) * weight.to(state.q)).sum(-1)
         if not self.orders:
             return total
-        factors = self.factors(q)
-        return total + sum_of_products(factors, self.orders)
+        return total + sum_of_products(self.factors(state.q), self.orders)
 
-    def factors(self, q: Float[Tensor, "*batch state"]) -> Float[Tensor, "*batch dof factors"]:
+    def factors(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof factors"]:
         """Values of all factors of the product units of all joints."""
         phi = unit_inputs(self.robot, q)
         return weigh_sums(phi, self.weight.to(q), self.bias.to(q), self.fixed.to(q))

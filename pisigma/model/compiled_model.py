@@ -10,14 +10,11 @@ from jaxtyping import Float64
 
 from pisigma.errors import ModelError
 from pisigma.hybrid.arms import HybridArm
-from pisigma.joint_correction.features import (
-    ConditionFeatures,
-    FourierSeries,
-    GravityTorques,
-    SharedFeatures,
-    scaled_joints,
-    turning_rate,
-)
+from pisigma.joint_correction.conditions import ConditionFeatures
+from pisigma.joint_correction.feature import scaled_joints, turning_rate
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
+from pisigma.joint_correction.shared_features import ScaledJoints, SinesCosines
 from pisigma.kernels.arrays import (
     DRAWN,
     FIXED,
@@ -197,8 +194,8 @@ def _add_features(
         masses = np.where(slides[:, None, None], masses * [1.0, 0.0, 0.0, 0.0], masses * scale)
         found["masses"], found["gravity"] = masses, np.array(features.gravity)
         return
-    if isinstance(features, SharedFeatures) and features.name in ("joints", "sin_cos"):
-        key = "scaled" if features.name == "joints" else "units"
+    if isinstance(features, ScaledJoints | SinesCosines):
+        key = "scaled" if isinstance(features, ScaledJoints) else "units"
         if not len(found[key]):
             found[key] = weight.copy()
             return

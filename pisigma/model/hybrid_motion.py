@@ -9,7 +9,7 @@ from torch import Tensor
 from pisigma.hybrid.arms import HybridArm, blend
 from pisigma.joint_correction.batched_correction import BatchedCorrection
 from pisigma.kinematics.jacobian import joint_jacobian
-from pisigma.measurement.conditions import with_conditions
+from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.se3 import rotation_vector
 
@@ -36,9 +36,9 @@ def hybrid_poses(arm: HybridArm, q: Float[Tensor, "*batch dof"]) -> Float[Tensor
 
 def corrected_joints(arm: HybridArm, measurements: Measurements) -> Float64[Tensor, "rows dof"]:
     """Joint values of measured rows with the correction of the network in full, `q + Δ(q)` [rad or m]."""
-    state, dof = with_conditions(measurements, arm.correction.conditions), measurements.dof
+    chunks = JointState.of(measurements).split(CHUNK)
     with torch.no_grad():
-        return torch.cat([part[:, :dof] + arm.correction(part) for part in torch.split(state, CHUNK)])
+        return torch.cat([state.q + arm.correction(state) for state in chunks])
 
 
 def hybrid_motion(

@@ -8,7 +8,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.joint_correction.features import FourierSeries
+from pisigma.joint_correction.conditions import learned_conditions
+from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.judging.pose_statistics import PoseErrors
 from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel
@@ -94,8 +95,9 @@ def gives_up(found: Distillation, report: dict[str, Any]) -> list[str]:
             f"network sees {'sine and cosine' if seen == 1 else f'up to {seen} cycles'} of the joint's nominal value "
             "and follows what is slower" + _of_smooth(found.trials) + "."
         )
-    if parent.hybrid is not None and parent.hybrid.correction.conditions:
-        names = " and ".join(parent.hybrid.correction.conditions)
+    learned = None if parent.hybrid is None else learned_conditions(parent.hybrid.correction)
+    if learned is not None:
+        names = " and ".join(learned.names)
         sentences.append(f"Conditions: {names} are taken as usual when the parent was measured.")
     return [
         *sentences,

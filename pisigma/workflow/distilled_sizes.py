@@ -8,7 +8,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
-from pisigma.joint_correction.features import FourierSeries
+from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.pi_sigma import PiSigma

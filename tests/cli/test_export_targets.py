@@ -10,7 +10,8 @@ from testing.identified import hybrid_model
 from testing.models import joints_around
 from testing.program_readers import READERS
 
-from pisigma.joint_correction.features import ConditionFeatures, FourierSeries
+from pisigma.joint_correction.conditions import ConditionFeatures
+from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model, save_model

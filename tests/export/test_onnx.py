@@ -14,7 +14,10 @@ from testing.models import hand_made_model, joints_around, with_limits
 
 from pisigma.errors import ModelError, OutputError
 from pisigma.export.onnx_model import FORWARD, INVERSE, export_onnx
-from pisigma.joint_correction.features import ConditionFeatures, FourierSeries, GravityTorques, SharedFeatures
+from pisigma.joint_correction.conditions import ConditionFeatures
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
+from pisigma.joint_correction.shared_features import NominalPose, ScaledJoints, SinesCosines
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot
 from pisigma.se3 import transform_from_xyzrpy
@@ -98,9 +101,9 @@ def features_of(robot: Robot, names: str):
     made = {
         "series": lambda: FourierSeries(robot, 110),
         "gravity": lambda: GravityTorques(robot, (0.1, -0.3, -1.0)),
-        "joints": lambda: SharedFeatures(robot, "joints"),
-        "sin_cos": lambda: SharedFeatures(robot, "sin_cos"),
-        "pose": lambda: SharedFeatures(robot, "pose"),
+        "joints": lambda: ScaledJoints(robot),
+        "sin_cos": lambda: SinesCosines(robot),
+        "pose": lambda: NominalPose(robot),
         "conditions": lambda: ConditionFeatures(
             robot, ("payload_kg", "temperature_c"), (2.0, 20.0), (1.0, 3.0)
         ),

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from pisigma.hybrid.arms import HybridArm, blend
 from pisigma.hybrid.coverage import FADE, JointCoverage, share_beyond
-from pisigma.joint_correction.features import FourierSeries
+from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot

@@ -7,7 +7,11 @@ from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_
 
 from pisigma.hybrid.design import Design, sum_up, weighted_columns
 from pisigma.hybrid.evidence import FIRST_SIZE
-from pisigma.joint_correction.features import AbstractFeatures, FourierSeries, GravityTorques, SharedFeatures
+from pisigma.joint_correction.feature import AbstractFeature
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
+from pisigma.joint_correction.shared_features import ScaledJoints
+from pisigma.measurement.conditions import JointState
 from pisigma.robot import Robot
 
 
@@ -19,8 +23,8 @@ def arm() -> LinearisedArm:
     return linearised(robot, tracker_data(robot, q, delta, 1e-5, turn_noise=1e-5, several=True))
 
 
-def features(robot: Robot, harmonics: int) -> tuple[AbstractFeatures, ...]:
-    return SharedFeatures(robot, "joints"), GravityTorques(robot), FourierSeries(robot, harmonics)
+def features(robot: Robot, harmonics: int) -> tuple[AbstractFeature, ...]:
+    return ScaledJoints(robot), GravityTorques(robot), FourierSeries(robot, harmonics)
 
 
 def test_sums_are_those_of_all_columns_at_once(arm: LinearisedArm, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,7 +84,7 @@ def test_columns_that_a_joint_does_not_have_get_no_unknown(arm: LinearisedArm) -
     assert columns.shape == (5, 3, design.unknowns)
     q = arm.rows.problem.q[arm.rows.values[0].row[:5]]
     weight = torch.randn(gravity.used.shape, generator=torch.Generator().manual_seed(0)).double()
-    delta = (gravity.columns(q) * weight * gravity.used).sum(-1)
+    delta = (gravity.columns(JointState(q)) * weight * gravity.used).sum(-1)
     expected = (arm.rows.values[0].joints[:5] @ delta[..., None])[..., 0]
     assert_close(columns[..., design.stretch(0)] @ weight[gravity.used], expected, atol=1e-13)
 

@@ -11,7 +11,8 @@ from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_
 from pisigma.hybrid.design import Design, sum_up
 from pisigma.hybrid.evidence import Posterior, solve_posterior
 from pisigma.hybrid.extrapolation import DENSE_FADE, FADES, fade_angle
-from pisigma.joint_correction.features import FourierSeries, GravityTorques
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.simulation import TrueRobot

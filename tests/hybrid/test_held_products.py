@@ -7,8 +7,9 @@ from testing.linearised import drawn_joints
 from torch import Tensor
 
 from pisigma.hybrid.held_products import HeldProducts, InputPairs, normalised, product_values, with_bias
-from pisigma.joint_correction.features import unit_inputs
+from pisigma.joint_correction.feature import unit_inputs
 from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.measurement.conditions import JointState
 from pisigma.robot import Robot
 
 
@@ -46,7 +47,7 @@ def test_columns_times_free_weights_are_the_products(name: str, orders: tuple[in
         held = HeldProducts(robot, orders, factors, turn)
         assert all(0 <= free - sum(orders[:u]) < orders[u] for u, free in enumerate(held.free))
         weights = factors[:, list(held.free)].flatten()
-        columns = held.columns(q)
+        columns = held.columns(JointState(q))
         assert columns.shape == (20, robot.dof, held.count)
         assert_close((columns * weights.view(robot.dof, -1)).sum(-1), expected, atol=1e-12)
         assert_close(held.solved(weights), factors)
@@ -68,9 +69,9 @@ def test_batches_of_any_shape_have_columns() -> None:
     held = HeldProducts(robot, (2,), normal(4, 2, pairs.inputs + 1), 0)
     q = drawn_joints(robot, 6, 0)
     for features in (pairs, held):
-        flat = features.columns(q)
-        assert_close(features.columns(q.view(2, 3, 4)), flat.view(2, 3, 4, -1))
-        assert_close(features.columns(q[0]), flat[0])
+        flat = features.columns(JointState(q))
+        assert_close(features.columns(JointState(q.view(2, 3, 4))), flat.view(2, 3, 4, -1))
+        assert_close(features.columns(JointState(q[0])), flat[0])
 
 
 def test_pairs_are_products_of_inputs_of_different_joints() -> None:
@@ -80,7 +81,7 @@ def test_pairs_are_products_of_inputs_of_different_joints() -> None:
     assert len(pairs.pairs) == 7 * 6 // 2 - 3
     phi = unit_inputs(robot, q)
     for column, (a, b) in enumerate(pairs.pairs):
-        assert_close(pairs.columns(q)[:, 2, column], phi[:, a] * phi[:, b], atol=1e-15)
+        assert_close(pairs.columns(JointState(q))[:, 2, column], phi[:, a] * phi[:, b], atol=1e-15)
     turning = [0, 1, 3]
     same = {(k, 3 + k) for k in range(len(turning))}
     assert not same & set(pairs.pairs)
@@ -105,7 +106,7 @@ def test_a_product_is_rebuilt_from_its_bilinear_form() -> None:
     first, second = [0, 1, 2, 6, 7, 8], [3, 4, 5, 9, 10, 11]
     r, s = parted(robot, 1, first, second)
     weights = bilinear(pairs, r, s)
-    expected = (pairs.columns(q) * weights).sum(-1)
+    expected = (pairs.columns(JointState(q)) * weights).sum(-1)
     phi = unit_inputs(robot, q)
     assert_close(expected, (phi @ r.t()) * (phi @ s.t()), atol=1e-12)
     for orders in ((2,), (3,), (2, 2)):
@@ -119,7 +120,7 @@ def test_two_products_are_rebuilt_by_two_units_and_not_by_one() -> None:
     first = parted(robot, 1, [0, 1, 2, 6, 7, 8], [3, 4, 5, 9, 10, 11])
     second = parted(robot, 3, [0, 2, 4, 6, 8, 10], [1, 3, 5, 7, 9, 11])
     weights = bilinear(pairs, *first) + bilinear(pairs, *second)
-    expected = (pairs.columns(q) * weights).sum(-1)
+    expected = (pairs.columns(JointState(q)) * weights).sum(-1)
     two = product_values(robot, pairs.factors(weights.flatten(), (2, 2)), (2, 2), q)
     assert_close(two, expected, atol=1e-11)
     one = product_values(robot, pairs.factors(weights.flatten(), (2,)), (2,), q)

@@ -15,7 +15,7 @@ from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.result import CalibrationResult
-from pisigma.joint_correction.features import GravityTorques
+from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot

@@ -11,12 +11,14 @@ from testing.sensors import mixed_data, true_robot
 from pisigma.hybrid.design import sum_up
 from pisigma.hybrid.evidence import solve_posterior
 from pisigma.hybrid.left_out import folds_left_out, left_out
-from pisigma.joint_correction.features import AbstractFeatures, FourierSeries, GravityTorques
+from pisigma.joint_correction.feature import AbstractFeature
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 
 
-def poses_with_repeats() -> tuple[LinearisedArm, tuple[AbstractFeatures, ...]]:
+def poses_with_repeats() -> tuple[LinearisedArm, tuple[AbstractFeature, ...]]:
     """Positions and rotations; some joint values are measured twice, some three times."""
     robot = Robot.load("rb5")
     q = drawn_joints(robot, 30, 0)
@@ -25,7 +27,7 @@ def poses_with_repeats() -> tuple[LinearisedArm, tuple[AbstractFeatures, ...]]:
     return linearised(robot, data), (FourierSeries(robot, 2),)
 
 
-def positions_beside_poses() -> tuple[LinearisedArm, tuple[AbstractFeatures, ...]]:
+def positions_beside_poses() -> tuple[LinearisedArm, tuple[AbstractFeature, ...]]:
     """Rows of different kinds: some without a rotation, some without a position."""
     robot = Robot.load("rb5")
     data = tracker_data(robot, drawn_joints(robot, 45, 1), noise=3e-5, turn_noise=1e-4, several=False)
@@ -38,7 +40,7 @@ def positions_beside_poses() -> tuple[LinearisedArm, tuple[AbstractFeatures, ...
     )
 
 
-def all_kinds() -> tuple[LinearisedArm, tuple[AbstractFeatures, ...]]:
+def all_kinds() -> tuple[LinearisedArm, tuple[AbstractFeature, ...]]:
     """All kinds of sensors, and a distance of sockets that is known for certain."""
     robot, data = true_robot().nominal, mixed_data()
     generator = torch.Generator().manual_seed(2)

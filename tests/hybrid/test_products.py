@@ -15,7 +15,7 @@ from pisigma.hybrid.products import ROUNDS, FittedProducts, ProductFit
 from pisigma.hybrid.refinement import network
 from pisigma.identification.prediction import predicted_poses
 from pisigma.identification.problem.user_coordinates import identified_geometry
-from pisigma.joint_correction.features import FourierSeries
+from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.robot import Robot
 

@@ -11,6 +11,7 @@ from pisigma.hybrid.refinement import Refined, refine, with_held_factors
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import HampelLoss
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.conditions import JointState
 from pisigma.robot import Robot
 
 ROBOT = Robot.load("rb5")
@@ -61,7 +62,7 @@ def test_held_factors_are_uncertain_too(refined: Refined) -> None:
     factors = other.factors
     weights = factors[:, list(other.free)].flatten()
     expected = product_values(ROBOT, factors, (2, 2), q)
-    assert_close((other.columns(q) * weights.view(6, -1)).sum(-1), expected, atol=1e-12)
+    assert_close((other.columns(JointState(q)) * weights.view(6, -1)).sum(-1), expected, atol=1e-12)
     assert_close(expected, refined.correction(q) - _additive(refined, q), atol=1e-12)
     size = refined.design.unknowns
     assert whole.design.unknowns == size + len(weights)
@@ -76,7 +77,7 @@ def test_held_factors_are_uncertain_too(refined: Refined) -> None:
 def _additive(refined: Refined, q: torch.Tensor) -> torch.Tensor:
     made = refined.correction
     parts = [
-        (chosen.columns(q) * weight).sum(-1)
+        (chosen.columns(JointState(q)) * weight).sum(-1)
         for chosen, weight in zip(made.features, made.linear, strict=True)
     ]
     return torch.stack(parts).sum(0)

@@ -10,7 +10,7 @@ from torch import Tensor
 from pisigma.hybrid.design import Design, sum_up
 from pisigma.hybrid.sensor_values import SensorValues, sensor_values
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.joint_correction.features import FourierSeries
+from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot

@@ -15,8 +15,10 @@ from pisigma.hybrid.held_products import HeldProducts
 from pisigma.hybrid.sensor_values import joint_columns, sensor_values
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.problem import CalibrationProblem
-from pisigma.joint_correction.features import FourierSeries, GravityTorques, SharedFeatures
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.joint_correction.shared_features import SinesCosines
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
@@ -93,7 +95,7 @@ def case(name: str, shift: JointCorrection | None = None) -> tuple[CalibrationPr
 
 
 def correction_of(robot: Robot, size: float = 0.02) -> JointCorrection:
-    features = (SharedFeatures(robot, "sin_cos"), FourierSeries(robot, 3))
+    features = (SinesCosines(robot), FourierSeries(robot, 3))
     made = JointCorrection(robot, features, (2,))
     generator = torch.Generator().manual_seed(3)
     with torch.no_grad():

@@ -24,7 +24,8 @@ from pisigma.hybrid.uncertainty import (
 )
 from pisigma.identification.prediction import predicted_poses
 from pisigma.identification.problem.user_coordinates import identified_geometry
-from pisigma.joint_correction.features import FourierSeries, GravityTorques
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.robot import Robot
 

@@ -6,9 +6,11 @@ from testing.calibrated_arm import joints_of, random_correction
 from testing.closeness import assert_close
 
 from pisigma.joint_correction.batched_correction import BatchedCorrection
-from pisigma.joint_correction.features import FourierSeries, GravityTorques
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.series_evaluation import SeriesTable
+from pisigma.measurement.conditions import JointState
 from pisigma.robot import Robot
 
 
@@ -51,7 +53,7 @@ def test_the_slope_is_that_of_the_series():
     correction = random_correction(robot)
     series = next(features for features in correction.features if isinstance(features, FourierSeries))
     weight, q = correction.linear[0], joints_of(robot, 20)
-    ends = [(series.columns(q + step) * weight).sum(-1) for step in (1e-6, -1e-6)]
+    ends = [(series.columns(JointState(q + step)) * weight).sum(-1) for step in (1e-6, -1e-6)]
     _, slope = BatchedCorrection(correction)(q.T.contiguous(), slope=True)
     assert_close(slope.T, (ends[0] - ends[1]) / 2e-6, atol=1e-9)
 

@@ -7,25 +7,23 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.joint_correction.feature_description import features_from
-from pisigma.joint_correction.features import (
-    BAND_STARTS,
-    ConditionFeatures,
-    FourierSeries,
-    GravityTorques,
-    SharedFeatures,
-    scaled_joints,
-    turning_rate,
-    unit_inputs,
-)
+from pisigma.joint_correction.backlash import Backlash
+from pisigma.joint_correction.conditions import ConditionFeatures
+from pisigma.joint_correction.feature import scaled_joints, turning_rate, unit_inputs
+from pisigma.joint_correction.fourier_series import BAND_STARTS, FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.joint_correction.registry import FEATURES, feature_from, feature_section
+from pisigma.joint_correction.shared_features import NominalPose, ScaledJoints, SinesCosines
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.conditions import APPROACH, JointState
 from pisigma.robot import Robot, Row
 from pisigma.se3 import rpy_from_rotation
 from pisigma.simulation.errors.joint_compliance import LinkMass, gravity_load
 
 GRAVITY = (1.0, -2.0, -9.0)
 CONDITIONS = ("payload_kg", "temperature_c")
+SHARED = ("joints", "sin_cos", "pose")
 ROBOTS = ("kiro3", "rb5", "panda")
 
 
@@ -52,14 +50,15 @@ def every_kind(robot: Robot) -> list:
         FourierSeries(robot, 5),
         GravityTorques(robot, GRAVITY),
         ConditionFeatures(robot, CONDITIONS, (3.0, 20.0), (1.5, 4.0), GRAVITY),
-        *(SharedFeatures(robot, name) for name in SharedFeatures.CHOICES),
+        *(FEATURES[name](robot) for name in SHARED),
+        Backlash(robot),
     ]
 
 
 def test_the_series_is_sines_and_cosines_of_the_joints_own_value():
     robot = arm()
     q = joints(robot, 7)
-    columns = FourierSeries(robot, 3).columns(q)
+    columns = FourierSeries(robot, 3).columns(JointState(q))
     assert columns.shape == (7, 4, 6)
     for joint in (0, 1, 3):
         for k in (1, 2, 3):
@@ -109,7 +108,7 @@ def test_gravity_columns_make_up_the_load_of_any_masses():
             [torch.tensor([robot.reach], dtype=torch.float64), centre / features.ARM]
         )
     scale = float(np.linalg.norm(GRAVITY))
-    columns = features.columns(q)
+    columns = features.columns(JointState(q))
     turning = torch.tensor(robot.revolute)
     found = scale * (columns * weights.flatten()).sum(-1)
     assert_close(found[..., turning], load[..., turning], atol=1e-10)
@@ -122,7 +121,7 @@ def test_gravity_columns_make_up_the_load_of_any_masses():
 def test_masses_before_a_joint_have_no_weight():
     robot = arm()
     features = GravityTorques(robot, GRAVITY)
-    columns = features.columns(joints(robot, 6))
+    columns = features.columns(JointState(joints(robot, 6)))
     assert_close(columns[:, ~features.used], 0.0)
     assert features.used[0].all()
     assert int(features.used[3].sum()) == 4
@@ -132,21 +131,24 @@ def test_base_and_tool_do_not_turn_gravity():
     robot = arm()
     bare = robot.with_geometry(base=np.zeros(6))
     q = joints(robot, 4)
-    assert_close(GravityTorques(robot, GRAVITY).columns(q), GravityTorques(bare, GRAVITY).columns(q))
+    assert_close(
+        GravityTorques(robot, GRAVITY).columns(JointState(q)),
+        GravityTorques(bare, GRAVITY).columns(JointState(q)),
+    )
 
 
 @pytest.mark.parametrize("name", ROBOTS)
 def test_shared_features_are_the_same_for_every_joint(name):
     robot = Robot.load(name)
     q = joints(robot, 6)
-    for choice in SharedFeatures.CHOICES:
-        columns = SharedFeatures(robot, choice).columns(q)
+    for choice in SHARED:
+        columns = FEATURES[choice](robot).columns(JointState(q))
         assert_close(columns, columns[:, :1].expand_as(columns))
-    assert_close(SharedFeatures(robot, "joints").columns(q)[:, 0], scaled_joints(robot, q))
-    assert_close(SharedFeatures(robot, "sin_cos").columns(q)[:, 0], unit_inputs(robot, q))
+    assert_close(ScaledJoints(robot).columns(JointState(q))[:, 0], scaled_joints(robot, q))
+    assert_close(SinesCosines(robot).columns(JointState(q))[:, 0], unit_inputs(robot, q))
     T = forward_kinematics(robot, q)
     pose = torch.cat([T[:, :3, 3] / robot.reach, rpy_from_rotation(T[:, :3, :3])], -1)
-    assert_close(SharedFeatures(robot, "pose").columns(q)[:, 0], pose, atol=1e-14)
+    assert_close(NominalPose(robot).columns(JointState(q))[:, 0], pose, atol=1e-14)
 
 
 def test_unit_inputs_are_sines_cosines_and_then_slides():
@@ -170,11 +172,11 @@ def test_batches_and_types(batch, dtype):
     robot = arm()
     q = joints(robot, *batch).to(dtype)
     for features in every_kind(robot):
-        columns = features.columns(q)
+        columns = features.columns(JointState(q))
         assert columns.shape == (*batch, 4, features.count)
         assert columns.dtype == dtype
         flat = q.reshape(-1, 4)
-        looped = [features.columns(one) for one in flat]
+        looped = [features.columns(JointState(one)) for one in flat]
         if looped:
             assert_close(columns.reshape(-1, 4, features.count), torch.stack(looped), atol=1e-5)
 
@@ -182,11 +184,13 @@ def test_batches_and_types(batch, dtype):
 @pytest.mark.parametrize("name", [None, *ROBOTS])
 def test_a_description_makes_the_same_features_again(name):
     robot = arm() if name is None else Robot.load(name)
-    q = torch.cat([joints(robot, 9), torch.randn(9, 2, dtype=torch.float64)], -1)
+    stated = dict.fromkeys(CONDITIONS, torch.randn(9, dtype=torch.float64))
+    state = JointState(joints(robot, 9), stated | {APPROACH: joints(robot, 9).sign()})
     for features in every_kind(robot):
-        again = features_from(robot, features.describe())
+        plain = features.describe().model_dump(mode="json")
+        again = feature_from(robot, feature_section(plain))
         assert type(again) is type(features)
-        assert torch.equal(again.columns(q), features.columns(q))
+        assert torch.equal(again.columns(state), features.columns(state))
         assert torch.equal(again.used, features.used)
         assert torch.equal(again.group, features.group)
         assert again.describe() == features.describe()
@@ -197,8 +201,8 @@ def test_only_scaled_joints_change_with_full_turns():
     q = joints(robot, 5)
     turned = q + 2 * torch.pi * torch.tensor([1.0, -1.0, 0.0, 2.0]).double()
     for features in every_kind(robot):
-        change = float((features.columns(turned) - features.columns(q)).abs().max())
-        assert (change < 1e-12) == features.periodic
+        change = float((features.columns(JointState(turned)) - features.columns(JointState(q))).abs().max())
+        assert (change < 1e-12) == features.is_periodic(np.ones(features.used.shape))
 
 
 @pytest.mark.parametrize(
@@ -206,26 +210,21 @@ def test_only_scaled_joints_change_with_full_turns():
     [
         ({"name": "seris", "harmonics": 3}, "no features 'seris'; did you mean 'series'"),
         ({}, "no features 'None'"),
-        ({"name": "series"}, "'harmonics'"),
-        ({"name": "gravity", "harmonics": 3}, "'gravity'"),
-        ({"name": "pose", "gravity": (0, 0, -1)}, "a name only"),
+        ({"name": "series"}, "harmonics\n  Field required"),
+        ({"name": "gravity", "harmonics": 3}, "harmonics\n  Extra inputs"),
+        ({"name": "pose", "gravity": (0, 0, -1)}, "gravity\n  Extra inputs"),
         (
             {"name": "conditions", "names": (), "mean": (), "spread": (), "gravity": (0.0, 0.0, 1.0)},
-            "need names",
+            "names\n  Tuple should have at least 1 item",
         ),
-        ({"name": "series", "harmonics": 0}, "at least one harmonic"),
+        ({"name": "series", "harmonics": 0}, "greater than or equal to 1"),
         ({"name": "gravity", "gravity": (0.0, 0.0, 0.0)}, "needs a direction"),
-        ({"name": "gravity", "gravity": (0.0, math.nan, 0.0)}, "needs a direction"),
+        ({"name": "gravity", "gravity": (0.0, math.nan, 0.0)}, "finite number"),
     ],
 )
 def test_descriptions_of_nothing_are_refused(description, complaint):
     with pytest.raises(ValueError, match=complaint):
-        features_from(Robot.load("rb5"), description)
-
-
-def test_unknown_shared_features_are_refused():
-    with pytest.raises(ValueError, match="joints, sin_cos, pose"):
-        SharedFeatures(Robot.load("rb5"), "sines")
+        feature_from(Robot.load("rb5"), feature_section(description))
 
 
 @pytest.mark.parametrize("orders", [(), (2,), (2, 3)])
@@ -243,7 +242,7 @@ def test_the_correction_is_what_its_formula_says(orders):
     for j in range(robot.dof):
         expected = torch.zeros(6, dtype=torch.float64)
         for chosen, weight in zip(features, correction.linear, strict=True):
-            expected = expected + chosen.columns(q)[:, j] @ weight[j]
+            expected = expected + chosen.columns(JointState(q))[:, j] @ weight[j]
         start = 0
         for order in orders:
             product = torch.ones(6, dtype=torch.float64)

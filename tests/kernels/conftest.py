@@ -11,8 +11,10 @@ from testing.models import no_type_checker
 
 from pisigma.hybrid.arms import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
-from pisigma.joint_correction.features import FourierSeries, GravityTorques, SharedFeatures
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.joint_correction.shared_features import ScaledJoints, SinesCosines
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.compiled_model import compile_model
 from pisigma.robot import Robot
@@ -35,9 +37,9 @@ def draw_correction(robot: Robot, joints: bool, seed: int = 0) -> JointCorrectio
     features = [
         FourierSeries(robot, 12),
         GravityTorques(robot, (0.1, -0.2, -1.0)),
-        SharedFeatures(robot, "sin_cos"),
+        SinesCosines(robot),
     ]
-    features += [SharedFeatures(robot, "joints")] if joints else []
+    features += [ScaledJoints(robot)] if joints else []
     correction = JointCorrection(robot, features, (2, 3))
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():

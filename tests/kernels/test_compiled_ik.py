@@ -13,8 +13,8 @@ from testing.models import hand_made_model, no_type_checker, with_limits
 from pisigma.errors import ModelError, PoseError
 from pisigma.hybrid.arms import HybridArm
 from pisigma.inverse.torch_ik import TorchIK
-from pisigma.joint_correction.features import SharedFeatures
 from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.joint_correction.shared_features import NominalPose
 from pisigma.kernels.solver import CompiledIK
 from pisigma.kinematics.status import Status
 from pisigma.model.compiled_model import compile_model, describe, save_compiled
@@ -226,7 +226,7 @@ def test_models_without_compiled_form_are_refused(arms):
     model = arms.calibrated("ur5")
     with pytest.raises(ModelError, match="corrects nominal joint values"):
         describe(replace(hand_made_model("ur10"), calibrated=model.calibrated))
-    correction = JointCorrection(model.robot, [SharedFeatures(model.robot, "pose")])
+    correction = JointCorrection(model.robot, [NominalPose(model.robot)])
     arm = HybridArm(model.calibrated, model.calibrated, correction, model.hybrid.coverage)
     with pytest.raises(ModelError, match="features 'pose'"):
         describe(replace(model, hybrid=arm))

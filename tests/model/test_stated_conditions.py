@@ -12,7 +12,10 @@ from testing.models import joints_around
 
 from pisigma.errors import ModelError
 from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.joint_correction.features import ConditionFeatures, FourierSeries, GravityTorques, SharedFeatures
+from pisigma.joint_correction.conditions import ConditionFeatures
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
+from pisigma.joint_correction.shared_features import ScaledJoints
 from pisigma.kinematics.status import Status
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import deviation_of_rows
@@ -29,7 +32,7 @@ SIDEWAYS = (0.6, 0.0, -0.8)
 """Gravity of a robot that is mounted on a slope."""
 BESIDE = {
     "nothing": lambda robot: [],
-    "all": lambda robot: [GravityTorques(robot), FourierSeries(robot, 5), SharedFeatures(robot, "joints")],
+    "all": lambda robot: [GravityTorques(robot), FourierSeries(robot, 5), ScaledJoints(robot)],
     "other gravity": lambda robot: [FourierSeries(robot, 1), GravityTorques(robot, SIDEWAYS)],
 }
 

@@ -8,8 +8,10 @@ import torch
 
 from pisigma.hybrid.arms import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
-from pisigma.joint_correction.features import FourierSeries, GravityTorques, SharedFeatures
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.joint_correction.registry import FEATURES
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot import Robot
 
@@ -31,7 +33,7 @@ def random_correction(
 ) -> JointCorrection:
     """A correction of about `size` times 1e-3 rad with all kinds of features, and product units."""
     features = [FourierSeries(robot, harmonics), GravityTorques(robot, (0.1, -0.2, -1.0))]
-    features += [SharedFeatures(robot, name) for name in shared]
+    features += [FEATURES[name](robot) for name in shared]
     correction = JointCorrection(robot, features, (2, 3))
     generator = torch.Generator().manual_seed(0)
     with torch.no_grad():

@@ -6,7 +6,7 @@ from testing.models import hand_made_model, joints_around
 
 from pisigma.hybrid.arms import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
-from pisigma.joint_correction.features import AbstractFeatures
+from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot import Robot
@@ -44,7 +44,7 @@ def geometric_model(name: str, robot: Robot | None = None) -> CalibratedModel:
 
 def hybrid_model(
     name: str,
-    features: list[AbstractFeatures],
+    features: list[AbstractFeature],
     *,
     orders: tuple[int, ...] = (),
     size: float = 1e-3,

@@ -15,7 +15,7 @@ from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import SquaredLoss
 from pisigma.identification.problem.noise import view_of
 from pisigma.identification.problem.setup import CalibrationSetup
-from pisigma.joint_correction.features import AbstractFeatures
+from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints
@@ -85,7 +85,7 @@ class LinearisedArm:
     noise: tuple[float, ...]
     prior_scale: tuple[float, ...]
 
-    def fitted(self, features: Sequence[AbstractFeatures], iterations: int = 40) -> "Fitted":
+    def fitted(self, features: Sequence[AbstractFeature], iterations: int = 40) -> "Fitted":
         """Geometry and a unit of order 1, prior sizes and noise by the evidence."""
         design = Design(self.rows.problem, tuple(features))
         sums = sum_up(design, self.rows.values, self.rows.start(design))

@@ -14,7 +14,8 @@ from testing.models import HOMES, hand_made_model, no_type_checker
 import pisigma
 from pisigma.errors import IdentificationError, ModelError
 from pisigma.inverse.torch_ik import TorchIK
-from pisigma.joint_correction.features import FourierSeries, GravityTorques
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel

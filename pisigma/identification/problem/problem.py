@@ -1,6 +1,6 @@
 """The calibration as a least-squares problem: normal equations summed over chunks of poses."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -26,6 +26,7 @@ from pisigma.identification.problem.noise import (
 )
 from pisigma.identification.problem.parameters import EVERYWHERE, ParameterSpace, PriorSizes
 from pisigma.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion, tool_motion
+from pisigma.measurement.conditions import JointState
 from pisigma.sensors.motion_memory import MotionMemory
 from pisigma.sensors.sensor import AbstractSensor, OwnUnknowns
 
@@ -49,7 +50,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         pose: number of every row's pose (joint values, frame, target), None where no pose is repeated.
         configuration: number of every row's joint values and frame, None where none is seen of several targets.
         pairs: so many pairs of rows, the first ones, are measured together.
-        conditions: payload, temperature (`measurement.conditions`) for corrections that depend on them.
+        stated: what rows state beside their joint values (see `JointState`), for corrections that depend on it.
         prior_sizes: "stated": the prior as it is; "widened": wider where the errors are larger than it says;
             "estimated": wider or narrower.
         memory: the last motion; shared with problems that differ in their free parameters or prior only.
@@ -67,7 +68,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     pose: Int64[Tensor, " rows"] | None = None
     configuration: Int64[Tensor, " rows"] | None = None
     pairs: int = 0
-    conditions: Float64[Tensor, "rows _conditions"] | None = None
+    stated: Mapping[str, Tensor] = field(default_factory=dict)
     prior_sizes: PriorSizes = "widened"
     memory: MotionMemory = field(default_factory=MotionMemory, repr=False)
 
@@ -113,14 +114,14 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             pose=None if self.pose is None else renumbered(self.pose[rows]),
             configuration=None if self.configuration is None else renumbered(self.configuration[rows]),
             pairs=int((rows < 2 * self.pairs).sum()) // 2,
-            conditions=None if self.conditions is None else self.conditions[rows],
+            stated={name: values[rows] for name, values in self.stated.items()},
             memory=MotionMemory(),
         )
 
     @cached_property
-    def state(self) -> Float64[Tensor, "rows _state"]:
-        """Joint values of the rows, and behind them their conditions."""
-        return self.q if self.conditions is None else torch.cat([self.q, self.conditions], 1)
+    def state(self) -> JointState:
+        """Joint values of the rows, and what is stated beside them."""
+        return JointState(self.q, self.stated)
 
     def moved(self, point: Tensor, step: Tensor) -> Tensor:
         """The parameters after a step of the free ones."""

@@ -15,7 +15,7 @@ from pisigma.identification.problem.loss import AbstractLoss
 from pisigma.identification.problem.noise import renumbered
 from pisigma.identification.problem.parameters import ParameterSpace, Prior, PriorSizes
 from pisigma.identification.problem.problem import CalibrationProblem
-from pisigma.measurement.conditions import conditions_of, stated_conditions, with_conditions
+from pisigma.measurement.conditions import JointState, repeat_key
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import KINDS
 from pisigma.measurement.readings import READINGS
@@ -136,8 +136,7 @@ def build_setup(
     start = start.to(device)
     known = build_socket_distances(measurements, options.socket_distances, options.socket_sigma)
     sensors = build_sensors(measurements, anchors.bases, anchors.tools, frame, target)
-    told = stated_conditions(measurements)
-    carried = with_conditions(measurements, tuple(name for name in told if name == "payload_kg"))
+    repeats = repeat_key(measurements)
     problem = CalibrationProblem(
         space=space,
         q=measurements.q,
@@ -148,10 +147,10 @@ def build_setup(
         nominal=start,
         precision=torch.from_numpy(space.precision(prior)).to(device),
         active=torch.zeros(0, dtype=torch.int64, device=device),
-        pose=repeated(carried, frame, target),
-        configuration=repeated(carried, frame) if len(space.targets) > 1 else None,
+        pose=repeated(repeats, frame, target),
+        configuration=repeated(repeats, frame) if len(space.targets) > 1 else None,
         pairs=len(names_of(measurements.pair)),
-        conditions=conditions_of(measurements, told) if told else None,
+        stated=JointState.of(measurements).stated,
         prior_sizes=options.prior_sizes,
     )
     return CalibrationSetup(

@@ -17,9 +17,9 @@ from pisigma.hybrid.coverage import JointCoverage
 from pisigma.hybrid.held_products import HeldProducts
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.problem.parameters import ParameterSpace
-from pisigma.joint_correction.feature_description import features_from
-from pisigma.joint_correction.features import AbstractFeatures, turning_rate
+from pisigma.joint_correction.feature import AbstractFeature, turning_rate
 from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.joint_correction.registry import feature_from
 from pisigma.model.accuracy import geometry_of
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_document import LearnedSection, ModelDocument, UncertaintySection
@@ -43,7 +43,7 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
     found: dict[str, Any] = {}
     if (arm := model.hybrid) is not None:
         found["learned"] = {
-            "features": [chosen.describe() for chosen in arm.correction.features],
+            "features": [chosen.describe().model_dump(mode="json") for chosen in arm.correction.features],
             "orders": list(arm.correction.orders),
             "fade_rad": arm.coverage.fade,
             "bases": {name: frame.tolist() for name, frame in model.hybrid_bases.items()},
@@ -183,7 +183,7 @@ def _frames(sections: Mapping[str, tuple[float, ...]]) -> Frames:
 
 
 def _empty_correction(learned: LearnedSection, robot: Robot) -> JointCorrection:
-    features = [features_from(robot, section.model_dump()) for section in learned.features]
+    features = [feature_from(robot, section) for section in learned.features]
     return JointCorrection(robot, features, learned.orders)
 
 
@@ -228,7 +228,7 @@ def _uncertainty(
     return PositionUncertainty(space, geometry, _weighted(known, hybrid), full, known.prior_scale)
 
 
-def _weighted(known: UncertaintySection, hybrid: HybridArm | None) -> tuple[AbstractFeatures, ...]:
+def _weighted(known: UncertaintySection, hybrid: HybridArm | None) -> tuple[AbstractFeature, ...]:
     """What the weights in the root belong to: the features, and factors of product units with the others held."""
     if hybrid is None:
         return ()

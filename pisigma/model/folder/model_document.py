@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import ConfigDict, Field, PositiveInt
+from pydantic import ConfigDict, Field, PlainValidator, PositiveInt
 
 from pisigma.errors import ModelError
+from pisigma.joint_correction.feature import FeatureSection
+from pisigma.joint_correction.registry import feature_section
 from pisigma.robot.robot_file import RobotDocument
 from pisigma.yaml_file import Section, parse_yaml
 
@@ -19,6 +21,7 @@ _CHECKSUM = re.compile(r"(.*^)sha256: ([0-9a-f]{64})\n", re.DOTALL | re.MULTILIN
 _Vector = tuple[float, float, float]
 _Frame = tuple[float, float, float, float, float, float]
 """x, y, z [m], roll, pitch, yaw [rad]."""
+_Feature = Annotated[FeatureSection, PlainValidator(feature_section)]
 
 
 class GroupSection(Section):
@@ -28,41 +31,6 @@ class GroupSection(Section):
     inputs: Annotated[tuple[str, ...], Field(min_length=1)]
     orders: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
     reference: tuple[_Vector, _Vector, _Vector]
-
-
-class SeriesSection(Section):
-    """See `pisigma.joint_correction.features.FourierSeries`."""
-
-    name: Literal["series"]
-    harmonics: Annotated[int, Field(ge=1, le=100_000)]
-
-
-class GravitySection(Section):
-    """See `pisigma.joint_correction.features.GravityTorques`."""
-
-    name: Literal["gravity"]
-    gravity: _Vector
-
-
-class ConditionSection(Section):
-    """See `pisigma.joint_correction.features.ConditionFeatures`."""
-
-    name: Literal["conditions"]
-    names: Annotated[tuple[Literal["payload_kg", "temperature_c"], ...], Field(min_length=1)]
-    mean: tuple[float, ...]
-    spread: tuple[float, ...]
-    gravity: _Vector
-
-
-class SharedSection(Section):
-    """See `pisigma.joint_correction.features.SharedFeatures`."""
-
-    name: Literal["joints", "sin_cos", "pose"]
-
-
-_Features = Annotated[
-    SeriesSection | GravitySection | ConditionSection | SharedSection, Field(discriminator="name")
-]
 
 
 class LearnedSection(Section):
@@ -76,7 +44,7 @@ class LearnedSection(Section):
         tools: per target.
     """
 
-    features: tuple[_Features, ...]
+    features: tuple[_Feature, ...]
     orders: tuple[Annotated[int, Field(ge=2, le=100)], ...]
     fade_rad: Annotated[float, Field(gt=0)]
     bases: dict[str, _Frame]

@@ -55,8 +55,9 @@ class OnnxGraph:
         self._constants: list[Any] = []
 
     def add_input(self, name: str, shape: Sequence[int], doc: str) -> str:
-        """Declare an input `(batch, *shape)`; gives its name."""
-        self.inputs.append(self._described(name, shape, doc))
+        """Declare an input `(batch, *shape)`, once; gives its name."""
+        if name not in {known.name for known in self.inputs}:
+            self.inputs.append(self._described(name, shape, doc))
         return name
 
     def add_output(self, value: str, name: str, shape: Sequence[int], doc: str) -> None:

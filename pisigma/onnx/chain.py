@@ -1,4 +1,4 @@
-"""Forward kinematics of a nominal robot as ONNX nodes, and the torques of gravity on its joints."""
+"""Forward kinematics of a nominal robot as ONNX nodes."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -6,9 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from pisigma.export.onnx_graph import OnnxGraph
-from pisigma.joint_correction.features import GravityTorques
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot
 from pisigma.robot.row import Row
 from pisigma.se3 import transform_from_xyzrpy
@@ -29,28 +28,39 @@ def add_pose(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str]:
     return graph.columns(cells, [3, 7, 11]), graph.columns(cells, [0, 1, 2, 4, 5, 6, 8, 9, 10])
 
 
-def add_gravity(graph: OnnxGraph, features: GravityTorques, weight: np.ndarray, robot: Robot, q: str) -> str:
-    """Weighted torques of unit masses and moments, `(batch, dof)`; see `GravityTorques.columns`."""
-    node, dof, g = graph.node, robot.dof, np.array(features.gravity)
+def add_joint_frames(graph: OnnxGraph, robot: Robot, q: str) -> tuple[str, str, str]:
+    """Axes `(batch, dof, 3)` and origins `(batch, dof, 3)` of the joints, and what is carried `(batch, 4 dof, 3)`.
+
+    All are in the frame of the first row, so without base and tool. Carried are, per joint, the origin and the three
+    axes of its row's frame.
+    """
+    node, dof = graph.node, robot.dof
     steps = [step for step in _add_chain(graph, robot, q, np.eye(4)) if step.row.type != "fixed"]
     before = [graph.reshape(step.before, [16]) for step in steps]
     after = [graph.reshape(step.after, [16]) for step in steps]
     axes = node("Concat", *(graph.columns(cells, [2, 6, 10]) for cells in before), axis=1)
-    z = node("Mul", graph.reshape(axes, [dof, 3]), robot.directions[:, None])
-    places = node("Concat", *(graph.columns(cells, [3, 7, 11]) for cells in before), axis=1)
+    origins = node("Concat", *(graph.columns(cells, [3, 7, 11]) for cells in before), axis=1)
     order = [3, 7, 11, 0, 4, 8, 1, 5, 9, 2, 6, 10]  # origin, then the three axes
     carried = node("Concat", *(graph.columns(cells, order) for cells in after), axis=1)
-    across = np.array([[0, -g[2], g[1]], [g[2], 0, -g[0]], [-g[1], g[0], 0]])
-    lever = node("MatMul", z, across.T)
-    cells = node("MatMul", lever, node("Transpose", graph.reshape(carried, [4 * dof, 3]), perm=[0, 2, 1]))
-    own = graph.reshape(graph.total(node("Mul", lever, graph.reshape(places, [dof, 3])), 2), [dof, 1])
-    origin = np.tile([1.0, 0.0, 0.0, 0.0], dof)
-    scale = np.tile([1 / robot.reach, *[features.ARM] * 3], dof)
-    turns = np.array(robot.revolute, dtype=np.float64)
-    weight = weight * features.used.numpy()
-    torques = node("Mul", node("Sub", cells, node("Mul", own, origin)), scale * weight * turns[:, None])
-    force = node("Mul", graph.total(node("Mul", z, g), 2), (weight * origin).sum(1) * (1 - turns))
-    return node("Add", graph.total(torques, 2), force)
+    return (
+        graph.reshape(axes, [dof, 3]),
+        graph.reshape(origins, [dof, 3]),
+        graph.reshape(carried, [4 * dof, 3]),
+    )
+
+
+def add_roll_pitch_yaw(graph: OnnxGraph, cells: str) -> list[str]:
+    """Roll, pitch, yaw of rotations `(batch, 9)`, each `(batch, 1)`; see `pisigma.se3.rpy_from_rotation`."""
+    node = graph.node
+    entry = {(i, j): graph.column(cells, 3 * i + j) for i in range(3) for j in range(3)}
+    square = node("Add", *(node("Mul", entry[i, 0], entry[i, 0]) for i in range(2)))
+    regular = node("Greater", square, 1e-24)
+    horizontal = node("Where", regular, node("Sqrt", square), 0.0)
+    pitch = graph.angle(node("Neg", entry[2, 0]), horizontal)
+    sine = node("Where", regular, entry[1, 0], node("Neg", entry[0, 1]))
+    roll = graph.angle(sine, node("Where", regular, entry[0, 0], entry[1, 1]))
+    yaw = graph.angle(node("Where", regular, entry[2, 1], 0.0), node("Where", regular, entry[2, 2], 1.0))
+    return [roll, pitch, yaw]
 
 
 def _add_chain(graph: OnnxGraph, robot: Robot, q: str, base: np.ndarray) -> Iterator[_Step]:

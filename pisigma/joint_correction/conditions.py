@@ -1,0 +1,189 @@
+"""Payload and temperature: what they do to the joints, and a correction under fixed ones."""
+
+from collections.abc import Callable, Sequence
+from typing import Annotated, Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from pydantic import Field
+from torch import Tensor
+
+from pisigma.joint_correction.feature import (
+    AbstractFeature,
+    FeatureOptions,
+    FeatureSection,
+    scaled_joints,
+)
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import Direction, GravityTorques
+from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.joint_correction.shared_features import ScaledJoints
+from pisigma.measurement.conditions import JointState
+from pisigma.onnx.graph import OnnxGraph
+from pisigma.robot.description import Robot
+
+
+class ConditionSection(FeatureSection):
+    """Conditions in the description of a model."""
+
+    name: Literal["conditions"]
+    names: Annotated[tuple[Literal["payload_kg", "temperature_c"], ...], Field(min_length=1)]
+    mean: tuple[float, ...]
+    spread: tuple[float, ...]
+    gravity: Direction
+
+
+class ConditionFeatures(AbstractFeature):
+    """Payload and temperature: each times 1, sine and cosine of the joint's own value (prismatic: scaled value).
+
+    A condition counts in standard deviations from its mean over the measured rows, so that joint values alone stand
+    for the usual conditions. The payload also goes with the gravity torques of a mass at the last row's frame.
+
+    Attributes:
+        names: of the conditions.
+        mean: over the measured rows [kg, deg C].
+        spread: standard deviation over them.
+    """
+
+    name = "conditions"
+    section = ConditionSection
+    reads = ("payload_kg", "temperature_c")
+
+    def __init__(
+        self,
+        robot: Robot,
+        names: Sequence[str],
+        mean: Sequence[float],
+        spread: Sequence[float],
+        gravity: Direction = (0.0, 0.0, -1.0),
+    ) -> None:
+        """Take some conditions.
+
+        Raises:
+            ValueError: there is none, or one does not vary.
+        """
+        super().__init__(robot)
+        if not names or not len(names) == len(mean) == len(spread) or min(spread) <= 0:
+            raise ValueError(
+                f"conditions need names, means and positive spreads, got {tuple(names)}, {tuple(mean)}, "
+                f"{tuple(spread)}."
+            )
+        self.names, self.mean, self.spread = tuple(names), tuple(mean), tuple(spread)
+        self._torques = GravityTorques(robot, gravity)
+        self.gravity = self._torques.gravity
+        loaded = 4 if "payload_kg" in self.names else 0
+        self.used = torch.ones(robot.dof, 3 * len(self.names) + loaded, dtype=torch.bool)
+        group = [k for k in range(len(self.names)) for _ in range(3)]
+        group += [self.names.index("payload_kg")] * 4 if loaded else []
+        self.group = torch.tensor(group).expand(self.used.shape)
+        self.group_names = self.names
+
+    @classmethod
+    def candidates(
+        cls, robot: Robot, options: FeatureOptions, state: JointState
+    ) -> tuple["ConditionFeatures", ...]:
+        """None where no condition varies."""
+        if not options.varying:
+            return ()
+        values = torch.stack([state.stated[name] for name in options.varying], 1)
+        mean, spread = values.mean(0).tolist(), values.std(0).tolist()
+        return (ConditionFeatures(robot, options.varying, mean, spread, options.gravity),)
+
+    @classmethod
+    def from_section(cls, robot: Robot, section: ConditionSection) -> "ConditionFeatures":
+        """See `AbstractFeature.from_section`."""
+        return ConditionFeatures(robot, section.names, section.mean, section.spread, section.gravity)
+
+    def describe(self) -> ConditionSection:
+        """See `AbstractFeature.describe`."""
+        return ConditionSection(
+            name="conditions", names=self.names, mean=self.mean, spread=self.spread, gravity=self.gravity
+        )
+
+    def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
+        """The products; 0 under the usual conditions, and for conditions that are NaN or missing."""
+        q = state.q
+        if not any(name in state.stated for name in self.names):
+            return q.new_zeros((*q.shape, self.count))
+        missing = torch.full_like(q[..., 0], torch.nan)
+        stated = torch.stack([state.stated.get(name, missing).to(q) for name in self.names], -1)
+        scaled = (stated - q.new_tensor(self.mean)) / q.new_tensor(self.spread)
+        scaled = torch.where(torch.isfinite(scaled), scaled, 0.0)
+        turning = torch.tensor(self.robot.revolute, device=q.device)
+        sine = torch.where(turning, q.sin(), scaled_joints(self.robot, q))
+        cosine = torch.where(turning, q.cos(), torch.zeros_like(q))
+        own = torch.stack([torch.ones_like(q), sine, cosine], -1)
+        columns = [own * scaled[..., k, None, None] for k in range(len(self.names))]
+        if "payload_kg" in self.names:
+            torques = self._torques.columns(state)[..., -4:]
+            columns.append(torques * scaled[..., self.names.index("payload_kg"), None, None])
+        return torch.cat(columns, -1)
+
+    def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> None:
+        """Nothing: under the usual conditions it is 0."""
+
+
+def learned_conditions(correction: JointCorrection) -> ConditionFeatures | None:
+    """What a correction has learned of payload and temperature; None where it has learned nothing."""
+    return next((own for own in correction.features if isinstance(own, ConditionFeatures)), None)
+
+
+def at_conditions(
+    correction: JointCorrection, scaled: Float64[Tensor, " conditions"]
+) -> tuple[JointCorrection, Float64[Tensor, " dof"]]:
+    """A correction under fixed conditions, as a function of the joint values alone.
+
+    With `ConditionFeatures` weights at fixed conditions are shifts of the joints, first harmonics, and gravity
+    torques of the last row; these are added to the weights of the other features.
+
+    Args:
+        correction: one that has learned what conditions do.
+        scaled: the conditions, in standard deviations from their mean.
+
+    Returns:
+        The correction without `ConditionFeatures`, and the shift of every joint [rad or m] that belongs to it.
+    """
+    robot = correction.robot
+    kept: list[tuple[AbstractFeature, Tensor]] = []
+    learned, weight = learned_conditions(correction), scaled
+    assert learned is not None
+    for feature, values in zip(correction.features, correction.linear, strict=True):
+        if feature is learned:
+            weight = values.detach()
+        else:
+            kept.append((feature, values.detach().clone()))
+    count = len(learned.names)
+    shift, sine, cosine = (weight[:, : 3 * count].view(-1, count, 3) * scaled[:, None]).sum(1).unbind(1)
+    slides = ~torch.tensor(robot.revolute)
+    series = _weights_of(kept, FourierSeries(robot, 1), lambda other: isinstance(other, FourierSeries))
+    harmonics = series.shape[1] // 2
+    series[:, 0] += torch.where(slides, 0.0, sine)
+    series[:, harmonics] += torch.where(slides, 0.0, cosine)
+    if bool(slides.any()):
+        joints = _weights_of(kept, ScaledJoints(robot), lambda other: isinstance(other, ScaledJoints))
+        joints.diagonal().add_(torch.where(slides, sine, 0.0))
+    if "payload_kg" in learned.names:
+        falling = GravityTorques(robot, learned.gravity)
+        torques = _weights_of(kept, falling, lambda other: other.describe() == falling.describe())
+        torques[:, -4:] += weight[:, 3 * count :] * scaled[learned.names.index("payload_kg")]
+    made = JointCorrection(robot, [feature for feature, _ in kept], correction.orders)
+    made.load_state_dict(
+        {f"linear.{k}": values for k, (_, values) in enumerate(kept)}
+        | {key: correction.state_dict()[key] for key in ("weight", "bias", "fixed")}
+    )
+    made.requires_grad_(False)
+    return made, shift
+
+
+def _weights_of(
+    kept: list[tuple[AbstractFeature, Tensor]],
+    wanted: AbstractFeature,
+    fits: Callable[[AbstractFeature], bool],
+) -> Float64[Tensor, "dof columns"]:
+    """Weights of the feature that fits, to be changed in place; of the wanted one, all 0, where none does."""
+    for feature, weights in kept:
+        if fits(feature):
+            return weights
+    kept.append((wanted, torch.zeros(wanted.used.shape, dtype=torch.float64)))
+    return kept[-1][1]

@@ -1,0 +1,181 @@
+"""What a feature is: functions of the joint values that a joint's correction is a weighted sum of."""
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float, Float64, Int64
+from torch import Tensor
+
+from pisigma.kernels.features import CompiledForm
+from pisigma.measurement.conditions import JointState
+from pisigma.onnx.graph import OnnxGraph
+from pisigma.robot.description import Robot
+from pisigma.yaml_file import Section
+
+Feature = TypeVar("Feature", bound="AbstractFeature")
+
+
+class FeatureSection(Section):
+    """A feature in the description of a model: its name, and in subclasses what else it is made from."""
+
+    name: str
+
+
+@dataclass(frozen=True)
+class FeatureOptions:
+    """What a calibrator says to the features that it tries.
+
+    Attributes:
+        harmonics: of Fourier series, in the order in which they are tried.
+        gravity: direction in which things fall, in the frame of the robot's first row.
+        configurations: number of different joint values that were measured.
+        varying: names of the conditions that all rows state and that vary.
+    """
+
+    harmonics: tuple[int, ...]
+    gravity: tuple[float, float, float]
+    configurations: int
+    varying: tuple[str, ...] = ()
+
+
+class AbstractFeature(ABC):
+    """Columns for every joint: the correction of joint j is `Σ_m weight[j, m] · columns(state)[..., j, m]`.
+
+    A new feature is a subclass in a file of its own and a line in `registry.py`; `register_feature` takes one from
+    anywhere. Without `compiled` the models that use it run by the torch reference, without `add_onnx` they are not
+    exported as ONNX.
+
+    Attributes:
+        robot: the nominal robot.
+        name: of the feature, as recipes and models write it.
+        section: how it stands in the description of a model.
+        reads: what it needs of the rows beside the joint values, by the names of `JointState.stated`.
+        compiled: its form in the kernels, which gets the numbers of `pack`; None where it has none.
+        used: `(dof, m)`: which columns a joint has; the others are not to be given weights.
+        group: `(dof, m)`: number of the prior size that a column's weight has, from 0 on.
+        group_names: of the prior sizes.
+        size: how large it is among those of its name that are tried in turn, such as its number of harmonics; 0
+            where there is only one.
+    """
+
+    name: ClassVar[str]
+    section: ClassVar[type[FeatureSection]] = FeatureSection
+    reads: ClassVar[tuple[str, ...]] = ()
+    compiled: ClassVar[CompiledForm | None] = None
+    used: Bool[Tensor, "dof columns"]
+    group: Int64[Tensor, "dof columns"]
+    group_names: tuple[str, ...]
+    size: int = 0
+
+    def __init__(self, robot: Robot) -> None:
+        """Prepare for the nominal robot."""
+        self.robot = robot
+
+    @abstractmethod
+    def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
+        """Values of the columns, of the order of 1.
+
+        Args:
+            state: joint values [rad or m], and what is stated beside them.
+        """
+
+    @classmethod
+    def candidates(
+        cls: type[Feature], robot: Robot, options: FeatureOptions, state: JointState
+    ) -> tuple[Feature, ...]:
+        """What a calibrator tries: one feature, ever larger ones, or none where the rows lack what it needs.
+
+        Args:
+            robot: the nominal robot.
+            options: of the calibrator.
+            state: of the rows on which features are chosen.
+        """
+        return (cls.from_section(robot, cls.section(name=cls.name)),)
+
+    @classmethod
+    def from_section(cls: type[Feature], robot: Robot, section: Any) -> Feature:
+        """The feature that a section describes, as `describe` gives it.
+
+        Args:
+            robot: the nominal robot.
+            section: of the type `cls.section`.
+
+        Raises:
+            ValueError: the values make no feature.
+        """
+        return cls(robot)
+
+    def describe(self) -> FeatureSection:
+        """What `from_section` makes the same feature again from."""
+        return self.section(name=self.name)
+
+    def pack(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, " values"]:
+        """The numbers that the compiled form reads, in its own order."""
+        return weight.ravel()
+
+    def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str | None:
+        """Add the weighted sum of the columns to an ONNX graph.
+
+        Args:
+            graph: to add to.
+            weight: of the columns.
+            q: joint values `(batch, dof)` in the graph.
+
+        Returns:
+            Corrections `(batch, dof)` in the graph; None where they are 0 at usual conditions.
+
+        Raises:
+            NotImplementedError: the feature has no ONNX form.
+        """
+        raise NotImplementedError
+
+    def is_periodic(self, weight: Float64[np.ndarray, "dof columns"]) -> bool:
+        """Whether a full turn of a revolute joint changes nothing, with these weights."""
+        return True
+
+    def places_in(self, larger: "AbstractFeature") -> Int64[Tensor, "dof columns"]:
+        """Which columns of a feature of the same name and at least this size are the columns of this one."""
+        return torch.arange(self.count).expand(self.used.shape)
+
+    @property
+    def count(self) -> int:
+        """Number of columns of a joint."""
+        return self.used.shape[1]
+
+    @property
+    def label(self) -> str:
+        """What it is called in a table of what was tried."""
+        return f"{self.name} {self.size}" if self.size else self.name
+
+
+def turning_rate(robot: Robot) -> Float[np.ndarray, " dof"]:
+    """Angle of a joint's periodic functions per joint value: 1 for a revolute joint [rad/rad].
+
+    A prismatic joint repeats after twice its travel, [rad/m]; without limits its unit of travel is the reach.
+    """
+    travel = np.diff(robot.limits)[:, 0]
+    travel = np.where(np.isfinite(travel) & (travel > 0), travel, max(robot.reach, 1e-3))
+    return np.where(robot.revolute, 1.0, np.pi / travel)
+
+
+def scaled_joints(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+    """Joint values, 0 in the middle of the limits and ±1 at them; without limits over pi or the reach."""
+    limited = np.isfinite(robot.limits).all(1)
+    bounds = np.where(limited[:, None], robot.limits, 0.0)
+    middle, half = bounds.mean(1), (bounds[:, 1] - bounds[:, 0]) / 2
+    half = np.where(limited, half, np.where(robot.revolute, np.pi, robot.reach))
+    return (q - q.new_tensor(middle)) / q.new_tensor(half)
+
+
+def unit_inputs(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch inputs"]:
+    """Inputs of the product units: sines, then cosines of the revolute joints, then scaled prismatic joints."""
+    turning = torch.from_numpy(np.flatnonzero(robot.revolute)).to(q.device)
+    sliding = torch.from_numpy(np.flatnonzero(~np.asarray(robot.revolute))).to(q.device)
+    angle = q.index_select(-1, turning)
+    inputs = [angle.sin(), angle.cos()]
+    if len(sliding):
+        inputs.append(scaled_joints(robot, q).index_select(-1, sliding))
+    return torch.cat(inputs, -1)

@@ -1,0 +1,170 @@
+"""Torques of gravity on the joints, for masses that are not known: joints and gears give way to them."""
+
+from typing import Any, Literal, no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, FeatureSection
+from pisigma.kernels.features import CompiledForm
+from pisigma.kinematics.forward import Geometry, iterate_rows
+from pisigma.measurement.conditions import JointState
+from pisigma.onnx.chain import add_joint_frames
+from pisigma.onnx.graph import OnnxGraph
+from pisigma.robot.description import Robot
+
+Direction = tuple[float, float, float]
+
+
+class GravitySection(FeatureSection):
+    """Torques of gravity in the description of a model."""
+
+    name: Literal["gravity"]
+    gravity: Direction
+
+
+@no_type_check
+def add_gravity(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
+    """Add what unknown masses turn the joints.
+
+    Torque j is `Σ_k z_j · (arm_jk × g)`, with the weights of row k in `arm_jk`, and `z · (a × g) = a · (g × z)`.
+    `correction.values` holds g, and for joint j and moved row k four weights: over the reach (mass), and times the
+    arm (first moments). `memory.frames` holds of every joint its axis and origin, and axes and origin of its row.
+    """
+    gx, gy, gz = correction.values[first], correction.values[first + 1], correction.values[first + 2]
+    dof = arms.dof
+    for j in range(dof):
+        own, sign = memory.frames[j], arms.direction[j]
+        zx, zy, zz = sign * own[0], sign * own[1], sign * own[2]
+        u, v, w = 0.0, 0.0, 0.0
+        force = 0.0
+        for k in range(j, dof):
+            start, frame = first + 3 + 4 * (dof * j + k), memory.frames[k]
+            weight = correction.values[start : start + 4]
+            force += weight[0]
+            u += weight[0] * (frame[15] - own[3])
+            v += weight[0] * (frame[16] - own[4])
+            w += weight[0] * (frame[17] - own[5])
+            u += weight[1] * frame[6] + weight[2] * frame[9] + weight[3] * frame[12]
+            v += weight[1] * frame[7] + weight[2] * frame[10] + weight[3] * frame[13]
+            w += weight[1] * frame[8] + weight[2] * frame[11] + weight[3] * frame[14]
+        if arms.revolute[j]:
+            memory.delta[j] += u * (gy * zz - gz * zy) + v * (gz * zx - gx * zz) + w * (gx * zy - gy * zx)
+        else:
+            memory.delta[j] += force * (zx * gx + zy * gy + zz * gz)
+
+
+class GravityTorques(AbstractFeature):
+    """What gravity turns a joint with.
+
+    The torque on joint j is linear in the masses beyond it. For every moved row k from joint j on it has four
+    columns, a mass in the origin p_k of the row's frame and first moments along its axes u [1/m, scaled by
+    `ARM` as a usual distance]::
+
+        z_j · ((p_k - p_j) × g) / reach        z_j · (u_k × g) · ARM
+
+    with g the direction of gravity; a weight is then compliance times mass. On a prismatic joint, the force
+    `z_j · g`. Taken on the nominal geometry.
+
+    Source: Whitney, Lozinski and Rourke, ASME Journal of Dynamic Systems, Measurement, and Control 108(1),
+    1986, 1-8; regressors linear in the masses as in Khalil and Dombre, "Modeling, Identification and Control
+    of Robots", 2002, chapter 9.
+    """
+
+    name = "gravity"
+    section = GravitySection
+    compiled = CompiledForm(add_gravity, frames=True)
+    ARM = 0.2
+    """Centres of mass lie about this share of the reach from the frames' origins."""
+    group_names = ("gravity",)
+
+    def __init__(self, robot: Robot, gravity: Direction = (0.0, 0.0, -1.0)) -> None:
+        """Prepare for a robot.
+
+        Args:
+            robot: the nominal robot; its base and tool do not matter.
+            gravity: direction in which things fall, in the frame of the robot's first row.
+        """
+        super().__init__(robot)
+        norm = float(np.linalg.norm(gravity))
+        if not norm > 0 or not np.isfinite(norm):
+            raise ValueError(f"gravity needs a direction, got {gravity}.")
+        unit = (
+            abs(norm - 1) < 1e-12
+        )  # kept as it is, so that features made again are the same to the last bit
+        x, y, z = (float(value if unit else value / norm) for value in gravity)
+        self.gravity: Direction = (x, y, z)
+        self.used = torch.ones(robot.dof, robot.dof, dtype=torch.bool).triu().repeat_interleave(4, 1)
+        self.group = torch.zeros_like(self.used, dtype=torch.int64)
+
+    @classmethod
+    def candidates(
+        cls, robot: Robot, options: FeatureOptions, state: JointState
+    ) -> tuple["GravityTorques", ...]:
+        """See `AbstractFeature.candidates`."""
+        return (GravityTorques(robot, options.gravity),)
+
+    @classmethod
+    def from_section(cls, robot: Robot, section: GravitySection) -> "GravityTorques":
+        """See `AbstractFeature.from_section`."""
+        return GravityTorques(robot, section.gravity)
+
+    def describe(self) -> GravitySection:
+        """See `AbstractFeature.describe`."""
+        return GravitySection(name="gravity", gravity=self.gravity)
+
+    def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
+        """Torques of unit masses and moments over the reach; 0 for masses before the joint."""
+        q = state.q
+        z, p, carried = self._frames(q.reshape(-1, self.robot.dof))
+        g, z = q.new_tensor(self.gravity), z * q.new_tensor(self.robot.directions)[:, None, None]
+        lever = torch.linalg.cross(g[None, :, None].expand_as(z), z, dim=1)  # z · (a × g) = a · (g × z)
+        cells = torch.stack([lever[:, c, None, None] * carried[:, :, c] for c in range(3)]).sum(0)
+        origin = cells[:, :, :1] - (lever * p).sum(1)[:, None, None]
+        cells = torch.cat([origin / self.robot.reach, cells[:, :, 1:] * self.ARM], 2)
+        turning = torch.tensor(self.robot.revolute, device=q.device)[:, None, None, None]
+        force = (z * g[:, None]).sum(1)[:, None, None] * q.new_tensor([1.0, 0.0, 0.0, 0.0])[:, None]
+        cells = torch.where(turning, cells, force) * self.used.to(q).view(*cells.shape[:3], 1)
+        return cells.flatten(1, 2).movedim(-1, 0).reshape(*q.shape, 4 * self.robot.dof)
+
+    def _frames(self, q: Float[Tensor, "poses dof"]) -> tuple[Tensor, Tensor, Tensor]:
+        """Per joint its axis and origin, and the origin and the axes of its row's frame; the pose index is last."""
+        geometry = Geometry(self.robot.dh.tolist(), [0.0] * 6, [0.0] * 6)
+
+        def vector(values: tuple[float | Tensor, ...]) -> Tensor:
+            return torch.stack([value * torch.ones_like(q[:, 0]) for value in values])
+
+        found = []
+        columns = q.t().contiguous().unbind(0)
+        for row, step in zip(self.robot.rows, iterate_rows(self.robot, geometry, columns), strict=True):
+            if row.type != "fixed":
+                carried = torch.stack([vector(part) for part in (step.after[3], *step.after[:3])])
+                found.append((vector(step.before[2]), vector(step.before[3]), carried))
+        z, p, carried = (torch.stack(part) for part in zip(*found, strict=True))
+        return z, p, carried
+
+    def pack(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, " values"]:
+        """Direction of gravity, and the scaled weights of every joint and moved row."""
+        dof, slides = self.robot.dof, ~np.array(self.robot.revolute)
+        masses = (weight * self.used.numpy()).reshape(dof, dof, 4)
+        scale = np.where(slides[:, None], [1.0, 0.0, 0.0, 0.0], [1 / self.robot.reach, *[self.ARM] * 3])
+        return np.concatenate([self.gravity, (masses * scale[:, None]).ravel()])
+
+    def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
+        """See `AbstractFeature.add_onnx`."""
+        node, dof, g = graph.node, self.robot.dof, np.array(self.gravity)
+        axes, origins, carried = add_joint_frames(graph, self.robot, q)
+        z = node("Mul", axes, self.robot.directions[:, None])
+        across = np.array([[0, -g[2], g[1]], [g[2], 0, -g[0]], [-g[1], g[0], 0]])
+        lever = node("MatMul", z, across.T)
+        cells = node("MatMul", lever, node("Transpose", carried, perm=[0, 2, 1]))
+        own = graph.reshape(graph.total(node("Mul", lever, origins), 2), [dof, 1])
+        origin = np.tile([1.0, 0.0, 0.0, 0.0], dof)
+        scale = np.tile([1 / self.robot.reach, *[self.ARM] * 3], dof)
+        turns = np.array(self.robot.revolute, dtype=np.float64)
+        weight = weight * self.used.numpy()
+        torques = node("Mul", node("Sub", cells, node("Mul", own, origin)), scale * weight * turns[:, None])
+        force = node("Mul", graph.total(node("Mul", z, g), 2), (weight * origin).sum(1) * (1 - turns))
+        return node("Add", graph.total(torques, 2), force)

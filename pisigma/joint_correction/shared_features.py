@@ -1,0 +1,138 @@
+"""Features that have the same columns for every joint: scaled joints, sines and cosines, or the nominal pose."""
+
+from abc import abstractmethod
+from typing import Any, no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from torch import Tensor
+
+from pisigma.joint_correction.feature import AbstractFeature, scaled_joints, unit_inputs
+from pisigma.kernels.features import CompiledForm
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.conditions import JointState
+from pisigma.network.inputs import Inputs
+from pisigma.onnx.chain import add_pose, add_roll_pitch_yaw
+from pisigma.onnx.graph import OnnxGraph
+from pisigma.robot.description import Robot
+
+
+class AbstractSharedFeature(AbstractFeature):
+    """What features share whose columns do not depend on the joint that they correct."""
+
+    def __init__(self, robot: Robot) -> None:
+        """Prepare for a robot."""
+        super().__init__(robot)
+        count = self.values(torch.zeros(robot.dof, dtype=torch.float64)).shape[-1]
+        self.used = torch.ones(robot.dof, count, dtype=torch.bool)
+        self.group = torch.zeros(robot.dof, count, dtype=torch.int64)
+        self.group_names = (self.name,)
+
+    def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
+        """The values, once for every joint."""
+        values = self.values(state.q)
+        return values.unsqueeze(-2).expand(*state.q.shape, values.shape[-1])
+
+    @abstractmethod
+    def values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:
+        """The columns."""
+
+    def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
+        """See `AbstractFeature.add_onnx`."""
+        return graph.node("MatMul", self.add_values(graph, q), weight.T)
+
+    @abstractmethod
+    def add_values(self, graph: OnnxGraph, q: str) -> str:
+        """The columns in an ONNX graph, `(batch, columns)`."""
+
+
+@no_type_check
+def add_scaled(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
+    """Add weighted scaled joint values."""
+    for j in range(arms.dof):
+        for i in range(arms.dof):
+            weight = correction.values[first + arms.dof * j + i]
+            memory.delta[j] += weight * (q[i] - correction.middle[i]) / correction.half[i]
+
+
+class ScaledJoints(AbstractSharedFeature):
+    """Scaled values of all joints: 0 in the middle of the limits, ±1 at them."""
+
+    name = "joints"
+    compiled = CompiledForm(add_scaled)
+
+    def values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:
+        """See `scaled_joints`."""
+        return scaled_joints(self.robot, q)
+
+    def add_values(self, graph: OnnxGraph, q: str) -> str:
+        """See `AbstractSharedFeature.add_values`."""
+        return add_scaled_joints(graph, self.robot, q)
+
+    def is_periodic(self, weight: Float64[np.ndarray, "dof columns"]) -> bool:
+        """Not where a revolute joint has weights."""
+        return not weight[:, np.array(self.robot.revolute)].any()
+
+
+@no_type_check
+def add_inputs(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
+    """Add weighted inputs of the product units."""
+    for j in range(arms.dof):
+        for i in range(correction.inputs):
+            memory.delta[j] += correction.values[first + correction.inputs * j + i] * memory.phi[i]
+
+
+class SinesCosines(AbstractSharedFeature):
+    """Sine and cosine of every revolute joint, scaled value of every prismatic one."""
+
+    name = "sin_cos"
+    compiled = CompiledForm(add_inputs)
+
+    def values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:
+        """See `unit_inputs`."""
+        return unit_inputs(self.robot, q)
+
+    def add_values(self, graph: OnnxGraph, q: str) -> str:
+        """See `AbstractSharedFeature.add_values`."""
+        return add_unit_inputs(graph, self.robot, q)
+
+
+class NominalPose(AbstractSharedFeature):
+    """The nominal pose's x, y, z over the reach, and roll, pitch, yaw [rad] (Jeong et al. 1998, section 3.2)."""
+
+    name = "pose"
+
+    def __init__(self, robot: Robot) -> None:
+        """Prepare for a robot."""
+        self._inputs = Inputs.of(robot, ("x", "y", "z", "roll", "pitch", "yaw"))
+        super().__init__(robot)
+
+    def values(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch columns"]:
+        """The coordinates of the pose."""
+        values = self._inputs(forward_kinematics(self.robot, q), q)
+        return values / values.new_tensor([self.robot.reach] * 3 + [1.0] * 3)
+
+    def add_values(self, graph: OnnxGraph, q: str) -> str:
+        """See `AbstractSharedFeature.add_values`."""
+        position, R = add_pose(graph, self.robot, q)
+        scaled = graph.node("Div", position, self.robot.reach)
+        return graph.node("Concat", scaled, *add_roll_pitch_yaw(graph, R), axis=1)
+
+
+def add_scaled_joints(graph: OnnxGraph, robot: Robot, q: str) -> str:
+    """See `scaled_joints`; `(batch, dof)`."""
+    zero = scaled_joints(robot, torch.zeros(robot.dof, dtype=torch.float64)).numpy()
+    one = scaled_joints(robot, torch.ones(robot.dof, dtype=torch.float64)).numpy()
+    return graph.node("Add", graph.node("Mul", q, one - zero), zero)
+
+
+def add_unit_inputs(graph: OnnxGraph, robot: Robot, q: str) -> str:
+    """See `unit_inputs`; `(batch, inputs)`."""
+    turning = np.flatnonzero(robot.revolute).tolist()
+    sliding = np.flatnonzero(~np.array(robot.revolute)).tolist()
+    angle = graph.columns(q, turning)
+    inputs = [graph.node("Sin", angle), graph.node("Cos", angle)] if turning else []
+    if sliding:
+        inputs.append(graph.columns(add_scaled_joints(graph, robot, q), sliding))
+    return graph.node("Concat", *inputs, axis=1)

@@ -1,0 +1,1 @@
+"""ONNX graphs, node by node, and the parts of them that several layers use."""
