@@ -19,37 +19,52 @@ if TYPE_CHECKING:
     from pisigma.measurement.dataset import Measurements as Measurements
     from pisigma.network.pi_sigma import PiSigma as PiSigma
     from pisigma.robot.description import Robot as Robot
+    from pisigma.workflow.evaluate import EvaluationSettings as EvaluationSettings
+    from pisigma.workflow.evaluate import Limits as Limits
+    from pisigma.workflow.evaluate import evaluate as evaluate
+    from pisigma.workflow.verify import VerificationSettings as VerificationSettings
+    from pisigma.workflow.verify import verify as verify
 
 __version__ = "0.1.0"
 
 _HOMES = {
     "CalibrationResult": "pisigma.identification.result",
     "CorrectedIK": "pisigma.inverse.corrected_ik",
+    "EvaluationSettings": "pisigma.workflow.evaluate",
     "GeometricCalibrator": "pisigma.identification.calibrator",
     "HybridCalibrator": "pisigma.hybrid.calibrator",
     "HybridResult": "pisigma.hybrid.result",
+    "Limits": "pisigma.workflow.evaluate",
     "Measurements": "pisigma.measurement.dataset",
     "PiSigma": "pisigma.network.pi_sigma",
     "PisigmaError": "pisigma.errors",
     "Robot": "pisigma.robot.description",
     "Solution": "pisigma.inverse.solution",
     "Status": "pisigma.kinematics.status",
+    "VerificationSettings": "pisigma.workflow.verify",
+    "evaluate": "pisigma.workflow.evaluate",
     "load": "pisigma.inverse.corrected_ik",
+    "verify": "pisigma.workflow.verify",
 }
 
 __all__ = [
     "CalibrationResult",
     "CorrectedIK",
+    "EvaluationSettings",
     "GeometricCalibrator",
     "HybridCalibrator",
     "HybridResult",
+    "Limits",
     "Measurements",
     "PiSigma",
     "PisigmaError",
     "Robot",
     "Solution",
     "Status",
+    "VerificationSettings",
+    "evaluate",
     "load",
+    "verify",
 ]
 
 
