@@ -131,7 +131,7 @@ class Cause:
             "correction".
         clause: what is wrong, such as "the sign of joint 3 is reversed".
         advice: what it means or what to check.
-        size: how much is assumed; of what explains equally well, the smallest is believed.
+        size: how much is assumed, 1 at least; of what explains equally well, the smallest is believed.
         joints: the joints that it is about, from 0.
     """
 
@@ -150,16 +150,16 @@ def joint_causes(maps: JointMaps, number: int, robot: Robot) -> tuple[Cause, ...
     advice = "check the order of the joint columns"
     if len(moved) == 2:
         clause = f"the columns of {_joints(moved)} are swapped"
-        causes.append(Cause("joint_order", clause, advice, 1, moved))
+        causes.append(Cause("joint_order", clause, advice, 1.0, moved))
     elif moved:
         columns = ", ".join(f"q{column + 1}" for column in order)
         clause = f"the joint columns stand in another order (joints 1 to {robot.dof} are in {columns})"
-        causes.append(Cause("joint_order", clause, advice, 2, moved))
+        causes.append(Cause("joint_order", clause, advice, 2.0, moved))
     if negative := tuple(i for i, value in enumerate(factor) if value < 0):
         signs = "the sign of {} is reversed" if len(negative) == 1 else "the signs of {} are reversed"
         clause = signs.format(_joints(negative))
         causes.append(
-            Cause("joint_sign", clause, "check the directions of the joints", len(negative), negative)
+            Cause("joint_sign", clause, "check the directions of the joints", float(len(negative)), negative)
         )
     causes.extend(_unit_causes(factor, robot))
     if zeros := tuple(i for i, value in enumerate(offset) if value):
@@ -176,7 +176,7 @@ def _unit_causes(factor: list[float], robot: Robot) -> list[Cause]:
             if wrong:
                 named, are = (large, small) if too_large else (small, large)
                 clause = f"the values of {_joints(wrong)} are {are} that are named {named}"
-                size = 1 if list(wrong) == joints else len(wrong)
+                size = 1.0 if list(wrong) == joints else float(len(wrong))
                 causes.append(
                     Cause("joint_unit", clause, "correct the unit in the column names", size, wrong)
                 )

@@ -178,12 +178,12 @@ def _hypotheses(model: CalibratedModel, some: Measurements, here: _Hypothesis) -
     yield from _elsewhere(model, some, here)
     for factor, are, named in ((1e-3, "millimetres", "metres"), (1e3, "metres", "millimetres")):
         clause = f"x, y and z are {are} that are named {named}"
-        unit = Cause("position_unit", clause, "correct the unit in the column names", 1)
+        unit = Cause("position_unit", clause, "correct the unit in the column names", 1.0)
         scaled = replace(here, measured=here.measured.scaled(factor), causes=(unit,))
         yield from _all_frames(model, some, scaled)
     for T, clause, advice in _other_corrections(model, some, here.T):
         yield from _all_frames(
-            model, some, here.with_cause(Cause("correction", clause, advice, 1), T, fitted=0)
+            model, some, here.with_cause(Cause("correction", clause, advice, 1.0), T, fitted=0)
         )
     if here.error > SMALL_SHARE * model.robot.reach:
         maps = likely_maps(model, some, here.measured)
@@ -255,12 +255,12 @@ def _frame_moved(X: Float64[Tensor, "rows 4 4"]) -> Cause:
         "the sensor or what it measures from stands elsewhere than when the model was fitted (if it was moved, verify "
         "with --fit-frame)"
     )
-    return Cause("frame", f"the measuring frame has moved ({_motion_text(X)})", advice, 2)
+    return Cause("frame", f"the measuring frame has moved ({_motion_text(X)})", advice, 2.0)
 
 
 def _tool_moved(X: Float64[Tensor, "rows 4 4"]) -> Cause:
     advice = "another point of the tool was measured than when the model was fitted"
-    return Cause("tool", f"another tool or target is mounted ({_motion_text(X)})", advice, 2)
+    return Cause("tool", f"another tool or target is mounted ({_motion_text(X)})", advice, 2.0)
 
 
 def _motion_text(X: Float64[Tensor, "rows 4 4"]) -> str:
