@@ -14,6 +14,8 @@ from pisigma.inverse.posture import Postures
 from pisigma.model.folder.folder_files import COMPILED, folder_hash
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
+    import pytorch_kinematics
+
     import pisigma.inverse.path
     import pisigma.inverse.solution
     import pisigma.inverse.torch_ik
@@ -182,6 +184,10 @@ class CorrectedIK:
         from pisigma.model.accuracy import position_accuracy
 
         return position_accuracy(self.model, torch.from_numpy(np.array(q, dtype=np.float64))).numpy()
+
+    def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
+        """The geometry as a chain of pytorch-kinematics; see `CalibratedModel.to_pytorch_kinematics`."""
+        return self.model.to_pytorch_kinematics()
 
     @cached_property
     def postures(self) -> Postures:

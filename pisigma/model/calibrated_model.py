@@ -1,7 +1,7 @@
 """A calibrated robot: geometry, learned joint corrections and where both hold."""
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -15,6 +15,9 @@ from pisigma.model.domain import Domain
 from pisigma.model.hybrid_motion import hybrid_poses
 from pisigma.network.correction_network import CorrectionNetwork
 from pisigma.robot.description import Robot
+
+if TYPE_CHECKING:
+    import pytorch_kinematics
 
 FORWARD_ITERATIONS = 100
 FORWARD_TOLERANCE = 1e-12
@@ -134,6 +137,15 @@ class CalibratedModel:
         settled = torch.isfinite(q_nominal).all(-1, keepdim=True)
         T = forward_kinematics(self.robot, torch.where(settled, q_nominal, q))
         return torch.where(settled[..., None], T, torch.nan)
+
+    def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
+        """Give the identified geometry as a chain of pytorch-kinematics in float64.
+
+        The joint correction is no part of such a chain: with a hybrid, or a network on nominal joint values, the chain
+        is where the tool would be at joint values without it. Without an identified geometry it is the nominal robot
+        with base and tool as fitted.
+        """
+        return (self.calibrated or self.robot).to_pytorch_kinematics()
 
     def nominal_joints(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
         """Joint values `q_nominal = q - Δ(FK(q_nominal), q_nominal)` [rad or m] that `network` corrects to q.

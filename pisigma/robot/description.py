@@ -2,7 +2,7 @@
 
 import os
 from dataclasses import dataclass, field, replace
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 from jaxtyping import Float64
@@ -10,6 +10,9 @@ from jaxtyping import Float64
 from pisigma.errors import PoseError, RobotError, nearest_choice
 from pisigma.robot.robot_file import read_robot
 from pisigma.robot.row import JointType, Row
+
+if TYPE_CHECKING:
+    import pytorch_kinematics
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,6 +149,16 @@ class Robot:
             base=self.base if base is None else base,
             tool=self.tool if tool is None else tool,
         )
+
+    def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
+        """Give the robot as a chain of pytorch-kinematics in float64; see `pisigma.robot.serial_chain`.
+
+        `chain.forward_kinematics(q).get_matrix()` is T_base_tool at joint values q [rad or m] of shape `(*batch, dof)`
+        with one batch axis.
+        """
+        from pisigma.robot.serial_chain import serial_chain
+
+        return serial_chain(self)
 
     def check_joint_count(self, count: int) -> None:
         """Refuse joint values whose last axis does not fit the robot.
