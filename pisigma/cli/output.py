@@ -1,20 +1,24 @@
-"""What the commands print: tables for people on stdout, one JSON object, one line for a problem."""
+"""What the commands print: tables and sentences for people on stdout, one JSON object, one line for a problem."""
 
 import functools
 import json
-from collections.abc import Callable, Sequence
+import shlex
+import textwrap
+from collections.abc import Callable, Collection, Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import typer
 
 from pisigma.errors import AcceptanceError, PisigmaError
 
-WIDTH_WITHOUT_TERMINAL = 120
+WIDTH_WITHOUT_TERMINAL = 80
 
 NOT_ACCEPTED = 3
 """Exit status of a model that does not meet its limits."""
 
 _INTERRUPTED = 130
+_ONLY_FOR_PRINTING = ("as_json", "verbose")
 
 
 def print_json(result: Any) -> None:
@@ -22,25 +26,66 @@ def print_json(result: Any) -> None:
     typer.echo(json.dumps(result, allow_nan=False))
 
 
+def print_lines(lines: Iterable[str], indent: str = "") -> None:
+    """Print sentences, each wrapped to the width of the screen; further lines of one are indented."""
+    width = screen_width()
+    for line in lines:
+        typer.echo(textwrap.fill(line, width, subsequent_indent=indent, break_long_words=False))
+
+
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table; columns that hold numbers are set right, and no cell is cut or wrapped."""
+    """Print a table; columns that hold numbers are set right, and texts are wrapped where the screen is too narrow."""
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    table = Table(box=SIMPLE_HEAD, padding=(0, 1), pad_edge=False, collapse_padding=True)
+    table = Table(box=SIMPLE_HEAD, padding=(0, 1), pad_edge=False, collapse_padding=True, show_edge=False)
     for index, column in enumerate(columns):
         number = index > 0 and all(_is_number(row[index]) for row in rows)
-        table.add_column(Text(column), justify="right" if number else "left", no_wrap=True)
+        words = [word for text in (column, *(row[index] for row in rows)) for word in text.split()]
+        table.add_column(
+            Text(column), justify="right" if number else "left", min_width=max(map(len, words), default=0)
+        )
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     console = Console(highlight=False)
-    width = console.width if console.is_terminal else WIDTH_WITHOUT_TERMINAL
-    widest = console.measure(table, options=console.options.update(max_width=10_000)).maximum
-    console.width = max(width, widest)
+    narrowest = console.measure(table, options=console.options.update(max_width=10_000)).minimum
+    console.width = max(screen_width(), narrowest)
     console.print(Text(title), soft_wrap=True)
     console.print(table)
+    console.print()
+
+
+def screen_width() -> int:
+    """Give the width of the terminal, or 80 without one."""
+    from rich.console import Console
+
+    console = Console()
+    return console.width if console.is_terminal else WIDTH_WITHOUT_TERMINAL
+
+
+def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> str:
+    """Give the command that is running, for cards: without folders of files, and options at their defaults.
+
+    Args:
+        context: of the command.
+        files: names of the options whose values are files or folders; arguments may all be.
+    """
+    words = ["pisigma", str(context.info_name)]
+    for parameter in context.command.params:
+        value = context.params.get(str(parameter.name))
+        if parameter.param_type_name == "argument":
+            words.append(Path(str(value)).name)
+        elif value != parameter.default and parameter.name not in _ONLY_FOR_PRINTING:
+            if isinstance(value, bool):
+                words.append((parameter.opts if value else parameter.secondary_opts)[0])
+            elif isinstance(value, tuple):
+                words += [parameter.opts[0], *(f"{number:g}" for number in value)]
+            else:
+                text = Path(str(value)).name if parameter.name in files else str(value)
+                words += [parameter.opts[0], text]
+    return shlex.join(words)
 
 
 def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
@@ -74,5 +119,5 @@ def _is_number(cell: str) -> bool:
     try:
         float(cell)
     except ValueError:
-        return False
+        return not cell
     return True

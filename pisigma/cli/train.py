@@ -44,10 +44,11 @@ def train(
     import shutil
 
     from pisigma.cli.output import print_json
+    from pisigma.measurement.splits import split_sets
     from pisigma.model.folder.model_folder import save_model
     from pisigma.model.folder.staging import check_replaceable, staged_folder
     from pisigma.recipes.recipe import recipe_hash
-    from pisigma.recipes.recipe_data import load_measurements, split_sets
+    from pisigma.recipes.recipe_data import load_measurements
     from pisigma.reporting.card import write_card
     from pisigma.reporting.training_report import report_training
     from pisigma.workflow.run import RunOptions, train_recipe

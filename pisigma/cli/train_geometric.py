@@ -3,13 +3,11 @@
 import shlex
 import textwrap
 import time
-from dataclasses import replace
 from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pisigma.identification.result import CalibrationResult
     from pisigma.recipes.geometric_recipe import GeometricRecipe
 
 _WIDTH = 44
@@ -36,15 +34,14 @@ def train_geometric(
     from pisigma.cli.calibrate import print_calibration
     from pisigma.cli.output import print_json
     from pisigma.errors import RecipeError
+    from pisigma.judging.calibration_summary import ErrorFigures, ValidationFigures, summarise
     from pisigma.judging.calibration_validation import errors_under
-    from pisigma.model.folder.model_folder import save_model
-    from pisigma.model.folder.staging import check_replaceable, staged_folder
-    from pisigma.model.geometric_model import model_of_calibration
+    from pisigma.model.folder.staging import check_replaceable
     from pisigma.recipes.recipe import recipe_hash
     from pisigma.recipes.recipe_data import simulate_held_out, simulate_training
-    from pisigma.reporting.calibration_card import write_calibration_card
-    from pisigma.reporting.calibration_report import report_calibration
+    from pisigma.reporting.calibration_card import CardTexts
     from pisigma.robot.description import Robot
+    from pisigma.workflow.calibrate import compose
 
     if data is not None or resume:
         given = "--data" if data is not None else "--resume"
@@ -53,34 +50,25 @@ def train_geometric(
     check_replaceable(folder)
     rows, held_out = simulate_training(stated), simulate_held_out(stated)
     result = stated.calibrate(rows)
-    report = {
-        **report_calibration(result),
-        **_redundancy(result),
-        "held_out": {"rows": held_out.rows, **errors_under(result, held_out).in_file_units()},
-    }
-    if stated.paper:
-        report["paper"] = stated.model_dump()["paper"]
-    model = model_of_calibration(
-        stated.name, Robot.load(stated.robot), result, rows, (stated.name, recipe_hash(recipe))
+    errors = ErrorFigures.model_validate(errors_under(result, held_out).in_file_units())
+    summary = summarise(result).having(
+        redundant_sets=tuple(tuple(members) for members in result.pairwise.sets),
+        no_effect=tuple(result.pairwise.no_effect),
+        pairwise_parameters=len(result.pairwise.kept),
+        held_out=ValidationFigures(rows=held_out.rows, geometric=errors),
+        paper=stated.model_dump(mode="json")["paper"] or None,
     )
-    texts = {
-        "description": stated.description,
-        "command": shlex.join(["pisigma", "train", recipe.as_posix()]),
-        "not_validated": stated.not_validated,
-    }
-    with staged_folder(folder) as scratch:
-        save_model(replace(model, metrics=report), scratch)
-        write_calibration_card(model, result, rows, None, report, texts, scratch)
-    finished = {
-        "model": str(folder),
-        "seconds": round(time.perf_counter() - started, 3),
-        **report,
-    }
+    texts = CardTexts(stated.description, stated.not_validated)
+    hashed = (stated.name, recipe_hash(recipe))
+    calibration = compose(Robot.load(stated.robot), result, rows, summary, texts, recipe=hashed)
+    calibration.save(folder, stated.name, shlex.join(["pisigma", "train", recipe.as_posix()]))
+    seconds = time.perf_counter() - started
+    finished = {"model": str(folder), "seconds": round(seconds, 3), **summary.to_json()}
     if as_json:
         print_json(finished)
         return
     print_redundancy(finished)
-    print_calibration(finished)
+    print_calibration(summary, folder, seconds)
 
 
 def print_redundancy(result: dict[str, Any]) -> None:
@@ -123,13 +111,3 @@ def _wrapped(label: str, *cells: str) -> list[tuple[str, str, str]]:
     """One row of a table as lines of bounded width."""
     columns = [[label], *(textwrap.wrap(cell, _WIDTH) or [""] for cell in cells)]
     return [(line[0], line[1], line[2]) for line in zip_longest(*columns, fillvalue="")]
-
-
-def _redundancy(result: "CalibrationResult") -> dict[str, Any]:
-    """The paper's figures: pairs found by correlation, parameters left, exact rank."""
-    pairwise = result.pairwise
-    return {
-        "redundant_sets": [list(members) for members in pairwise.sets],
-        "no_effect": list(pairwise.no_effect),
-        "pairwise_parameters": len(pairwise.kept),
-    }

@@ -2,11 +2,11 @@
 
 import shlex
 import time
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from pisigma.judging.calibration_summary import CalibrationSummary
     from pisigma.measurement.dataset import Measurements
     from pisigma.measurement.splits import TrainTest
     from pisigma.recipes.hybrid_recipe import HybridRecipe
@@ -36,13 +36,11 @@ def train_hybrid(
     from pisigma.cli.progress import progress_of
     from pisigma.errors import RecipeError
     from pisigma.judging.calibration_validation import judge, validate
-    from pisigma.judging.held_out_rows import HELD_OUT_CSV, held_out_csv, held_out_section
-    from pisigma.model.folder.model_folder import save_model
-    from pisigma.model.folder.staging import check_replaceable, staged_folder
-    from pisigma.model.geometric_model import model_of_hybrid
+    from pisigma.model.folder.staging import check_replaceable
     from pisigma.recipes.recipe import MeasuredData, recipe_hash
-    from pisigma.reporting.calibration_card import write_calibration_card
+    from pisigma.reporting.calibration_card import CardTexts
     from pisigma.robot.description import Robot
+    from pisigma.workflow.calibrate import compose
 
     if resume:
         raise RecipeError(f"{recipe}: a recipe of kind {stated.kind} has no use for --resume; leave it out.")
@@ -57,32 +55,30 @@ def train_hybrid(
     with progress_of("held-out rows") as tell:
         validation = validate(calibrator, everything, parts, tell)
     kept_aside = None if test is None else judge(calibrator, result, rows, test)
-    report: dict[str, Any] = {"rows": rows.rows, "fit_seconds": round(fitting, 3)}
-    report |= _report(stated, result, (validation, kept_aside), everything, parts)
+    summary = _summary(stated, result, (validation, kept_aside), everything, parts).having(
+        rows=rows.rows, fit_seconds=round(fitting, 3)
+    )
+    held_out = rows if isinstance(stated.data, MeasuredData) else None
+    texts = CardTexts(stated.description, stated.not_validated)
+    hashed = (stated.name, recipe_hash(recipe))
     nominal = Robot.load(stated.robot)
-    held_out = held_out_csv(validation, rows, nominal) if isinstance(stated.data, MeasuredData) else None
-    if held_out is not None:
-        report |= held_out_section(held_out, rows)
-    model = model_of_hybrid(stated.name, nominal, result, rows, (stated.name, recipe_hash(recipe)))
+    calibration = compose(
+        nominal, result, rows, summary, texts, validation, kept_aside, held_out, recipe=hashed
+    )
     command = shlex.join(["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])])
-    texts = {"description": stated.description, "command": command, "not_validated": stated.not_validated}
-    with staged_folder(folder) as scratch:
-        save_model(replace(model, metrics=report), scratch)
-        write_calibration_card(model, result, rows, validation, report, texts, scratch)
-        if held_out is not None:
-            (scratch / HELD_OUT_CSV).write_text(held_out, encoding="utf-8", newline="\n")
-    finished = {"model": str(folder), "seconds": round(time.perf_counter() - started, 3), **report}
+    calibration.save(folder, stated.name, command)
+    seconds = time.perf_counter() - started
     if as_json:
-        print_json(finished)
+        print_json({"model": str(folder), "seconds": round(seconds, 3), **calibration.summary.to_json()})
     else:
-        print_calibration(finished)
+        print_calibration(calibration.summary, folder, seconds)
 
 
 def _rows(recipe: "HybridRecipe", data: Path | None) -> "Given":
     """Rows to calibrate with, all rows to judge on, those of the set `test`, and how the rows are parted."""
-    from pisigma.measurement.splits import k_folds
+    from pisigma.measurement.splits import k_folds, split_sets
     from pisigma.recipes.recipe import MeasuredData
-    from pisigma.recipes.recipe_data import load_measurements, simulate_repeats, split_sets
+    from pisigma.recipes.recipe_data import load_measurements, simulate_repeats
 
     rows, test = split_sets(load_measurements(recipe, data))
     if isinstance(recipe.data, MeasuredData):
@@ -91,32 +87,32 @@ def _rows(recipe: "HybridRecipe", data: Path | None) -> "Given":
     return rows, everything, None, parts
 
 
-def _report(
+def _summary(
     recipe: "HybridRecipe",
     result: Any,
     judged: tuple[Any, Any],
     everything: "Measurements",
     parts: "tuple[TrainTest, ...]",
-) -> dict[str, Any]:
+) -> "CalibrationSummary":
     """Figures of the calibration, of held-out rows and of the learning curve."""
     from pisigma.cli.progress import progress_of
+    from pisigma.judging.calibration_summary import summarise
     from pisigma.judging.learning_curve import learning_curve
     from pisigma.recipes.recipe import MeasuredData
-    from pisigma.reporting.calibration_report import report_calibration
 
     validation, test = judged
+    summary = summarise(result)
     if isinstance(recipe.data, MeasuredData):
-        report = report_calibration(result, validation, test)
+        summary = summary.having(
+            cross_validation=validation.figures(), test=None if test is None else test.figures()
+        )
     else:
-        report = {
-            **report_calibration(result),
-            "held_out": validation.in_file_units() | validation.means(parts),
-        }
+        summary = summary.having(held_out=validation.figures(parts))
     if recipe.learning_curve is not None:
         stated = recipe.learning_curve
         with progress_of("learning curve") as tell:
             points = learning_curve(
                 recipe.calibrator(), everything, parts, stated.rows, stated.seed, tell, validation
             )
-        report["learning_curve"] = [point.in_file_units() for point in points]
-    return report
+        summary = summary.having(learning_curve=tuple(point.figures() for point in points))
+    return summary

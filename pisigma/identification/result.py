@@ -29,6 +29,7 @@ class ParameterEstimate:
         change: estimated - nominal.
         standard_error: of the estimate; NaN where it was not estimated.
         remark: "identified", what it is only identified together with, or why it was not estimated.
+        label: the remark in a few words, for tables.
     """
 
     name: str
@@ -38,6 +39,7 @@ class ParameterEstimate:
     change: float
     standard_error: float
     remark: str
+    label: str
 
     @property
     def free(self) -> bool:

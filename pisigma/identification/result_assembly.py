@@ -181,14 +181,16 @@ def _table(
     columns = (nominal.tolist(), values.tolist(), change.tolist())
     for index, (parameter, before, after, moved) in enumerate(zip(space.parameters, *columns, strict=True)):
         free = index in active or bool(errors[index] > 0)
-        remark = _remark(parameter.name, free, index in findings.extended, findings.redundancy)
+        remark, label = _remark(parameter.name, free, index in findings.extended, findings.redundancy)
         if free and held[index]:
-            remark += "; the data hardly see it, the prior holds it"
+            remark += "; the data hardly determine it, the prior holds it"
+            label = "held by the prior" if label == "identified" else f"{label}; prior"
         if untold[index]:
-            free, remark = False, "too few rows that count show it, the others are outliers"
+            free, label = False, "outliers"
+            remark = "too few rows that count show it, the others are outliers"
         error = float(errors[index]) if free else float("nan")
         name, unit = parameter.name, parameter.unit
-        rows.append(ParameterEstimate(name, unit, before, after, moved, error, remark))
+        rows.append(ParameterEstimate(name, unit, before, after, moved, error, remark, label))
     return tuple(rows)
 
 
@@ -229,14 +231,20 @@ def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -
     return found
 
 
-def _remark(name: str, free: bool, extended: bool, redundancy: Redundancy) -> str:
+def _remark(name: str, free: bool, extended: bool, redundancy: Redundancy) -> tuple[str, str]:
+    """What is to be said of a parameter, in full and in a few words."""
     if name not in redundancy.names:
-        return "identified" if free else "fixed"
+        remark = "identified" if free else "fixed"
+        return remark, remark
     if extended:
-        return "identified at the solution, though redundant at the nominal geometry"
+        remark = "identified at the solution, though redundant at the nominal geometry"
+        return remark, "only at solution"
     if name in redundancy.no_effect:
-        return "without effect on what was measured"
-    return redundancy.group(name) or ("identified" if free else "left out")
+        return "without effect on what was measured", "no effect"
+    if (sentence := redundancy.group(name)) is not None:
+        return sentence, "in a sum"
+    remark = "identified" if free else "left out"
+    return remark, remark
 
 
 def _residuals(

@@ -11,6 +11,7 @@ from pisigma.errors import IdentificationError
 from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.prediction import predicted_poses
+from pisigma.judging.calibration_summary import ErrorFigures, ValidationFigures
 from pisigma.judging.held_out_frames import judgeable, with_frames
 from pisigma.judging.pose_statistics import PoseErrors, error_statistics
 from pisigma.judging.predicted_spread import PredictedSpread, predicted_spread
@@ -28,7 +29,7 @@ class CalibrationValidation:
     In rows that were never held out they are NaN.
 
     Attributes:
-        folds: how many times the rows were parted.
+        folds: number of folds; 1 where rows were held out once, 0 for rows that were kept apart from the start.
         models: by name: "nominal" (the nominal arm, base and tool fitted to the training rows), "geometric" and
             "hybrid" where it was asked for, which chooses its features on the training rows alone.
         spread: errors of positions beside what the hybrid predicts of them; None without one.
@@ -68,38 +69,45 @@ class CalibrationValidation:
         spreads = [repeat.spread for repeat in self.repeats if repeat.spread is not None]
         return PredictedSpread.joined(spreads) if spreads else None
 
-    def in_file_units(self) -> dict[str, object]:
-        """The figures in mm and deg of all repeats; `rows` counts the held-out ones with a length, once each."""
+    def figures(self, simulations: Sequence[TrainTest] = ()) -> ValidationFigures:
+        """The figures in mm and deg of all repeats.
+
+        Args:
+            simulations: training and test rows of each of several simulations; their RMS errors are given one by one.
+        """
         last = list(self.models.values())[-1]
-        figures: dict[str, object] = {"folds": self.folds, "rows": int(torch.isfinite(last.position).sum())}
+        figures: dict[str, object] = {"folds": self.folds} if self.folds else {}
+        figures["rows"] = int(torch.isfinite(last.position).sum())
         if self.again:
             figures["repeats"] = len(self.repeats)
             figures["rms_mm_of_repeats"] = {
-                name: [error_statistics(one.models[name].position)["rms"] * 1e3 for one in self.repeats]
+                name: tuple(_rms_mm(one.models[name].position) for one in self.repeats)
                 for name in self.models
             }
-        figures |= {name: errors.in_file_units() for name, errors in self.all_errors.items()}
+        figures |= {
+            name: ErrorFigures.model_validate(errors.in_file_units())
+            for name, errors in self.all_errors.items()
+        }
         if self.all_spread is not None:
             figures |= self.all_spread.in_file_units()
-        distances = {
-            name: torch.cat([one.distances[name] for one in self.repeats]) for name in self.distances
-        }
         count = max((len(errors) for errors in self.distances.values()), default=0)
         if count:
-            sizes = {name: _sizes(errors) for name, errors in distances.items()}
+            sizes = {
+                name: _sizes(torch.cat([one.distances[name] for one in self.repeats]))
+                for name in self.distances
+            }
             figures["socket_distance"] = {"count": count, **sizes}
         counts = {"frames_fitted": self.frames_fitted, "sockets_held_out": self.sockets_held_out}
         counts["rows_not_judged"] = max(repeat.not_judged for repeat in self.repeats)
-        return figures | {name: count for name, count in counts.items() if count}
-
-    def means(self, parts: Sequence[TrainTest]) -> dict[str, object]:
-        """RMS position errors of every part's held-out rows, and their mean over the parts [mm], by model."""
-        found = {
-            name: [error_statistics(errors.position[test])["rms"] * 1e3 for _, test in parts]
-            for name, errors in self.models.items()
-        }
-        means = {name: sum(figures) / len(figures) for name, figures in found.items()}
-        return {"rms_mm_of_parts": found, "mean_rms_mm": means}
+        figures |= {name: count for name, count in counts.items() if count}
+        if simulations:
+            rms = {
+                name: tuple(_rms_mm(errors.position[test]) for _, test in simulations)
+                for name, errors in self.models.items()
+            }
+            figures["rms_mm_of_simulations"] = rms
+            figures["mean_rms_mm"] = {name: sum(values) / len(values) for name, values in rms.items()}
+        return ValidationFigures.model_validate(figures)
 
 
 class _Judged:
@@ -218,7 +226,7 @@ def judge(
     judged = _Judged(test)
     results = trained(calibrator, seen, known=result)
     _judge(judged, None, results, seen, (test, torch.arange(test.rows)))
-    return judged.validation(1)
+    return judged.validation(0)
 
 
 def _judge(
@@ -286,6 +294,10 @@ def _poses(result: Result, rows: Measurements) -> Float64[Tensor, "rows 4 4"]:
 
 def _sockets(rows: Measurements) -> set[str]:
     return set(rows.socket or ()) - {""}
+
+
+def _rms_mm(errors: Float64[Tensor, " rows"]) -> float:
+    return error_statistics(errors)["rms"] * 1e3
 
 
 def _sizes(errors: Float64[Tensor, " pairs"]) -> dict[str, float]:

@@ -13,6 +13,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import ModelError
+from pisigma.judging.calibration_summary import HeldOutFile, summary_of
 from pisigma.judging.calibration_validation import CalibrationValidation
 from pisigma.judging.pose_statistics import PoseErrors
 from pisigma.measurement.dataset import Measurements
@@ -20,8 +21,6 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
 
 HELD_OUT_CSV = "held_out.csv"
-SECTION = "held_out_rows"
-"""Of a model's metrics: SHA-256 of the file, and of the rows that it is of."""
 
 _RESIDUAL = tuple(f"residual_{axis}_mm" for axis in "xyz")
 _DEGREES = float(np.rad2deg(1.0))
@@ -48,43 +47,52 @@ class HeldOutRows:
     residual: Float64[Tensor, "rows 3"]
     data_sha256: str
 
+    @staticmethod
+    def of(validation: CalibrationValidation, measurements: Measurements) -> "HeldOutRows":
+        """Give the errors of the first repeat of a validation.
 
-def held_out_csv(validation: CalibrationValidation, measurements: Measurements, robot: Robot) -> str:
-    """The rows as CSV text: joint values, frame and target, and per model the errors in mm and deg.
+        Args:
+            validation: of the measurements.
+            measurements: the rows that were held out in turn.
+        """
+        spread = validation.spread
+        residual = torch.full((measurements.rows, 3), torch.nan) if spread is None else spread.error
+        return HeldOutRows(
+            measurements.q,
+            measurements.frame,
+            measurements.target,
+            validation.models,
+            residual.double(),
+            measurements.content_hash(),
+        )
 
-    Args:
-        validation: of the measurements; the errors are those of its first repeat.
-        measurements: the rows that were held out in turn.
-        robot: says which joints turn (degrees) and which slide (millimetres).
-    """
-    scale = [(_DEGREES, "deg") if turns else (1e3, "mm") for turns in robot.revolute]
-    columns: dict[str, list[str]] = {}
-    for j, (factor, unit) in enumerate(scale):
-        columns[f"q{j + 1}_{unit}"] = [repr(value) for value in (measurements.q[:, j] * factor).tolist()]
-    columns |= {"frame": list(measurements.frame), "target": list(measurements.target)}
-    for name, errors in validation.models.items():
-        columns[f"{name}_mm"] = _cells(errors.position * 1e3)
-        if errors.rotation is not None:
-            columns[f"{name}_deg"] = _cells(errors.rotation * _DEGREES)
-    if validation.spread is not None:
-        for axis, name in enumerate(_RESIDUAL):
-            columns[name] = _cells(validation.spread.error[:, axis] * 1e3)
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows(zip(*columns.values(), strict=True))
-    return text.getvalue()
+    def to_csv(self, robot: Robot) -> str:
+        """Give CSV text: joint values, frame and target, and per model the errors in mm and deg.
 
+        Args:
+            robot: says which joints turn (degrees) and which slide (millimetres).
+        """
+        columns: dict[str, list[str]] = {}
+        for j, turns in enumerate(robot.revolute):
+            factor, unit = (_DEGREES, "deg") if turns else (1e3, "mm")
+            columns[f"q{j + 1}_{unit}"] = [repr(value) for value in (self.q[:, j] * factor).tolist()]
+        columns |= {"frame": list(self.frame), "target": list(self.target)}
+        for name, errors in self.models.items():
+            columns[f"{name}_mm"] = _cells(errors.position * 1e3)
+            if errors.rotation is not None:
+                columns[f"{name}_deg"] = _cells(errors.rotation * _DEGREES)
+        if bool(torch.isfinite(self.residual).any()):
+            for axis, name in enumerate(_RESIDUAL):
+                columns[name] = _cells(self.residual[:, axis] * 1e3)
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(zip(*columns.values(), strict=True))
+        return text.getvalue()
 
-def held_out_section(text: str, measurements: Measurements) -> dict[str, dict[str, str]]:
-    """What belongs into the metrics of a model whose folder holds the file.
-
-    Args:
-        text: from `held_out_csv`.
-        measurements: the rows that it is of.
-    """
-    digest = hashlib.sha256(text.encode()).hexdigest()
-    return {SECTION: {"sha256": digest, "data_sha256": measurements.content_hash()}}
+    def hashes(self, text: str) -> HeldOutFile:
+        """Give what the metrics of a model hold whose folder keeps these rows as such a text."""
+        return HeldOutFile(sha256=hashlib.sha256(text.encode()).hexdigest(), data_sha256=self.data_sha256)
 
 
 def read_held_out(folder: Path, model: CalibratedModel) -> HeldOutRows | None:
@@ -93,15 +101,16 @@ def read_held_out(folder: Path, model: CalibratedModel) -> HeldOutRows | None:
     Raises:
         ModelError: the file is missing, or is not the one that was written with the model.
     """
-    section = model.metrics.get(SECTION)
-    if not isinstance(section, dict):
+    summary = summary_of(model)
+    if summary is None or summary.held_out_rows is None:
         return None
+    hashes = summary.held_out_rows
     path = folder / HELD_OUT_CSV
     try:
         content = path.read_bytes()
     except OSError as problem:
         raise ModelError(f"{path}: cannot be read ({problem.strerror}); copy the model again.") from None
-    if hashlib.sha256(content).hexdigest() != section["sha256"]:
+    if hashlib.sha256(content).hexdigest() != hashes.sha256:
         raise ModelError(f"{path}: was changed since the model was written; copy the model again.")
     head, *rows = csv.reader(io.StringIO(content.decode(), newline=""))
     columns = dict(zip(head, zip(*rows, strict=True), strict=True))
@@ -120,7 +129,7 @@ def read_held_out(folder: Path, model: CalibratedModel) -> HeldOutRows | None:
     kept = [_numbers(columns[name]) / 1e3 for name in _RESIDUAL if name in columns]
     residual = torch.stack(kept, 1) if kept else none
     frame, target = columns["frame"], columns["target"]
-    return HeldOutRows(torch.stack(q, 1), frame, target, models, residual, section["data_sha256"])
+    return HeldOutRows(torch.stack(q, 1), frame, target, models, residual, hashes.data_sha256)
 
 
 def _cells(values: Float64[Tensor, " rows"]) -> list[str]:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from pisigma.judging.calibration_summary import LearningPoint
 from pisigma.judging.calibration_validation import CalibrationValidation, Progress, validate
 from pisigma.judging.trained_calibrations import Calibrator
 from pisigma.measurement.dataset import Measurements
@@ -21,10 +22,10 @@ class CurvePoint:
     rows: int
     validation: CalibrationValidation
 
-    def in_file_units(self) -> dict[str, object]:
-        """The figures in mm and deg; "rows" are those to calibrate with, "held_out" those judged."""
-        figures = self.validation.in_file_units()
-        return {"rows": self.rows, "held_out": figures.pop("rows"), **figures}
+    def figures(self) -> LearningPoint:
+        """The figures in mm and deg."""
+        figures = self.validation.figures().model_dump(exclude_unset=True)
+        return LearningPoint.model_validate({**figures, "rows": self.rows, "held_out": figures["rows"]})
 
 
 def learning_curve(

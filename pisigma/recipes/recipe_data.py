@@ -1,10 +1,10 @@
-"""The rows of a recipe: simulated, or read from a file and parted by its column `set`."""
+"""The rows of a recipe: simulated, or read from a file."""
 
 from pathlib import Path
 
 import torch
 
-from pisigma.errors import MeasurementError, RecipeError
+from pisigma.errors import RecipeError
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.splits import TrainTest
 from pisigma.recipes.geometric_recipe import GeometricRecipe
@@ -14,31 +14,8 @@ from pisigma.robot.description import Robot
 from pisigma.simulation.true_robot import TrueRobot
 
 
-def split_sets(measurements: Measurements) -> tuple[Measurements, Measurements | None]:
-    """Part rows by the column `set`: those to train on, and those that are kept aside for a test.
-
-    Args:
-        measurements: rows, with or without the column.
-
-    Returns:
-        The rows to train on, and the others; None where there are none.
-
-    Raises:
-        MeasurementError: all rows are kept aside, or the two rows of a pair are in different sets.
-    """
-    test = torch.tensor([name == "test" for name in measurements.split or ()], dtype=torch.bool)
-    if not test.any():
-        return measurements, None
-    if test.all():
-        raise MeasurementError(
-            f"{measurements.source}: column 'set' marks all {measurements.rows} rows as 'test', so nothing is "
-            "left to train on; mark some as 'train' or remove the column."
-        )
-    return measurements.select(~test), measurements.select(test)
-
-
 def load_measurements(recipe: Recipe | HybridRecipe, data: Path | None) -> Measurements:
-    """Give the rows of a recipe: the simulated training rows, or all of a file; see `split_sets`.
+    """Give the rows of a recipe: the simulated training rows, or all rows of a file, the set "test" among them.
 
     Raises:
         RecipeError: a simulated recipe was given a file, or a measured one none.

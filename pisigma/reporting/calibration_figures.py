@@ -1,23 +1,41 @@
-"""Figures of a calibration: residuals, held-out errors, correlations."""
+"""Figures of a calibration: residuals, held-out errors, correlations, and what was learned beyond the geometry."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
+from torch import Tensor
 
 from pisigma.identification.identifiability.pairwise import CorrelationTable
+from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.judging.calibration_summary import LearningPoint
+from pisigma.judging.predicted_spread import WITHIN, PredictedSpread
+from pisigma.measurement.dataset import Measurements
 from pisigma.reporting.figures import save_figure
 
 RESIDUALS_PNG = "residuals.png"
 HELD_OUT_PNG = "held_out_errors.png"
 CORRELATION_PNG = "correlation.png"
+CORRECTIONS_PNG = "joint_corrections.png"
+CURVE_PNG = "learning_curve.png"
+SPREAD_PNG = "predicted_spread.png"
 
 _UNITS = {"position": ("mm", 1e3), "rotation": ("deg", float(np.rad2deg(1.0)))}
 _REDUNDANT = 1 - 1e-6
+STYLES = {"nominal": (":", "s"), "geometric": ("--", "o"), "hybrid": ("-", "^")}
+"""Line and mark of every model, so that they are told apart without colour."""
+POINTS = 2_000
+"""Points of a curve: 18 to a period of the 110th harmonic."""
+MOST_DOTS = 2_000
+FAR_APART = 5.0
+"""Axes of deviations are logarithmic where the largest is more than so many times the smallest."""
+BINS = 8
+"""Parts of equally many values in which predicted and actual spread are compared."""
 
 
 def draw_residuals(
@@ -108,3 +126,133 @@ def draw_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:
         "white + or -: redundant (|r| = 1);  grey: without effect on what was measured", fontsize=10
     )
     save_figure(figure, path)
+
+
+def draw_corrections(correction: JointCorrection, measurements: Measurements, path: Path) -> None:
+    """Draw what every joint is corrected by over its own value, and over the measured rows.
+
+    The line is with all other joints at the middle (median) of their measured values, the dots at the measured
+    joint values; where the dots leave the line, the correction depends on other joints too.
+
+    Args:
+        correction: Δ.
+        measurements: the measured rows.
+        path: the PNG to write.
+    """
+    joints, q = correction.robot.joints, measurements.q
+    rows = (len(joints) + 1) // 2
+    figure = Figure(figsize=(10.0, 2.3 * rows + 0.5), layout="constrained")
+    panels = figure.subplots(rows, 2, squeeze=False).flatten()
+    with torch.no_grad():
+        seen = correction.of_rows(measurements).numpy()
+    for j, (axes, joint) in enumerate(zip(panels, joints, strict=False)):
+        unit, factor, small, scale = (
+            ("deg", float(np.rad2deg(1.0)), "mdeg", float(np.rad2deg(1e3)))
+            if joint.type == "revolute"
+            else ("mm", 1e3, "µm", 1e6)
+        )
+        own, line = _over_own_value(correction, q, j)
+        step = max(len(q) // MOST_DOTS, 1)
+        axes.plot(q[::step, j].numpy() * factor, seen[::step, j] * scale, ".", color="0.55", markersize=2.5)
+        axes.plot(own * factor, line * scale, "-", color="black", linewidth=0.8)
+        axes.axhline(0.0, color="black", linewidth=0.5, linestyle=":")
+        axes.set_title(joint.name, loc="left", fontsize=10)
+        axes.set_xlabel(f"joint value [{unit}]", fontsize=9)
+        axes.set_ylabel(f"correction [{small}]", fontsize=9)
+        axes.tick_params(labelsize=8)
+        axes.grid(alpha=0.3)
+    for axes in panels[len(joints) :]:
+        axes.set_visible(False)
+    figure.supxlabel(
+        "line: the other joints at the middle of the measured rows;  dots: the measured rows", fontsize=9
+    )
+    save_figure(figure, path)
+
+
+def _over_own_value(
+    correction: JointCorrection, q: Float64[Tensor, "rows dof"], joint: int
+) -> tuple[Float64[np.ndarray, " points"], Float64[np.ndarray, " points"]]:
+    """Values of one joint over its measured range, the others at their medians, and its corrections there."""
+    own = torch.linspace(float(q[:, joint].min()), float(q[:, joint].max()), POINTS, dtype=torch.float64)
+    at = q.median(0).values.repeat(POINTS, 1)
+    at[:, joint] = own
+    with torch.no_grad():
+        return own.numpy(), correction(at)[:, joint].numpy()
+
+
+def draw_learning_curve(points: Sequence[LearningPoint], path: Path) -> None:
+    """Draw the error on held-out rows over the number of training rows, both logarithmic.
+
+    Args:
+        points: by number of training rows, the fewest first.
+        path: the PNG to write.
+    """
+    rows = [point.rows for point in points]
+    names = [name for name in points[0].models if name != "nominal"]
+    models = {name: [point.models[name].rms_mm or 0.0 for point in points] for name in names}
+    figure = Figure(figsize=(6.8, 4.4), layout="constrained")
+    axes = figure.add_subplot()
+    for name, errors in models.items():
+        line, mark = STYLES.get(name, ("-.", "x"))
+        axes.plot(rows, errors, line, marker=mark, label=name, linewidth=1.6, markersize=6)
+        for count, error in zip(rows, errors, strict=True):
+            axes.annotate(
+                f"{error:.3f}", (count, error), (0, 6), textcoords="offset points", ha="center", fontsize=8
+            )
+    axes.set(
+        xscale="log", yscale="log", xlabel="rows to calibrate with", ylabel="RMS error of held-out rows [mm]"
+    )
+    axes.set_xticks(rows, [str(count) for count in rows])
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.margins(0.06, 0.12)
+    _plain_numbers(axes)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=9)
+    save_figure(figure, path)
+
+
+def draw_spread(spread: PredictedSpread, path: Path) -> None:
+    """Draw errors of held-out coordinates over the standard deviation that was predicted of them.
+
+    The steps are the root mean square errors of parts with equally many values; they should lie on the line.
+
+    Args:
+        spread: with at least one judged value.
+        path: the PNG to write.
+    """
+    known = torch.isfinite(spread.error) & torch.isfinite(spread.sigma)
+    sigma, error = spread.sigma[known].numpy() * 1e3, np.abs(spread.error[known].numpy()) * 1e3
+    order = sigma.argsort(kind="stable")
+    sigma, error = sigma[order], error[order]
+    figure = Figure(figsize=(6.8, 5.2), layout="constrained")
+    axes = figure.add_subplot()
+    step = max(len(sigma) // (3 * MOST_DOTS), 1)
+    axes.plot(sigma[::step], error[::step], ".", color="0.6", markersize=2, label="a coordinate of a row")
+    ends = np.array([sigma[0], sigma[-1]])
+    axes.plot(ends, ends, "-", color="black", linewidth=1.0, label="as predicted")
+    axes.plot(ends, WITHIN * ends, "--", color="black", linewidth=1.0, label="95 % should lie below")
+    parts = [part for part in np.array_split(np.arange(len(sigma)), BINS) if len(part)]
+    middle = [np.sqrt((sigma[part] ** 2).mean()) for part in parts]
+    axes.plot(
+        middle, [np.sqrt((error[part] ** 2).mean()) for part in parts], "D", color="tab:red",
+        markeredgecolor="black", label="RMS error of an eighth of them",
+    )  # fmt: skip
+    axes.set(xlabel="predicted standard deviation [mm]", ylabel="|error| [mm]")
+    far = bool(ends[1] > FAR_APART * ends[0])
+    if far:
+        axes.set(xscale="log", yscale="log", ylim=(float(np.quantile(error, 0.02)), None))
+    else:
+        axes.set_ylim(bottom=0.0)
+    axes.set_title(f"{spread.coverage * 100:.1f} % within 1.96 predicted deviations", loc="left", fontsize=10)
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize=9, loc="upper left" if far else "upper right", framealpha=1.0)
+    save_figure(figure, path)
+
+
+def _plain_numbers(axes: Axes) -> None:
+    """Numbers such as 0.02 instead of powers of ten up the axis, where it is short enough for them."""
+    low, high = axes.get_ylim()
+    if low > 0 and high < 1e3 * low:
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7) if high < 30 * low else (1, 2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.yaxis.set_minor_formatter(NullFormatter())

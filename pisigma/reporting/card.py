@@ -14,9 +14,8 @@ from pisigma.reporting.figures import (
     draw_errors_over_workspace,
     write_energy_csv,
 )
-from pisigma.reporting.markdown import CARD as CARD
-from pisigma.reporting.markdown import use_text
-from pisigma.reporting.tables import joint_table, pose_table
+from pisigma.reporting.tables import CARD as CARD
+from pisigma.reporting.tables import joint_table, pose_table, use_text
 from pisigma.workflow.run import TrainingRun
 
 

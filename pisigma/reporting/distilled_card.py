@@ -4,8 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from pisigma.reporting.markdown import CARD, markdown_table, use_text
-from pisigma.reporting.tables import figure_text, pose_table
+from pisigma.reporting.tables import CARD, figure_text, markdown_table, pose_table, use_text
 from pisigma.workflow.distillation import Distillation
 
 _SIZES = ("orders", "harmonics", "unknowns per joint", "tool, RMS [mm]", "kept")

@@ -1,15 +1,37 @@
-"""Figures as text: numbers, and the Markdown tables of the cards."""
+"""Figures as text: numbers, tables, and what the cards of all models have in common."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
-from pisigma.reporting.markdown import markdown_table
+CARD = "README.md"
 
 PARTS = (("training", "training"), ("held_out", "held-out"), ("paper", "paper"))
 """Keys of a joint's figures and what the tables call them."""
 
 _STATISTICS = ("average", "deviation", "maximum")
 _SHOWN = {"rms": "RMS", "p95": "95 %", "max": "maximum"}
+
+
+class Table(NamedTuple):
+    """Names of the columns, and rows of text."""
+
+    columns: tuple[str, ...]
+    rows: tuple[tuple[str, ...], ...]
+
+
+def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = [columns, ["---"] * len(columns), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+
+
+def use_text(name: str) -> str:
+    """How a model is used, as a piece of Python."""
+    return (
+        f'```python\nimport pisigma\n\nik = pisigma.load("models/{name}")\n'
+        "solution = ik(T_base_tool)  # (*batch, 4, 4) [m]\n"
+        "solution.q, solution.status  # joint values to command [rad or m], and whether to trust them\n```"
+    )
 
 
 def figure_text(value: float) -> str:
@@ -48,8 +70,8 @@ def joint_table(joints: Sequence[Mapping[str, Any]]) -> str:
     return markdown_table(head, joint_rows(joints))
 
 
-def pose_rows(models: Mapping[str, Mapping[str, float]]) -> tuple[list[str], list[tuple[str, ...]]]:
-    """Names of the columns and the rows of pose errors: one column per model, one row per figure.
+def pose_rows(models: Mapping[str, Mapping[str, float]]) -> Table:
+    """Pose errors: one column per model, one row per figure.
 
     Args:
         models: by name, the figures of `pisigma.judging.pose_statistics.PoseErrors.in_file_units`.
@@ -58,7 +80,7 @@ def pose_rows(models: Mapping[str, Mapping[str, float]]) -> tuple[list[str], lis
     rows = [
         (*_with_unit(name), *(figure_text(figures[name]) for figures in models.values())) for name in names
     ]
-    return ["error", "unit", *models], rows
+    return Table(("error", "unit", *models), tuple(rows))
 
 
 def pose_table(models: Mapping[str, Mapping[str, float]]) -> str:

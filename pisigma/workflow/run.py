@@ -12,12 +12,12 @@ from torch import Tensor
 from pisigma.errors import MeasurementError, RecipeError
 from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.splits import groups_of_equal_joints
+from pisigma.measurement.splits import groups_of_equal_joints, split_sets
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.domain import Domain
 from pisigma.model.stored_starts import spread_rows
 from pisigma.recipes.recipe import MeasuredData, Recipe, SimulatedData
-from pisigma.recipes.recipe_data import simulate_held_out, split_sets
+from pisigma.recipes.recipe_data import simulate_held_out
 from pisigma.robot.description import Robot
 from pisigma.training.networks import TrainingHistory, fit_networks
 from pisigma.training.pairs import TrainingPairs, build_pairs

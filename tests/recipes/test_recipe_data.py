@@ -8,8 +8,8 @@ from testing.models import no_type_checker, trained_run
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.splits import split_sets
 from pisigma.recipes.recipe import MeasuredData
-from pisigma.recipes.recipe_data import split_sets
 from pisigma.reporting.training_report import report_training
 from pisigma.workflow.run import train_recipe
 

@@ -4,8 +4,7 @@ import pytest
 from testing.models import trained_run
 
 from pisigma.reporting.card import write_card
-from pisigma.reporting.markdown import CARD
-from pisigma.reporting.tables import joint_table
+from pisigma.reporting.tables import CARD, joint_table
 from pisigma.reporting.training_report import report_training
 
 SECTIONS = ("Data", "Joint errors", "Figures", "Domain", "Not validated", "Use", "Provenance")

@@ -4,10 +4,6 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from testing.closeness import assert_close
-from testing.hybrid import hybrid_of
-
-from pisigma.judging.predicted_spread import PredictedSpread
 from pisigma.reporting.hybrid_card import compared, curve_rows, hybrid_parts
 from pisigma.reporting.hybrid_figures import (
     _over_own_value,
@@ -16,6 +12,10 @@ from pisigma.reporting.hybrid_figures import (
     draw_spread,
 )
 from pisigma.reporting.hybrid_report import TRIAL_COLUMNS, coverage_line, report_hybrid, trial_rows
+from testing.closeness import assert_close
+from testing.hybrid import hybrid_of
+
+from pisigma.judging.predicted_spread import PredictedSpread
 
 
 def ink(path) -> float:

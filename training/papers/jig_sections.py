@@ -10,7 +10,7 @@ from jig_tables import (
     seed_table,
 )
 from markdown_text import command_block, folded, picture, plain
-from pisigma.reporting.markdown import markdown_table
+from pisigma.reporting.tables import markdown_table
 from pisigma.robot.description import Robot
 from published import Published
 from redundancy_sections import dh_lines

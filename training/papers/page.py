@@ -8,7 +8,7 @@ from jig_sections import jig_sections
 from joint_sections import joint_sections
 from markdown_text import command_of, link_to
 from measured_sections import OTHERS, measured_sections
-from pisigma.reporting.markdown import markdown_table
+from pisigma.reporting.tables import markdown_table
 from published import Item, Paper, Published, read_published
 from redundancy_sections import redundancy_sections
 from stored_results import StoredResults, read_results

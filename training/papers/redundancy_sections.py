@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from markdown_text import command_block, folded, picture, plain, scientific
-from pisigma.reporting.markdown import markdown_table
+from pisigma.reporting.tables import markdown_table
 from pisigma.robot.description import Robot
 from published import CorrelationTriangle, DhTable, Published
 from stored_results import Result, StoredResults

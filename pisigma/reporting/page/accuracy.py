@@ -6,9 +6,10 @@ from typing import Any
 
 import torch
 
+from pisigma.judging.calibration_summary import ValidationFigures
 from pisigma.judging.pose_statistics import PoseErrors, error_statistics
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.held_out_sentences import cross_validation_text
+from pisigma.reporting.calibration_tables import cross_validation_text
 from pisigma.reporting.page.judged_rows import JudgedRows
 
 STATISTICS = (("mean", "mean"), ("rms", "RMS"), ("p95", "95 %"), ("max", "maximum"))
@@ -145,5 +146,5 @@ def _how(key: str, figures: Mapping[str, Any], rows: int) -> str:
     if key == "held_out":
         return f"{rows} other rows of the simulation, which the model never saw."
     if figures.get("folds", 1) > 1:
-        return f"{cross_validation_text({**figures, 'rows': rows})}; {nominal}"
+        return f"{cross_validation_text(ValidationFigures.model_validate(figures))}; {nominal}"
     return f"{rows} rows that were held out once, judged by a calibration on the others; {nominal}"

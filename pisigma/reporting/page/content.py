@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pisigma.judging.calibration_summary import summary_of
 from pisigma.judging.held_out_rows import read_held_out
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_figures import CORRELATION_PNG
-from pisigma.reporting.correlation_csv import CORRELATION_CSV
-from pisigma.reporting.hybrid_report import coverage_line, learned_lines
-from pisigma.reporting.markdown import CARD
+from pisigma.reporting.calibration_files import CORRELATION_CSV
+from pisigma.reporting.calibration_tables import coverage_line, learned_lines
 from pisigma.reporting.page.accuracy import Accuracy, accuracies
 from pisigma.reporting.page.advice import advice_for
 from pisigma.reporting.page.corrections import CorrectionCurve, correction_curves
@@ -21,6 +21,7 @@ from pisigma.reporting.page.judged_rows import JudgedRows, rows_of_file, rows_of
 from pisigma.reporting.page.limits import Limit, limit_of
 from pisigma.reporting.page.parameters import ParameterFindings, parameter_findings
 from pisigma.reporting.page.verdict import Verdict, verdict_of
+from pisigma.reporting.tables import CARD
 
 KINDS = {
     "hybrid_calibration": "Hybrid calibration: geometry, and a learned correction of the joints",
@@ -123,13 +124,12 @@ def report_content(
 
 
 def _learned(model: CalibratedModel) -> tuple[str, ...]:
-    metrics = model.metrics
-    lines = learned_lines(metrics["hybrid"]) if "hybrid" in metrics else []
-    judged = next(
-        (metrics[k] for k in ("cross_validation", "held_out", "test") if "coverage" in metrics.get(k, ())),
-        None,
-    )
-    return (*lines, *([coverage_line(judged)] if judged else []))
+    summary = summary_of(model)
+    if summary is None:
+        return ()
+    lines = learned_lines(summary.hybrid) if summary.hybrid is not None else []
+    judged = "" if summary.judged is None else coverage_line(summary.judged)
+    return (*lines, *([judged] if judged else []))
 
 
 def _provenance(model: CalibratedModel, folder: Path, rows: JudgedRows | None) -> tuple[tuple[str, str], ...]:
@@ -139,7 +139,7 @@ def _provenance(model: CalibratedModel, folder: Path, rows: JudgedRows | None) -
     found = [
         ("model", f"{model.name}, {model.kind.replace('_', ' ')}"),
         ("robot", f"{model.robot.name} ({model.robot.maker})"),
-        ("made by", _command(folder)),
+        ("made by", str(model.metrics.get("command") or _command(folder))),
         ("recipe", recipe),
         ("made of", f"{known.rows} rows of {known.data_source}{left_out}"),
         ("sha256 of these rows", known.data_sha256),

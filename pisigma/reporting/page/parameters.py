@@ -1,17 +1,21 @@
 """What a model folder tells of the identified parameters: values, doubts, correlations, observability."""
 
 import csv
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
+from pisigma.judging.calibration_summary import summary_of
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.calibration_card import PARAMETER_COLUMNS, not_identified_lines, parameter_table
-from pisigma.reporting.correlation_csv import CORRELATION_CSV
+from pisigma.reporting.calibration_files import CORRELATION_CSV
+from pisigma.reporting.calibration_tables import (
+    PARAMETER_COLUMNS,
+    parameter_table,
+    undetermined_lines,
+    warning_lines,
+)
 
 STRONG = 0.9
 """Pairs of parameters with a larger correlation are named."""
@@ -59,11 +63,10 @@ class ParameterFindings:
 
 def parameter_findings(model: CalibratedModel, folder: Path) -> ParameterFindings:
     """Gather it from the metrics of a model and the files of its folder."""
-    metrics = model.metrics
-    known = _has_parameters(metrics)
+    summary = summary_of(model)
     tables = read_correlations(folder / CORRELATION_CSV)
     missing = []
-    if not known:
+    if summary is None:
         missing.append(
             "This model has no identified parameters: its geometry is the nominal one."
             if model.calibrated is None
@@ -73,26 +76,22 @@ def parameter_findings(model: CalibratedModel, folder: Path) -> ParameterFinding
         missing.append(
             "The model folder does not keep the correlations as numbers; calibrate again to have them."
         )
-    seen = metrics.get("observability")
+    if summary is None:
+        return ParameterFindings(
+            PARAMETER_COLUMNS, (), 0, (), (), None, None, _pairs(tables), tables, tuple(missing)
+        )
     return ParameterFindings(
         columns=PARAMETER_COLUMNS,
-        table=tuple(_table(metrics)) if known else (),
-        estimated=sum(row["standard_error"] is not None for row in metrics["parameters"]) if known else 0,
-        not_identified=tuple(not_identified_lines(metrics)) if known else (),
-        observability=tuple((name, float(seen[name]), text) for name, text in INDICES if name in seen)
-        if isinstance(seen, Mapping)
-        else (),
-        rank=metrics.get("rank"),
-        condition=metrics.get("condition_number"),
+        table=parameter_table(summary.parameters).rows,
+        estimated=sum(row.standard_error is not None for row in summary.parameters),
+        not_identified=(*undetermined_lines(summary), *warning_lines(summary)),
+        observability=tuple((name, getattr(summary.observability, name), text) for name, text in INDICES),
+        rank=summary.rank,
+        condition=summary.condition_number,
         pairs=_pairs(tables),
         correlations=tables,
         missing=tuple(missing),
     )
-
-
-def _table(metrics: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """The table of the card, whose sentences stand before it here."""
-    return [(*row[:-1], row[-1].replace("see below", "see above")) for row in parameter_table(metrics)]
 
 
 def read_correlations(path: Path) -> tuple[tuple[tuple[str, ...], Float64[np.ndarray, "_names _names"]], ...]:
@@ -114,10 +113,6 @@ def read_correlations(path: Path) -> tuple[tuple[tuple[str, ...], Float64[np.nda
     except (KeyError, ValueError, TypeError, OSError):
         return ()
     return tuple(tables)
-
-
-def _has_parameters(metrics: Mapping[str, Any]) -> bool:
-    return all(name in metrics for name in ("parameters", "redundancy", "weak_directions", "warnings"))
 
 
 def _pairs(tables: tuple[tuple[tuple[str, ...], np.ndarray], ...]) -> tuple[tuple[str, str, float], ...]:

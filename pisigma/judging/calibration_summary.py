@@ -1,0 +1,477 @@
+"""The figures of a calibration as one typed value.
+
+Cards, tables on the screen, report pages and JSON render it, and a model folder keeps it as the metrics of its model.
+Figures are in millimetres and degrees. What does not exist is not set and stands in no JSON; what was wanted but has no
+finite value is None.
+"""
+
+import math
+from dataclasses import asdict
+from typing import Any
+
+from pydantic import JsonValue, ValidationError
+
+from pisigma.errors import ModelError
+from pisigma.hybrid.result import HybridResult, LearnedPart
+from pisigma.identification.result import CalibrationResult, SensorNoise
+from pisigma.judging.trained_calibrations import Result, geometric_result
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.yaml_file import Section
+
+MODELS = ("nominal", "geometric", "hybrid")
+"""Calibrations that are judged side by side, in the order of the tables."""
+
+KINDS = ("geometric_calibration", "hybrid_calibration")
+"""Kinds of models whose metrics are a `CalibrationSummary`."""
+
+_UNITS = {"m": ("mm", 1e3), "rad": ("deg", math.degrees(1.0))}
+
+
+class ErrorFigures(Section):
+    """Root mean square, mean, 95 % quantile and maximum of errors of position [mm] and orientation [deg]."""
+
+    rms_mm: float | None = None
+    mean_mm: float | None = None
+    p95_mm: float | None = None
+    max_mm: float | None = None
+    rms_deg: float | None = None
+    mean_deg: float | None = None
+    p95_deg: float | None = None
+    max_deg: float | None = None
+
+    @property
+    def by_name(self) -> dict[str, float]:
+        """The figures that there are, by name."""
+        return self.model_dump(exclude_unset=True)
+
+
+class DistanceFigures(Section):
+    """Mean and maximum of the errors of distances between sockets [mm]."""
+
+    mean_mm: float
+    max_mm: float
+
+
+class SocketDistances(Section):
+    """Errors of the distances of held-out sockets, per calibration; `count` distances are known."""
+
+    count: int
+    nominal: DistanceFigures | None = None
+    geometric: DistanceFigures | None = None
+    hybrid: DistanceFigures | None = None
+
+    @property
+    def models(self) -> dict[str, DistanceFigures]:
+        """The calibrations that there are, by name."""
+        return {name: figures for name in MODELS if (figures := getattr(self, name)) is not None}
+
+
+class AbstractValidationFigures(Section):
+    """Errors of held-out rows under several calibrations.
+
+    Attributes:
+        folds: of the cross-validation; 1 where rows were held out once; not set for a test set.
+        repeats: of the cross-validation, where there are several.
+        rms_mm_of_repeats: by calibration, the RMS position error of each repeat [mm].
+        nominal: the robot as drawn, with base and tool fitted to the training rows.
+        geometric: the geometric calibration.
+        hybrid: geometry and joint correction.
+        coverage: share of the held-out coordinates that lie within the 95 % intervals that the hybrid predicts.
+        predicted_rms_mm: RMS of the position errors that it predicts [mm].
+        socket_distance: errors of distances between held-out sockets.
+        frames_fitted: number of frames that were held out whole; their bases were fitted to the held-out rows.
+        sockets_held_out: number of sockets that were held out whole.
+        rows_not_judged: number of held-out rows whose target or anchor no training row has.
+    """
+
+    folds: int | None = None
+    repeats: int | None = None
+    rms_mm_of_repeats: dict[str, tuple[float, ...]] | None = None
+    nominal: ErrorFigures | None = None
+    geometric: ErrorFigures | None = None
+    hybrid: ErrorFigures | None = None
+    coverage: float | None = None
+    predicted_rms_mm: float | None = None
+    socket_distance: SocketDistances | None = None
+    frames_fitted: int | None = None
+    sockets_held_out: int | None = None
+    rows_not_judged: int | None = None
+
+    @property
+    def models(self) -> dict[str, ErrorFigures]:
+        """The calibrations that were judged, by name."""
+        return {name: figures for name in MODELS if (figures := getattr(self, name)) is not None}
+
+
+class ValidationFigures(AbstractValidationFigures):
+    """See `AbstractValidationFigures`.
+
+    Attributes:
+        rows: number of held-out rows with a length; each counts once, however many repeats there are.
+        rms_mm_of_simulations: by calibration, the RMS position error in each of several simulations [mm].
+        mean_rms_mm: by calibration, the mean of these [mm].
+    """
+
+    rows: int
+    rms_mm_of_simulations: dict[str, tuple[float, ...]] | None = None
+    mean_rms_mm: dict[str, float] | None = None
+
+
+class LearningPoint(AbstractValidationFigures):
+    """Errors of held-out rows by calibrations with `rows` training rows; `held_out` rows were judged."""
+
+    rows: int
+    held_out: int
+
+
+class NoiseFigures(Section):
+    """Noise of one kind of sensor, as the residuals show it.
+
+    Attributes:
+        sensor: such as "position".
+        values: number of measured values.
+        used_by_parameters: how many of them the parameters use up.
+        sigma_mm: standard deviation of one value [mm].
+        sigma_deg: the same of an angle [deg].
+        factor_on_stated_sigma: the same as a factor, where the rows state their standard deviations.
+    """
+
+    sensor: str
+    values: int | None = None
+    used_by_parameters: float | None = None
+    sigma_mm: float | None = None
+    sigma_deg: float | None = None
+    factor_on_stated_sigma: float | None = None
+
+
+class ParameterFigures(Section):
+    """One row of the parameter table; see `pisigma.identification.result.ParameterEstimate`.
+
+    Attributes:
+        name: such as "theta_1".
+        unit: "mm" or "deg"; the unit of the four figures.
+        nominal: as drawn.
+        estimated: as identified.
+        change: estimated minus nominal.
+        standard_error: of the estimate; None where it was not estimated.
+        remark: what is to be said of it, in full.
+        label: the same in a few words.
+    """
+
+    name: str
+    unit: str
+    nominal: float | None
+    estimated: float | None
+    change: float | None
+    standard_error: float | None
+    remark: str
+    label: str
+
+
+class RedundancyFigures(Section):
+    """Which parameters the data determine; see `pisigma.identification.identifiability`.
+
+    Attributes:
+        kept: parameters of an identifiable choice.
+        removed: parameters that act like combinations of these.
+        no_effect: parameters that change no measured value.
+        dependencies: the combinations that are identified where single values are not, a sentence each.
+        pairwise_sets: sets of parameters that are redundant by Pearson correlation of pairs.
+        pairwise_kept: parameters that are left by pairs.
+    """
+
+    kept: tuple[str, ...]
+    removed: tuple[str, ...]
+    no_effect: tuple[str, ...]
+    dependencies: tuple[str, ...]
+    pairwise_sets: tuple[tuple[str, ...], ...]
+    pairwise_kept: tuple[str, ...]
+
+
+class ObservabilityFigures(Section):
+    """Observability indices of the free parameters; see `pisigma.identification.identifiability.observability`."""
+
+    O1: float
+    O2: float
+    O3: float
+    O4: float
+    O5: float
+
+
+class OutlierFigures(Section):
+    """A row that counted for less than half.
+
+    Attributes:
+        row: number in the measurements, from 0.
+        place: file and line.
+        sensor: which value of the row.
+        deviations: length of the residual, in standard deviations of one value.
+        residual_mm: length of the residual [mm].
+        residual_deg: the same of an orientation [deg].
+    """
+
+    row: int
+    place: str
+    sensor: str
+    deviations: float
+    residual_mm: float | None = None
+    residual_deg: float | None = None
+
+
+class TrialFigures(Section):
+    """A joint correction that was tried; see `pisigma.hybrid.search.Trial`.
+
+    Attributes:
+        name: such as "gravity + series 56 + products (2, 2)".
+        unknowns: number of parameters and weights.
+        log_evidence: up to a constant of the data; None where it was not worked out.
+        left_out: RMS of training rows that were left out of the fit, in units of the geometric calibration's.
+        seconds: time it took [s].
+        kept: whether it was better than what was kept before it.
+    """
+
+    name: str
+    unknowns: int
+    log_evidence: float | None
+    left_out: float
+    seconds: float
+    kept: bool
+
+
+class LearnedFigures(Section):
+    """A joint correction that was kept.
+
+    Attributes:
+        features: name and settings of every feature.
+        orders: number of factors of every product unit.
+        unknowns: number of parameters and weights.
+        effective_parameters: how many of them the data determine; the prior holds the others.
+        linearisations: iterations of the fit.
+        noise: per sensor.
+        prior_scale: factor on predicted variances, by which left-out rows were met.
+        fades_over_deg: angle beyond the measured joint values over which the correction fades [deg].
+    """
+
+    features: tuple[dict[str, JsonValue], ...]
+    orders: tuple[int, ...]
+    unknowns: int
+    effective_parameters: float
+    linearisations: int
+    noise: tuple[NoiseFigures, ...]
+    prior_scale: float
+    fades_over_deg: float
+
+
+class HybridFigures(Section):
+    """What a hybrid calibration found beyond the geometry.
+
+    Attributes:
+        verdict: what was kept and why, in a sentence.
+        learned: the correction; None where none was kept.
+        trials: what was tried, in order.
+    """
+
+    verdict: str
+    learned: LearnedFigures | None
+    trials: tuple[TrialFigures, ...]
+
+
+class HeldOutFile(Section):
+    """SHA-256 of the file of held-out rows in the model folder, and of the measurements that it is of."""
+
+    sha256: str
+    data_sha256: str
+
+
+class CalibrationSummary(Section):
+    """All figures of a calibration.
+
+    Attributes:
+        command: what made the model: a command line or a call.
+        rows: number of rows that were calibrated with.
+        fit_seconds: time that the calibration took without its validation [s].
+        status: why the search ended.
+        iterations: steps tried.
+        rank: number of independent combinations of parameters that the data determine.
+        condition_number: of the Jacobian of the free parameters.
+        observability: indices O1 to O5.
+        noise: per sensor.
+        parameters: the parameter table.
+        redundancy: which parameters the data determine.
+        weak_directions: directions that the data hardly determine, a sentence each.
+        outliers: rows that counted for less than half, the worst first.
+        warnings: what to check or to measure next, a sentence each.
+        rmse_mm: RMS of the first sensor's residuals at every iteration, the initial guess first.
+        hybrid: what a hybrid calibration found beyond the geometry.
+        cross_validation: errors of rows that were held out in turn.
+        test: errors of the rows that the file marks as test.
+        held_out: errors of other simulated rows.
+        held_out_rows: hashes of the file with every held-out row.
+        learning_curve: errors of held-out rows by the number of training rows.
+        redundant_sets: of a recipe: sets of parameters that are redundant by pairs.
+        no_effect: of a recipe: parameters without effect, by pairs.
+        pairwise_parameters: of a recipe: number of parameters that are left by pairs.
+        paper: of a recipe: published figures, by name.
+    """
+
+    command: str = ""
+    rows: int | None = None
+    fit_seconds: float | None = None
+    status: str
+    iterations: int
+    rank: int
+    condition_number: float | None
+    observability: ObservabilityFigures
+    noise: tuple[NoiseFigures, ...]
+    parameters: tuple[ParameterFigures, ...]
+    redundancy: RedundancyFigures
+    weak_directions: tuple[str, ...]
+    outliers: tuple[OutlierFigures, ...]
+    warnings: tuple[str, ...]
+    rmse_mm: tuple[float, ...]
+    hybrid: HybridFigures | None = None
+    cross_validation: ValidationFigures | None = None
+    test: ValidationFigures | None = None
+    held_out: ValidationFigures | None = None
+    held_out_rows: HeldOutFile | None = None
+    learning_curve: tuple[LearningPoint, ...] | None = None
+    redundant_sets: tuple[tuple[str, ...], ...] | None = None
+    no_effect: tuple[str, ...] | None = None
+    pairwise_parameters: int | None = None
+    paper: dict[str, JsonValue] | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything that is set as JSON values, by name."""
+        return self.model_dump(mode="json", exclude_unset=True)
+
+    def having(self, **figures: object) -> "CalibrationSummary":
+        """The same with more figures; those that are None are left out."""
+        return self.model_copy(update={name: value for name, value in figures.items() if value is not None})
+
+    @property
+    def judged(self) -> ValidationFigures | None:
+        """Held-out errors: of the cross-validation, else of simulated rows, else of the test set."""
+        return self.cross_validation or self.held_out or self.test
+
+
+def summary_of(model: CalibratedModel) -> CalibrationSummary | None:
+    """Read the figures that a model keeps of its calibration.
+
+    Returns:
+        None for a model that is no calibration, or keeps no figures.
+
+    Raises:
+        ModelError: the figures are not in the form of this version.
+    """
+    if model.kind not in KINDS or not model.metrics:
+        return None
+    try:
+        return CalibrationSummary.model_validate(model.metrics)
+    except ValidationError as problem:
+        first = problem.errors()[0]
+        key = ".".join(map(str, first["loc"]))
+        raise ModelError(
+            f"model '{model.name}': the metrics are not those of a calibration ({key}: {first['msg']}); "
+            "calibrate again, or run `pisigma upgrade` on the folder of an earlier version."
+        ) from None
+
+
+def summarise(result: Result) -> CalibrationSummary:
+    """Gather the figures of a calibration, without those of its validation.
+
+    Args:
+        result: geometric or hybrid.
+    """
+    geometric = geometric_result(result)
+    exact, pairwise = geometric.redundancy, geometric.pairwise
+    summary = CalibrationSummary(
+        status=geometric.status.value,
+        iterations=geometric.iterations,
+        rank=geometric.rank,
+        condition_number=_or_none(geometric.condition_number),
+        observability=ObservabilityFigures(**asdict(geometric.observability)),
+        noise=tuple(_noise(noise) for noise in geometric.noise),
+        parameters=_parameters(geometric),
+        redundancy=RedundancyFigures(
+            kept=exact.kept,
+            removed=exact.removed,
+            no_effect=exact.no_effect,
+            dependencies=tuple(dependency.sentence for dependency in exact.dependencies),
+            pairwise_sets=tuple(tuple(members) for members in pairwise.sets),
+            pairwise_kept=tuple(pairwise.kept),
+        ),
+        weak_directions=geometric.weak_directions,
+        outliers=_outliers(geometric),
+        warnings=geometric.warnings,
+        rmse_mm=tuple(value * 1e3 for value in geometric.rms_path),
+    )
+    return summary.having(hybrid=_hybrid(result)) if isinstance(result, HybridResult) else summary
+
+
+def _parameters(result: CalibrationResult) -> tuple[ParameterFigures, ...]:
+    rows = []
+    for parameter in result.parameters:
+        unit, factor = _UNITS[parameter.unit]
+        names = ("nominal", "estimated", "change", "standard_error")
+        figures = {name: _or_none(getattr(parameter, name) * factor) for name in names}
+        texts = {"name": parameter.name, "remark": parameter.remark, "label": parameter.label}
+        rows.append(ParameterFigures(unit=unit, **texts, **figures))
+    return tuple(rows)
+
+
+def _outliers(result: CalibrationResult) -> tuple[OutlierFigures, ...]:
+    rows = []
+    for outlier in result.outliers:
+        unit, factor = _UNITS["rad" if outlier.sensor == "rotation" else "m"]
+        figures = {"deviations": outlier.deviations, f"residual_{unit}": outlier.residual * factor}
+        rows.append(OutlierFigures(row=outlier.row, place=outlier.place, sensor=outlier.sensor, **figures))
+    return tuple(rows)
+
+
+def _noise(noise: SensorNoise) -> NoiseFigures:
+    return NoiseFigures(
+        sensor=noise.sensor,
+        values=noise.values,
+        used_by_parameters=noise.used,
+        **_sigma(noise.sigma, noise.unit),
+    )
+
+
+def _sigma(sigma: float, unit: str) -> dict[str, float]:
+    if unit not in _UNITS:
+        return {"factor_on_stated_sigma": sigma}
+    name, factor = _UNITS[unit]
+    return {f"sigma_{name}": sigma * factor}
+
+
+def _hybrid(result: HybridResult) -> HybridFigures:
+    trials = []
+    for trial in result.trials:
+        figures = asdict(trial) | {
+            "log_evidence": _or_none(trial.log_evidence),
+            "seconds": round(trial.seconds, 3),
+        }
+        trials.append(TrialFigures(**figures))
+    learned = None if result.learned is None else _learned(result, result.learned)
+    return HybridFigures(verdict=result.verdict, learned=learned, trials=tuple(trials))
+
+
+def _learned(result: HybridResult, learned: LearnedPart) -> LearnedFigures:
+    units = {noise.sensor: noise.unit for noise in result.geometric.noise}
+    return LearnedFigures(
+        features=tuple(features.describe() for features in learned.correction.features),
+        orders=tuple(learned.correction.orders),
+        unknowns=learned.unknowns,
+        effective_parameters=learned.effective,
+        linearisations=learned.rounds,
+        noise=tuple(
+            NoiseFigures(sensor=sensor, **_sigma(sigma, units[sensor]))
+            for sensor, sigma in learned.noise.items()
+        ),
+        prior_scale=result.uncertainty.prior_scale,
+        fades_over_deg=math.degrees(learned.coverage.fade),
+    )
+
+
+def _or_none(value: float) -> float | None:
+    return value if math.isfinite(value) else None

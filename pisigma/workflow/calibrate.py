@@ -1,0 +1,332 @@
+"""Calibrate a robot from measurements: typed settings in, a typed result out that writes itself as a model folder."""
+
+import math
+import os
+import re
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from pisigma.errors import IdentificationError, MeasurementError, nearest_choice
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.hybrid.result import HybridResult
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.problem.loss import HampelLoss, SquaredLoss
+from pisigma.identification.problem.parameters import Prior
+from pisigma.judging.calibration_summary import CalibrationSummary, summarise
+from pisigma.judging.calibration_validation import CalibrationValidation, judge, validate_repeatedly
+from pisigma.judging.held_out_rows import HELD_OUT_CSV, HeldOutRows
+from pisigma.judging.trained_calibrations import Calibrator, Result, fit
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.drawing import draw_rows, with_fewer
+from pisigma.measurement.splits import SplitBy, TrainTest, holdout, repeats, split_sets
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import save_model
+from pisigma.model.folder.staging import staged_folder
+from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
+from pisigma.reporting.calibration_card import CardTexts, write_calibration_card
+from pisigma.robot.description import Robot
+
+FOLDS = 5
+"""Of a cross-validation that is not by placement."""
+
+ModelKind = Literal["hybrid", "geometric"]
+
+
+@dataclass(frozen=True)
+class CalibrationSettings:
+    """How a robot is calibrated, and how the calibration is validated.
+
+    Attributes:
+        model: "hybrid": geometry and, where the data are for it, a joint correction; or "geometric".
+        folds: of the cross-validation, 0 for none; None for 5, or one per placement.
+        hold_out: share of the rows that are held out once, instead of folds.
+        split: how rows are split: see `pisigma.measurement.splits.SplitBy`.
+        repeats: of the cross-validation; None for 1 to 10, the more the fewer different joint values there are.
+        seed: of the split, and of drawing training rows.
+        train_rows: number of rows, drawn at random, to calibrate with, in the cross-validation too; None for all.
+        free: "identifiable", "joint_offsets", or names of parameters.
+        prior_length: prior standard deviation of length errors [m]; 0 for no prior.
+        prior_angle: prior standard deviation of angle errors [rad]; 0 for no prior.
+        robust: whether rows that are far off count less.
+        socket_distances: by the names of two sockets their known distance [m]. A * in both names stands for the same
+            text, so that ("*/0", "*/1") means a/0 and a/1, b/0 and b/1 and so on.
+
+    Raises:
+        IdentificationError: the model is no choice, or only one of the two prior standard deviations is 0.
+        MeasurementError: the split is no choice, or settings of the validation exclude each other.
+    """
+
+    model: ModelKind = "hybrid"
+    folds: int | None = None
+    hold_out: float | None = None
+    split: SplitBy = "joints"
+    repeats: int | None = None
+    seed: int = 0
+    train_rows: int | None = None
+    free: Literal["identifiable", "joint_offsets"] | tuple[str, ...] = "identifiable"
+    prior_length: float = 1e-3
+    prior_angle: float = 1e-3
+    robust: bool = True
+    socket_distances: Mapping[tuple[str, str], float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse settings that are no choice or exclude each other."""
+        if self.model not in get_args(ModelKind):
+            choices = nearest_choice(self.model, get_args(ModelKind))
+            raise IdentificationError(f"model '{self.model}' is unknown; {choices}")
+        if self.split not in get_args(SplitBy):
+            choices = nearest_choice(self.split, get_args(SplitBy))
+            raise MeasurementError(f"split '{self.split}' is unknown; {choices}")
+        once = self.hold_out is not None or self.folds == 0
+        if self.repeats is not None and self.repeats > 1 and once:
+            raise MeasurementError(
+                f"repeats {self.repeats}: only folds can be repeated; leave out hold-out, and folds 0."
+            )
+        if self.hold_out is not None and self.folds is not None:
+            raise MeasurementError(
+                f"folds {self.folds} and hold-out {self.hold_out:g} exclude each other; leave one out."
+            )
+        prior = (self.prior_length, self.prior_angle)
+        if not all(map(math.isfinite, prior)) or min(prior) < 0 or (prior[0] == 0) != (prior[1] == 0):
+            raise IdentificationError(
+                f"the prior's standard deviations were wanted above 0, or both 0 for none, got {prior[0] * 1e3:g} mm "
+                f"and {prior[1] * 1e3:g} mrad."
+            )
+
+    def calibrator(self, robot: Robot, sockets: Iterable[str] = ()) -> Calibrator:
+        """Give the calibrator of a robot.
+
+        Args:
+            robot: as drawn.
+            sockets: names of the sockets in the data, for `socket_distances`.
+
+        Raises:
+            IdentificationError: a setting does not fit the robot, or the data have no such sockets.
+        """
+        length, angle = self.prior_length, self.prior_angle
+        geometric = GeometricCalibrator(
+            robot,
+            free=self.free,
+            prior=Prior(theta=angle, d=length, a=length, alpha=angle, beta=angle) if length else None,
+            loss=HampelLoss() if self.robust else SquaredLoss(),
+            socket_distances=_matching_sockets(self.socket_distances, sockets),
+        )
+        return HybridCalibrator(geometric) if self.model == "hybrid" else geometric
+
+    def splits(self, measurements: Measurements) -> Sequence[Sequence[TrainTest]]:
+        """Give training and test rows of every fold, per repeat; nothing without a validation.
+
+        Raises:
+            MeasurementError: the measurements cannot be split like that.
+        """
+        if self.hold_out is not None:
+            splits: Sequence[Sequence[TrainTest]] = [
+                [holdout(measurements, self.hold_out, self.seed, self.split)]
+            ]
+        elif self.folds == 0:
+            return []
+        else:
+            folds = FOLDS if self.folds is None and self.split != "placement" else self.folds
+            splits = repeats(measurements, folds, self.seed, self.split, self.repeats)
+        if self.train_rows is None:
+            return splits
+        return [with_fewer(measurements, folds, self.train_rows, self.seed) for folds in splits]
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """A calibrated robot, how well it was judged, and all figures of it.
+
+    Attributes:
+        model: what `pisigma.load` would read, with all figures as its metrics.
+        result: the geometric or hybrid calibration that the model was made of.
+        rows: what it was calibrated with.
+        validation: errors of rows under calibrations without them; None without one.
+        test: errors of the rows that the data mark as test; None without such rows.
+        held_out: every held-out row with its errors, as the folder keeps them; None without.
+        summary: all figures.
+        texts: description, and what was not validated.
+        settings: what it was calibrated with; None for a recipe.
+        seconds: time it took [s].
+    """
+
+    model: CalibratedModel
+    result: Result
+    rows: Measurements
+    validation: CalibrationValidation | None
+    test: CalibrationValidation | None
+    held_out: HeldOutRows | None
+    summary: CalibrationSummary
+    texts: CardTexts
+    settings: CalibrationSettings | None = None
+    seconds: float = 0.0
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to check or to measure next, a sentence each."""
+        return self.summary.warnings
+
+    def to_json(self) -> dict[str, Any]:
+        """Give all figures as JSON values, in mm and deg."""
+        return {"seconds": round(self.seconds, 3), **self.summary.to_json()}
+
+    def save(
+        self, folder: str | os.PathLike[str], name: str | None = None, command: str | None = None
+    ) -> CalibratedModel:
+        """Write the model folder with card and figures, whole or not at all; a model that is there is replaced.
+
+        Args:
+            folder: to write.
+            name: of the model; None for the name of the folder.
+            command: what made the model, for the card; None for the call of `calibrate`.
+
+        Returns:
+            The model as written.
+
+        Raises:
+            OutputError: the folder holds something that is no model, or cannot be written.
+        """
+        summary = self.summary.having(command=command)
+        name = name or Path(folder).resolve().name
+        model = replace(self.model, name=name, metrics=summary.to_json())
+        with staged_folder(folder) as scratch:
+            save_model(model, scratch)
+            judged = self.validation or self.test
+            write_calibration_card(model, self.result, self.rows, judged, summary, self.texts, scratch)
+            if self.held_out is not None:
+                text = self.held_out.to_csv(model.robot)
+                (scratch / HELD_OUT_CSV).write_text(text, encoding="utf-8", newline="\n")
+        return model
+
+
+def calibrate(
+    robot: Robot | str | os.PathLike[str],
+    data: Measurements | str | os.PathLike[str],
+    settings: CalibrationSettings = CalibrationSettings(),
+    progress: Callable[[str], None] = lambda what: None,
+) -> Calibration:
+    """Calibrate a robot, and judge the calibration on rows that it did not see.
+
+    Args:
+        robot: as drawn: a robot, a name of the catalogue, or a robot file (YAML or URDF).
+        data: measurements, or a CSV file of them; rows of the set "test" are kept apart and judged in the end.
+        settings: see `CalibrationSettings`.
+        progress: called with what is being done.
+
+    Raises:
+        RobotError: there is no such robot.
+        MeasurementError: the data cannot be read, or cannot be split as the settings say.
+        IdentificationError: the data do not determine what is asked for.
+    """
+    started = time.perf_counter()
+    nominal = robot if isinstance(robot, Robot) else Robot.load(os.fspath(robot))
+    measurements = data if isinstance(data, Measurements) else Measurements.read_csv(data, nominal)
+    training, test_rows = split_sets(measurements)
+    splits = settings.splits(training)
+    rows = training
+    if settings.train_rows is not None:
+        rows = training.select(draw_rows(training, settings.train_rows, settings.seed))
+    calibrator = settings.calibrator(nominal, training.socket or ())
+    result = fit(calibrator, rows, lambda what: progress(f"calibration: {what}"))
+    validation = None
+    if splits:
+        validation = validate_repeatedly(
+            calibrator, training, splits, lambda what: progress(f"cross-validation: {what}")
+        )
+    test = None if test_rows is None else judge(calibrator, result, rows, test_rows)
+    summary = summarise(result).having(
+        command=_call(nominal, measurements, settings),
+        rows=rows.rows,
+        cross_validation=None if validation is None else validation.figures(),
+        test=None if test is None else test.figures(),
+    )
+    texts = CardTexts(
+        _description(settings.model, nominal),
+        "Judged on rows of the same measurement only, not on other days, payloads or temperatures.",
+    )
+    calibration = compose(nominal, result, rows, summary, texts, validation, test, training)
+    return replace(calibration, settings=settings, seconds=time.perf_counter() - started)
+
+
+def compose(
+    nominal: Robot,
+    result: Result,
+    rows: Measurements,
+    summary: CalibrationSummary,
+    texts: CardTexts,
+    validation: CalibrationValidation | None = None,
+    test: CalibrationValidation | None = None,
+    held_out: Measurements | None = None,
+    recipe: tuple[str, str] = ("", ""),
+) -> Calibration:
+    """Make a model of a calibration and put everything together.
+
+    Args:
+        nominal: the robot as drawn.
+        result: the calibration.
+        rows: what it was calibrated with.
+        summary: all figures.
+        texts: for the card.
+        validation: errors of held-out rows.
+        test: errors of rows that were kept apart.
+        held_out: the rows of the validation, where the folder is to keep their errors.
+        recipe: name and SHA-256 of the recipe, where there was one.
+    """
+    name = recipe[0] or nominal.name
+    if isinstance(result, HybridResult):
+        model = model_of_hybrid(name, nominal, result, rows, recipe)
+    else:
+        model = model_of_calibration(name, nominal, result, rows, recipe)
+    kept = None if validation is None or held_out is None else HeldOutRows.of(validation, held_out)
+    if kept is not None:
+        summary = summary.having(held_out_rows=kept.hashes(kept.to_csv(nominal)))
+    model = replace(model, metrics=summary.to_json())
+    return Calibration(model, result, rows, validation, test, kept, summary, texts)
+
+
+def _matching_sockets(
+    distances: Mapping[tuple[str, str], float], sockets: Iterable[str]
+) -> dict[tuple[str, str], float]:
+    """Distances by names of sockets in the data; see `CalibrationSettings.socket_distances`."""
+    names = dict.fromkeys(name for name in sockets if name)
+    matching: dict[tuple[str, str], float] = {}
+    for (first, second), distance in distances.items():
+        pattern = re.compile(re.escape(first).replace(r"\*", "(.*)", 1))
+        pairs = []
+        for name in names:
+            match = pattern.fullmatch(name)
+            other = second.replace("*", match[1], 1) if match and "*" in first else second
+            if match and other in names:
+                pairs.append((name, other))
+        if not pairs:
+            raise IdentificationError(
+                f"no two sockets of the data are called '{first}' and '{second}'; there are "
+                f"{', '.join(names) or 'none'}."
+            )
+        matching |= dict.fromkeys(pairs, distance)
+    return matching
+
+
+def _call(robot: Robot, measurements: Measurements, settings: CalibrationSettings) -> str:
+    """The call that gives this calibration again, with the settings that are not the default."""
+    usual = CalibrationSettings()
+    named = {item.name: getattr(settings, item.name) for item in fields(settings)}
+    stated = [f"{name}={value!r}" for name, value in named.items() if value != getattr(usual, name)]
+    words = [repr(robot.name), repr(Path(measurements.source).name)]
+    words += [f"CalibrationSettings({', '.join(stated)})"] if stated else []
+    return f"pisigma.calibrate({', '.join(words)})"
+
+
+def _description(model: ModelKind, nominal: Robot) -> str:
+    if model == "geometric":
+        return (
+            f"Geometric calibration of robot {nominal.name} ({nominal.maker}): DH and Hayati parameters, base and tool "
+            "by least squares."
+        )
+    return (
+        f"Hybrid calibration of robot {nominal.name} ({nominal.maker}): DH and Hayati parameters, base and tool, and "
+        "with them, where the data are for it, a Pi-Sigma network that corrects the joint values."
+    )
