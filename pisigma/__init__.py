@@ -24,11 +24,16 @@ if TYPE_CHECKING:
     from pisigma.workflow.evaluate import evaluate as evaluate
     from pisigma.workflow.verify import VerificationSettings as VerificationSettings
     from pisigma.workflow.verify import verify as verify
+    from pisigma.workflow.calibrate import Calibration as Calibration
+    from pisigma.workflow.calibrate import CalibrationSettings as CalibrationSettings
+    from pisigma.workflow.calibrate import calibrate as calibrate
 
 __version__ = "0.1.0"
 
 _HOMES = {
+    "Calibration": "pisigma.workflow.calibrate",
     "CalibrationResult": "pisigma.identification.result",
+    "CalibrationSettings": "pisigma.workflow.calibrate",
     "CorrectedIK": "pisigma.inverse.corrected_ik",
     "EvaluationSettings": "pisigma.workflow.evaluate",
     "GeometricCalibrator": "pisigma.identification.calibrator",
@@ -43,12 +48,15 @@ _HOMES = {
     "Status": "pisigma.kinematics.status",
     "VerificationSettings": "pisigma.workflow.verify",
     "evaluate": "pisigma.workflow.evaluate",
+    "calibrate": "pisigma.workflow.calibrate",
     "load": "pisigma.inverse.corrected_ik",
     "verify": "pisigma.workflow.verify",
 }
 
 __all__ = [
+    "Calibration",
     "CalibrationResult",
+    "CalibrationSettings",
     "CorrectedIK",
     "EvaluationSettings",
     "GeometricCalibrator",
@@ -63,6 +71,7 @@ __all__ = [
     "Status",
     "VerificationSettings",
     "evaluate",
+    "calibrate",
     "load",
     "verify",
 ]

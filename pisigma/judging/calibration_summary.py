@@ -354,7 +354,7 @@ class CalibrationSummary(Section):
         return self.cross_validation or self.held_out or self.test
 
 
-def summary_of(model: CalibratedModel) -> CalibrationSummary | None:
+def read_summary(model: CalibratedModel) -> CalibrationSummary | None:
     """Read the figures that a model keeps of its calibration.
 
     Returns:

@@ -1,13 +1,9 @@
 """Recipes of the geometric calibrator on simulated robots."""
 
-import math
-import re
-from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import Field, PositiveFloat, PositiveInt
 
-from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import HampelLoss, SquaredLoss
 from pisigma.identification.problem.parameters import Prior
@@ -105,71 +101,3 @@ class GeometricRecipe(Section):
             IdentificationError: the rows do not determine what is asked for.
         """
         return self.calibration.calibrator(Robot.load(self.robot)).fit(measurements)
-
-
-def calibration_section(free: str, prior_mm: float, prior_mrad: float, robust: bool) -> CalibrationSection:
-    """Settings as the command line gives them.
-
-    Args:
-        free: "identifiable", "joint_offsets", or names of parameters with commas between them.
-        prior_mm: standard deviation of length errors [mm]; 0 for no prior.
-        prior_mrad: the same of angle errors [mrad].
-        robust: see `CalibrationSection`.
-
-    Raises:
-        IdentificationError: one of the two standard deviations is 0 and the other is not, or one is below 0
-            or no finite number.
-    """
-    given = (prior_mm, prior_mrad)
-    if not all(map(math.isfinite, given)) or min(given) < 0 or (prior_mm == 0) != (prior_mrad == 0):
-        raise IdentificationError(
-            f"the prior's standard deviations were wanted above 0, or both 0 for none, got {prior_mm:g} mm and "
-            f"{prior_mrad:g} mrad."
-        )
-    prior = PriorSection(length_mm=prior_mm, angle_mrad=prior_mrad) if prior_mm else None
-    named = free in ("identifiable", "joint_offsets")
-    return CalibrationSection(
-        free=free if named else tuple(name.strip() for name in free.split(",")),
-        prior=prior,
-        robust=robust,
-    )
-
-
-def known_socket_distances(stated: str | None, sockets: Sequence[str]) -> dict[tuple[str, str], float]:
-    """Known distances between sockets as the command line gives them.
-
-    Args:
-        stated: "A,B,MM"; a * in both names stands for the same text, so that "*/0,*/1,50" means 50 mm between a/0 and
-            a/1, b/0 and b/1 and so on. None for none.
-        sockets: the names in the data.
-
-    Returns:
-        By the names of two sockets their distance [m].
-
-    Raises:
-        IdentificationError: it is not of this form, or no two sockets have such names.
-    """
-    if stated is None:
-        return {}
-    parts = [part.strip() for part in stated.split(",")]
-    try:
-        first, second, distance = parts[0], parts[1], float(parts[2])
-    except (IndexError, ValueError):
-        distance = 0.0
-    if len(parts) != 3 or not 0 < distance < float("inf"):
-        raise IdentificationError(
-            f"a known socket distance as A,B,MM was wanted, such as */0,*/1,50, got '{stated}'."
-        )
-    pattern = re.compile(re.escape(first).replace(r"\*", "(.*)", 1))
-    found = {}
-    for name in dict.fromkeys(sockets):
-        match = pattern.fullmatch(name)
-        other = second.replace("*", match[1], 1) if match and "*" in first else second
-        if match and other in sockets:
-            found[name, other] = distance / 1e3
-    if not found:
-        raise IdentificationError(
-            f"no two sockets of the data are called '{first}' and '{second}'; there are "
-            f"{', '.join(dict.fromkeys(sockets)) or 'none'}."
-        )
-    return found

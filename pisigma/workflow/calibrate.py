@@ -20,8 +20,15 @@ from pisigma.judging.calibration_validation import CalibrationValidation, judge,
 from pisigma.judging.held_out_rows import HELD_OUT_CSV, HeldOutRows
 from pisigma.judging.trained_calibrations import Calibrator, Result, fit
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.drawing import draw_rows, with_fewer
-from pisigma.measurement.splits import SplitBy, TrainTest, holdout, repeats, split_sets
+from pisigma.measurement.splits import (
+    SplitBy,
+    TrainTest,
+    draw_rows,
+    holdout,
+    repeats,
+    split_sets,
+    with_fewer,
+)
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.folder.staging import staged_folder

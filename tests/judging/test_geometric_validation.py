@@ -15,7 +15,7 @@ from pisigma.judging.calibration_validation import validate
 from pisigma.judging.held_out_frames import with_frames
 from pisigma.measurement import Measurements, k_folds
 from pisigma.measurement.dataset import join
-from pisigma.reporting.held_out_sentences import held_out_lines
+from pisigma.reporting.calibration_tables import held_out_lines
 
 KNOWN = {(f"{plate}/0", f"{plate}/1"): 0.05 for plate in ("plate", "low", "high")}
 
@@ -38,12 +38,12 @@ def test_sockets_of_exact_data_are_met_where_they_were_held_out() -> None:
     assert (found.folds, found.sockets_held_out, found.frames_fitted) == (3, 6, 0)
     assert_close(found.models["geometric"].position, torch.zeros(data.rows, dtype=torch.float64), atol=1e-8)
     assert_close(found.distances["geometric"], torch.zeros(3, dtype=torch.float64), atol=1e-8)
-    figures = found.in_file_units()
-    distance = figures["socket_distance"]
-    assert distance["count"] == 3  # type: ignore[index]
+    figures = found.figures()
+    distance = figures.socket_distance
+    assert distance.count == 3
     nominal = found.distances["nominal"].abs() * 1e3
-    assert_close(distance["nominal"]["mean_mm"], float(nominal.mean()), atol=1e-12)  # type: ignore[index]
-    assert_close(distance["nominal"]["max_mm"], float(nominal.max()), atol=1e-12)  # type: ignore[index]
+    assert_close(distance.nominal.mean_mm, float(nominal.mean()), atol=1e-12)
+    assert_close(distance.nominal.max_mm, float(nominal.max()), atol=1e-12)
     assert float(nominal.mean()) > 0.1
     lines = held_out_lines(figures)
     assert lines[0].startswith("6 sockets were held out whole")
@@ -55,8 +55,8 @@ def test_rows_of_a_target_that_is_seen_once_are_not_judged() -> None:
     rows = replace(arm.measurements, target=("A",) * 79 + ("B",))
     found = validate(GeometricCalibrator(arm.nominal), rows, k_folds(rows, 4, seed=0))
     assert int(torch.isnan(found.models["geometric"].position).sum()) == 1
-    figures = found.in_file_units()
-    assert (figures["rows"], figures["rows_not_judged"]) == (79, 1)
+    figures = found.figures()
+    assert (figures.rows, figures.rows_not_judged) == (79, 1)
     assert held_out_lines(figures) == [
         "1 rows could not be judged: no row that was calibrated with had their target or anchor."
     ]
@@ -93,8 +93,8 @@ def test_known_distances_that_were_calibrated_with_are_not_judged() -> None:
     data = socket_data()
     found = validate(exact(socket_distances=KNOWN), data, k_folds(data, 3, 0))
     assert found.sockets_held_out == 0
-    assert "socket_distance" not in found.in_file_units()
-    assert held_out_lines(found.in_file_units()) == []
+    assert found.figures().socket_distance is None
+    assert held_out_lines(found.figures()) == []
 
 
 def test_distances_of_sockets_that_no_row_has_are_still_refused() -> None:
@@ -111,7 +111,7 @@ def test_frames_of_exact_touches_are_met_where_they_were_held_out() -> None:
     assert (found.folds, found.sockets_held_out, found.frames_fitted) == (3, 0, 3)
     assert_close(found.models["geometric"].position, torch.zeros(data.rows, dtype=torch.float64), atol=1e-8)
     assert float(found.models["nominal"].position.square().mean().sqrt()) > 5e-4
-    assert held_out_lines(found.in_file_units())[0].startswith("3 frames were held out whole")
+    assert held_out_lines(found.figures())[0].startswith("3 frames were held out whole")
 
 
 def test_a_frame_that_is_fitted_afterwards_leaves_the_arm_as_it_was() -> None:

@@ -9,13 +9,15 @@ import pytest
 import torch
 from testing.closeness import assert_close
 from testing.models import hand_made_model
+from testing.report import bare_summary
 
 from pisigma.errors import ModelError
 from pisigma.judging.calibration_validation import CalibrationValidation
-from pisigma.judging.held_out_rows import HELD_OUT_CSV, held_out_csv, held_out_section, read_held_out
+from pisigma.judging.held_out_rows import HELD_OUT_CSV, HeldOutRows, read_held_out
 from pisigma.judging.pose_statistics import PoseErrors
 from pisigma.judging.predicted_spread import PredictedSpread
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
 
 ROWS = 20
 
@@ -32,6 +34,16 @@ def _validation(rows: int, turned: bool, spread: bool) -> CalibrationValidation:
     return CalibrationValidation(5, models, found)
 
 
+def _kept(
+    model: CalibratedModel, validation: CalibrationValidation, measured: Measurements
+) -> tuple[str, CalibratedModel]:
+    """The file of held-out rows, and the model whose metrics hold its hash."""
+    held_out = HeldOutRows.of(validation, measured)
+    text = held_out.to_csv(model.robot)
+    metrics = bare_summary(held_out_rows=held_out.hashes(text)).to_json()
+    return text, replace(model, kind="geometric_calibration", metrics=metrics)
+
+
 @pytest.fixture
 def measured() -> Measurements:
     q = hand_made_model("kiro3").starts[:ROWS]
@@ -44,9 +56,9 @@ def measured() -> Measurements:
 def test_rows_come_back(measured, tmp_path, turned, spread):
     model = hand_made_model("kiro3")
     validation = _validation(ROWS, turned, spread)
-    text = held_out_csv(validation, measured, model.robot)
+    text, keeping = _kept(model, validation, measured)
     (tmp_path / HELD_OUT_CSV).write_text(text, encoding="utf-8", newline="\n")
-    found = read_held_out(tmp_path, replace(model, metrics=held_out_section(text, measured)))
+    found = read_held_out(tmp_path, keeping)
     assert found is not None
     assert found.data_sha256 == measured.content_hash()
     assert (found.frame, found.target) == (measured.frame, measured.target)
@@ -66,11 +78,8 @@ def test_rows_come_back(measured, tmp_path, turned, spread):
 
 
 def test_columns_bear_their_units(measured):
-    head = next(
-        csv.reader(
-            io.StringIO(held_out_csv(_validation(ROWS, True, True), measured, hand_made_model("kiro3").robot))
-        )
-    )
+    text, _ = _kept(hand_made_model("kiro3"), _validation(ROWS, True, True), measured)
+    head = next(csv.reader(io.StringIO(text)))
     assert head[:6] == ["q1_deg", "q2_deg", "q3_mm", "q4_deg", "frame", "target"]
     assert head[6:8] == ["nominal_mm", "nominal_deg"]
     assert head[-3:] == ["residual_x_mm", "residual_y_mm", "residual_z_mm"]
@@ -81,8 +90,7 @@ def test_without_a_section_there_are_none(tmp_path):
 
 
 def test_a_changed_or_missing_file_is_refused(measured, tmp_path):
-    text = held_out_csv(_validation(ROWS, False, False), measured, hand_made_model("kiro3").robot)
-    model = replace(hand_made_model("kiro3"), metrics=held_out_section(text, measured))
+    text, model = _kept(hand_made_model("kiro3"), _validation(ROWS, False, False), measured)
     with pytest.raises(ModelError, match="cannot be read"):
         read_held_out(tmp_path, model)
     (tmp_path / HELD_OUT_CSV).write_text(text.replace("wall", "hall", 1), encoding="utf-8")

@@ -43,11 +43,11 @@ def found(arm):
 def test_all_three_are_judged_on_the_same_rows(found):
     validation, _, steps = found
     assert list(validation.models) == ["nominal", "geometric", "hybrid"]
-    figures = validation.in_file_units()
-    assert (figures["folds"], figures["rows"]) == (3, ROWS)
+    figures = validation.figures()
+    assert (figures.folds, figures.rows) == (3, ROWS)
     for errors in validation.models.values():
         assert bool(torch.isfinite(errors.position).all())
-    nominal, geometric, hybrid = (figures[name]["rms_mm"] for name in validation.models)
+    nominal, geometric, hybrid = (errors.rms_mm for errors in figures.models.values())
     assert hybrid < 0.6 * geometric < 0.6 * nominal
     assert steps[0] == "fold 1 of 3"
     assert any(step.startswith("fold 3 of 3: gravity + series 8") for step in steps)
@@ -58,7 +58,7 @@ def test_geometric_figures_are_those_of_the_geometric_calibrator_alone(arm, foun
     alone = validate(GeometricCalibrator(arm.true.nominal), arm.measurements, parts)
     assert list(alone.models) == ["nominal", "geometric"]
     assert alone.spread is None
-    assert "coverage" not in alone.in_file_units()
+    assert alone.figures().coverage is None
     for name in alone.models:
         assert_close(alone.models[name].position, validation.models[name].position, atol=1e-15)
 
@@ -73,11 +73,11 @@ def test_every_fold_knows_its_training_rows_only(arm, found):
 
 def test_means_over_the_parts(found):
     validation, parts, _ = found
-    means = validation.means(parts)
+    figures = validation.figures(parts)
     for name, errors in validation.models.items():
         own = [float(errors.position[test].square().mean().sqrt()) * 1e3 for _, test in parts]
-        assert_close(means["rms_mm_of_parts"][name], own, rtol=1e-12)
-        assert_close(means["mean_rms_mm"][name], sum(own) / 3, rtol=1e-12)
+        assert_close(figures.rms_mm_of_simulations[name], own, rtol=1e-12)
+        assert_close(figures.mean_rms_mm[name], sum(own) / 3, rtol=1e-12)
 
 
 def test_coverage_counts_coordinates_within_their_intervals(found):
@@ -132,11 +132,11 @@ def test_a_learning_curve_falls_and_ends_with_all_rows(arm, found):
     points = learning_curve(small(arm.true.nominal), arm.measurements, parts, (100, 40), 0, whole=whole)
     assert [point.rows for point in points] == [40, 100, 160]
     assert points[-1].validation is whole
-    figures = [point.in_file_units() for point in points]
-    assert [figure["held_out"] for figure in figures] == [ROWS] * 3
-    errors = [figure["hybrid"]["rms_mm"] for figure in figures]
+    figures = [point.figures() for point in points]
+    assert [figure.held_out for figure in figures] == [ROWS] * 3
+    errors = [figure.hybrid.rms_mm for figure in figures]
     assert errors == sorted(errors, reverse=True)
-    assert all(figure["hybrid"]["rms_mm"] < 1.05 * figure["geometric"]["rms_mm"] for figure in figures)
+    assert all(figure.hybrid.rms_mm < 1.05 * figure.geometric.rms_mm for figure in figures)
 
 
 def test_a_frame_that_was_held_out_is_fitted_under_both_arms(arm):
@@ -145,7 +145,7 @@ def test_a_frame_that_was_held_out_is_fitted_under_both_arms(arm):
     part = torch.arange(160), torch.arange(160, ROWS)
     found = validate(small(arm.true.nominal), named, [part])
     assert found.frames_fitted == 1
-    rms = {name: figures["rms_mm"] for name, figures in found.in_file_units().items() if name in found.models}
+    rms = {name: errors.rms_mm for name, errors in found.figures().models.items()}
     assert rms["hybrid"] < 0.7 * rms["geometric"]
     assert found.spread.values == 0  # nothing is predicted of where a frame is that was not seen
     calibrator = small(arm.true.nominal)
@@ -163,11 +163,12 @@ def test_sockets_are_judged_as_a_geometric_calibration_judges_them():
     known = {(f"{plate}/0", f"{plate}/1"): 0.05 for plate in ("plate", "low", "high")}
     parts = k_folds(data, None, 0, "placement")
     found = validate(small(true_arm().nominal, socket_distances=known), data, parts)
-    figures = found.in_file_units()
-    assert figures["sockets_held_out"] == 6
-    assert set(figures["socket_distance"]) == {"count", "nominal", "geometric", "hybrid"}
-    assert "coverage" not in figures
-    assert figures["hybrid"]["rms_mm"] <= 1.02 * figures["geometric"]["rms_mm"] + 1e-6
+    figures = found.figures()
+    assert figures.sockets_held_out == 6
+    assert figures.socket_distance.count == 3
+    assert list(figures.socket_distance.models) == ["nominal", "geometric", "hybrid"]
+    assert figures.coverage is None
+    assert figures.hybrid.rms_mm <= 1.02 * figures.geometric.rms_mm + 1e-6
 
 
 def test_nothing_to_learn_leaves_the_geometric_figures():

@@ -3,7 +3,7 @@
 import pytest
 
 from pisigma.errors import RecipeError, UnknownRobotError
-from pisigma.recipes.geometric_recipe import GeometricRecipe, calibration_section
+from pisigma.recipes.geometric_recipe import GeometricRecipe
 from pisigma.recipes.recipe import Recipe
 from pisigma.recipes.recipe_kinds import read_any_recipe, read_geometric_recipe
 
@@ -52,12 +52,3 @@ def test_a_kind_need_not_be_stated_where_it_is_inverse_calibration(write_recipe)
     path = write_recipe("kiro3_paper", ("name: kiro3_paper", "kind: inverse_calibratio\nname: kiro3_paper"))
     with pytest.raises(RecipeError, match=r"line 1: 'kind' cannot be .* did you mean 'inverse_calibration'"):
         read_any_recipe(path)
-
-
-def test_options_of_the_command_line_become_settings():
-    section = calibration_section("a_2, theta_3", 0.0, 0.0, False)
-    assert (section.free, section.prior, section.robust) == (("a_2", "theta_3"), None, False)
-    section = calibration_section("joint_offsets", 2.0, 0.5, True)
-    assert section.free == "joint_offsets"
-    assert section.prior.prior().d == 2e-3
-    assert section.prior.prior().theta == 5e-4

@@ -4,18 +4,24 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from pisigma.reporting.hybrid_card import compared, curve_rows, hybrid_parts
-from pisigma.reporting.hybrid_figures import (
+from testing.closeness import assert_close
+from testing.hybrid import hybrid_of
+
+from pisigma.judging.calibration_summary import ErrorFigures, LearningPoint, TrialFigures, summarise
+from pisigma.judging.predicted_spread import PredictedSpread
+from pisigma.reporting.calibration_figures import (
     _over_own_value,
     draw_corrections,
     draw_learning_curve,
     draw_spread,
 )
-from pisigma.reporting.hybrid_report import TRIAL_COLUMNS, coverage_line, report_hybrid, trial_rows
-from testing.closeness import assert_close
-from testing.hybrid import hybrid_of
-
-from pisigma.judging.predicted_spread import PredictedSpread
+from pisigma.reporting.calibration_tables import (
+    TRIAL_COLUMNS,
+    coverage_line,
+    curve_table,
+    learned_lines,
+    trial_table,
+)
 
 
 def ink(path) -> float:
@@ -64,42 +70,45 @@ def test_one_value_can_be_drawn(tmp_path):
     assert one.coverage == 1.0
 
 
+def point(rows: int, scale: float = 1.0, **figures: float) -> LearningPoint:
+    """Errors of all three models; of the nominal one three times those of the hybrid."""
+    errors = {
+        name: ErrorFigures(rms_mm=factor * scale)
+        for name, factor in (("hybrid", 1.0), ("nominal", 3.0), ("geometric", 2.0))
+    }
+    return LearningPoint(rows=rows, held_out=5, **errors, **figures)
+
+
 @pytest.mark.parametrize("rows", [[30], [30, 50, 100, 1500]])
 def test_a_curve_for_every_model(tmp_path, rows):
-    models = {
-        name: [scale / count for count in rows] for name, scale in (("geometric", 9.0), ("hybrid", 3.0))
-    }
-    draw_learning_curve(rows, models, tmp_path / "curve.png")
+    draw_learning_curve([point(count, 3.0 / count) for count in rows], tmp_path / "curve.png")
     assert ink(tmp_path / "curve.png") > 0.01
 
 
-def test_what_was_tried_is_told_in_order(arm):
-    report = report_hybrid(arm.result)
-    rows = trial_rows(report)
-    assert all(len(row) == len(TRIAL_COLUMNS) for row in rows)
+def test_what_was_tried_is_listed_in_order(arm):
+    hybrid = summarise(arm.result).hybrid
+    columns, rows = trial_table(hybrid)
+    assert columns == TRIAL_COLUMNS
+    assert all(len(row) == len(columns) for row in rows)
     assert [row[0] for row in rows] == [trial.name for trial in arm.result.trials]
     assert rows[0][3] == "1.000"
     assert rows[0][2] == f"{arm.result.trials[0].log_evidence:.1f}"
-    learned = report["learned"]
-    assert [chosen["name"] for chosen in learned["features"]] == ["gravity", "series"]
-    assert_close(learned["noise"][0]["sigma_mm"], 1e3 * arm.result.learned.noise["position"], rtol=1e-12)
-    text = "\n\n".join(hybrid_parts({"hybrid": report}))
-    assert arm.result.verdict in text
-    assert "joint_corrections.png" in text
-    assert "learning_curve.png" not in text
-    assert "predicted_spread.png" not in text
+    assert [features["name"] for features in hybrid.learned.features] == ["gravity", "series"]
+    assert_close(hybrid.learned.noise[0].sigma_mm, 1e3 * arm.result.learned.noise["position"], rtol=1e-12)
+    assert learned_lines(hybrid)[0] == arm.result.verdict
 
 
-def test_trials_without_evidence_have_an_empty_cell():
-    trial = {"name": "x", "unknowns": 3, "log_evidence": None, "left_out": 0.5, "seconds": 1.0, "kept": False}
-    assert trial_rows({"trials": [trial]}) == [("x", "3", "", "0.500", "1.0", "no")]
+def test_trials_without_evidence_have_an_empty_cell(arm):
+    trial = TrialFigures(name="x", unknowns=3, log_evidence=None, left_out=0.5, seconds=1.0, kept=False)
+    hybrid = summarise(arm.result).hybrid.model_copy(update={"trials": (trial,)})
+    assert trial_table(hybrid).rows == (("x", "3", "", "0.500", "1.0", "no"),)
 
 
 def test_models_are_compared_in_one_order():
-    figures = {"hybrid": {"rms_mm": 1.0}, "rows": 3, "nominal": {"rms_mm": 3.0}, "geometric": {"rms_mm": 2.0}}
-    assert list(compared(figures)) == ["nominal", "geometric", "hybrid"]
-    head, rows = curve_rows([{**figures, "rows": 30, "coverage": 0.934}])
-    assert head[0] == "training rows"
-    assert rows == [("30", "3.0000", "2.0000", "1.0000", "93.4")]
-    assert coverage_line({"coverage": 0.934, "predicted_rms_mm": 0.1}).startswith("93.4 % of")
-    assert hybrid_parts({}) == []
+    judged = point(30, coverage=0.934, predicted_rms_mm=0.1)
+    assert list(judged.models) == ["nominal", "geometric", "hybrid"]
+    columns, rows = curve_table([judged])
+    assert columns[0] == "training rows"
+    assert rows == (("30", "3.0000", "2.0000", "1.0000", "93.4"),)
+    assert coverage_line(judged).startswith("93.4 % of")
+    assert coverage_line(point(30)) == ""

@@ -6,19 +6,25 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from pisigma.reporting.calibration_report import report_calibration
-from pisigma.reporting.calibration_files import CORRELATION_CSV, write_correlations
 from testing.hybrid import NOISE, HybridArmUnderTest, hybrid_of, joints_in
 from testing.models import no_type_checker
 
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.judging.calibration_summary import (
+    CalibrationSummary,
+    ObservabilityFigures,
+    RedundancyFigures,
+    read_summary,
+    summarise,
+)
 from pisigma.judging.calibration_validation import CalibrationValidation, judge
-from pisigma.judging.held_out_rows import HELD_OUT_CSV, held_out_csv, held_out_section
+from pisigma.judging.held_out_rows import HELD_OUT_CSV, HeldOutRows
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
+from pisigma.reporting.calibration_files import CORRELATION_CSV, write_correlations
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&\u2028$x_1$"
 """A name that breaks pages which do not show it as text."""
@@ -36,9 +42,11 @@ def hybrid_under_test(frames: bool = False) -> tuple[HybridArmUnderTest, Calibra
     """A simulated arm, and its model with all metrics, judged on other rows as a test set."""
     arm = hybrid_of("rb5", 200, frames=frames)
     with no_type_checker():
-        report = report_calibration(arm.result, None if frames else judged_on(arm, measured(arm, 60, 5)))
+        summary = summarise(arm.result).having(rows=200)
+        if not frames:
+            summary = summary.having(cross_validation=judged_on(arm, measured(arm, 60, 5)).figures())
         model = model_of_hybrid("arm", arm.true.nominal, arm.result, arm.measurements)
-    return arm, replace(model, metrics={"rows": 200, **report})
+    return arm, replace(model, metrics=summary.to_json())
 
 
 def judged_on(arm: HybridArmUnderTest, rows: Measurements) -> CalibrationValidation:
@@ -54,7 +62,7 @@ def geometric_under_test() -> tuple[HybridArmUnderTest, CalibratedModel]:
     with no_type_checker():
         result = arm.result.geometric
         model = model_of_calibration("plain", arm.true.nominal, result, arm.measurements)
-        return arm, replace(model, metrics={"rows": 200, **report_calibration(result)})
+        return arm, replace(model, metrics=summarise(result).having(rows=200).to_json())
 
 
 def folder_with_held_out(arm: HybridArmUnderTest, model: CalibratedModel, folder: Path) -> CalibratedModel:
@@ -63,11 +71,33 @@ def folder_with_held_out(arm: HybridArmUnderTest, model: CalibratedModel, folder
         found = judged_on(arm, arm.measurements)
         for errors in found.models.values():
             errors.position.mul_(1.1)
-        text = held_out_csv(found, arm.measurements, model.robot)
-        model = replace(model, metrics=model.metrics | held_out_section(text, arm.measurements))
+        held_out = HeldOutRows.of(found, arm.measurements)
+        text = held_out.to_csv(model.robot)
+        summary = read_summary(model).having(held_out_rows=held_out.hashes(text))
+        model = replace(model, metrics=summary.to_json())
         folder.mkdir()
         save_model(model, folder)
         (folder / HELD_OUT_CSV).write_text(text, encoding="utf-8", newline="\n")
         pairwise = arm.result.geometric.pairwise
         write_correlations((pairwise.lengths, pairwise.angles), folder / CORRELATION_CSV)
     return model
+
+
+def bare_summary(**figures: object) -> CalibrationSummary:
+    """The figures of a calibration that found nothing, and some more."""
+    return CalibrationSummary(
+        status="converged",
+        iterations=1,
+        rank=0,
+        condition_number=None,
+        observability=ObservabilityFigures(O1=0.0, O2=0.0, O3=0.0, O4=0.0, O5=0.0),
+        noise=(),
+        parameters=(),
+        redundancy=RedundancyFigures(
+            kept=(), removed=(), no_effect=(), dependencies=(), pairwise_sets=(), pairwise_kept=()
+        ),
+        weak_directions=(),
+        outliers=(),
+        warnings=(),
+        rmse_mm=(),
+    ).having(**figures)

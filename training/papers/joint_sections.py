@@ -4,8 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from markdown_text import command_block, picture
-from pisigma.reporting.tables import markdown_table
-from pisigma.reporting.tables import figure_text
+from pisigma.reporting.tables import figure_text, markdown_table
 from published import Published
 from stored_results import StoredResults
 

@@ -1,8 +1,7 @@
 """Recipes that stand beside no paper: measured robots, and the hybrid."""
 
 from markdown_text import command_block, picture
-from pisigma.reporting.tables import markdown_table
-from pisigma.reporting.tables import pose_table
+from pisigma.reporting.tables import markdown_table, pose_table
 from published import Published
 from stored_results import Result, StoredResults
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pisigma.judging.calibration_summary import summary_of
+from pisigma.judging.calibration_summary import read_summary
 from pisigma.judging.held_out_rows import read_held_out
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -124,7 +124,7 @@ def report_content(
 
 
 def _learned(model: CalibratedModel) -> tuple[str, ...]:
-    summary = summary_of(model)
+    summary = read_summary(model)
     if summary is None:
         return ()
     lines = learned_lines(summary.hybrid) if summary.hybrid is not None else []

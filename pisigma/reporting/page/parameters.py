@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.judging.calibration_summary import summary_of
+from pisigma.judging.calibration_summary import read_summary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_files import CORRELATION_CSV
 from pisigma.reporting.calibration_tables import (
@@ -63,7 +63,7 @@ class ParameterFindings:
 
 def parameter_findings(model: CalibratedModel, folder: Path) -> ParameterFindings:
     """Gather it from the metrics of a model and the files of its folder."""
-    summary = summary_of(model)
+    summary = read_summary(model)
     tables = read_correlations(folder / CORRELATION_CSV)
     missing = []
     if summary is None:

@@ -131,7 +131,8 @@ def test_every_section_stands_there(tmp_path):
     arm, model = hybrid_under_test()
     kept = folder_with_held_out(arm, model, tmp_path / "arm")
     curve = [
-        {"rows": n, "geometric": {"rms_mm": 0.2}, "hybrid": {"rms_mm": 0.1 + 1 / n}} for n in (50, 100, 200)
+        {"rows": n, "held_out": 9, "geometric": {"rms_mm": 0.2}, "hybrid": {"rms_mm": 0.1 + 1 / n}}
+        for n in (50, 100, 200)
     ]
     kept = replace(kept, metrics=kept.metrics | {"learning_curve": curve})
     content = report_content(kept, tmp_path / "arm", arm.measurements)
