@@ -44,7 +44,6 @@ def train(
     import shutil
 
     from pisigma.cli.output import print_json
-    from pisigma.measurement.splits import split_sets
     from pisigma.model.folder.model_folder import save_model
     from pisigma.model.folder.staging import check_replaceable, staged_folder
     from pisigma.recipes.recipe import recipe_hash
@@ -55,7 +54,7 @@ def train(
 
     folder = out or Path("runs") / stated.name
     check_replaceable(folder)
-    measurements, test = split_sets(load_measurements(stated, data))
+    measurements, test = load_measurements(stated, data).split_sets()
     checkpoints = folder.parent / f".{folder.name}.training"
     run = train_recipe(stated, measurements, RunOptions(checkpoints, resume, True, recipe_hash(recipe)))
     report = report_training(stated, run, _cross_validate(stated, measurements), test)

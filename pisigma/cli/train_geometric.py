@@ -34,8 +34,9 @@ def train_geometric(
     from pisigma.cli.calibrate import print_calibration
     from pisigma.cli.output import print_json
     from pisigma.errors import RecipeError
-    from pisigma.judging.calibration_summary import ErrorFigures, ValidationFigures, summarise
+    from pisigma.judging.calibration_summary import summarise
     from pisigma.judging.calibration_validation import errors_under
+    from pisigma.judging.validation_figures import ErrorFigures, ValidationFigures
     from pisigma.model.folder.staging import check_replaceable
     from pisigma.recipes.recipe import recipe_hash
     from pisigma.recipes.recipe_data import simulate_held_out, simulate_training

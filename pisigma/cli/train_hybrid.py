@@ -76,11 +76,11 @@ def train_hybrid(
 
 def _rows(recipe: "HybridRecipe", data: Path | None) -> "Given":
     """Rows to calibrate with, all rows to judge on, those of the set `test`, and how the rows are parted."""
-    from pisigma.measurement.splits import k_folds, split_sets
+    from pisigma.measurement.splits import k_folds
     from pisigma.recipes.recipe import MeasuredData
     from pisigma.recipes.recipe_data import load_measurements, simulate_repeats
 
-    rows, test = split_sets(load_measurements(recipe, data))
+    rows, test = load_measurements(recipe, data).split_sets()
     if isinstance(recipe.data, MeasuredData):
         return rows, rows, test, k_folds(rows, recipe.data.folds, recipe.data.seed)
     everything, parts = simulate_repeats(recipe)

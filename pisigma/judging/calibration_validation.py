@@ -11,11 +11,11 @@ from pisigma.errors import IdentificationError
 from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.prediction import predicted_poses
-from pisigma.judging.calibration_summary import ErrorFigures, ValidationFigures
 from pisigma.judging.held_out_frames import judgeable, with_frames
 from pisigma.judging.pose_statistics import PoseErrors, error_statistics
 from pisigma.judging.predicted_spread import PredictedSpread, predicted_spread
 from pisigma.judging.trained_calibrations import Calibrator, Result, geometric_of, trained, without_missing
+from pisigma.judging.validation_figures import ErrorFigures, ValidationFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import TrainTest
 

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from pisigma.judging.calibration_summary import LearningPoint
 from pisigma.judging.calibration_validation import CalibrationValidation, Progress, validate
 from pisigma.judging.trained_calibrations import Calibrator
+from pisigma.judging.validation_figures import LearningPoint
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import TrainTest, with_fewer
 

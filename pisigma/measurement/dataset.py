@@ -184,6 +184,25 @@ class Measurements:
         """Name a row as complaints do: by file and line, or by source and row counted from 0."""
         return self.as_fields().label(row)
 
+    def split_sets(self) -> "tuple[Measurements, Measurements | None]":
+        """Split the rows by the column `set`: those to train on, and those of the set "test", which are kept apart.
+
+        Returns:
+            The rows to train on, and the others; None where there are none.
+
+        Raises:
+            MeasurementError: all rows are of the set "test", or the two rows of a pair are in different sets.
+        """
+        test = torch.tensor([name == "test" for name in self.split or ()], dtype=torch.bool)
+        if not test.any():
+            return self, None
+        if test.all():
+            raise MeasurementError(
+                f"{self.source}: column 'set' marks all {self.rows} rows as 'test', so nothing is left to train on; "
+                "mark some as 'train' or remove the column."
+            )
+        return self.select(~test), self.select(test)
+
     def select(self, index: Tensor) -> "Measurements":
         """The rows of an index, in its order, or of a mask, with everything that belongs to them.
 

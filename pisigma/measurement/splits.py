@@ -112,29 +112,6 @@ def repeats(
     return first, *(k_folds(measurements, folds, generator, by) for _ in range(times - 1))
 
 
-def split_sets(measurements: Measurements) -> tuple[Measurements, Measurements | None]:
-    """Split rows by the column `set`: those to train on, and those of the set "test", which are kept apart.
-
-    Args:
-        measurements: rows, with or without the column.
-
-    Returns:
-        The rows to train on, and the others; None where there are none.
-
-    Raises:
-        MeasurementError: all rows are of the set "test", or the two rows of a pair are in different sets.
-    """
-    test = torch.tensor([name == "test" for name in measurements.split or ()], dtype=torch.bool)
-    if not test.any():
-        return measurements, None
-    if test.all():
-        raise MeasurementError(
-            f"{measurements.source}: column 'set' marks all {measurements.rows} rows as 'test', so nothing is "
-            "left to train on; mark some as 'train' or remove the column."
-        )
-    return measurements.select(~test), measurements.select(test)
-
-
 def holdout(
     measurements: Measurements, share: float, seed: int | torch.Generator, by: SplitBy = "joints"
 ) -> TrainTest:

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from pisigma.identification.identifiability.pairwise import CorrelationTable
 from pisigma.joint_correction.joint_correction import JointCorrection
-from pisigma.judging.calibration_summary import LearningPoint
 from pisigma.judging.predicted_spread import WITHIN, PredictedSpread
+from pisigma.judging.validation_figures import LearningPoint
 from pisigma.measurement.dataset import Measurements
 from pisigma.reporting.figures import save_figure
 

@@ -3,14 +3,12 @@
 from collections.abc import Sequence
 
 from pisigma.judging.calibration_summary import (
-    AbstractValidationFigures,
     CalibrationSummary,
     HybridFigures,
-    LearningPoint,
     NoiseFigures,
     ParameterFigures,
-    ValidationFigures,
 )
+from pisigma.judging.validation_figures import AbstractValidationFigures, LearningPoint, ValidationFigures
 from pisigma.reporting.tables import Table, figure_text, pose_rows
 
 PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")

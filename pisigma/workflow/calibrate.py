@@ -26,7 +26,7 @@ from pisigma.measurement.splits import (
     draw_rows,
     holdout,
     repeats,
-    split_sets,
+   ,
     with_fewer,
 )
 from pisigma.model.calibrated_model import CalibratedModel
@@ -231,7 +231,7 @@ def calibrate(
     started = time.perf_counter()
     nominal = robot if isinstance(robot, Robot) else Robot.load(os.fspath(robot))
     measurements = data if isinstance(data, Measurements) else Measurements.read_csv(data, nominal)
-    training, test_rows = split_sets(measurements)
+    training, test_rows = measurements.split_sets()
     splits = settings.splits(training)
     rows = training
     if settings.train_rows is not None:

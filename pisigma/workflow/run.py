@@ -12,7 +12,7 @@ from torch import Tensor
 from pisigma.errors import MeasurementError, RecipeError
 from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.splits import groups_of_equal_joints, split_sets
+from pisigma.measurement.splits import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.domain import Domain
 from pisigma.model.stored_starts import spread_rows
@@ -92,7 +92,7 @@ def train_recipe(
     Raises:
         PisigmaError: the data or the recipe do not allow it; the message says what to do.
     """
-    measurements, _ = split_sets(measurements)
+    measurements, _ = measurements.split_sets()
     robot = Robot.load(recipe.robot)
     if isinstance(recipe.data, MeasuredData):
         check_one_pose(measurements)

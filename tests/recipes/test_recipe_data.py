@@ -8,7 +8,6 @@ from testing.models import no_type_checker, trained_run
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.splits import split_sets
 from pisigma.recipes.recipe import MeasuredData
 from pisigma.reporting.training_report import report_training
 from pisigma.workflow.run import train_recipe
@@ -21,7 +20,7 @@ def rows(*split: str) -> Measurements:
 
 
 def test_rows_are_parted_by_the_column():
-    train, test = split_sets(rows("train", "test", "train", "train", "test", "train"))
+    train, test = rows("train", "test", "train", "train", "test", "train").split_sets()
     assert train.q[:, 0].tolist() == [0, 4, 6, 10]
     assert test.q[:, 0].tolist() == [2, 8]
     assert set(train.split) == {"train"}
@@ -31,12 +30,12 @@ def test_rows_are_parted_by_the_column():
 @pytest.mark.parametrize("split", [(), ("train",) * 6])
 def test_without_test_rows_all_are_trained_on(split):
     measurements = rows(*split)
-    assert split_sets(measurements) == (measurements, None)
+    assert measurements.split_sets() == (measurements, None)
 
 
 def test_test_rows_alone_are_refused():
     with pytest.raises(MeasurementError, match=r"rows\.csv: column 'set' marks all 6 rows as 'test'"):
-        split_sets(rows(*["test"] * 6))
+        rows(*["test"] * 6).split_sets()
 
 
 def test_rows_of_the_test_set_change_nothing_that_is_learned():
@@ -47,7 +46,7 @@ def test_rows_of_the_test_set_change_nothing_that_is_learned():
     position = everything.position.clone()
     position[::4] += 0.5
     marked = replace(everything, split=split)
-    train, test = split_sets(marked)
+    train, test = marked.split_sets()
     with no_type_checker():
         models = [
             train_recipe(measured, data).model for data in (marked, replace(marked, position=position), train)

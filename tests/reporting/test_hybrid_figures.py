@@ -7,8 +7,9 @@ from PIL import Image
 from testing.closeness import assert_close
 from testing.hybrid import hybrid_of
 
-from pisigma.judging.calibration_summary import ErrorFigures, LearningPoint, TrialFigures, summarise
+from pisigma.judging.calibration_summary import TrialFigures, summarise
 from pisigma.judging.predicted_spread import PredictedSpread
+from pisigma.judging.validation_figures import ErrorFigures, LearningPoint
 from pisigma.reporting.calibration_figures import (
     _over_own_value,
     draw_corrections,

@@ -6,8 +6,8 @@ from typing import Any
 
 import torch
 
-from pisigma.judging.calibration_summary import ValidationFigures
 from pisigma.judging.pose_statistics import PoseErrors, error_statistics
+from pisigma.judging.validation_figures import ValidationFigures
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_tables import cross_validation_text
 from pisigma.reporting.page.judged_rows import JudgedRows
