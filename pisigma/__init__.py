@@ -19,14 +19,14 @@ if TYPE_CHECKING:
     from pisigma.measurement.dataset import Measurements as Measurements
     from pisigma.network.pi_sigma import PiSigma as PiSigma
     from pisigma.robot.description import Robot as Robot
+    from pisigma.workflow.calibrate import Calibration as Calibration
+    from pisigma.workflow.calibrate import CalibrationSettings as CalibrationSettings
+    from pisigma.workflow.calibrate import calibrate as calibrate
     from pisigma.workflow.evaluate import EvaluationSettings as EvaluationSettings
     from pisigma.workflow.evaluate import Limits as Limits
     from pisigma.workflow.evaluate import evaluate as evaluate
     from pisigma.workflow.verify import VerificationSettings as VerificationSettings
     from pisigma.workflow.verify import verify as verify
-    from pisigma.workflow.calibrate import Calibration as Calibration
-    from pisigma.workflow.calibrate import CalibrationSettings as CalibrationSettings
-    from pisigma.workflow.calibrate import calibrate as calibrate
 
 __version__ = "0.1.0"
 
@@ -70,8 +70,8 @@ __all__ = [
     "Solution",
     "Status",
     "VerificationSettings",
-    "evaluate",
     "calibrate",
+    "evaluate",
     "load",
     "verify",
 ]

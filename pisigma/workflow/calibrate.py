@@ -26,7 +26,6 @@ from pisigma.measurement.splits import (
     draw_rows,
     holdout,
     repeats,
-   ,
     with_fewer,
 )
 from pisigma.model.calibrated_model import CalibratedModel
