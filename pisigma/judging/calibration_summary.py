@@ -360,7 +360,9 @@ def _hybrid(result: HybridResult) -> HybridFigures:
 def _learned(result: HybridResult, learned: LearnedPart) -> LearnedFigures:
     units = {noise.sensor: noise.unit for noise in result.geometric.noise}
     return LearnedFigures(
-        features=tuple(features.describe() for features in learned.correction.features),
+        features=tuple(
+            features.describe().model_dump(mode="json") for features in learned.correction.features
+        ),
         orders=tuple(learned.correction.orders),
         unknowns=learned.unknowns,
         effective_parameters=learned.effective,
