@@ -21,7 +21,6 @@ app = typer.Typer(
     name="pisigma",
     help="Learn a robot's errors from measurements and command joints that really reach the pose.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )

@@ -5,8 +5,10 @@ import io
 
 import numpy as np
 
+from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
+from pisigma.export.geometry import calibrated_geometry, remarks
 from pisigma.robot.description import Robot
-from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS
+from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, in_file_units
 from pisigma.robot.writing import robot_to_yaml
 
 CONVENTION = (
@@ -15,7 +17,7 @@ CONVENTION = (
     "Trans(x, y, z) RotZ(roll) RotY(pitch) RotX(yaw)."
 )
 
-_LENGTHS = {"d", "a", "x", "y", "z"}
+TABLE_SUFFIXES = (".csv", ".yaml", ".yml")
 
 
 def dh_yaml(robot: Robot, comments: tuple[str, ...] = ()) -> str:
@@ -30,7 +32,7 @@ def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
     """
     text = io.StringIO()
     limits = ("lower_deg", "upper_deg", "lower_mm", "upper_mm")
-    parameters = [in_units(name) for name in (*DH_COLUMNS, *FRAME_COLUMNS)]
+    parameters = (*in_file_units(DH_COLUMNS, robot.dh[0]), *in_file_units(FRAME_COLUMNS, robot.base))
     columns = ("part", "name", "type", "direction", *limits, *parameters)
     writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
     writer.writeheader()
@@ -48,24 +50,20 @@ def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
     return head((CONVENTION, *comments)) + text.getvalue()
 
 
-def in_units(name: str) -> str:
-    """The column of a parameter."""
-    return f"{name}_mm" if name in _LENGTHS else f"{name}_deg"
-
-
 def cells(names: tuple[str, ...], values: np.ndarray) -> dict[str, str]:
     """Parameters by column [mm, deg], with all digits."""
-    return {in_units(name): repr(value) for name, value in file_values(names, values).items()}
-
-
-def file_values(names: tuple[str, ...], values: np.ndarray) -> dict[str, float]:
-    """Parameters by name [mm, deg]."""
-    return {
-        name: float(value * 1e3 if name in _LENGTHS else np.rad2deg(value))
-        for name, value in zip(names, values, strict=True)
-    }
+    return {column: repr(value) for column, value in in_file_units(names, values).items()}
 
 
 def head(sentences: tuple[str, ...]) -> str:
     """Sentences as lines that begin with #."""
     return "".join(f"# {' '.join(sentence.split())}\n" for sentence in sentences)
+
+
+def _write(request: ExportRequest) -> Exported:
+    model = request.load()
+    robot, said = calibrated_geometry(model), remarks(model)
+    return Exported((dh_csv if request.as_csv else dh_yaml)(robot, said), model_facts(model), said)
+
+
+FORMAT = ExportFormat("dh", "a DH table", TABLE_SUFFIXES, _write)

@@ -1,18 +1,145 @@
 """Joint offsets alone: the most that a controller can take which knows nothing but its zero positions."""
 
+import csv
+import io
 from dataclasses import dataclass
 
 import numpy as np
 import torch
+import yaml
 from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import ModelError
-from pisigma.export.offset_fit import OffsetProblem, solve_offsets
+from pisigma.export.dh_table import TABLE_SUFFIXES, cells, head
+from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
+from pisigma.export.geometry import offset_remarks
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.jacobian import joint_jacobian
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
-from pisigma.se3 import rotation_vector
+from pisigma.robot.row import FRAME_COLUMNS, in_file_units
+from pisigma.se3 import (
+    pose_error,
+    rotation_from_vector,
+    rotation_vector,
+    skew,
+    transform,
+    transform_from_xyzrpy,
+    xyzrpy_from_transform,
+)
+
+ITERATIONS = 50
+UNSEEN = 1e-6
+"""A joint's column whose part outside those of base and tool is a smaller share of it tells nothing."""
+NO_EFFECT = 1e-4
+"""Directions of the unknowns whose effect is smaller than this share of the largest are not moved along: base and
+tool would run away for next to nothing."""
+SETTLED = 1e-12
+
+
+@dataclass(frozen=True, eq=False)
+class OffsetProblem:
+    """Bring a robot to poses by moving its joints' zero positions, its base and its tool.
+
+    Attributes:
+        robot: the robot to begin with.
+        q: joint values [rad or m] of the poses.
+        T: where the tool shall be then.
+    """
+
+    robot: Robot
+    q: Float64[Tensor, "poses dof"]
+    T: Float64[Tensor, "poses 4 4"]
+
+    @property
+    def lever(self) -> float:
+        """Length [m] that makes an angle [rad] count as much as a distance: half a reach."""
+        return self.robot.reach / 2
+
+    def residual(self, robot: Robot) -> tuple[Float64[Tensor, " values"], Float64[Tensor, "values unknowns"]]:
+        """What is missing [m], and its derivative by joints [rad or m], base and tool [m, rad].
+
+        Base and tool count as small shifts and turns, of the base in the frame that poses are given in, of the
+        tool in its own.
+        """
+        T, J = joint_jacobian(robot, self.q)
+        R, p = T[:, :3, :3], T[:, :3, 3]
+        eye, none = torch.eye(3).to(R).expand_as(R), torch.zeros_like(R)
+        shifts = torch.cat([J[:, :3], eye, -skew(p), R, none], -1)
+        turns = self.lever * torch.cat([J[:, 3:], none, eye, none, R], -1)
+        missing = pose_error(self.T, T)
+        missing = torch.cat([missing[:, :3], self.lever * missing[:, 3:]], -1)
+        return missing.flatten(), torch.cat([shifts, turns], 1).flatten(0, 1)
+
+    def moved(self, robot: Robot, step: Float64[Tensor, " unknowns"]) -> Robot:
+        """The robot with joint offsets, base and tool changed by a step."""
+        dof = robot.dof
+        dh = robot.dh.copy()
+        for joint, row, change in zip(robot.joints, robot.joint_rows, step[:dof].tolist(), strict=True):
+            dh[row, 0 if joint.type == "revolute" else 1] += joint.direction * change
+        base, tool = (transform_from_xyzrpy(torch.from_numpy(f.copy())) for f in (robot.base, robot.tool))
+        base, tool = _small(step[dof : dof + 6]) @ base, tool @ _small(step[dof + 6 :])
+        return robot.with_geometry(
+            dh, xyzrpy_from_transform(base).numpy(), xyzrpy_from_transform(tool).numpy()
+        )
+
+
+def solve_offsets(problem: OffsetProblem) -> tuple[Robot, tuple[bool, ...]]:
+    """Minimise the sum of squares by damped Gauss-Newton steps (Levenberg-Marquardt) from the robot as it is.
+
+    Returns:
+        The robot, and for every joint whether its offset could be told from base and tool; else it is left 0.
+    """
+    robot = problem.robot
+    missing, J = problem.residual(robot)
+    seen = _seen(J, robot.dof)
+    free = torch.tensor([*seen, *[True] * 12])
+    damping = 1e-3
+    for _ in range(ITERATIONS):
+        step = torch.zeros(len(free), dtype=torch.float64)
+        step[free] = _step(J[:, free], missing, damping)
+        there = problem.moved(robot, step)
+        left, J_there = problem.residual(there)
+        if left @ left < missing @ missing:
+            settled = float(step.abs().max()) < SETTLED
+            robot, missing, J, damping = there, left, J_there, damping / 10
+            if settled:
+                break
+        elif damping > 1e6 or float(step.abs().max()) < SETTLED:
+            break
+        else:
+            damping *= 10
+    return robot, seen
+
+
+def _step(
+    J: Float64[Tensor, "values _free"], missing: Float64[Tensor, " values"], damping: float
+) -> Float64[Tensor, " _free"]:
+    """Damped step by the singular values of the column-scaled derivative."""
+    scale = J.norm(dim=0).clamp(min=1e-12)
+    U, s, V = torch.linalg.svd(J / scale, full_matrices=False)
+    gain = torch.where(s > NO_EFFECT * s[0], s / (s.square() + damping * s[0].square()), 0.0)
+    step: Tensor = V.mT @ (gain * (U.mT @ missing)) / scale
+    return step
+
+
+def _seen(J: Float64[Tensor, "values unknowns"], dof: int) -> tuple[bool, ...]:
+    """For every joint whether its column is no combination of those of base, tool and the joints before."""
+    known, found = J[:, dof:] / J[:, dof:].norm(dim=0).clamp(min=1e-12), []
+    for column in J[:, :dof].unbind(1):
+        column = column / column.norm()
+        U, s, _ = torch.linalg.svd(known, full_matrices=False)
+        basis = U[:, s > UNSEEN * s[0]]
+        found.append(bool((column - basis @ (basis.mT @ column)).norm() > UNSEEN))
+        if found[-1]:
+            known = torch.cat([known, column[:, None]], 1)
+    return tuple(found)
+
+
+def _small(step: Float64[Tensor, " 6"]) -> Float64[Tensor, "4 4"]:
+    return transform(rotation_from_vector(step[3:]), step[:3])
+
 
 POSES = 1_000
 """Poses that the offsets are fitted to, and as many others that they are judged by."""
@@ -132,3 +259,83 @@ def _departure(T: Float64[Tensor, "poses 4 4"], T_model: Float64[Tensor, "poses 
         maximum=float(distance.max()),
         mean_angle=float(angle.mean()),
     )
+
+
+MEANING = (
+    "The real robot commanded to q stands where the robot as drawn stands at q + offset: command q - offset, "
+    "or put the offset into the controller's zero positions. Base and tool were fitted anew for this."
+)
+
+
+def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
+    """What the offsets mean and what they give up."""
+    lost, nominal = offsets.lost.in_file_units(), offsets.nominal.in_file_units()
+    said = [
+        MEANING,
+        f"Offsets alone are off the whole model by {lost['mean_mm']:.4g} mm in the mean, "
+        f"{lost['p95_mm']:.4g} mm in 95 % of its poses, {lost['max_mm']:.4g} mm at most, and "
+        f"{lost['mean_mrad']:.4g} mrad in the mean (the robot as drawn, on the model's base and tool: "
+        f"{nominal['mean_mm']:.4g}, {nominal['p95_mm']:.4g}, {nominal['max_mm']:.4g} mm and "
+        f"{nominal['mean_mrad']:.4g} mrad).",
+    ]
+    if offsets.unobservable:
+        said.append(f"Base or tool take in the offset of {', '.join(offsets.unobservable)}, which is 0 here.")
+    return tuple(said)
+
+
+def offsets_csv(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
+    """One line a joint, then base and tool; cells that do not apply are empty."""
+    text = io.StringIO()
+    frame = in_file_units(FRAME_COLUMNS, offsets.robot.base)
+    columns = ("part", "name", "type", "offset_deg", "offset_mm", *frame)
+    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
+    writer.writeheader()
+    for entry in _joints(offsets):
+        writer.writerow({"part": "joint", **entry})
+    for part in ("base", "tool"):
+        writer.writerow({"part": part, **cells(FRAME_COLUMNS, getattr(offsets.robot, part))})
+    return head((*comments, *offset_sentences(offsets))) + text.getvalue()
+
+
+def offsets_yaml(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
+    """Offsets, base, tool and what they give up."""
+    document: dict[str, object] = {"robot": offsets.robot.name, "joints": _joints(offsets)}
+    for part in ("base", "tool"):
+        document[part] = in_file_units(FRAME_COLUMNS, getattr(offsets.robot, part))
+    document["off_the_whole_model"] = offsets.lost.in_file_units()
+    document["robot_as_drawn"] = offsets.nominal.in_file_units()
+    body = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+    return head((*comments, *offset_sentences(offsets))) + body
+
+
+def _joints(offsets: JointOffsets) -> list[dict[str, object]]:
+    return [
+        {"name": joint.name, "type": joint.type}
+        | (
+            {"offset_deg": float(np.rad2deg(value))}
+            if joint.type == "revolute"
+            else {"offset_mm": float(value * 1e3)}
+        )
+        for joint, value in zip(offsets.robot.joints, offsets.values, strict=True)
+    ]
+
+
+def _write(request: ExportRequest) -> Exported:
+    model = request.load()
+    offsets, said = fit_joint_offsets(model), offset_remarks(model)
+    facts: dict[str, object] = {
+        **model_facts(model),
+        "off_the_whole_model": {**offsets.lost.in_file_units()},
+        "robot_as_drawn": {**offsets.nominal.in_file_units()},
+    }
+    text = (offsets_csv if request.as_csv else offsets_yaml)(offsets, said)
+    return Exported(text, facts, (*said, *offset_sentences(offsets)))
+
+
+FORMAT = ExportFormat(
+    "offsets",
+    "a table of joint offsets",
+    TABLE_SUFFIXES,
+    _write,
+    frozenset(("payload_kg", "temperature_c")),
+)

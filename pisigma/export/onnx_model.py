@@ -1,9 +1,11 @@
 """A model's network as an ONNX graph, for programs that run no Python."""
 
+import hashlib
 import json
 from typing import Any
 
 from pisigma.errors import ModelError
+from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.export.onnx_joint_correction import add_joint_correction, add_share
 from pisigma.export.onnx_network import add_network, needs_pose
 from pisigma.hybrid.arms import HybridArm
@@ -153,3 +155,12 @@ def _joints(model: CalibratedModel) -> str:
 def _units(model: CalibratedModel) -> str:
     kinds = dict.fromkeys("rad" if turns else "m" for turns in model.robot.revolute)
     return " or ".join(kinds)
+
+
+def _write(request: ExportRequest) -> Exported:
+    model = request.load()
+    content = export_onnx(model, hashlib.sha256((request.model / "model.yaml").read_bytes()).hexdigest())
+    return Exported(content, model_facts(model), onnx_remarks(model))
+
+
+FORMAT = ExportFormat("onnx", "an ONNX graph", (".onnx",), _write)

@@ -1,5 +1,6 @@
 """What a serial robot is written down as: DH + Hayati rows with their joints, base and tool, in SI units."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -13,6 +14,23 @@ DH_COLUMNS = ("theta", "d", "a", "alpha", "beta")
 
 FRAME_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
 """Order of the parameters of base and tool, everywhere; x, y, z [m], roll, pitch, yaw [rad]."""
+
+_LENGTHS = frozenset(("d", "a", "x", "y", "z"))
+
+
+def in_file_units(names: Sequence[str], values: Float64[np.ndarray, " names"]) -> dict[str, float]:
+    """Parameters in the units of files, by their columns there: `d` [m] as `d_mm`, `theta` [rad] as `theta_deg`.
+
+    Args:
+        names: of `DH_COLUMNS` or `FRAME_COLUMNS`.
+        values: the parameters [m or rad].
+    """
+    return {
+        f"{name}_mm" if name in _LENGTHS else f"{name}_deg": float(
+            value * 1e3 if name in _LENGTHS else np.rad2deg(value)
+        )
+        for name, value in zip(names, values, strict=True)
+    }
 
 
 @dataclass(frozen=True)

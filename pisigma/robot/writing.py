@@ -10,7 +10,7 @@ import yaml
 
 from pisigma.errors import OutputError, RobotError
 from pisigma.robot.description import Robot
-from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, Drawing, Row
+from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, Drawing, Row, in_file_units
 from pisigma.robot.urdf_chain import Chain, origin_of, parse_xml, read_chain, read_urdf
 from pisigma.robot.urdf_frames import Frame, frame_of, inverse, row_frame, shift, turn, xyzrpy_of
 from pisigma.robot.urdf_rows import ChainRows, rows_of_chain
@@ -25,10 +25,7 @@ def robot_to_yaml(robot: Robot) -> str:
     rows = []
     for row, parameters in zip(robot.rows, robot.dh, strict=True):
         entry: dict[str, object] = {"name": row.name, "type": row.type, "direction": row.direction}
-        entry |= _limits_entry(row)
-        for name, value in zip(DH_COLUMNS, parameters, strict=True):
-            entry |= _in_file_units(name, float(value), length=name in ("d", "a"))
-        rows.append(entry)
+        rows.append(entry | _limits_entry(row) | in_file_units(DH_COLUMNS, parameters))
     document: dict[str, object] = {
         "name": robot.name,
         "maker": robot.maker,
@@ -36,11 +33,7 @@ def robot_to_yaml(robot: Robot) -> str:
         "rows": rows,
     }
     for frame in ("base", "tool"):
-        values = getattr(robot, frame)
-        section: dict[str, float] = {}
-        for name, value in zip(FRAME_COLUMNS, values, strict=True):
-            section |= _in_file_units(name, float(value), length=name in ("x", "y", "z"))
-        document[frame] = section
+        document[frame] = in_file_units(FRAME_COLUMNS, getattr(robot, frame))
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
 
 
@@ -53,10 +46,6 @@ def _limits_entry(row: Row) -> dict[str, list[float]]:
     if row.type == "revolute":
         return {"limits_deg": [float(np.rad2deg(row.lower)), float(np.rad2deg(row.upper))]}
     return {"limits_mm": [row.lower * 1e3, row.upper * 1e3]}
-
-
-def _in_file_units(name: str, value: float, length: bool) -> dict[str, float]:
-    return {f"{name}_mm": value * 1e3} if length else {f"{name}_deg": float(np.rad2deg(value))}
 
 
 BASE_LINK = "base_link"

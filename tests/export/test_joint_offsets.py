@@ -9,8 +9,7 @@ from testing.closeness import assert_close
 from testing.models import hand_made_model, joints_around
 
 from pisigma.errors import ModelError
-from pisigma.export.joint_offsets import fit_joint_offsets
-from pisigma.export.offset_fit import OffsetProblem, solve_offsets
+from pisigma.export.joint_offsets import OffsetProblem, fit_joint_offsets, solve_offsets
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot import Robot

@@ -3,14 +3,24 @@
 The three turns are about fixed axes in that order, so the rotation is `RotZ(R) RotY(P) RotX(W)`.
 """
 
+import re
+
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import OutputError
-from pisigma.export.programs.heading import heading
+from pisigma.export.programs.language import FILES_OF_SYSTEMS, Language, Program
 from pisigma.export.programs.targets import Targets
-from pisigma.export.programs.text import DIGITS, comments, labelled, millimetres_and_euler, number, place
+from pisigma.export.programs.text import (
+    DIGITS,
+    comments,
+    heading,
+    labelled,
+    millimetres_and_euler,
+    number,
+    place,
+)
 
 SPEED = "5%"
 """Of the largest joint speeds."""
@@ -26,21 +36,19 @@ COUPLING = (
 FRAME = ("X", "Y", "Z", "W", "P", "R")
 """R turns about Z and W about X, so the angles come in the other order than elsewhere."""
 
+CONFIGURATION = re.compile(r"[NF] ([LR] )?[UD] [TB], -?\d, -?\d, -?\d")
 WORLD = "UFRAME counts from the world frame, which on FANUC robots lies at the height of J2."
 
 
-def fanuc_ls(targets: Targets, name: str, cartesian: bool, config: str = "") -> str:
+def fanuc_ls(program: Program) -> str:
     """The targets as one program of joint moves that stop at every target.
 
-    Args:
-        targets: of a robot with six joints that turn, none missing; all on one branch where `cartesian`.
-        name: of the program.
-        cartesian: give poses instead of joint values.
-        config: of all poses, such as `N U T, 0, 0, 0`.
+    Poses lie on one branch, and all have the same configuration, such as `N U T, 0, 0, 0`.
 
     Raises:
         OutputError: more lines than a program can have, or joints on turns that one `config` cannot name.
     """
+    targets, name, cartesian = program.targets, program.name, program.cartesian
     number_of_frame = 1 if cartesian else 0
     said = [*heading(targets, cartesian), f"Speed: {SPEED} in every move.", COUPLING]
     if cartesian:
@@ -63,7 +71,7 @@ def fanuc_ls(targets: Targets, name: str, cartesian: bool, config: str = "") -> 
         (
             *_attributes(name, len(lines)),
             *("/MN", *numbered),
-            *("/POS", *_positions(targets, cartesian, config)),
+            *("/POS", *_positions(program)),
             *("/END", ""),
         )
     )
@@ -92,9 +100,10 @@ def _attributes(name: str, lines: int) -> list[str]:
     ]
 
 
-def _positions(targets: Targets, cartesian: bool, config: str) -> list[str]:
-    if cartesian:
-        head, units = f"\tUF : 1, UT : 1,\tCONFIG : '{config}',", ("mm",) * 3 + ("deg",) * 3
+def _positions(program: Program) -> list[str]:
+    targets = program.targets
+    if program.cartesian:
+        head, units = f"\tUF : 1, UT : 1,\tCONFIG : '{program.config}',", ("mm",) * 3 + ("deg",) * 3
         labels = tuple(f"{label} =" for label in FRAME)
         rows = _xyzwpr(targets.T).tolist()
     else:
@@ -131,3 +140,15 @@ def _check_turns(targets: Targets) -> None:
             f"{targets.source}, line {targets.line[row]}: a joint stands on another turn than in line "
             f"{targets.line[0]}, so one --config does not fit both; take --targets joints or write two programs."
         )
+
+
+FANUC = Language(
+    "FANUC",
+    36,
+    FILES_OF_SYSTEMS,
+    fanuc_ls,
+    capitals=True,
+    configuration=CONFIGURATION,
+    cautions=(COUPLING,),
+    cartesian_cautions=(WORLD,),
+)

@@ -4,9 +4,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.export.programs.heading import heading
-from pisigma.export.programs.targets import Targets
-from pisigma.export.programs.text import comments, labelled, millimetres_and_euler, place
+from pisigma.export.programs.language import FILES_OF_SYSTEMS, Language, Program, words
+from pisigma.export.programs.text import comments, heading, labelled, millimetres_and_euler, place
 
 SPEED = 5
 """[%] Of the largest speed and acceleration of every axis."""
@@ -19,18 +18,13 @@ FIRST = (
 )
 
 
-def krl(targets: Targets, name: str, cartesian: bool) -> str:
-    """The targets as one module of point-to-point moves that stop at every target.
-
-    Args:
-        targets: of a robot with six joints that turn, none missing; all on one branch where `cartesian`.
-        name: of the module, as its file is called.
-        cartesian: give frames instead of axis angles.
-    """
+def krl(program: Program) -> str:
+    """The targets as one module of point-to-point moves that stop at every target; poses lie on one branch."""
+    targets, cartesian = program.targets, program.cartesian
     lines = [
         "&ACCESS RVP",
         "&REL 1",
-        f"DEF {name}( )",
+        f"DEF {program.name}( )",
         *comments([*heading(targets, cartesian), *([FIRST] if cartesian else [])], "; "),
         "DECL INT SPEED",
         "DECL INT I",
@@ -61,3 +55,19 @@ def _axes(degrees: list[float]) -> str:
 
 def _frame(T: Float64[Tensor, "4 4"]) -> str:
     return f"{{FRAME: {labelled(FRAME, millimetres_and_euler(T).tolist())}}}"
+
+
+KRL = Language(
+    "KRL",
+    24,
+    words(
+        "and anin anout b_and b_exor b_not b_or bool brake bas case ccomp channel char circ circ_rel confirm "
+        "const continue ct_i decl def default defdat deffct digin do else end enddat endfct endfor endif "
+        "endloop endspline endswitch endwhile enum exit exor ext extfct false for frame global goto halt if "
+        "import int interrupt is lin lin_rel loop maximum minimum not or pos e6pos axis e6axis priority ptp "
+        "ptp_rel public pulse real repeat resume return sec signal slin spl spline spo sptp step struc "
+        "switch then to trigger true until wait when while speed i"
+    )
+    | FILES_OF_SYSTEMS,
+    krl,
+)

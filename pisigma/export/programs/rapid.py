@@ -4,9 +4,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.export.programs.heading import heading
-from pisigma.export.programs.targets import Targets
-from pisigma.export.programs.text import DIGITS, FINE_DIGITS, comments, numbers, place
+from pisigma.export.programs.language import Language, Program, words
+from pisigma.export.programs.text import DIGITS, FINE_DIGITS, comments, heading, numbers, place
 from pisigma.se3 import rotation_vector
 
 SPEED = "[50, 10, 50, 10]"
@@ -23,14 +22,13 @@ FIRST = (
 )
 
 
-def rapid(targets: Targets, name: str, cartesian: bool) -> str:
+def rapid(program: Program) -> str:
     """The targets as one module with one procedure of joint moves that stop at every target.
 
-    Args:
-        targets: of a robot with six joints that turn, none missing; all on one branch where `cartesian`.
-        name: of the module; its procedure is called name_run, its tool and work object name_tool, name_wobj.
-        cartesian: give robtargets instead of jointtargets.
+    The procedure is called name_run, tool and work object name_tool and name_wobj. Poses (robtargets) lie on
+    one branch.
     """
+    targets, name, cartesian = program.targets, program.name, program.cartesian
     lines = [
         f"MODULE {name}",
         *comments([*heading(targets, cartesian), FIRST if cartesian else TOOL_OF_JOINTS], "  ! "),
@@ -78,3 +76,17 @@ def quaternion(R: Float64[Tensor, "*batch 3 3"]) -> Float64[Tensor, "*batch 4"]:
     vector = rotation_vector(R)
     half = torch.linalg.vector_norm(vector, dim=-1, keepdim=True) / 2
     return torch.cat([torch.cos(half), vector / 2 * torch.sinc(half / torch.pi)], -1)
+
+
+RAPID = Language(
+    "RAPID",
+    27,  # of 32, with _tool behind it
+    words(
+        "alias and backward bool case connect const default div do else elseif endfor endfunc endif endmodule "
+        "endproc endrecord endtest endtrap endwhile error exit false for from func goto if inout local mod "
+        "module nostepin not noview num or pers proc raise readonly record retry return step string "
+        "sysmodule task test then to trap true trynext undo user var viewonly while with xor slow fine tool0 "
+        "wobj0 movej moveabsj confj base"
+    ),
+    rapid,
+)

@@ -1,4 +1,4 @@
-"""Numbers and comments as every controller reads them."""
+"""Numbers, comments and the head of a program, as every controller reads them."""
 
 import math
 import textwrap
@@ -11,6 +11,38 @@ from torch import Tensor
 from pisigma.export.programs.targets import Targets
 from pisigma.kinematics.status import Status
 from pisigma.se3 import rpy_from_rotation
+
+TEST = (
+    "TEST IT AT LOW SPEED FIRST: nothing was checked for collisions, neither the targets nor the ways between "
+    "them."
+)
+
+
+def heading(targets: Targets, cartesian: bool) -> tuple[str, ...]:
+    """Sentences on what the program does and on what it relies.
+
+    Args:
+        targets: the targets.
+        cartesian: whether they are poses and not joint values.
+    """
+    said = [
+        targets.title,
+        TEST,
+        f"Joint values count from the zeros and in the directions of the robot description "
+        f"'{targets.robot.name}'; the controller has to count the same.",
+    ]
+    if cartesian:
+        said += [
+            "Poses are those that the robot as drawn takes at the corrected joint values: the controller has to "
+            "compute with the robot as drawn, and any accuracy option of its own has to be off.",
+            "Frame and tool are those of the model, as seen from the origin and from the last row of the robot "
+            "description, which have to be the controller's origin and flange.",
+            *targets.remarks,
+        ]
+    if targets.doubt:
+        said.append(targets.doubt)
+    return tuple(said)
+
 
 DIGITS = 6
 """Decimals of degrees and millimetres: joints are rounded by 1e-8 rad, which moves no tool by a micrometre."""

@@ -4,9 +4,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.export.programs.heading import heading
-from pisigma.export.programs.targets import Targets
-from pisigma.export.programs.text import FINE_DIGITS, comments, numbers, place
+from pisigma.export.programs.language import Language, Program, words
+from pisigma.export.programs.text import FINE_DIGITS, comments, heading, numbers, place
 from pisigma.se3 import rotation_vector
 
 SPEED = 0.1
@@ -22,19 +21,16 @@ OWN_LENGTHS = (
 )
 
 
-def urscript(targets: Targets, name: str, cartesian: bool) -> str:
+def urscript(program: Program) -> str:
     """The targets as one function of joint moves that stop at every target.
 
-    Args:
-        targets: of a robot with six joints that turn, none missing.
-        name: of the function.
-        cartesian: give poses, which the controller turns into the joint values nearest to the corrected
-            ones, instead of joint values.
+    Poses are turned by the controller into the joint values nearest to the corrected ones.
     """
+    targets, cartesian = program.targets, program.cartesian
     said = [*heading(targets, cartesian), *([OWN_LENGTHS] if cartesian else []), START]
     lines = [
         *comments(said, "# "),
-        f"def {name}():",
+        f"def {program.name}():",
         "  # rad/s and rad/s^2 of the leading joint",
         f"  speed = {SPEED}",
         f"  acceleration = {ACCELERATION}",
@@ -56,3 +52,16 @@ def _pose(T: Float64[Tensor, "4 4"]) -> str:
     """x, y, z [m] and rotation vector [rad]."""
     values = torch.cat([T[:3, 3], rotation_vector(T[:3, :3])])
     return f"p[{numbers(values.tolist(), FINE_DIGITS)}]"
+
+
+URSCRIPT = Language(
+    "URScript",
+    64,
+    words(
+        "and break continue def elif else end enum false for global halt if local not or pass return run sec "
+        "struct then thread true while xor movej get_inverse_kin pose_trans set_tcp p speed acceleration frame"
+    ),
+    urscript,
+    keeps_branch=True,
+    cartesian_cautions=(OWN_LENGTHS,),
+)

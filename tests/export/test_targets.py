@@ -12,7 +12,7 @@ from testing.hybrid import hybrid_of
 from testing.models import hand_made_model, joints_around
 
 from pisigma.export.programs.targets import Targets, targets_of
-from pisigma.export.programs.targets_csv import targets_csv
+from pisigma.export.targets import targets_csv
 from pisigma.inverse.torch_ik import TorchIK
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status

@@ -1,0 +1,25 @@
+"""What shells complete: names of robots, model folders and export formats."""
+
+from pathlib import Path
+
+
+def complete_robot(incomplete: str) -> list[str]:
+    """Robots of the catalogue."""
+    from pisigma.robot.robot_file import catalogue
+
+    return [name for name in catalogue() if name.startswith(incomplete)]
+
+
+def complete_model(incomplete: str) -> list[str]:
+    """Model folders, and folders on the way to them."""
+    written = Path(incomplete)
+    parent = written if incomplete.endswith("/") else written.parent
+    folders = [path for path in parent.glob("*/") if str(path).startswith(incomplete.removesuffix("/"))]
+    return [str(path) if (path / "model.yaml").is_file() else f"{path}/" for path in sorted(folders)]
+
+
+def complete_export(incomplete: str) -> list[str]:
+    """Formats of `pisigma export`."""
+    from pisigma.export.registry import export_names
+
+    return [name for name in export_names() if name.startswith(incomplete)]

@@ -1,0 +1,78 @@
+"""The registry of exports: which formats there are and where each is made."""
+
+from importlib import import_module
+
+from pisigma.errors import OutputError, nearest_choice
+from pisigma.export.export_format import OPTIONS, Exported, ExportFormat, ExportRequest, refuse_option
+from pisigma.export.output_file import check_output, write_whole
+
+BUILT_IN = {
+    "urdf": ("pisigma.export.urdf", "calibrated geometry"),
+    "dh": ("pisigma.export.dh_table", "its DH + Hayati table with base and tool"),
+    "offsets": (
+        "pisigma.export.joint_offsets",
+        "the best joint offsets alone, with the accuracy that this gives up",
+    ),
+    "targets": ("pisigma.export.targets", "corrected targets for --poses"),
+    "onnx": ("pisigma.export.onnx_model", "the network alone"),
+}
+"""By name the module whose `FORMAT` it is, imported on use, and what the help says of it."""
+
+_REGISTERED: dict[str, ExportFormat] = {}
+
+
+def register_export(form: ExportFormat) -> ExportFormat:
+    """Make `pisigma export --format NAME` and `export_model` know a format.
+
+    Raises:
+        OutputError: another format has this name, or an option is none of `OPTIONS`.
+    """
+    if form.name in BUILT_IN or _REGISTERED.setdefault(form.name, form) is not form:
+        raise OutputError(f"there is an export '{form.name}' already; name yours otherwise.")
+    if unknown := sorted(form.options - set(OPTIONS)):
+        del _REGISTERED[form.name]
+        raise OutputError(f"export '{form.name}': {unknown[0]}: {nearest_choice(unknown[0], OPTIONS)}")
+    return form
+
+
+def export_names() -> tuple[str, ...]:
+    """Names of all formats."""
+    return (*BUILT_IN, *_REGISTERED)
+
+
+def export_format(name: str) -> ExportFormat:
+    """The format of a name.
+
+    Raises:
+        OutputError: there is none; the message lists them.
+    """
+    if name in _REGISTERED:
+        return _REGISTERED[name]
+    if name not in BUILT_IN:
+        raise OutputError(f"--format '{name}' is unknown; {nearest_choice(name, export_names())}")
+    form = import_module(BUILT_IN[name][0]).FORMAT
+    assert isinstance(form, ExportFormat)
+    return form
+
+
+def export_model(name: str, request: ExportRequest) -> Exported:
+    """Write a model in a format, whole or not at all.
+
+    Args:
+        name: of the format.
+        request: the model, the file and the options.
+
+    Raises:
+        OutputError: there is no such format, an option does not go with it, or the file cannot be written.
+        PisigmaError: the format cannot hold the model.
+    """
+    form = export_format(name)
+    for option in request.stated:
+        if option not in form.options:
+            takers = tuple(other for other in export_names() if option in export_format(other).options)
+            raise refuse_option(option, takers, name)
+    form.check(request)
+    check_output(request.out, form.suffixes, form.contents)
+    exported = form.write(request)
+    write_whole(request.out, exported.content)
+    return exported
