@@ -19,6 +19,8 @@ def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) 
     """
     robot, terms = correction.robot, []
     for feature, weight in zip(correction.features, correction.linear, strict=True):
+        if feature.usually_zero:
+            continue
         try:
             terms.append(feature.add_onnx(graph, weight.detach().numpy(), q))
         except NotImplementedError:
@@ -33,9 +35,8 @@ def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) 
         phi = add_unit_inputs(graph, robot, q)
         sums = graph.node("Add", graph.node("MatMul", phi, weight.reshape(-1, inputs).T), bias)
         terms.append(graph.sum_of_products(graph.reshape(sums, [dof, factors]), correction.orders))
-    kept = [term for term in terms if term is not None]
-    total = kept[0] if kept else graph.node("Mul", q, 0.0)
-    for term in kept[1:]:
+    total = terms[0] if terms else graph.node("Mul", q, 0.0)
+    for term in terms[1:]:
         total = graph.node("Add", total, term)
     return total
 

@@ -31,10 +31,17 @@ class HybridArm:
     correction: JointCorrection
     coverage: JointCoverage
 
-    def forward(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch 4 4"]:
-        """Pose T_base_tool at commanded joint values q [rad or m]."""
+    def forward(
+        self, q: Float[Tensor, "*batch dof"], approach: Float[Tensor, "*batch dof"] | None = None
+    ) -> Float[Tensor, "*batch 4 4"]:
+        """Pose T_base_tool at commanded joint values.
+
+        Args:
+            q: joint values [rad or m].
+            approach: see `JointCorrection.forward`.
+        """
         with torch.no_grad():
-            delta = self.correction(q)
+            delta = self.correction(q, approach)
         return blend(
             forward_kinematics(self.geometric, q),
             forward_kinematics(self.hybrid, q + delta),

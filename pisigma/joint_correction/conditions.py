@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from typing import Annotated, Literal
 
-import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from pydantic import Field
@@ -20,7 +19,6 @@ from pisigma.joint_correction.gravity_torques import Direction, GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.shared_features import ScaledJoints
 from pisigma.measurement.conditions import JointState
-from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot
 
 
@@ -49,6 +47,7 @@ class ConditionFeatures(AbstractFeature):
     name = "conditions"
     section = ConditionSection
     reads = ("payload_kg", "temperature_c")
+    usually_zero = True
 
     def __init__(
         self,
@@ -119,9 +118,6 @@ class ConditionFeatures(AbstractFeature):
             torques = self._torques.columns(state)[..., -4:]
             columns.append(torques * scaled[..., self.names.index("payload_kg"), None, None])
         return torch.cat(columns, -1)
-
-    def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> None:
-        """Nothing: under the usual conditions it is 0."""
 
 
 def learned_conditions(correction: JointCorrection) -> ConditionFeatures | None:

@@ -54,6 +54,8 @@ class AbstractFeature(ABC):
         section: how it stands in the description of a model.
         reads: what it needs of the rows beside the joint values, by the names of `JointState.stated`.
         compiled: its form in the kernels, which gets the numbers of `pack`; None where it has none.
+        usually_zero: whether it is 0 where nothing is stated beside the joint values, so that kernels and graphs may
+            leave it out.
         used: `(dof, m)`: which columns a joint has; the others are not to be given weights.
         group: `(dof, m)`: number of the prior size that a column's weight has, from 0 on.
         group_names: of the prior sizes.
@@ -65,6 +67,7 @@ class AbstractFeature(ABC):
     section: ClassVar[type[FeatureSection]] = FeatureSection
     reads: ClassVar[tuple[str, ...]] = ()
     compiled: ClassVar[CompiledForm | None] = None
+    usually_zero: ClassVar[bool] = False
     used: Bool[Tensor, "dof columns"]
     group: Int64[Tensor, "dof columns"]
     group_names: tuple[str, ...]
@@ -116,7 +119,7 @@ class AbstractFeature(ABC):
         """The numbers that the compiled form reads, in its own order."""
         return weight.ravel()
 
-    def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str | None:
+    def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
         """Add the weighted sum of the columns to an ONNX graph.
 
         Args:
@@ -125,7 +128,7 @@ class AbstractFeature(ABC):
             q: joint values `(batch, dof)` in the graph.
 
         Returns:
-            Corrections `(batch, dof)` in the graph; None where they are 0 at usual conditions.
+            Corrections `(batch, dof)` in the graph.
 
         Raises:
             NotImplementedError: the feature has no ONNX form.

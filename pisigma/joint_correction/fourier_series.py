@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, FeatureSection, turning_rate
-from pisigma.kernels.features import LANES, CompiledForm
+from pisigma.kernels.features import MOST_JOINTS, CompiledForm
 from pisigma.measurement.conditions import JointState
 from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot
@@ -30,12 +30,13 @@ def add_series(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> N
     """Add sums of sines and cosines of multiples of every joint's angle, four joints abreast.
 
     `correction.values` holds the number of harmonics, and for each the weights of the sines and of the cosines of
-    all `LANES` joints.
+    `MOST_JOINTS` joints.
 
     Source: C. W. Clenshaw, A note on the summation of Chebyshev series, 1955: from the last multiple to the first,
     `b_k = w_k + 2 cos(θ) b_k+1 - b_k+2`; the sum is `b_1 cos(θ) - b_2` of cosines and `b_1 sin(θ)` of sines.
     """
-    harmonics = int(correction.values[first])
+    values = correction.values
+    harmonics = int(values[first])
     for j in range(0, arms.dof, 4):
         sine, cosine = memory.turning[0, j : j + 4], memory.turning[1, j : j + 4]
         total = memory.delta[j : j + 4]
@@ -43,8 +44,8 @@ def add_series(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> N
         s_0, s_1, s_2, s_3, c_0, c_1, c_2, c_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         u_0, u_1, u_2, u_3, v_0, v_1, v_2, v_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(harmonics - 1, -1, -1):
-            start = first + 1 + 2 * LANES * k + j
-            a, b = correction.values[start : start + 4], correction.values[start + LANES : start + LANES + 4]
+            start = first + 1 + 2 * MOST_JOINTS * k + j
+            a, b = values[start : start + 4], values[start + MOST_JOINTS : start + MOST_JOINTS + 4]
             u_0, s_0 = s_0, t_0 * s_0 + (a[0] - u_0)
             u_1, s_1 = s_1, t_1 * s_1 + (a[1] - u_1)
             u_2, s_2 = s_2, t_2 * s_2 + (a[2] - u_2)
@@ -62,7 +63,8 @@ def add_series(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> N
 @no_type_check
 def add_series_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
     """Add the slope of every joint's series by the joint's own value, with the same recurrence."""
-    harmonics = int(correction.values[first])
+    values = correction.values
+    harmonics = int(values[first])
     for j in range(0, arms.dof, 4):
         sine, cosine = memory.turning[0, j : j + 4], memory.turning[1, j : j + 4]
         total, rate = memory.slope[j : j + 4], correction.rate[j : j + 4]
@@ -70,8 +72,8 @@ def add_series_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any
         s_0, s_1, s_2, s_3, c_0, c_1, c_2, c_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         u_0, u_1, u_2, u_3, v_0, v_1, v_2, v_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(harmonics - 1, -1, -1):
-            start, times = first + 1 + 2 * LANES * k + j, k + 1.0
-            a, b = correction.values[start : start + 4], correction.values[start + LANES : start + LANES + 4]
+            start, times = first + 1 + 2 * MOST_JOINTS * k + j, k + 1.0
+            a, b = values[start : start + 4], values[start + MOST_JOINTS : start + MOST_JOINTS + 4]
             u_0, s_0 = s_0, t_0 * s_0 - (times * b[0] + u_0)
             u_1, s_1 = s_1, t_1 * s_1 - (times * b[1] + u_1)
             u_2, s_2 = s_2, t_2 * s_2 - (times * b[2] + u_2)
@@ -145,7 +147,7 @@ class FourierSeries(AbstractFeature):
 
     def pack(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, " values"]:
         """The number of harmonics, and for each the weights of the sines and of the cosines of all joints."""
-        lanes = np.zeros((self.harmonics, 2, LANES))
+        lanes = np.zeros((self.harmonics, 2, MOST_JOINTS))
         lanes[..., : len(weight)] = weight.reshape(-1, 2, self.harmonics).transpose(2, 1, 0)
         return np.concatenate([[self.harmonics], lanes.ravel()])
 

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from pisigma.joint_correction.feature import AbstractFeature, unit_inputs
-from pisigma.measurement.conditions import JointState
+from pisigma.measurement.conditions import APPROACH, JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.network.pi_sigma import sum_of_products, weigh_sums
 from pisigma.robot.description import Robot
@@ -73,14 +73,21 @@ class JointCorrection(nn.Module):
         delta: Tensor = self(JointState.of(measurements))
         return delta
 
-    def forward(self, q: Float[Tensor, "*batch dof"] | JointState) -> Float[Tensor, "*batch dof"]:
+    def forward(
+        self,
+        q: Float[Tensor, "*batch dof"] | JointState,
+        approach: Float[Tensor, "*batch dof"] | None = None,
+    ) -> Float[Tensor, "*batch dof"]:
         """Corrections to add to joint values [rad or m].
 
         Args:
             q: joint values [rad or m], under the usual conditions and in the middle of all play; or with what is
                 stated beside them.
+            approach: of plain joint values, from which side every joint comes: +1 as its value grows, -1 as it
+                falls, 0 where that is not stated.
         """
-        state = q if isinstance(q, JointState) else JointState(q)
+        stated = {} if approach is None else {APPROACH: approach}
+        state = q if isinstance(q, JointState) else JointState(q, stated)
         total = torch.zeros_like(state.q)
         for feature, weight in zip(self.features, self.linear, strict=True):
             total = total + (feature.columns(state) * weight.to(state.q)).sum(-1)

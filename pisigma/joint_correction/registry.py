@@ -19,7 +19,7 @@ FEATURES: dict[str, type[AbstractFeature]] = {}
 def register_feature(feature: type[AbstractFeature]) -> type[AbstractFeature]:
     """Make a feature known: calibrators and recipes may choose it, and models with it are read.
 
-    May decorate the class. A feature with a compiled form has the kernels made again where it is first used, which
+    It may decorate the class. A feature with a compiled form has the kernels made again where it is first used, which
     needs numba (`pip install 'pisigma[compile]'`).
 
     Raises:
@@ -81,3 +81,8 @@ for _feature in (
     NominalPose,
 ):
     register_feature(_feature)
+
+if __name__ == "__main__":
+    from pisigma.kernels.build import build
+
+    build()

@@ -66,32 +66,27 @@ class Correction(NamedTuple):
 
     Attributes:
         rate: per joint, angle per joint value.
-        series: `(harmonics, 2, dof)`: weights of sines and cosines of a joint's own angle.
-        gravity: direction in which things fall.
-        masses: `(dof, dof, 4)`: weights of joint and moved row, over the reach (mass), and times the arm (first
-            moments); empty without gravity.
-        scaled: `(dof, dof)`: weights of scaled joint values; empty without them.
         middle: of every joint's values [rad or m].
         half: of every joint's travel [rad or m].
-        units: `(dof, inputs)`: weights of the sines and cosines of all joints; empty without them.
+        values: the numbers of all features one after the other, as their `pack` gives them.
+        starts: where those of every feature begin, in the order of `Description.features`.
         weight: `(factors, inputs, dof)` of the product units.
         bias: `(factors, dof)` of the product units.
         orders: number of factors of every product unit.
         periodic: 1 where the correction is the same on all turns, else 0.
+        frames: 1 where a feature reads the frames of the joints, else 0.
     """
 
     rate: Any
-    series: Any
-    gravity: Any
-    masses: Any
-    scaled: Any
     middle: Any
     half: Any
-    units: Any
+    values: Any
+    starts: Any
     weight: Any
     bias: Any
     orders: Any
     periodic: int
+    frames: int
 
 
 class Coverage(NamedTuple):
@@ -207,7 +202,11 @@ class Starts(NamedTuple):
 
 
 class Description(NamedTuple):
-    """All of a calibrated arm."""
+    """All of a calibrated arm.
+
+    Attributes:
+        features: names of the features that its correction has.
+    """
 
     arms: Arms
     correction: Correction
@@ -215,6 +214,7 @@ class Description(NamedTuple):
     network: Network
     closed_form: ClosedForm
     starts: Starts
+    features: tuple[str, ...] = ()
 
 
 PARTS: dict[str, Any] = {

@@ -1,12 +1,16 @@
-"""Make the kernels' intermediate code with numba: `python -m pisigma.kernels.build` writes what comes with the package.
+"""Make the kernels' intermediate code with numba, with the features that are registered.
+
+`python -m pisigma.joint_correction.registry` registers those of the package and writes what comes with it.
 
 The code is that of no processor in particular, and without vectors: 64-bit machines lay out the kernels' structs alike,
 and the machine that loads it says which processor it has and makes the vectors.
 """
 
 import re
+import sys
 from importlib.metadata import version
 
+from pisigma.kernels.features import FORMS
 from pisigma.kernels.ready import FILE, write_ready
 
 ENTRY = "pisigma_run"
@@ -26,7 +30,10 @@ _MANGLED = re.compile(r"(?<=[@\"])_ZN[\w.$]+")
 
 
 def intermediate_code() -> str:
-    """What numba makes of the kernels, as text of LLVM with the entry `ENTRY`.
+    """What numba makes of the kernels with all features of `kernels.features.FORMS`.
+
+    Returns:
+        Text of LLVM with the entry `ENTRY`.
 
     Raises:
         ImportError: numba is not installed.
@@ -36,6 +43,9 @@ def intermediate_code() -> str:
     for name, value in _NO_PROCESSOR.items():
         setattr(config, name, value)
 
+    for name, module in list(sys.modules.items()):
+        if name.startswith("pisigma.kernels.") and hasattr(module, "njit"):
+            del sys.modules[name]  # its kernels may have been made for other features
     from pisigma.kernels.kernels import run
     from pisigma.kernels.layout import DESCRIPTION, MEMORY
 
@@ -54,12 +64,8 @@ def intermediate_code() -> str:
     return _MANGLED.sub(lambda found: names[found[0]], text)
 
 
-def main() -> None:
-    """Write the file and say how large it is."""
+def build() -> None:
+    """Write what comes with the package, and say how large it is."""
     code = intermediate_code()
-    write_ready(code, numba=version("numba"), llvmlite=version("llvmlite"))
+    write_ready(code, tuple(FORMS), numba=version("numba"), llvmlite=version("llvmlite"))
     print(f"{FILE}: {FILE.stat().st_size / 1e3:.0f} kB ({len(code) / 1e6:.1f} MB of text)")
-
-
-if __name__ == "__main__":
-    main()

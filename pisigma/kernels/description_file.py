@@ -12,7 +12,7 @@ import numpy as np
 from pisigma.errors import ModelError
 from pisigma.kernels.arrays import PARTS, Description
 
-FORMAT = 3
+FORMAT = 4
 _NAMES = ("branches", "joints", "name", "belongs_to")
 _FIELDS = [(part, field) for part, kind in PARTS.items() for field in kind._fields]
 
@@ -42,6 +42,7 @@ def write_description(
         "joints": joints,
         "name": name,
         "belongs_to": belongs_to,
+        "features": description.features,
         "shapes": shapes,
     }
     values = {
@@ -82,7 +83,9 @@ def read_description(file: str | os.PathLike[str]) -> tuple[Description, dict[st
     ):
         raise ModelError(f"{file}: was changed or is no whole compiled model; export the model again.")
     header = json.loads(str(values["header"]))
-    return _description(header["shapes"], values), {name: header[name] for name in _NAMES}
+    description = _description(header["shapes"], values)
+    description = description._replace(features=tuple(header["features"]))
+    return description, {name: header[name] for name in _NAMES}
 
 
 def _description(shapes: dict[str, Any], values: dict[str, Any]) -> Description:

@@ -3,8 +3,8 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 
-LANES = 8
-"""Joints whose weights stand side by side: the largest number of joints that the kernels know."""
+MOST_JOINTS = 8
+"""The largest number of joints; weights that are worked on side by side stand in rows of so many."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,15 @@ class CompiledForm:
     add_slope: Callable[..., None] | None = None
     frames: bool = False
 
+    @property
+    def fingerprint(self) -> str:
+        """What the functions do, as a text that is another one where they change."""
+        codes = [function.__code__ for function in (self.add, self.add_slope) if function is not None]
+        return repr([(code.co_code, code.co_consts, code.co_names) for code in codes])
+
+
+MOST_KINDS, MOST_VALUES = 16, 4_096
+"""The largest numbers of kinds of features, and of the values of all features of a correction."""
 
 FORMS: dict[str, CompiledForm] = {}
 """By the feature's name, in the order in which they were registered."""

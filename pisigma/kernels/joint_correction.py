@@ -1,35 +1,65 @@
 """The joint correction Δ(q) of one place, on plain numbers."""
 
 import math
+from collections.abc import Callable, Iterable
 from typing import Any, no_type_check
 
 from numba import njit
 
 from pisigma.kernels.arrays import DRAWN, FIXED, REVOLUTE
+from pisigma.kernels.features import FORMS
 
 Array = Any
 Record = Any
 
 
+def _chained(functions: Iterable[Callable[..., None] | None]) -> Any:
+    """One function that calls those of the features that a correction has; see `CompiledForm`."""
+
+    @njit(error_model="numpy")
+    @no_type_check
+    def chain(arms: Record, correction: Record, memory: Record, q: Array) -> None:
+        pass
+
+    for index, function in enumerate(functions):
+        if function is not None:
+            compiled = njit(error_model="numpy", fastmath={"contract"})(function)
+            chain = _then(chain, compiled, index)
+    return chain
+
+
+def _then(chain: Any, function: Any, index: int) -> Any:
+    @njit(error_model="numpy")
+    @no_type_check
+    def both(arms: Record, correction: Record, memory: Record, q: Array) -> None:
+        chain(arms, correction, memory, q)
+        first = correction.first[index]
+        if first >= 0:
+            function(arms, correction, first, memory, q)
+
+    return both
+
+
+_add_features = _chained(form.add for form in FORMS.values())
+_add_slopes = _chained(form.add_slope for form in FORMS.values())
+
+
 @njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
-def joint_correction(
-    arms: Record, correction: Record, q: Array, turning: Array, phi: Array, delta: Array
-) -> None:
-    """Corrections to add to joint values, without gravity's; see `network.joint_correction.JointCorrection`.
+def joint_correction(arms: Record, correction: Record, memory: Record, q: Array) -> None:
+    """Write corrections to add to joint values [rad or m] into `memory.delta`; see `JointCorrection`.
 
     Args:
         arms: the arms.
         correction: the weights.
+        memory: whose `approach` is read; `turning`, `phi` and `frames` are written.
         q: joint values [rad or m].
-        turning: `(2, DOF)`, written: sines and cosines of the joints' angles.
-        phi: `(INPUTS,)`, overwritten.
-        delta: `(DOF,)`, written [rad or m].
     """
-    dof, revolute = arms.dof, 0
+    dof, revolute, turning, phi = arms.dof, 0, memory.turning, memory.phi
     for j in range(dof):
         angle = correction.rate[j] * q[j]
         turning[0, j], turning[1, j] = math.sin(angle), math.cos(angle)
+        memory.delta[j] = 0.0
         revolute += arms.revolute[j]
     i, k = 0, 2 * revolute
     for j in range(dof):
@@ -39,79 +69,26 @@ def joint_correction(
         else:
             phi[k] = (q[j] - correction.middle[j]) / correction.half[j]
             k += 1
-    _series(correction, dof, turning, delta)
-    if correction.has_scaled:
-        for j in range(dof):
-            for i in range(dof):
-                delta[j] += correction.scaled[j, i] * (q[i] - correction.middle[i]) / correction.half[i]
-    if correction.has_units:
-        for j in range(dof):
-            for i in range(correction.inputs):
-                delta[j] += correction.units[j, i] * phi[i]
-    _add_products(correction, dof, phi, delta)
+    if correction.frames:
+        _walk_drawn(arms, q, turning, memory.frames)
+    _add_features(arms, correction, memory, q)
+    _add_products(correction, dof, phi, memory.delta)
 
 
-@njit(error_model="numpy", fastmath={"contract"})
+@njit(error_model="numpy")
 @no_type_check
-def _series(correction: Record, dof: int, turning: Array, delta: Array) -> None:
-    """Sums of sines and cosines of multiples of every joint's angle, four joints abreast.
-
-    Source: C. W. Clenshaw, A note on the summation of Chebyshev series, 1955: from the last multiple to the first,
-    `b_k = w_k + 2 cos(θ) b_k+1 - b_k+2`; the sum is `b_1 cos(θ) - b_2` of cosines and `b_1 sin(θ)` of sines.
-    """
-    for j in range(0, dof, 4):
-        sine, cosine, total = turning[0, j : j + 4], turning[1, j : j + 4], delta[j : j + 4]
-        weights = correction.series[:, :, j : j + 4]
-        t_0, t_1, t_2, t_3 = 2 * cosine[0], 2 * cosine[1], 2 * cosine[2], 2 * cosine[3]
-        s_0, s_1, s_2, s_3, c_0, c_1, c_2, c_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        u_0, u_1, u_2, u_3, v_0, v_1, v_2, v_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for k in range(correction.harmonics - 1, -1, -1):
-            w = weights[k]
-            u_0, s_0 = s_0, t_0 * s_0 + (w[0, 0] - u_0)
-            u_1, s_1 = s_1, t_1 * s_1 + (w[0, 1] - u_1)
-            u_2, s_2 = s_2, t_2 * s_2 + (w[0, 2] - u_2)
-            u_3, s_3 = s_3, t_3 * s_3 + (w[0, 3] - u_3)
-            v_0, c_0 = c_0, t_0 * c_0 + (w[1, 0] - v_0)
-            v_1, c_1 = c_1, t_1 * c_1 + (w[1, 1] - v_1)
-            v_2, c_2 = c_2, t_2 * c_2 + (w[1, 2] - v_2)
-            v_3, c_3 = c_3, t_3 * c_3 + (w[1, 3] - v_3)
-        total[0] = sine[0] * s_0 + (cosine[0] * c_0 - v_0)
-        total[1] = sine[1] * s_1 + (cosine[1] * c_1 - v_1)
-        total[2] = sine[2] * s_2 + (cosine[2] * c_2 - v_2)
-        total[3] = sine[3] * s_3 + (cosine[3] * c_3 - v_3)
-
-
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
-def series_slope(correction: Record, dof: int, turning: Array, slope: Array) -> None:
-    """Slope of the series of every joint by the joint's own value; the steepest part of a correction.
+def correction_slope(arms: Record, correction: Record, memory: Record, q: Array) -> None:
+    """Write the slopes of every joint's correction by its own value into `memory.slope`, as far as they are steep.
 
     Args:
+        arms: the arms.
         correction: the weights.
-        dof: number of joints.
-        turning: sines and cosines, as `joint_correction` leaves them.
-        slope: `(DOF,)`, written.
+        memory: with sines and cosines as `joint_correction` leaves them.
+        q: joint values [rad or m].
     """
-    for j in range(0, dof, 4):
-        sine, cosine, total = turning[0, j : j + 4], turning[1, j : j + 4], slope[j : j + 4]
-        weights, rate = correction.series[:, :, j : j + 4], correction.rate[j : j + 4]
-        t_0, t_1, t_2, t_3 = 2 * cosine[0], 2 * cosine[1], 2 * cosine[2], 2 * cosine[3]
-        s_0, s_1, s_2, s_3, c_0, c_1, c_2, c_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        u_0, u_1, u_2, u_3, v_0, v_1, v_2, v_3 = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        for k in range(correction.harmonics - 1, -1, -1):
-            w, times = weights[k], k + 1.0
-            u_0, s_0 = s_0, t_0 * s_0 - (times * w[1, 0] + u_0)
-            u_1, s_1 = s_1, t_1 * s_1 - (times * w[1, 1] + u_1)
-            u_2, s_2 = s_2, t_2 * s_2 - (times * w[1, 2] + u_2)
-            u_3, s_3 = s_3, t_3 * s_3 - (times * w[1, 3] + u_3)
-            v_0, c_0 = c_0, t_0 * c_0 + (times * w[0, 0] - v_0)
-            v_1, c_1 = c_1, t_1 * c_1 + (times * w[0, 1] - v_1)
-            v_2, c_2 = c_2, t_2 * c_2 + (times * w[0, 2] - v_2)
-            v_3, c_3 = c_3, t_3 * c_3 + (times * w[0, 3] - v_3)
-        total[0] = rate[0] * (sine[0] * s_0 + (cosine[0] * c_0 - v_0))
-        total[1] = rate[1] * (sine[1] * s_1 + (cosine[1] * c_1 - v_1))
-        total[2] = rate[2] * (sine[2] * s_2 + (cosine[2] * c_2 - v_2))
-        total[3] = rate[3] * (sine[3] * s_3 + (cosine[3] * c_3 - v_3))
+    for j in range(arms.dof):
+        memory.slope[j] = 0.0
+    _add_slopes(arms, correction, memory, q)
 
 
 @njit(error_model="numpy", fastmath={"contract"})
@@ -142,48 +119,11 @@ def _add_products(correction: Record, dof: int, phi: Array, delta: Array) -> Non
 
 @njit(error_model="numpy", fastmath={"contract"})
 @no_type_check
-def add_gravity(
-    arms: Record, correction: Record, q: Array, turning: Array, frames: Array, delta: Array
-) -> None:
-    """Add what unknown masses turn the joints; see `network.features.GravityTorques`.
+def _walk_drawn(arms: Record, q: Array, turning: Array, frames: Array) -> None:
+    """Write axis and origin of every joint, and axes and origin of its row's frame, of the arm as drawn.
 
-    Torque j is `Σ_k z_j · (arm_jk × g)`, with the weights of row k in `arm_jk`, and `z · (a × g) = a · (g × z)`.
-
-    Args:
-        arms: the arms.
-        correction: the weights.
-        q: joint values [rad or m].
-        turning: sines and cosines of the joints' angles, as `joint_correction` leaves them.
-        frames: `(dof, 18)`, overwritten: axis and origin of a joint, axes and origin of its row's frame.
-        delta: `(dof,)`, added to [rad or m].
+    All are in the frame of the arm's first row. `frames` is `(dof, 18)`.
     """
-    _walk_drawn(arms, correction, q, turning, frames)
-    gx, gy, gz = correction.gravity[0], correction.gravity[1], correction.gravity[2]
-    dof = arms.dof
-    for j in range(dof):
-        own, sign = frames[j], arms.direction[j]
-        zx, zy, zz = sign * own[0], sign * own[1], sign * own[2]
-        u, v, w = 0.0, 0.0, 0.0
-        force = 0.0
-        for k in range(j, dof):
-            weight, frame = correction.masses[j, k], frames[k]
-            force += weight[0]
-            u += weight[0] * (frame[15] - own[3])
-            v += weight[0] * (frame[16] - own[4])
-            w += weight[0] * (frame[17] - own[5])
-            u += weight[1] * frame[6] + weight[2] * frame[9] + weight[3] * frame[12]
-            v += weight[1] * frame[7] + weight[2] * frame[10] + weight[3] * frame[13]
-            w += weight[1] * frame[8] + weight[2] * frame[11] + weight[3] * frame[14]
-        if arms.revolute[j]:
-            delta[j] += u * (gy * zz - gz * zy) + v * (gz * zx - gx * zz) + w * (gx * zy - gy * zx)
-        else:
-            delta[j] += force * (zx * gx + zy * gy + zz * gz)
-
-
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
-def _walk_drawn(arms: Record, correction: Record, q: Array, turning: Array, frames: Array) -> None:
-    """Frames of the arm as drawn, in the frame of its first row."""
     ax, ay, az, ap = 1.0, 0.0, 0.0, 0.0
     bx, by, bz, bp = 0.0, 1.0, 0.0, 0.0
     cx, cy, cz, cp = 0.0, 0.0, 1.0, 0.0

@@ -3,15 +3,18 @@
 Arrays are as long as the largest robot needs, with counts beside them, so that one compiled function serves all.
 """
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from pisigma.errors import ModelError
 from pisigma.kernels.arrays import PARTS, Description
+from pisigma.kernels.features import MOST_JOINTS, MOST_KINDS, MOST_VALUES
 
-DOF, ROWS, HARMONICS, FACTORS, UNITS, STRETCHES, STARTS = 8, 24, 128, 24, 12, 96, 512
-"""The largest numbers of joints, rows, harmonics, factors and product units, stretches and starts."""
+DOF = MOST_JOINTS
+ROWS, FACTORS, UNITS, STRETCHES, STARTS = 24, 24, 12, 96, 512
+"""The largest numbers of rows, factors and product units, stretches and starts."""
 BRANCHES = 8
 """The largest number of branches of a closed form."""
 INPUTS = 2 * DOF
@@ -37,23 +40,17 @@ _ARMS = _integers(dof=(), rows_used=(), hybrid=(), kind=(ROWS,), revolute=(DOF,)
     rows=(4, ROWS, 9), ends=(4, 2, 3, 4), reach=(4,), direction=(DOF,), limits=(DOF, 2)
 )
 _CORRECTION = _integers(
-    harmonics=(),
     inputs=(),
     products=(),
-    has_gravity=(),
-    has_scaled=(),
-    has_units=(),
+    frames=(),
     periodic=(),
     orders=(UNITS,),
+    first=(MOST_KINDS,),
 ) + _floats(
     rate=(DOF,),
-    series=(HARMONICS, 2, DOF),
-    gravity=(3,),
-    masses=(DOF, DOF, 4),
-    scaled=(DOF, DOF),
     middle=(DOF,),
     half=(DOF,),
-    units=(DOF, INPUTS),
+    values=(MOST_VALUES,),
     weight=(FACTORS, INPUTS, DOF),
     bias=(FACTORS, DOF),
 )
@@ -154,19 +151,20 @@ MEMORY = np.dtype(
 """What kernels work in: overwritten all the time, and nothing in it outlives a pose."""
 
 
-def pack(description: Description, name: str) -> np.ndarray:
+def pack(description: Description, name: str, features: Sequence[str] = ()) -> np.ndarray:
     """A description as one struct, `(1,)` of `DESCRIPTION`.
 
     Args:
         description: the arm as arrays.
         name: of the model, for complaints.
+        features: names of those that the kernels evaluate, in their order.
 
     Raises:
-        ModelError: the arm is larger than the compiled kernels allow.
+        ModelError: the arm is larger than the compiled kernels allow, or its correction has features that they lack.
     """
     packed = np.zeros(1, DESCRIPTION)
     for part, kind in PARTS.items():
-        for field in kind._fields:
+        for field in set(kind._fields) & set(packed[part].dtype.names or ()):
             value = np.asarray(getattr(getattr(description, part), field))
             room = packed[part][field][0]
             if value.ndim != np.ndim(room) or any(
@@ -180,15 +178,16 @@ def pack(description: Description, name: str) -> np.ndarray:
     arms, correction = description.arms, description.correction
     packed["arms"]["dof"], packed["arms"]["rows_used"] = len(arms.direction), len(arms.kind)
     packed["correction"]["half"][0, len(arms.direction) :] = 1.0
-    for count, value in {
-        "harmonics": len(correction.series),
-        "inputs": correction.weight.shape[1],
-        "products": len(correction.orders),
-        "has_gravity": len(correction.masses) > 0,
-        "has_scaled": len(correction.scaled) > 0,
-        "has_units": len(correction.units) > 0,
-    }.items():
-        packed["correction"][count] = value
+    packed["correction"]["inputs"] = correction.weight.shape[1]
+    packed["correction"]["products"] = len(correction.orders)
+    packed["correction"]["first"] = -1
+    for feature, start in zip(description.features, correction.starts, strict=True):
+        if feature not in features:
+            raise ModelError(
+                f"model '{name}': its correction uses the feature '{feature}', which these kernels do not evaluate; "
+                "import what registers it, and install pisigma[compile]."
+            )
+        packed["correction"]["first"][0, features.index(feature)] = start
     network = description.network
     if network.samples > SAMPLES:
         raise ModelError(

@@ -11,7 +11,7 @@ import os
 import stat
 import tempfile
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ import llvmlite.binding as llvm  # type: ignore[import-untyped]
 
 from pisigma.errors import ModelError
 from pisigma.kernels.build import ARGUMENTS, ENTRY, intermediate_code
+from pisigma.kernels.features import FORMS
 from pisigma.kernels.ready import read_ready, source_hash
 
 _ALLOWED = frozenset(
@@ -46,26 +47,44 @@ _lock = threading.Lock()
 _kept: list[Any] = []
 
 
-def load_kernels() -> Callable[..., int]:
+@functools.cache
+def _ready() -> tuple[str, tuple[str, ...]] | None:
+    return read_ready()
+
+
+def kernel_features(wanted: Collection[str] = ()) -> tuple[str, ...]:
+    """Names of the features that the kernels evaluate that `load_kernels` gives, in their order.
+
+    They are those of the code that comes with the package where that has all that are wanted; else those that are
+    registered.
+    """
+    ready = _ready()
+    return ready[1] if ready is not None and set(wanted) <= set(ready[1]) else tuple(FORMS)
+
+
+def load_kernels(wanted: Collection[str] = ()) -> Callable[..., int]:
     """The function `kernels.run`, on addresses and numbers; -1, or what `kernels.solve_poses` says.
 
     Machine code is made when it is first wanted on a machine, in some seconds, and read from a file afterwards.
+
+    Args:
+        wanted: names of features that they have to evaluate.
 
     Raises:
         ModelError: there is no intermediate code of the present sources, and numba, which makes it, is not installed.
     """
     with _lock:
-        return _load()
+        return _load(kernel_features(wanted))
 
 
 @functools.cache
-def _load() -> Callable[..., int]:
+def _load(features: tuple[str, ...]) -> Callable[..., int]:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    name = f"kernels-{_key()}.o"
+    name = f"kernels-{_key(features)}.o"
     code = next((kept for folder in cache_folders() if (kept := read_code(folder / name)) is not None), None)
     if code is None:
-        code = optimised_object(_intermediate_code(), _native_machine())
+        code = optimised_object(_intermediate_code(features), _native_machine())
         any(write_code(folder / name, code) for folder in cache_folders())
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _native_machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
@@ -84,11 +103,12 @@ def _call(native: Any, *arguments: int) -> int:
     return result[0]
 
 
-def _key() -> str:
+def _key(features: tuple[str, ...]) -> str:
     """What the machine code depends on: sources, options, the versions of the compiler, and the processor."""
-    digest = hashlib.sha256()
+    digest, ready = hashlib.sha256(), _ready()
     for word in (
         source_hash(),
+        *(name if ready is not None and name in ready[1] else FORMS[name].fingerprint for name in features),
         _OPTIONS,
         llvmlite.__version__,
         str(llvm.llvm_version_info),
@@ -100,11 +120,11 @@ def _key() -> str:
     return digest.hexdigest()[:16]
 
 
-def _intermediate_code() -> str:
-    """What comes with the package, where it is of the present sources; else what numba makes."""
-    ready = read_ready()
-    if ready is not None:
-        return ready
+def _intermediate_code(features: tuple[str, ...]) -> str:
+    """What comes with the package, where it is of the present sources and features; else what numba makes."""
+    ready = _ready()
+    if ready is not None and ready[1] == features:
+        return ready[0]
     try:
         return intermediate_code()
     except ImportError:

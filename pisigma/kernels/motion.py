@@ -7,7 +7,7 @@ from numba import njit
 
 from pisigma.kernels.arrays import BLENDED, GEOMETRIC, HYBRID
 from pisigma.kernels.chain import jacobian, walk
-from pisigma.kernels.joint_correction import add_gravity, joint_correction
+from pisigma.kernels.joint_correction import joint_correction
 from pisigma.kernels.rotations import rotation_from_vector, rotation_vector
 
 Array = Any
@@ -19,9 +19,7 @@ Record = Any
 def correct(description: Record, memory: Record, q: Array) -> None:
     """Write Δ(q) into `memory.delta` and q + Δ(q) into `memory.theta`."""
     arms, correction = description.arms, description.correction
-    joint_correction(arms, correction, q, memory.turning, memory.phi, memory.delta)
-    if correction.has_gravity:
-        add_gravity(arms, correction, q, memory.turning, memory.frames, memory.delta)
+    joint_correction(arms, correction, memory, q)
     for j in range(arms.dof):
         memory.theta[j] = q[j] + memory.delta[j]
 

@@ -7,7 +7,7 @@ from numba import njit
 
 from pisigma.kernels.arrays import BLENDED, GEOMETRIC, HYBRID
 from pisigma.kernels.damped_step import damped_step, scaled_square
-from pisigma.kernels.joint_correction import series_slope
+from pisigma.kernels.joint_correction import correction_slope
 from pisigma.kernels.motion import correct, move
 from pisigma.kernels.rotations import pose_error
 from pisigma.kernels.rows import copy, copy_rows, fill
@@ -56,7 +56,7 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
     arms, dof = description.arms, description.arms.dof
     reach = arms.reach[HYBRID if arm == BLENDED else arm]
     share = move(description, memory, arm, q)
-    _steepen(description, memory, arm, share)
+    _steepen(description, memory, arm, q, share)
     pose_error(T, memory.T, memory.R, memory.best)
     copy_rows(memory.J, memory.J_best)
     old, damping = scaled_square(reach, memory.best), FIRST_DAMPING
@@ -69,7 +69,7 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
             for j in range(dof):
                 memory.trial[j] = q[j] + memory.step[j]
             share = move(description, memory, arm, memory.trial)
-            _steepen(description, memory, arm, share)
+            _steepen(description, memory, arm, memory.trial, share)
             pose_error(T, memory.T, memory.R, memory.error)
             new = scaled_square(reach, memory.error)
         if new < old:
@@ -84,12 +84,12 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
 
 @njit(error_model="numpy")
 @no_type_check
-def _steepen(description: Record, memory: Record, arm: int, share: float) -> None:
-    """Take the slope of the correction's series into the Jacobian of a blended arm."""
+def _steepen(description: Record, memory: Record, arm: int, q: Array, share: float) -> None:
+    """Take the slope of the correction into the Jacobian of a blended arm."""
     dof = description.arms.dof
     if arm != BLENDED or share == 0.0 or dof > 6:
         return  # with joints to spare it would lead to another of the many solutions than the torch route's
-    series_slope(description.correction, dof, memory.turning, memory.slope)
+    correction_slope(description.arms, description.correction, memory, q)
     for j in range(dof):
         for i in range(6):
             memory.J[i, j] *= 1 + share * memory.slope[j]
@@ -140,7 +140,7 @@ def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
     for attempt in range(20):
         correct(description, memory, q)
         if attempt == 0:
-            series_slope(description.correction, dof, memory.turning, memory.slope)
+            correction_slope(arms, description.correction, memory, q)
         moved = 0.0
         for j in range(dof):
             step = (memory.trial[j] - memory.theta[j]) / (1 + memory.slope[j])

@@ -4,10 +4,11 @@ import hashlib
 import json
 import re
 import zlib
+from collections.abc import Sequence
 from pathlib import Path
 
 FILE = Path(__file__).parent / "kernels.ll.zlib"
-"""A line of JSON and the code as compressed text; `python -m pisigma.kernels.build` writes it."""
+"""A line of JSON and the code as compressed text; `python -m pisigma.joint_correction.registry` writes it."""
 
 _PYTHON = frozenset(
     ("__init__.py", "array_kinematics.py", "build.py", "description_file.py", "machine_code.py", "ready.py")
@@ -18,39 +19,52 @@ _SHARED = ("kinematics/status.py", "kinematics/tolerances.py")
 _NO_CODE = re.compile(rb'"""[\s\S]*?"""|#[^\n]*|^[ \t]*\n', re.MULTILINE)
 
 
+_FORMS = re.compile(rb"^@no_type_check\ndef [\s\S]*?(?=^(?:@|class |def |[A-Z_a-z])|\Z)", re.MULTILINE)
+"""Compiled forms among the files of features."""
+
+
 def source_files() -> list[Path]:
-    """The files that the kernels are made from."""
+    """The files that the kernels are made from, without those of features."""
     package = Path(__file__).parent.parent
     kernels = sorted(path for path in (package / "kernels").glob("*.py") if path.name not in _PYTHON)
     return [*kernels, *(package / name for name in _SHARED)]
 
 
 def source_hash() -> str:
-    """SHA-256 of the sources without docstrings, comments and empty lines."""
+    """SHA-256 of the sources without docstrings, comments and empty lines; of features only the compiled forms."""
+    features = sorted((Path(__file__).parent.parent / "joint_correction").glob("*.py"))
+    contents = [path.read_bytes() for path in source_files()]
+    contents += [form for path in features for form in _FORMS.findall(path.read_bytes())]
     digest = hashlib.sha256()
-    for path in source_files():
-        lines = _NO_CODE.sub(b"", path.read_bytes()).split(b"\n")
+    for content in contents:
+        lines = _NO_CODE.sub(b"", content).split(b"\n")
         digest.update(b"\n".join(stripped for line in lines if (stripped := line.rstrip())) + b"\0")
     return digest.hexdigest()
 
 
-def write_ready(code: str, **made_with: str) -> None:
+def write_ready(code: str, features: Sequence[str], **made_with: str) -> None:
     """Write the intermediate code of the present sources.
 
     Args:
         code: text of LLVM.
+        features: names of those that it evaluates, in order.
         made_with: versions of the compilers that made it.
     """
-    header = json.dumps({"sources": source_hash(), **made_with}, sort_keys=True)
+    header = json.dumps({"sources": source_hash(), "features": list(features), **made_with}, sort_keys=True)
     FILE.write_bytes(header.encode() + b"\n" + zlib.compress(code.encode(), 9))
 
 
-def read_ready() -> str | None:
-    """The intermediate code; None where there is none, it is damaged, or the sources have changed since."""
+def read_ready() -> tuple[str, tuple[str, ...]] | None:
+    """The intermediate code, and the names of the features that it evaluates.
+
+    Returns:
+        None where there is none, it is damaged, or the sources have changed since.
+    """
     try:
-        header, _, content = FILE.read_bytes().partition(b"\n")
-        if json.loads(header)["sources"] != source_hash():
+        stated, _, content = FILE.read_bytes().partition(b"\n")
+        header = json.loads(stated)
+        if header["sources"] != source_hash():
             return None
-        return zlib.decompress(content).decode()
+        return zlib.decompress(content).decode(), tuple(header["features"])
     except (OSError, ValueError, KeyError, TypeError, zlib.error):
         return None

@@ -26,7 +26,7 @@ from pisigma.kernels.arrays import (
 )
 from pisigma.kernels.description_file import read_description
 from pisigma.kernels.layout import make_memory, pack
-from pisigma.kernels.machine_code import load_kernels
+from pisigma.kernels.machine_code import kernel_features, load_kernels
 from pisigma.kernels.solution import CompiledSolution, solution_of_row, solution_of_rows, width
 
 CHUNK = 2_048
@@ -51,14 +51,14 @@ _COMPILING = (
 )
 
 
-def _kernels() -> Callable[..., int]:
+def _kernels(features: tuple[str, ...]) -> Callable[..., int]:
     """The kernels; where they have to be compiled first, somebody at a terminal is told why it takes so long."""
     told = threading.Timer(_PATIENCE, sys.stderr.write, (_COMPILING,))
     told.daemon = True
     if sys.stderr.isatty():
         told.start()
     try:
-        return load_kernels()
+        return load_kernels(features)
     finally:
         told.cancel()
 
@@ -88,14 +88,14 @@ class CompiledIK:
             ModelError: the arm is larger than the compiled kernels allow.
         """
         self.description = description
-        self._packed = pack(description, name)
+        self._packed = pack(description, name, kernel_features(description.features))
         self._address = _address(self._packed)
         self.branches = tuple(branches)
         self.joints = tuple(joints)
         self.name = name
         self.belongs_to = belongs_to
         self._none = np.zeros((0, len(self.joints)))
-        self._kernels = _kernels()
+        self._kernels = _kernels(description.features)
         self._threads = threading.local()
 
     @staticmethod

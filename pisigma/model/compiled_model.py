@@ -10,11 +10,8 @@ from jaxtyping import Float64
 
 from pisigma.errors import ModelError
 from pisigma.hybrid.arms import HybridArm
-from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.feature import scaled_joints, turning_rate
-from pisigma.joint_correction.fourier_series import FourierSeries
-from pisigma.joint_correction.gravity_torques import GravityTorques
-from pisigma.joint_correction.shared_features import ScaledJoints, SinesCosines
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kernels.arrays import (
     DRAWN,
     FIXED,
@@ -103,9 +100,11 @@ def describe(model: CalibratedModel) -> tuple[Description, tuple[str, ...]]:
             "start from; calibrate it again."
         )
     geometric = model.calibrated or model.robot
+    correction, features = _correction(model)
     description = Description(
         arms=_arms(model.robot, geometric, model.hybrid),
-        correction=_correction(model),
+        correction=correction,
+        features=features,
         coverage=_coverage(geometric, model.hybrid),
         network=describe_network(model),
         closed_form=_closed_form(model, solver),
@@ -142,68 +141,42 @@ def _rows(arm: Robot) -> Float64[np.ndarray, "rows 9"]:
     return np.array(rows, dtype=np.float64)
 
 
-def _correction(model: CalibratedModel) -> Correction:
+def _correction(model: CalibratedModel) -> tuple[Correction, tuple[str, ...]]:
+    """The joint correction of a model, and the names of its features in the order of their numbers.
+
+    Raises:
+        ModelError: a feature has no compiled form, or two have the same name.
+    """
     dof, hybrid = model.robot.dof, model.hybrid
     robot = model.robot if hybrid is None else hybrid.correction.robot
     zero = scaled_joints(robot, torch.from_numpy(np.zeros(dof))).numpy()
-    one = scaled_joints(robot, torch.from_numpy(np.ones(dof))).numpy()
-    inputs = dof + sum(robot.revolute)
-    found: dict[str, np.ndarray] = {
-        "series": np.zeros((0, 2, dof)),
-        "gravity": np.zeros(3),
-        "masses": np.zeros((0, dof, 4)),
-        "scaled": np.zeros((0, dof)),
-        "units": np.zeros((0, inputs)),
-        "weight": np.zeros((0, inputs, dof)),
-        "bias": np.zeros((0, dof)),
-        "orders": np.zeros(0, dtype=np.int64),
-    }
-    if hybrid is not None:
-        own = hybrid.correction
-        for features, weight in zip(own.features, own.linear, strict=True):
-            _add_features(model, robot, features, weight.detach().numpy(), found)
-        fixed = own.fixed.numpy()
-        found["weight"] = (own.weight.detach().numpy() * fixed[..., None]).transpose(1, 2, 0).copy()
-        found["bias"] = (own.bias.detach().numpy() * fixed).T.copy()
-        found["orders"] = np.array(own.orders, dtype=np.int64)
-    half = 1 / (one - zero)
-    turning = np.array(robot.revolute)
-    periodic = not (found["scaled"][:, turning].any())
-    return Correction(
-        rate=turning_rate(robot), middle=-zero * half, half=half, periodic=int(periodic), **found
+    half = 1 / (scaled_joints(robot, torch.from_numpy(np.ones(dof))).numpy() - zero)
+    correction = JointCorrection(robot, ()) if hybrid is None else hybrid.correction
+    numbers: dict[str, np.ndarray] = {}
+    for feature, weight in zip(correction.features, correction.linear, strict=True):
+        if feature.compiled is not None and feature.name not in numbers:
+            numbers[feature.name] = feature.pack(weight.detach().numpy())
+        elif not feature.usually_zero:
+            raise ModelError(
+                f"model '{model.name}': its correction uses the feature '{feature.name}', which has no compiled form "
+                "(or stands twice)."
+            )
+    fixed, starts = correction.fixed.numpy(), np.cumsum([0, *(len(values) for values in numbers.values())])
+    compiled = Correction(
+        rate=turning_rate(robot),
+        middle=-zero * half,
+        half=half,
+        values=np.concatenate([np.zeros(0), *numbers.values()]),
+        starts=starts[:-1].astype(np.int64),
+        weight=(correction.weight.detach().numpy() * fixed[..., None]).transpose(1, 2, 0).copy(),
+        bias=(correction.bias.detach().numpy() * fixed).T.copy(),
+        orders=np.array(correction.orders, dtype=np.int64),
+        periodic=int(correction.is_periodic),
+        frames=int(
+            any(feature.compiled is not None and feature.compiled.frames for feature in correction.features)
+        ),
     )
-
-
-def _add_features(
-    model: CalibratedModel,
-    robot: Robot,
-    features: object,
-    weight: Float64[np.ndarray, "dof columns"],
-    found: dict[str, np.ndarray],
-) -> None:
-    """Put the weights of one choice of features where the kernels look for them."""
-    if isinstance(features, ConditionFeatures):
-        return  # 0 under the usual conditions, and inverse kinematics knows no others
-    if isinstance(features, FourierSeries) and not len(found["series"]):
-        found["series"] = weight.reshape(robot.dof, 2, features.harmonics).transpose(2, 1, 0).copy()
-        return
-    if isinstance(features, GravityTorques) and not len(found["masses"]):
-        scale = np.array([1 / robot.reach, *[features.ARM] * 3])
-        masses = (weight * features.used.numpy()).reshape(robot.dof, robot.dof, 4)
-        slides = ~np.array(robot.revolute)
-        masses = np.where(slides[:, None, None], masses * [1.0, 0.0, 0.0, 0.0], masses * scale)
-        found["masses"], found["gravity"] = masses, np.array(features.gravity)
-        return
-    if isinstance(features, ScaledJoints | SinesCosines):
-        key = "scaled" if isinstance(features, ScaledJoints) else "units"
-        if not len(found[key]):
-            found[key] = weight.copy()
-            return
-    name = getattr(features, "name", type(features).__name__)
-    raise ModelError(
-        f"model '{model.name}': its correction uses the features '{name}', which have no compiled form (or stand "
-        "twice); use pisigma.load, or calibrate with series, gravity, joints or sin_cos, each once."
-    )
+    return compiled, tuple(numbers)
 
 
 def _coverage(robot: Robot, hybrid: HybridArm | None) -> Coverage:

@@ -228,7 +228,7 @@ def test_models_without_compiled_form_are_refused(arms):
         describe(replace(hand_made_model("ur10"), calibrated=model.calibrated))
     correction = JointCorrection(model.robot, [NominalPose(model.robot)])
     arm = HybridArm(model.calibrated, model.calibrated, correction, model.hybrid.coverage)
-    with pytest.raises(ModelError, match="features 'pose'"):
+    with pytest.raises(ModelError, match="feature 'pose'"):
         describe(replace(model, hybrid=arm))
     panda = arms.calibrated("panda")
     with pytest.raises(ModelError, match="no closed-form inverse"):
@@ -275,7 +275,7 @@ def test_files_that_are_no_models_are_refused(arms, tmp_path):
         tmp_path / "other.npz" if (tmp_path / "other.npz").exists() else _foreign(tmp_path)
     ) as foreign:
         assert foreign.files
-    with pytest.raises(ModelError, match="no compiled model of format 3"):
+    with pytest.raises(ModelError, match="no compiled model of format 4"):
         CompiledIK.load(tmp_path / "other.npz")
 
 

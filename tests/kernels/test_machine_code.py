@@ -15,7 +15,9 @@ TRIPLES = ["x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "arm64-apple
 
 
 def test_the_intermediate_code_is_that_of_the_sources():
-    assert ready.read_ready() is not None, "the kernels changed: run python -m pisigma.kernels.build"
+    assert ready.read_ready() is not None, (
+        "the kernels changed: run python -m pisigma.joint_correction.registry"
+    )
 
 
 def test_the_hash_covers_every_kernel_and_no_comment(tmp_path, monkeypatch):
@@ -39,8 +41,8 @@ def test_the_hash_covers_every_kernel_and_no_comment(tmp_path, monkeypatch):
 def test_code_of_other_sources_or_damaged_code_is_not_used(tmp_path, monkeypatch):
     monkeypatch.setattr(ready, "FILE", tmp_path / "kernels.ll.zlib")
     assert ready.read_ready() is None
-    ready.write_ready("define", numba="1")
-    assert ready.read_ready() == "define"
+    ready.write_ready("define", ("series",), numba="1")
+    assert ready.read_ready() == ("define", ("series",))
     whole = ready.FILE.read_bytes()
     for wrong in (whole[:-3], b"", b"[1]\nx", whole.replace(b'"sources": "', b'"sources": "0')):
         ready.FILE.write_bytes(wrong)
@@ -51,12 +53,12 @@ def test_without_code_and_without_numba_one_sentence_says_what_to_install(monkey
     def missing() -> str:
         raise ImportError
 
-    monkeypatch.setattr(machine_code, "read_ready", lambda: None)
+    monkeypatch.setattr(machine_code, "_ready", lambda: None)
     monkeypatch.setattr(machine_code, "intermediate_code", missing)
     with pytest.raises(ModelError, match=r"install pisigma\[compile\]"):
-        machine_code._intermediate_code()
+        machine_code._intermediate_code(())
     monkeypatch.setattr(machine_code, "intermediate_code", lambda: "made now")
-    assert machine_code._intermediate_code() == "made now"
+    assert machine_code._intermediate_code(()) == "made now"
 
 
 def test_objects_for_other_processors_can_be_made():
@@ -121,8 +123,8 @@ def test_a_relative_cache_is_ignored_and_a_missing_home_survived(stated, tmp_pat
 
 
 def test_the_key_holds_what_the_code_depends_on(monkeypatch):
-    key = machine_code._key()
-    assert key == machine_code._key()
+    key = machine_code._key(())
+    assert key == machine_code._key(())
     for owner, name, other in (
         (machine_code.llvm, "get_host_cpu_name", lambda: "another"),
         (machine_code.llvm, "get_process_triple", lambda: "another"),
@@ -133,7 +135,7 @@ def test_the_key_holds_what_the_code_depends_on(monkeypatch):
     ):
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, other)
-            assert machine_code._key() != key, name
+            assert machine_code._key(()) != key, name
 
 
 def test_loading_kernels_on_a_fresh_cache_needs_no_compiler(tmp_path):
@@ -154,4 +156,4 @@ def test_loading_kernels_on_a_fresh_cache_needs_no_compiler(tmp_path):
 
 def test_the_code_names_its_compilers():
     assert b'"numba"' in ready.FILE.read_bytes().partition(b"\n")[0]
-    assert build.ENTRY in (ready.read_ready() or "")
+    assert build.ENTRY in (ready.read_ready() or ("",))[0]
