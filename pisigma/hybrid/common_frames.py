@@ -8,9 +8,9 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.hybrid.refinement import Refined
-from pisigma.identification.identifiability.unobservable import frames_adrift
+from pisigma.identification.identifiability.sufficiency import floating_frames
 from pisigma.identification.prediction import predicted_poses
-from pisigma.identification.problem.user_coordinates import IdentifiedGeometry, identified_geometry
+from pisigma.identification.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.identification.result_assembly import SolvedCalibration
 from pisigma.measurement.dataset import Measurements
 from pisigma.se3 import transform, transform_from_xyzrpy, xyzrpy_from_transform
@@ -33,7 +33,7 @@ def with_frames_of(
         refined: the hybrid one.
         geometry: of the hybrid.
     """
-    frames = frames_adrift(solved.setup)
+    frames = floating_frames(solved.setup)
     if not frames:
         return geometry
     rows = solved.measurements
@@ -72,14 +72,16 @@ def _moved(
 ) -> IdentifiedGeometry:
     """The geometry with everything that stands in some frames moved."""
     setup, frames = solved.setup, solved.setup.problem.space.frames
-    bases, sockets, anchors = dict(geometry.bases), dict(geometry.sockets), dict(geometry.anchors)
+    bases = dict(geometry.bases)
+    unknowns = {group: dict(owners) for group, owners in geometry.unknowns.items()}
     for frame, T in motions.items():
         base = transform_from_xyzrpy(torch.from_numpy(np.asarray(bases[frame])))
         bases[frame] = xyzrpy_from_transform(T @ base).numpy()
-        for places, numbers in ((sockets, setup.socket_frame), (anchors, setup.anchor_frame)):
-            for name, number in zip(list(places), numbers.tolist(), strict=True):
-                if frames[number] == frame:
-                    there = torch.from_numpy(np.asarray(places[name]))
-                    places[name] = (T[:3, :3] @ there + T[:3, 3]).numpy()
+        for own in setup.problem.space.unknowns:
+            for owner, number in zip(own.owners, setup.unknown_frames[own.name].tolist(), strict=True):
+                if own.has_point and frames[number] == frame:
+                    values = unknowns[own.name][owner]
+                    point = (T[:3, :3] @ torch.from_numpy(np.asarray(values[:3])) + T[:3, 3]).numpy()
+                    unknowns[own.name][owner] = np.concatenate([point, values[3:]])
     robot = geometry.robot.with_geometry(base=next(iter(bases.values())))
-    return replace(geometry, robot=robot, bases=bases, sockets=sockets, anchors=anchors)
+    return replace(geometry, robot=robot, bases=bases, unknowns=unknowns)

@@ -155,7 +155,7 @@ class BatchRows:
         always = torch.zeros(rows, dtype=torch.bool)
         for sensor in problem.sensors:
             if sensor.certain:
-                always |= sensor.seen.cpu()
+                always |= sensor.present.cpu()
         self._unit, self._always, self._schedule = unit, always, schedule
         self._epoch, self._batch_of_unit = -1, unit
 

@@ -11,11 +11,12 @@ from pisigma.hybrid.arms import HybridArm, blend
 from pisigma.hybrid.coverage import JointCoverage
 from pisigma.hybrid.search import Trial
 from pisigma.hybrid.uncertainty import PositionUncertainty
-from pisigma.identification.prediction import errors_of_poses, predicted_poses
-from pisigma.identification.problem.user_coordinates import IdentifiedGeometry
+from pisigma.identification.prediction import predicted_poses
+from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.identification.result import CalibrationResult
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
+from pisigma.sensors.registry import measured_errors
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +94,7 @@ class HybridResult:
             return self.geometric.errors_of(measurements)
         known = self.learned.geometry
         T = self.predicted_poses(measurements)
-        return errors_of_poses(T, measurements, known.sockets, known.anchors, known.zeros)
+        return measured_errors(T, measurements, known.unknowns)
 
     def deviation(self, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
         """Standard deviation of the predicted positions along the axes of the row's frame [m], without noise.

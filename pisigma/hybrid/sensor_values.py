@@ -145,12 +145,12 @@ def sensor_values(
     moved = problem if shift is None else replace(problem, q=problem.q + shift(problem.state))
     index = torch.cat([problem.active, joint_columns(problem.space).to(problem.q.device)])
     direction = problem.q.new_tensor(robot.directions)
-    own = problem.space.own(point)
+    own = problem.space.sensor_unknowns(point)
     parts: list[list[tuple[Tensor, ...]]] = [[] for _ in problem.sensors]
     for rows in moved.chunks():
         motion = moved.motion(point, rows, index)
         for sensor, found in zip(moved.sensors, parts, strict=True):
-            seen = sensor.seen[rows].nonzero()[:, 0]
+            seen = sensor.present[rows].nonzero()[:, 0]
             J = moved.derivative(sensor, motion, own, rows, index)[..., seen].permute(2, 1, 0)
             r = sensor.residual(motion, own, rows)[:, seen].t()
             other = sensor.partner_derivative(motion)[len(problem.active) :][..., seen].permute(2, 1, 0)

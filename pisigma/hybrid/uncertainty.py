@@ -13,12 +13,12 @@ from pisigma.hybrid.left_out import LeftOut, folds_left_out, left_out
 from pisigma.hybrid.rows import Rows
 from pisigma.hybrid.sensor_values import joint_columns
 from pisigma.identification.problem.parameters import ParameterSpace
-from pisigma.identification.problem.user_coordinates import IdentifiedGeometry
+from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
-from pisigma.sensors.building import numbers_of
+from pisigma.sensors.sensor import numbers_of
 
 CHUNK = 512
 """Rows whose columns are in memory at a time."""

@@ -12,10 +12,12 @@ from torch import Tensor
 from pisigma.errors import IdentificationError
 from pisigma.identification.identifiability.pairwise import find_pairwise_redundancy
 from pisigma.identification.identifiability.plausibility import refuse_implausible
-from pisigma.identification.identifiability.rank_extension import rank_extension
-from pisigma.identification.identifiability.redundancy import Redundancy, find_redundancy
-from pisigma.identification.identifiability.sufficiency import check_sufficiency
-from pisigma.identification.identifiability.unobservable import tells_scale, untold
+from pisigma.identification.identifiability.redundancy import Redundancy, find_redundancy, rank_extension
+from pisigma.identification.identifiability.sufficiency import (
+    check_sufficiency,
+    determines_scale,
+    undetermined,
+)
 from pisigma.identification.initial_guess.initial_guess import chosen_rows
 from pisigma.identification.problem.information import Information, information
 from pisigma.identification.problem.least_squares import Solution, levenberg_marquardt
@@ -29,7 +31,7 @@ from pisigma.identification.result_assembly import Findings, SolvedCalibration
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS
-from pisigma.sensors.building import PairOfSockets
+from pisigma.sensors.socket import PairOfSockets
 
 ROUGH_ROWS = 4_096
 """Rows that the first steps and the start are worked out from."""
@@ -127,24 +129,24 @@ class GeometricCalibrator:
             PoseError: the joint values do not fit the robot.
         """
         setup = self.build(measurements)
-        own = setup.own_candidates
-        candidates, seen = self._seen(setup, self.candidates(setup.problem.space))
+        unknowns = setup.free_unknowns
+        candidates, at_start = self._at_start(setup, self.candidates(setup.problem.space))
         sizes = setup.start.cpu().numpy()[candidates]
-        redundancy = find_redundancy(seen, sizes)
+        redundancy = find_redundancy(at_start, sizes)
         warnings = check_sufficiency(
             self.robot,
             setup.problem,
             redundancy,
             not isinstance(self.free, str),
             measurements.source,
-            len(own),
+            len(unknowns),
         )
-        warnings = (*warnings, *untold(setup))
-        active = [*self._chosen(setup.problem.space, seen, sizes, redundancy), *own]
+        warnings = (*warnings, *undetermined(setup))
+        active = [*self._chosen(setup.problem.space, at_start, sizes, redundancy), *unknowns]
         problem = setup.problem.with_active(active)
-        solution, problem, extended = self._solved(problem, setup.start, own + candidates)
+        solution, problem, extended = self._solved(problem, setup.start, unknowns + candidates)
         refuse_implausible(problem, solution.linearisation, measurements.source)
-        findings = Findings(seen, sizes, redundancy, extended, warnings)
+        findings = Findings(at_start, sizes, redundancy, extended, warnings)
         return SolvedCalibration(measurements, setup, problem, solution, findings)
 
     def build(self, measurements: Measurements) -> CalibrationSetup:
@@ -192,24 +194,26 @@ class GeometricCalibrator:
             found |= {place for name in self.free for place in space.indices(name)}
         return sorted(found)
 
-    def _seen(self, setup: CalibrationSetup, candidates: list[int]) -> tuple[list[int], Information]:
+    def _at_start(self, setup: CalibrationSetup, candidates: list[int]) -> tuple[list[int], Information]:
         """What the data say of the candidates at the start, after the sensors' own unknowns.
 
-        Where they do not tell the scale, the longest length that they see keeps its nominal value: errors of the
-        nominal geometry would pretend to tell it, and a robot that shrinks to a point meets all sockets.
+        Where they do not determine the scale, the longest length that they see keeps its nominal value: errors of the
+        nominal geometry would pretend to determine it, and a robot that shrinks to a point meets all sockets.
         """
-        own = setup.own_candidates
-        seen = information(setup.problem, setup.start, own + candidates).after(list(range(len(own))))
-        if tells_scale(setup):
-            return candidates, seen
-        size = np.linalg.norm(seen.jacobian, axis=0)
+        unknowns = setup.free_unknowns
+        at_start = information(setup.problem, setup.start, unknowns + candidates).after(
+            list(range(len(unknowns)))
+        )
+        if determines_scale(setup):
+            return candidates, at_start
+        size = np.linalg.norm(at_start.jacobian, axis=0)
         values = np.abs(setup.start.cpu().numpy()[candidates])
-        arm = [parameter.group in ("d", "a") for parameter in seen.parameters]
+        arm = [parameter.group in ("d", "a") for parameter in at_start.parameters]
         lengths = np.where(np.array(arm) & (size > SEEN_AT_ALL * size.max(initial=0.0)), values, 0.0)
         if not lengths.any():
-            return candidates, seen
+            return candidates, at_start
         longest = int(lengths.argmax())
-        return [i for i in candidates if i != candidates[longest]], seen.without(longest)
+        return [i for i in candidates if i != candidates[longest]], at_start.without(longest)
 
     def _chosen(
         self,

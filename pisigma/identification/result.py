@@ -1,20 +1,19 @@
-"""What a calibration comes to: the robot, its parameters with their errors, and what the data do not tell."""
+"""What a calibration comes to: the robot, its parameters with their errors, and what the data cannot determine."""
 
 from dataclasses import dataclass, field
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.identification.identifiability.observability import Observability
-from pisigma.identification.identifiability.pairwise import PairwiseRedundancy, find_pairwise_redundancy
-from pisigma.identification.identifiability.redundancy import Redundancy, find_redundancy
-from pisigma.identification.prediction import prediction_errors
-from pisigma.identification.problem.information import Information
+from pisigma.identification.identifiability.pairwise import PairwiseRedundancy
+from pisigma.identification.identifiability.redundancy import Redundancy
+from pisigma.identification.prediction import predicted_poses
 from pisigma.identification.problem.least_squares import SolutionStatus
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
+from pisigma.sensors.registry import measured_errors
 
 
 @dataclass(frozen=True)
@@ -52,8 +51,9 @@ class SensorNoise:
     """Noise of one kind of sensor, as the residuals show it.
 
     Attributes:
-        sensor: "position", "rotation", "touch", "socket", "distance", "pair" or "socket distance".
-        sigma: standard deviation of one value [m or rad]; where the rows give their own, the factor on it.
+        sensor: "position", "rotation", "touch", "socket", "distance", "pair", "socket distance", or the name of a
+            registered sensor.
+        sigma: standard deviation of one value [m or rad]; where the rows state their own, the factor on it.
         unit: "m" or "rad", or "given" for a factor.
         values: number of measured values.
         used: how many of them the parameters used up.
@@ -74,7 +74,7 @@ class Outlier:
 
     Attributes:
         row: its number in the measurements, from 0.
-        place: file and line, or source and row.
+        place: file and line, or source and row, as complaints name the row.
         sensor: which value of the row.
         residual: length of the residual [m or rad].
         deviations: the same in standard deviations of one value.
@@ -97,23 +97,22 @@ class CalibrationResult:
         tools: the same per target.
         parameters: all parameters, free or not.
         covariance: of all parameters in their order (SI), zero where they were not free.
-        residuals: per sensor, measured - predicted of every row [m or rad], NaN where it saw nothing.
+        residuals: per sensor, measured - predicted of every row [m or rad], NaN where it measured nothing.
         outliers: rows that counted for less than half, the worst first.
         noise: per sensor.
         redundancy: rank, chosen parameters and dependencies at the start.
-        information: what `redundancy` was found from.
-        sizes: nominal values behind `information`.
-        extended: parameters that were added because at the solution the data do tell them.
-        weak_directions: directions that the data hardly see, in words; there the nominal value stands.
+        pairwise: redundancy the paper's way, by Pearson correlation.
+        arm_rank: rank of the arm's parameters alone, when bases and tools may take any value.
+        extended: parameters that were added because at the solution the data do determine them.
+        weak_directions: directions that the data hardly determine, in words; there the nominal value stands.
         observability: indices O1 to O5 of the free parameters at the solution.
         iterations: steps tried.
         cost: sum of squared residuals over variances, with loss and prior.
         status: why the search ended.
         rms_path: RMS of the first sensor's residuals' lengths at every point passed [m], the start first.
         warnings: what to measure next, in sentences.
-        sockets: per socket, its place in its frame [m].
-        anchors: per anchor, its place in its frame [m].
-        zeros: per anchor, what its sensor shows at no distance [m].
+        unknowns: by group and owner, what the sensors found out about themselves, in the owner's frame: of a
+            "socket" x, y, z [m], of an "anchor" x, y, z and what its sensor shows at no distance [m].
     """
 
     robot: Robot
@@ -125,8 +124,8 @@ class CalibrationResult:
     outliers: tuple[Outlier, ...]
     noise: tuple[SensorNoise, ...]
     redundancy: Redundancy
-    information: Information
-    sizes: Float64[np.ndarray, " candidates"]
+    pairwise: PairwiseRedundancy
+    arm_rank: int
     extended: tuple[str, ...]
     weak_directions: tuple[str, ...]
     observability: Observability
@@ -135,26 +134,15 @@ class CalibrationResult:
     status: SolutionStatus
     rms_path: tuple[float, ...]
     warnings: tuple[str, ...]
-    sockets: dict[str, Float64[np.ndarray, " 3"]] = field(default_factory=dict)
-    anchors: dict[str, Float64[np.ndarray, " 3"]] = field(default_factory=dict)
-    zeros: dict[str, float] = field(default_factory=dict)
+    unknowns: dict[str, dict[str, Float64[np.ndarray, " columns"]]] = field(default_factory=dict)
 
     @property
     def rank(self) -> int:
-        """How many independent combinations of the parameters the data see, at the nominal geometry.
+        """How many independent combinations of the parameters the data determine, at the nominal geometry.
 
-        Counted after the places of sockets and anchors and the zeros, which may take any value.
+        Counted after the sensors' own unknowns, which may take any value.
         """
         return self.redundancy.rank
-
-    @cached_property
-    def arm_rank(self) -> int:
-        """The same of the arm's parameters alone, after bases and tools too."""
-        groups = [parameter.group for parameter in self.information.parameters]
-        nuisance = [k for k, group in enumerate(groups) if group in ("base", "tool")]
-        rest = self.information.after(nuisance)
-        sizes = np.zeros(len(rest.parameters))
-        return find_redundancy(rest, sizes, self.redundancy.tolerance).rank
 
     @property
     def condition_number(self) -> float:
@@ -165,11 +153,6 @@ class CalibrationResult:
     def free(self) -> tuple[str, ...]:
         """Names of the parameters that were estimated."""
         return tuple(parameter.name for parameter in self.parameters if parameter.free)
-
-    @cached_property
-    def pairwise(self) -> PairwiseRedundancy:
-        """Redundancy the paper's way, by Pearson correlation."""
-        return find_pairwise_redundancy(self.information, self.sizes)
 
     def parameter(self, name: str) -> ParameterEstimate:
         """The row of the parameter table with that name.
@@ -183,16 +166,14 @@ class CalibrationResult:
         raise KeyError(name)
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
-        """Measured - predicted of any measurements with known frames and targets, such as held-out ones.
+        """Measured - predicted of any measurements in calibrated frames with calibrated targets, such as held-out ones.
 
         Returns:
-            What was measured of "position", "touch", "socket", "distance" and "pair" [m] and "rotation" [rad],
-            one value a row or three; NaN where a row has none. A socket that was not calibrated is where its
-            own rows meet on average.
+            By sensor [m or rad], NaN where a row has no value; see `pisigma.sensors.registry.measured_errors`. A
+            socket that was not calibrated is where its own rows meet on average.
 
         Raises:
-            IdentificationError: a row has a frame, a target or an anchor that is not known.
+            IdentificationError: a row has a frame, a target or an anchor that was not calibrated.
         """
-        return prediction_errors(
-            self.robot, self.bases, self.tools, measurements, self.sockets, self.anchors, self.zeros
-        )
+        T = predicted_poses(self.robot, self.bases, self.tools, measurements)
+        return measured_errors(T, measurements, self.unknowns)

@@ -7,21 +7,19 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.identification.identifiability.mixed_frames import frames_mixed_up
-from pisigma.identification.identifiability.observability import observability_of
-from pisigma.identification.identifiability.redundancy import Redundancy
-from pisigma.identification.identifiability.weak_directions import find_weak_directions
-from pisigma.identification.problem.covariance import covariance_of
+from pisigma.identification.identifiability.observability import find_weak_directions, observability_of
+from pisigma.identification.identifiability.pairwise import find_pairwise_redundancy
+from pisigma.identification.identifiability.plausibility import misfitting_frames
+from pisigma.identification.identifiability.redundancy import Redundancy, find_redundancy
 from pisigma.identification.problem.information import Information
-from pisigma.identification.problem.least_squares import Linearisation, Solution
+from pisigma.identification.problem.least_squares import Linearisation, Solution, covariance_of
 from pisigma.identification.problem.noise import values_used, view_of
 from pisigma.identification.problem.problem import CalibrationProblem
-from pisigma.identification.problem.setup import CalibrationSetup
-from pisigma.identification.problem.user_coordinates import (
-    UserCoordinates,
-    named_geometry,
-    own_places,
-    user_coordinates,
+from pisigma.identification.problem.setup import (
+    CalibrationSetup,
+    IdentifiedGeometry,
+    identified_geometry,
+    unknowns_in_frames,
 )
 from pisigma.identification.result import CalibrationResult, Outlier, ParameterEstimate, SensorNoise
 from pisigma.measurement.dataset import Measurements
@@ -29,14 +27,14 @@ from pisigma.robot.row import FRAME_COLUMNS
 from pisigma.se3 import wrap_to_pi
 
 LOST = 1e-10
-"""Information, columns scaled to 1, with a smaller eigenvalue does not tell some direction."""
+"""Information, columns scaled to 1, with a smaller eigenvalue does not determine some direction."""
 HELD = 0.7
-"""A parameter whose standard error is more than this share of its prior's is not told by the data."""
+"""A parameter whose standard error is more than this share of its prior's is not determined by the data."""
 
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What was found out about the parameters on the way.
+    """What the rank analysis says about the parameters.
 
     Attributes:
         information: the condensed Jacobian of the candidates at the start.
@@ -58,7 +56,7 @@ class SolvedCalibration:
     """A calibration problem with its solution.
 
     Attributes:
-        measurements: as given.
+        measurements: all rows, also those that could not be used.
         setup: start, and what base and tool are relative to.
         problem: with its free parameters.
         solution: of it.
@@ -85,29 +83,25 @@ def assemble_result(
 ) -> CalibrationResult:
     """Make the result; see `CalibrationResult` for its parts."""
     here = problem.refined(solution.linearisation)
-    space, point = problem.space, here.point.cpu()
-    estimate = user_coordinates(setup, point, problem)
-    found = named_geometry(space, point, estimate)
-    covariance = _covariance(here, problem, estimate)
+    geometry = identified_geometry(setup, here.point)
+    covariance = _covariance(here, problem, geometry)
     gram = sum((sums.normal for sums in view_of(here).sums), torch.zeros_like(here.normal))
     usual = problem.step_scale * 1e3  # to rows in mm and mrad, columns per 1 mm and 1 mrad
-    poses = int(torch.stack([sensor.seen for sensor in problem.sensors]).any(0).sum())
+    poses = int(torch.stack([sensor.present for sensor in problem.sensors]).any(0).sum())
     return CalibrationResult(
-        robot=found.robot,
-        bases=found.bases,
-        tools=found.tools,
-        sockets=found.sockets,
-        anchors=found.anchors,
-        zeros=found.zeros,
-        parameters=_table(setup, problem, here, estimate, covariance, findings),
+        robot=geometry.robot,
+        bases=geometry.bases,
+        tools=geometry.tools,
+        unknowns=geometry.unknowns,
+        parameters=_table(setup, problem, here, geometry, covariance, findings),
         covariance=covariance,
         residuals=_residuals(measurements, setup, problem, here),
         outliers=_outliers(measurements, setup, problem, here),
         noise=_noise(problem, here),
         redundancy=findings.redundancy,
-        information=findings.information,
-        sizes=findings.sizes,
-        extended=tuple(space.names[i] for i in findings.extended),
+        pairwise=find_pairwise_redundancy(findings.information, findings.sizes),
+        arm_rank=_arm_rank(findings),
+        extended=tuple(problem.space.names[i] for i in findings.extended),
         weak_directions=find_weak_directions(problem, here),
         observability=observability_of(gram * usual * usual[:, None], poses),
         iterations=solution.iterations,
@@ -118,14 +112,21 @@ def assemble_result(
     )
 
 
+def _arm_rank(findings: Findings) -> int:
+    """The rank of the arm's parameters alone, after bases and tools."""
+    groups = [parameter.group for parameter in findings.information.parameters]
+    rest = findings.information.after([k for k, group in enumerate(groups) if group in ("base", "tool")])
+    return find_redundancy(rest, np.zeros(len(rest.parameters)), findings.redundancy.tolerance).rank
+
+
 def _covariance(
-    here: Linearisation[Tensor], problem: CalibrationProblem, estimate: UserCoordinates
+    here: Linearisation[Tensor], problem: CalibrationProblem, geometry: IdentifiedGeometry
 ) -> Float64[np.ndarray, "parameters parameters"]:
     size = len(problem.space.parameters)
     full = torch.zeros(size, size, dtype=torch.float64)
     active = problem.active.cpu()
     full[active[:, None], active] = covariance_of(here.normal).cpu()
-    return (estimate.change @ full @ estimate.change.mT).numpy()
+    return (geometry.change @ full @ geometry.change.mT).numpy()
 
 
 def _warnings(
@@ -151,24 +152,21 @@ def _warnings(
                 f"the {kind} errors are about {factor:.2g} times as large as the prior says, so their size was "
                 "taken from the data; check the nominal geometry and the robot, or give a wider prior."
             )
-    return (*found, *frames_mixed_up(problem, here))
+    return (*found, *misfitting_frames(problem, here))
 
 
 def _table(
     setup: CalibrationSetup,
     problem: CalibrationProblem,
     here: Linearisation[Tensor],
-    estimate: UserCoordinates,
+    geometry: IdentifiedGeometry,
     covariance: np.ndarray,
     findings: Findings,
 ) -> tuple[ParameterEstimate, ...]:
     space, robot = problem.space, problem.space.robot
     bases, tools = np.tile(robot.base, (len(space.frames), 1)), np.tile(robot.tool, (len(space.targets), 1))
-    sockets, anchors = own_places(setup, setup.start.cpu(), space)
-    nominal = space.values(bases, tools, sockets.numpy(), anchors.numpy())
-    arm = here.point.cpu()[: space.arm_size]
-    others = (estimate.bases, estimate.tools, estimate.sockets, estimate.anchors)
-    values = torch.cat([arm, *(part.flatten() for part in others)])
+    nominal = space.values(bases, tools, unknowns_in_frames(setup, setup.start))
+    values = geometry.values()
     change = values - nominal
     angle = torch.tensor([parameter.unit == "rad" for parameter in space.parameters])
     change = torch.where(angle, wrap_to_pi(change), change)
@@ -176,7 +174,7 @@ def _table(
     held = errors * np.sqrt(_prior_precision(problem, here)) > HELD
     active = set(problem.active.tolist())
     silent = _without_rows(problem, here.normal.cpu(), findings)
-    untold = (estimate.change[:, silent] != 0).any(1).tolist()
+    undetermined = (geometry.change[:, silent] != 0).any(1).tolist()
     rows = []
     columns = (nominal.tolist(), values.tolist(), change.tolist())
     for index, (parameter, before, after, moved) in enumerate(zip(space.parameters, *columns, strict=True)):
@@ -185,7 +183,7 @@ def _table(
         if free and held[index]:
             remark += "; the data hardly determine it, the prior holds it"
             label = "held by the prior" if label == "identified" else f"{label}; prior"
-        if untold[index]:
+        if undetermined[index]:
             free, label = False, "outliers"
             remark = "too few rows that count show it, the others are outliers"
         error = float(errors[index]) if free else float("nan")
@@ -197,7 +195,7 @@ def _table(
 def _without_rows(
     problem: CalibrationProblem, normal: Float64[Tensor, "active active"], findings: Findings
 ) -> list[int]:
-    """Free parameters that the rows left over do not hold: those that none shows, and bases that are not all told.
+    """Free parameters that the rows left over do not hold: those that none shows, and bases not wholly determined.
 
     Not those that all rows together would not show either.
     """
@@ -211,13 +209,13 @@ def _without_rows(
         at_start = findings.information
         columns = [at_start.names.index(names[k]) for k in own.tolist()]
         J = torch.from_numpy(at_start.jacobian[:, columns])
-        if len(own) and _tells_all(J.t() @ J) and not _tells_all(normal[own[:, None], own]):
+        if len(own) and _determines_all(J.t() @ J) and not _determines_all(normal[own[:, None], own]):
             lost[own] = True
     found: list[int] = active[lost].tolist()
     return found
 
 
-def _tells_all(information: Float64[Tensor, "own own"]) -> bool:
+def _determines_all(information: Float64[Tensor, "own own"]) -> bool:
     """Whether information holds its parameters in every direction."""
     scale = information.diagonal().clamp(min=1e-300).rsqrt()
     return float(torch.linalg.eigvalsh(information * scale * scale[:, None])[0]) >= LOST
@@ -261,7 +259,7 @@ def _residuals(
         if sensor.components == 3:
             own = (R @ own[..., None])[..., 0]
         values = torch.full((measurements.q.shape[0], sensor.components), torch.nan, dtype=own.dtype)
-        values[setup.rows.cpu()] = torch.where(sensor.seen[:, None], own, torch.nan).cpu()
+        values[setup.rows.cpu()] = torch.where(sensor.present[:, None], own, torch.nan).cpu()
         found[sensor.name] = values.numpy()
     return found
 

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from pisigma.identification.problem.user_coordinates import IdentifiedGeometry
+from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.measurement.conditions import CONDITIONS
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -71,4 +71,4 @@ def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Flo
 
 def geometry_of(robot: Robot, bases: Frames, tools: Frames) -> IdentifiedGeometry:
     """A geometry as an uncertainty needs it: without sockets, anchors, and how it was solved for."""
-    return IdentifiedGeometry(robot, bases, tools, {}, {}, {}, torch.zeros(0, 0, dtype=torch.float64))
+    return IdentifiedGeometry(robot, bases, tools, {}, torch.zeros(0, 0, dtype=torch.float64))

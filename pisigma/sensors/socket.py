@@ -1,114 +1,235 @@
-"""Sockets: fixed points that the ball at the tool sits in, and known distances between them."""
+"""Sockets: fixed points that the ball at the tool sits in, and given distances between them."""
 
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
+from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.kinematics.parameter_jacobian import ToolMotion
-from pisigma.sensors.sensor import AbstractSensor, OwnDerivative, OwnUnknowns
+from pisigma.measurement.dataset import Measurements
+from pisigma.sensors.sensor import (
+    AbstractSensor,
+    InitialUnknowns,
+    SensorRows,
+    UnknownDerivative,
+    UnknownGroup,
+    Unknowns,
+    names_of,
+    numbers_of,
+    owners_of,
+    unit_vectors,
+)
 
-SHORTEST = 1e-12
-"""[m] Distances are not divided by less."""
+PairOfSockets = tuple[str, str]
+SOCKET_COLUMNS = ("x", "y", "z")
+
+LARGEST_SCATTER = 0.05
+"""[reach] By the robot as drawn, rows of one socket are not farther apart than this."""
 
 
 @dataclass(frozen=True, eq=False)
 class SocketSensor(AbstractSensor):
-    """A ball that sits in a socket: `p_tool - p_socket = 0`, the socket's place being unknown.
+    """A ball that sits in a socket: `p_tool - p_socket = 0`, where the socket is unknown.
 
     Attributes:
-        socket: number of every row's socket, -1 where there is none.
-        seen: whether a row has one.
+        socket: index of every row's socket, -1 where there is none.
+        present: whether a row has one.
         sigma: standard deviation of a coordinate [m] of every row, or None.
     """
 
     name = "socket"
     unit = "m"
     components = 3
-    turning = False
+    holds_frame = False
     socket: Int64[Tensor, " rows"]
-    seen: Bool[Tensor, " rows"]
+    present: Bool[Tensor, " rows"]
     sigma: Float64[Tensor, " rows"] | None
 
-    def residual(
-        self, motion: ToolMotion, own: OwnUnknowns, rows: slice
-    ) -> Float[Tensor, "components poses"]:
-        """The socket's place minus the tool's [m]."""
-        return own.sockets[:, self.socket[rows]] - motion.position
+    @classmethod
+    def build(cls, rows: SensorRows) -> "SocketSensor | None":
+        """Gather the rows whose ball sat in a socket."""
+        names = rows.measurements.socket
+        present = rows.measurements.measured("socket")
+        if not bool(present.any()):
+            return None
+        return cls(rows.numbers(names, names_of(names)), present, rows.sigma(present))
 
-    def select(self, rows: Int64[Tensor, " chosen"]) -> "SocketSensor":
-        """Some of the rows."""
-        return SocketSensor(
-            self.socket[rows], self.seen[rows], None if self.sigma is None else self.sigma[rows]
-        )
+    def residual(
+        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
+    ) -> Float[Tensor, "components poses"]:
+        """Return the socket's position minus the tool's [m]."""
+        return unknowns["socket"][:, self.socket[rows]] - motion.position
 
     def derivative(
-        self, motion: ToolMotion, own: OwnUnknowns, rows: slice
+        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> Float[Tensor, "parameters components poses"]:
-        """The tool's shift."""
+        """Return the tool's shift."""
         return motion.derivative[:, :3]
 
-    def own_derivatives(self, motion: ToolMotion, own: OwnUnknowns, rows: slice) -> tuple[OwnDerivative, ...]:
-        """Minus the socket's shift."""
+    def unknown_derivatives(
+        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
+    ) -> tuple[UnknownDerivative, ...]:
+        """Return minus the socket's shift."""
+        socket = self.socket[rows]
         eye = torch.eye(3).to(motion.position)
-        return (
-            OwnDerivative("socket", self.socket[rows], -eye[..., None].expand(3, 3, len(self.socket[rows]))),
-        )
+        return (UnknownDerivative("socket", socket, -eye[..., None].expand(3, 3, len(socket))),)
+
+    @classmethod
+    def unknowns(cls, measurements: Measurements) -> UnknownGroup | None:
+        """Name the sockets; each has a position."""
+        owners, frames = owners_of(measurements, measurements.socket)
+        return UnknownGroup("socket", SOCKET_COLUMNS, owners, frames) if owners else None
+
+    @classmethod
+    def initial_guess(
+        cls, measurements: Measurements, T: Float64[Tensor, "rows 4 4"], reach: float
+    ) -> InitialUnknowns | None:
+        """Guess every socket at the mean of its rows.
+
+        Raises:
+            IdentificationError: by the robot as drawn, the rows of one socket are far from each other.
+        """
+        names = names_of(measurements.socket)
+        if not names:
+            return None
+        socket = numbers_of(measurements.socket, names, measurements.rows)
+        points, socket = T[socket >= 0, :3, 3], socket[socket >= 0]
+        middle = means(points, socket, len(names))
+        usual = float((points - middle[socket]).norm(dim=-1).median())
+        if usual > LARGEST_SCATTER * reach:
+            raise IdentificationError(
+                f"{measurements.source}: by the robot as drawn the rows of one socket are about {usual * 1e3:.3g} mm "
+                "away from each other; check the directions and zeros of the joints, the tool, and the names of the "
+                "sockets."
+            )
+        return InitialUnknowns(middle, torch.ones_like(middle, dtype=torch.bool))
+
+    @classmethod
+    def uncalibrated(
+        cls,
+        measurements: Measurements,
+        owner: str,
+        T: Float64[Tensor, "rows 4 4"],
+        calibrated: Collection[str],
+    ) -> Float64[Tensor, " columns"]:
+        """Return where the rows of a socket meet on average."""
+        rows = numbers_of(measurements.socket, (owner,), measurements.rows).to(T.device) == 0
+        middle: Tensor = T[rows, :3, 3].mean(0)
+        return middle
 
 
 @dataclass(frozen=True, eq=False)
 class SocketDistanceSensor(AbstractSensor):
-    """Known distances between two sockets, each attached to a row of one of them.
+    """Given distances between two sockets, each attached to a row of one of them.
 
     Attributes:
-        first: number of one socket, -1 where a row has no such distance.
-        second: number of the other.
+        first: index of one socket, -1 where a row has no such distance.
+        second: index of the other.
         measured: the distance [m].
-        seen: whether a row has one.
-        sigma: how well it is known [m].
+        present: whether a row has one.
+        sigma: its standard deviation [m].
     """
 
     name = "socket distance"
     unit = "m"
     components = 1
-    turning = False
     certain = True
+    holds_frame = False
     first: Int64[Tensor, " rows"]
     second: Int64[Tensor, " rows"]
     measured: Float64[Tensor, " rows"]
-    seen: Bool[Tensor, " rows"]
+    present: Bool[Tensor, " rows"]
     sigma: Float64[Tensor, " rows"] | None
 
+    @classmethod
+    def build(cls, rows: SensorRows) -> "SocketDistanceSensor | None":
+        """Find none: the distances come from the user, see `between`."""
+        return None
+
+    @classmethod
+    def between(
+        cls, measurements: Measurements, distances: Mapping[PairOfSockets, float], sigma: float
+    ) -> "SocketDistanceSensor | None":
+        """Attach distances to rows of their sockets, each to another row; None where there is no distance.
+
+        Args:
+            measurements: rows with sockets.
+            distances: between two sockets [m].
+            sigma: standard deviation of the distances [m].
+
+        Raises:
+            IdentificationError: a distance is none, or names a socket that no row has, or twice the same.
+        """
+        if not distances:
+            return None
+        order = names_of(measurements.socket)
+        rows, device = measurements.rows, measurements.q.device
+        first, second = (torch.full((rows,), -1, dtype=torch.int64) for _ in range(2))
+        measured = torch.zeros(rows, dtype=torch.float64)
+        free: dict[str, list[int]] = {name: [] for name in order}
+        for row, name in enumerate(measurements.socket or ()):
+            if name:
+                free[name].append(row)
+        for (one, other), distance in distances.items():
+            _check_distance(one, other, distance, order, measurements.source)
+            rows_left = free[one] or free[other]
+            if not rows_left:
+                raise IdentificationError(
+                    f"{measurements.source}: more distances of the sockets '{one}' and '{other}' are stated than they "
+                    "have rows; give fewer distances."
+                )
+            row = rows_left.pop(0)
+            first[row], second[row], measured[row] = order.index(one), order.index(other), distance
+        tensors = (first, second, measured, first >= 0, torch.full_like(measured, sigma))
+        return cls(*(tensor.to(device) for tensor in tensors))
+
     def residual(
-        self, motion: ToolMotion, own: OwnUnknowns, rows: slice
+        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> Float[Tensor, "components poses"]:
-        """Known minus present distance [m]."""
-        residual: Tensor = self.measured[rows] - self._apart(own, rows).norm(dim=0)
+        """Return given minus present distances [m]."""
+        residual: Tensor = self.measured[rows] - self._apart(unknowns, rows).norm(dim=0)
         return residual[None]
 
-    def select(self, rows: Int64[Tensor, " chosen"]) -> "SocketDistanceSensor":
-        """Some of the rows."""
-        sigma = None if self.sigma is None else self.sigma[rows]
-        return SocketDistanceSensor(
-            self.first[rows], self.second[rows], self.measured[rows], self.seen[rows], sigma
-        )
-
     def derivative(
-        self, motion: ToolMotion, own: OwnUnknowns, rows: slice
+        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> Float[Tensor, "parameters components poses"]:
-        """None: the tool has no part in it."""
+        """Return 0: the tool has no part in it."""
         return torch.zeros_like(motion.derivative[:, :1])
 
-    def own_derivatives(self, motion: ToolMotion, own: OwnUnknowns, rows: slice) -> tuple[OwnDerivative, ...]:
-        """The direction from the second socket to the first, and back."""
-        apart = self._apart(own, rows)
-        direction = (apart / apart.norm(dim=0).clamp(min=SHORTEST))[:, None]
+    def unknown_derivatives(
+        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
+    ) -> tuple[UnknownDerivative, ...]:
+        """Return the direction from the second socket to the first, and back."""
+        direction = unit_vectors(self._apart(unknowns, rows))[:, None]
         return (
-            OwnDerivative("socket", self.first[rows], direction),
-            OwnDerivative("socket", self.second[rows], -direction),
+            UnknownDerivative("socket", self.first[rows], direction),
+            UnknownDerivative("socket", self.second[rows], -direction),
         )
 
-    def _apart(self, own: OwnUnknowns, rows: slice) -> Tensor:
-        apart: Tensor = own.sockets[:, self.first[rows]] - own.sockets[:, self.second[rows]]
+    def _apart(self, unknowns: Unknowns, rows: slice) -> Tensor:
+        sockets = unknowns["socket"]
+        apart: Tensor = sockets[:, self.first[rows]] - sockets[:, self.second[rows]]
         return apart
+
+
+def _check_distance(one: str, other: str, distance: float, order: tuple[str, ...], source: str) -> None:
+    for name in (one, other):
+        if name not in order:
+            raise IdentificationError(
+                f"{source}: socket_distances names the socket '{name}', but no row has it; "
+                f"{nearest_choice(name, order)}"
+            )
+    if one == other or not distance > 0:
+        raise IdentificationError(
+            f"{source}: socket_distances states {distance * 1e3:.6g} mm between '{one}' and '{other}'; a positive "
+            "distance between two different sockets was wanted."
+        )
+
+
+def means(values: Float64[Tensor, "rows size"], number: Int64[Tensor, " rows"], count: int) -> Tensor:
+    """Return the mean over the rows of every number from 0 to `count - 1`."""
+    total = values.new_zeros((count, values.shape[1])).index_add(0, number, values)
+    return total / torch.bincount(number, minlength=count).clamp(min=1)[:, None]

@@ -160,8 +160,8 @@ def test_nonsense_is_refused(wrong, said):
 
 def test_an_epoch_counts_all_rows_equally_and_keeps_pairs_together():
     rows, pairs = 23, 3
-    tape = SimpleNamespace(certain=True, seen=torch.arange(rows) >= 21)
-    tracker = SimpleNamespace(certain=False, seen=torch.arange(rows) < 21)
+    tape = SimpleNamespace(certain=True, present=torch.arange(rows) >= 21)
+    tracker = SimpleNamespace(certain=False, present=torch.arange(rows) < 21)
     problem = SimpleNamespace(q=torch.zeros(rows, 6), pairs=pairs, sensors=(tracker, tape))
     schedule = BatchSchedule(batches=4, epochs=2, learning_rate=0.1, seed=0)
     total, orders = torch.zeros(rows).double(), []

@@ -14,7 +14,7 @@ from pisigma.hybrid.held_products import HeldProducts, normalised
 from pisigma.hybrid.products import ROUNDS, FittedProducts, ProductFit
 from pisigma.hybrid.refinement import network
 from pisigma.identification.prediction import predicted_poses
-from pisigma.identification.problem.user_coordinates import identified_geometry
+from pisigma.identification.problem.setup import identified_geometry
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.robot import Robot

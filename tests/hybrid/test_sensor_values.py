@@ -14,7 +14,7 @@ from pisigma.hybrid.design import Design
 from pisigma.hybrid.held_products import HeldProducts
 from pisigma.hybrid.sensor_values import joint_columns, sensor_values
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.problem.problem import CalibrationProblem
+from pisigma.identification.problem.problem import CalibrationProblem, MotionMemory
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -22,8 +22,7 @@ from pisigma.joint_correction.shared_features import SinesCosines
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.sensors.motion_memory import MotionMemory
-from pisigma.sensors.sensor import RotationSensor
+from pisigma.sensors.pose import RotationSensor
 
 WEIGHTS = ((-4 / 5, 1), (1 / 5, 2), (-4 / 105, 3), (1 / 280, 4))
 """Of central differences of order 8, with the step's multiple."""
@@ -56,8 +55,8 @@ def residuals(problem: CalibrationProblem, point: Tensor, q: Tensor) -> list[Ten
     moved = replace(problem, q=q, memory=MotionMemory())
     rows = slice(0, len(q))
     motion = moved.motion(point, rows, moved.active)
-    own = moved.space.own(point)
-    return [sensor.residual(motion, own, rows)[:, sensor.seen].t() for sensor in moved.sensors]
+    own = moved.space.sensor_unknowns(point)
+    return [sensor.residual(motion, own, rows)[:, sensor.present].t() for sensor in moved.sensors]
 
 
 def differences(of: Callable[[Tensor], list[Tensor]], at: Tensor, step: float, place: object) -> list[Tensor]:

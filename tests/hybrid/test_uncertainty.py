@@ -23,7 +23,7 @@ from pisigma.hybrid.uncertainty import (
     position_uncertainty,
 )
 from pisigma.identification.prediction import predicted_poses
-from pisigma.identification.problem.user_coordinates import identified_geometry
+from pisigma.identification.problem.setup import identified_geometry
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection

@@ -9,7 +9,7 @@ from testing.simulated_arm import BASE, TOOL, draw_joints, simulate
 from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.identifiability.observability import observability_of
-from pisigma.identification.problem.user_coordinates import turning_axes
+from pisigma.identification.problem.setup import turning_axes
 from pisigma.identification.result import CalibrationResult
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements

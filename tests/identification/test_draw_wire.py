@@ -12,14 +12,16 @@ from torch import Tensor
 
 from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.prediction import prediction_errors
+from pisigma.identification.prediction import predicted_poses
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot import Robot
+from pisigma.sensors.registry import measured_errors
 
 PLACE = np.array([1.5, -0.2, 0.9])
 ZERO = 0.012
-FREE_FRAME = "where the robot's base is there is not told"
+WIRE = np.array([*PLACE, ZERO])
+FREE_FRAME = "where the robot's base is there is not determined"
 
 
 def distances_after_moving(points: Tensor, to: Tensor) -> Tensor:
@@ -62,28 +64,29 @@ def test_who_stands_at_a_known_place_is_told() -> None:
         warnings = GeometricCalibrator(nominal).fit(data).warnings
         assert not any(FREE_FRAME in warning for warning in warnings)
     apart = GeometricCalibrator(nominal).fit(join([touch_data(), replace(wire_data(), frame=("far",) * 80)]))
-    assert any(f"in frame 'far' stands at a known place, so {FREE_FRAME}" in text for text in apart.warnings)
+    assert any(f"in frame 'far' has a stated position, so {FREE_FRAME}" in text for text in apart.warnings)
 
 
-def errors(data: Measurements, **known: object) -> Tensor:
+def errors(data: Measurements, **anchors: np.ndarray) -> Tensor:
     """Distance errors of the true robot."""
     robot = true_robot().geometric_robot
-    found = prediction_errors(robot, {"": robot.base}, {"": robot.tool}, data, **known)  # type: ignore[arg-type]
+    T = predicted_poses(robot, {"": robot.base}, {"": robot.tool}, data)
+    found = measured_errors(T, data, {"anchor": anchors})
     assert set(found) == {"distance"}
     return found["distance"][:, 0]
 
 
 def test_errors_of_an_anchor_that_was_calibrated() -> None:
     data = wire_data()
-    exact = errors(data, anchors={"wire": PLACE}, zeros={"wire": ZERO})
+    exact = errors(data, wire=WIRE)
     assert_close(exact, torch.zeros(80), atol=1e-12)
     assert_close(
-        errors(data, anchors={"wire": PLACE}), torch.full((80,), ZERO, dtype=torch.float64), atol=1e-12
+        errors(data, wire=np.array([*PLACE, 0.0])), torch.full((80,), ZERO, dtype=torch.float64), atol=1e-12
     )
     assert data.distance is not None
     longer = replace(data, distance=data.distance + 0.003)
     assert_close(
-        errors(longer, anchors={"wire": PLACE}, zeros={"wire": ZERO}),
+        errors(longer, wire=WIRE),
         torch.full((80,), 0.003, dtype=torch.float64),
         atol=1e-12,
     )
@@ -91,8 +94,9 @@ def test_errors_of_an_anchor_that_was_calibrated() -> None:
 
 def test_the_place_of_a_row_counts_where_the_anchor_was_not_calibrated() -> None:
     data = wire_data(known=True)
-    assert_close(errors(data, zeros={"wire": ZERO}), torch.zeros(80), atol=1e-12)
-    moved = errors(data, anchors={"wire": PLACE + np.array([0.0, 0.0, 0.05])}, zeros={"wire": ZERO})
+    assert data.distance is not None
+    assert_close(errors(replace(data, distance=data.distance - ZERO)), torch.zeros(80), atol=1e-12)
+    moved = errors(data, wire=WIRE + np.array([0.0, 0.0, 0.05, 0.0]))
     p = forward_kinematics(true_robot().geometric_robot, data.q)[:, :3, 3]
     place = torch.from_numpy(PLACE)
     lifted = torch.from_numpy(PLACE + np.array([0.0, 0.0, 0.05]))
@@ -101,24 +105,23 @@ def test_the_place_of_a_row_counts_where_the_anchor_was_not_calibrated() -> None
 
 def test_an_anchor_of_unknown_place_is_refused() -> None:
     with pytest.raises(
-        IdentificationError, match="anchor 'wire' was not calibrated and its place is not given"
+        IdentificationError, match="anchor 'wire' was not calibrated and its position is not stated"
     ):
         errors(wire_data())
     with pytest.raises(IdentificationError, match=r"row 0\b.*did you mean 'wires'"):
-        errors(wire_data(), anchors={"wires": PLACE})
+        errors(wire_data(), wires=WIRE)
     partly = wire_data(known=True)
     assert partly.anchor_place is not None
     nowhere = replace(partly, anchor_place=torch.full_like(partly.anchor_place, torch.nan))
-    with pytest.raises(IdentificationError, match="its place is not given"):
+    with pytest.raises(IdentificationError, match="its position is not stated"):
         errors(nowhere)
 
 
 def test_rows_without_a_distance_have_no_error() -> None:
     data = join([wire_data(count=30), Measurements(q=joints(5, 8), position=torch.zeros(5, 3).double())])
     robot = true_robot().geometric_robot
-    found = prediction_errors(
-        robot, {"": robot.base}, {"": robot.tool}, data, anchors={"wire": PLACE}, zeros={"wire": ZERO}
-    )
+    T = predicted_poses(robot, {"": robot.base}, {"": robot.tool}, data)
+    found = measured_errors(T, data, {"anchor": {"wire": WIRE}})
     assert bool(torch.isnan(found["distance"][30:]).all())
     assert_close(found["distance"][:30, 0], torch.zeros(30), atol=1e-12)
     assert bool(torch.isnan(found["position"][:30]).all())

@@ -8,10 +8,11 @@ import torch
 
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
-from pisigma.identification.prediction import prediction_errors
+from pisigma.identification.prediction import predicted_poses
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import k_folds
 from pisigma.robot import Robot
+from pisigma.sensors.registry import measured_errors
 
 
 def folds(measurements: Measurements, count: int, seed: int) -> torch.Tensor:
@@ -28,8 +29,9 @@ def held_out(robot: Robot, data: Measurements, count: int, seed: int = 0) -> dic
     for number in range(count):
         train, test = data.select(fold != number), data.select(fold == number)
         fit = fit_base_and_tool(robot, train)
+        nominal = predicted_poses(robot, {"": fit.robot.base}, fit.tools, test)
         for name, errors in (
-            ("nominal", prediction_errors(robot, {"": fit.robot.base}, fit.tools, test)),
+            ("nominal", measured_errors(nominal, test, {})),
             ("calibrated", GeometricCalibrator(robot).fit(train).errors_of(test)),
         ):
             for sensor, values in errors.items():

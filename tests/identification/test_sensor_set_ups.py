@@ -41,7 +41,7 @@ def test_touches_that_fit_nowhere_ask_for_a_start() -> None:
     data = touch_data(("left",))
     assert data.touch is not None
     wild = replace(data, touch=data.touch.roll(7) * 3)
-    with pytest.raises(IdentificationError, match="do not tell where it stands"):
+    with pytest.raises(IdentificationError, match="do not determine where it stands"):
         calibrator().fit(wild)
 
 
@@ -57,7 +57,7 @@ def test_touches_of_one_plane_have_no_scale() -> None:
     data = touch_data(("left",), count=90)
     flat = replace(data, touch=torch.zeros(90, dtype=torch.float64))
     start = {"left": tuple(TRUE_BASES["left"])}
-    with pytest.raises(IdentificationError, match="do not tell where it stands"):
+    with pytest.raises(IdentificationError, match="do not determine where it stands"):
         calibrator(frames={}).fit(flat)
     assert any("at one coordinate" in w for w in calibrator(frames=start).fit(flat).warnings)
 
@@ -88,7 +88,7 @@ def test_a_wire_shorter_than_possible_is_refused(known: bool) -> None:
     assert data.distance is not None
     short = data.distance.clone()
     short[17] = 0.05
-    with pytest.raises(IdentificationError, match=r"row 17.*50 mm.*shorter than any place"):
+    with pytest.raises(IdentificationError, match=r"row 17.*50 mm.*shorter than any position"):
         calibrator().fit(replace(data, distance=short))
 
 

@@ -1,11 +1,11 @@
-"""Fits that no calibration error explains: probably the data are of another robot, or in other units."""
+"""Fits that no calibration error explains: of another robot, in other units, with swapped frame names."""
 
 import torch
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
-from pisigma.identification.identifiability.mixed_frames import residual_sizes
 from pisigma.identification.problem.least_squares import Linearisation
+from pisigma.identification.problem.noise import view_of
 from pisigma.identification.problem.problem import CalibrationProblem
 
 IMPLAUSIBLE_SHARE = 0.01
@@ -15,6 +15,12 @@ LONG_SHARE = 0.1
 """Links longer than this share of the reach are long."""
 RUINED_SHARE = 0.5
 """A long link that changes by more than this share was not that long."""
+FAR_OFF = 10.0
+"""Times the other frames' residuals."""
+NOTICED = 1e-6
+"""[m] Smaller residuals are never far off."""
+OFF_SHARE = 0.2
+"""Share of a frame's rows that must be far off."""
 
 
 def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor], source: str) -> None:
@@ -34,7 +40,7 @@ def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor],
     """
     _refuse_ruined_links(problem, here.point, source)
     robot = problem.space.robot
-    measured = [sensor.seen for sensor in problem.sensors if sensor.name == "position"]
+    measured = [sensor.present for sensor in problem.sensors if sensor.name == "position"]
     sizes = residual_sizes(problem, here)[measured[0]] if measured else problem.q.new_empty(0)
     if not bool((problem.active < problem.space.arm_size).any()) or len(sizes) == 0 or robot.reach == 0:
         return
@@ -67,3 +73,43 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
             "explains; check the units (metres in a _mm column?), order and directions of the joints, and whether this "
             "robot was measured."
         )
+
+
+def misfitting_frames(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[str, ...]:
+    """Say which frames' residuals are far off those of the others.
+
+    Args:
+        problem: with its free parameters.
+        here: its linearisation at the solution.
+    """
+    frames = problem.space.frames
+    if len(frames) < 2:
+        return ()
+    sizes = residual_sizes(problem, here)
+    off, others = [], []
+    for number in range(len(frames)):
+        theirs = sizes[(problem.frame == number) & torch.isfinite(sizes)]
+        rest = sizes[(problem.frame != number) & torch.isfinite(sizes)]
+        if len(theirs) == 0 or len(rest) == 0:
+            continue
+        usual = max(float(rest.median()), NOTICED)
+        wrong = theirs > FAR_OFF * usual
+        if float(wrong.double().mean()) > OFF_SHARE:
+            off.append((number, float(theirs[wrong].median()), int(wrong.sum()), len(theirs)))
+            others.append(usual)
+    return tuple(
+        f"{wrong} of {count} rows of frame '{frames[number]}' are off by {size * 1e3:.3g} mm, where "
+        f"{usual * 1e3:.3g} mm is usual in the other frames; check whether rows of it are named after another "
+        "frame, or whether what it stands on was moved."
+        for (number, size, wrong, count), usual in zip(off, others, strict=True)
+    )
+
+
+def residual_sizes(problem: CalibrationProblem, here: Linearisation[Tensor]) -> Tensor:
+    """Length of every row's residual per component [m], NaN where no length was measured."""
+    found = torch.full_like(problem.q[:, 0], torch.nan)
+    for sensor, sums in zip(problem.sensors, view_of(here).sums, strict=True):
+        if sensor.unit == "m" and sensor.name != "socket distance":
+            size = sums.residual.norm(dim=0) / sensor.components**0.5
+            found = torch.where(sensor.present, size, found)
+    return found

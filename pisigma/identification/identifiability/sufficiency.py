@@ -1,4 +1,4 @@
-"""Whether measurements suffice for what is asked of them, and what to measure next where they do not."""
+"""Whether measurements suffice for what is asked of them, what they cannot determine, and what to measure next."""
 
 import numpy as np
 import torch
@@ -6,30 +6,26 @@ import torch
 from pisigma.errors import IdentificationError
 from pisigma.identification.identifiability.redundancy import Redundancy
 from pisigma.identification.problem.problem import CalibrationProblem
+from pisigma.identification.problem.setup import CalibrationSetup
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 
 LITTLE_MOTION = 0.1
-"""[rad or m] A joint that moves less tells little."""
+"""[rad or m] A joint that moves less hardly shows its errors."""
 NEAR_AXIS = 5e-3
 """Share of the reach: a target nearer to the last axis hardly shows that joint's errors."""
 GOOD_RATIO = 3
 """Values a parameter that a calibration should have."""
-
-
-def check_poses(measurements: Measurements) -> None:
-    """Refuse measurements that are all of one pose.
-
-    Raises:
-        IdentificationError: see above.
-    """
-    q = measurements.q
-    if q.shape[0] > 1 and float((q - q[0]).abs().max()) < 1e-9:
-        raise IdentificationError(
-            f"{measurements.source}: all {q.shape[0]} rows are one pose, which tells the noise but no "
-            "parameter; measure at other joint values, spread over the workspace."
-        )
+SAME_FACE = 1e-6
+"""[m] Coordinates within this are of one face."""
+TOUCHES_WITHOUT_SCALE = (
+    "the touches of every frame and axis are at one coordinate, which a robot of any size can meet, so the scale stays "
+    "as drawn; touch faces at different coordinates along an axis."
+)
+SOCKETS_WITHOUT_SCALE = (
+    "sockets alone are met by a robot of any size, so the scale stays as drawn; give the distance between two sockets "
+    "(socket_distances), or measure one length otherwise."
+)
 
 
 def check_sufficiency(
@@ -38,17 +34,17 @@ def check_sufficiency(
     redundancy: Redundancy,
     explicit: bool,
     source: str,
-    own: int = 0,
+    unknowns: int = 0,
 ) -> tuple[str, ...]:
     """Refuse data that cannot determine the free parameters; warn of data that hardly do.
 
     Args:
-        robot: with the tool that was found.
+        robot: with the tool of the fit.
         problem: rows and sensors.
         redundancy: of the candidates at the start.
         explicit: whether the candidates were named one by one.
         source: what complaints call the data.
-        own: number of the sensors' own unknowns, places of sockets and the like.
+        unknowns: number of the sensors' unknowns, such as where sockets are.
 
     Returns:
         Sentences that say what to measure next.
@@ -57,17 +53,16 @@ def check_sufficiency(
         IdentificationError: there are not more values than parameters.
     """
     wanted = len(redundancy.names) - len(redundancy.no_effect) if explicit else redundancy.rank
-    wanted += own
+    wanted += unknowns
     values = distinct_values(problem)
     per_row = values / max(distinct_rows(problem), 1)
     if values <= wanted:
-        most = (
-            len(redundancy.names) - len(redundancy.no_effect) + own
-        )  # the rank is at most that of the few values
+        # not the rank, which is at most that of the few values
+        most = len(redundancy.names) - len(redundancy.no_effect) + unknowns
         missing = int(np.ceil((GOOD_RATIO * most - values) / per_row))
         raise IdentificationError(
             f"{source}: {distinct_rows(problem)} different poses give {values} values for {most} free "
-            "parameters, which leaves nothing to tell noise from error; measure about "
+            "parameters, which leaves nothing to distinguish noise from error; measure about "
             f"{missing} more poses, or free fewer parameters."
         )
     warnings = [*_still_joints(robot, problem), *_targets_on_axis(robot, problem)]
@@ -94,19 +89,19 @@ def distinct_values(problem: CalibrationProblem) -> int:
 def _still_joints(robot: Robot, problem: CalibrationProblem) -> list[str]:
     """A sentence for every joint that hardly moves."""
     span = (problem.q.amax(0) - problem.q.amin(0)).tolist()
-    found = []
+    sentences = []
     for joint, moved in zip(robot.joints, span, strict=True):
         if moved < LITTLE_MOTION:
             text = f"{np.rad2deg(moved):.3g} deg" if joint.type == "revolute" else f"{moved * 1e3:.3g} mm"
-            found.append(
-                f"joint {joint.name} moves by {text} only, so its errors cannot be told from its "
+            sentences.append(
+                f"joint {joint.name} moves by {text} only, so its errors cannot be distinguished from its "
                 "neighbours'; measure poses that move it through more of its range."
             )
-    return found
+    return sentences
 
 
 def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[str]:
-    """A sentence for every target that positions alone see too near to the last axis."""
+    """A sentence for targets that are all too near to the last axis, where positions alone are measured."""
     if any(sensor.turning for sensor in problem.sensors) or robot.joints[-1].type != "revolute":
         return []
     last = robot.joint_rows[-1]
@@ -123,6 +118,80 @@ def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[str]:
     which = f"target {names[int(np.argmax(offs))]}" if len(names) > 1 else "the target"
     return [
         f"{which} is {max(offs) * 1e3:.2g} mm from the axis of joint {robot.joints[-1].name}, so positions "
-        "say next to nothing of that joint and of its axis; mount it "
+        "say next to nothing about that joint and of its axis; mount it "
         f"{0.05 * robot.reach * 1e3:.0f} mm or more beside the axis, or measure orientations too."
+    ]
+
+
+def undetermined(setup: CalibrationSetup) -> tuple[str, ...]:
+    """Say what a set-up cannot determine whatever its poses are, and what to measure for it."""
+    return (*_scale(setup), *_touched_frames(setup), *_floating_frames(setup))
+
+
+def determines_scale(setup: CalibrationSetup) -> bool:
+    """Say whether any length was measured.
+
+    Sockets are met by a robot of any size; touches determine lengths by faces at different coordinates. Orientations
+    alone do not, but do not pretend to.
+    """
+    data = setup.measurements
+    lengths = {sensor.name for sensor in setup.problem.sensors if sensor.unit == "m"}
+    if not lengths or lengths - {"touch", "socket"}:
+        return True
+    faces: dict[tuple[str, str], list[float]] = {}
+    if data.touch is not None and data.touch_axis is not None:
+        for frame, axis, value in zip(data.frame, data.touch_axis, data.touch.tolist(), strict=True):
+            if axis:
+                faces.setdefault((frame, axis), []).append(value)
+    return any(max(values) - min(values) > SAME_FACE for values in faces.values())
+
+
+def _scale(setup: CalibrationSetup) -> list[str]:
+    if determines_scale(setup):
+        return []
+    return [TOUCHES_WITHOUT_SCALE if "touch" in setup.measurements.kinds else SOCKETS_WITHOUT_SCALE]
+
+
+def _touched_frames(setup: CalibrationSetup) -> list[str]:
+    """A sentence for every frame that is touched along some axes only."""
+    data = setup.measurements
+    if data.touch is None or data.touch_axis is None or not setup.problem.space.of("base"):
+        return []
+    other = (data.measured("position") | data.measured("pose")).tolist()
+    sentences = []
+    for frame in setup.problem.space.frames:
+        rows = [row for row, name in enumerate(data.frame) if name == frame]
+        axes = {data.touch_axis[row] for row in rows if data.touch_axis[row]}
+        lacking = [axis for axis in "xyz" if axis not in axes]
+        if axes and lacking and not any(other[row] for row in rows):
+            sentences.append(
+                f"frame '{frame}' was touched along {' and '.join(sorted(axes))} only, so where it stands along "
+                f"{' and '.join(lacking)} is not determined; touch faces that are square to "
+                f"{'it' if len(lacking) == 1 else 'them'} too."
+            )
+    return sentences
+
+
+def floating_frames(setup: CalibrationSetup) -> list[str]:
+    """Name the frames in which nothing measured has a stated position: whatever is there may move as a whole."""
+    data, sensors = setup.measurements, setup.problem.sensors
+    if all(sensor.holds_frame for sensor in sensors):
+        return []
+    held = torch.stack([sensor.present & sensor.holds_frame for sensor in sensors]).any(0)
+    if data.anchor_place is not None:
+        held |= torch.isfinite(data.anchor_place).all(-1)
+    holding = {frame for frame, holds in zip(data.frame, held.tolist(), strict=True) if holds}
+    return [frame for frame in setup.problem.space.frames if frame not in holding]
+
+
+def _floating_frames(setup: CalibrationSetup) -> list[str]:
+    floating = floating_frames(setup)
+    if not floating:
+        return []
+    names = " and ".join(f"'{frame}'" for frame in floating)
+    where = f"frame{'s' if len(floating) > 1 else ''} {names}" if any(floating) else "the frame"
+    return [
+        f"nothing that was measured in {where} has a stated position, so where the robot's base is there is not "
+        "determined: predicted positions are right among each other, up to one motion of them all; measure three "
+        "positions, touches, or distances from anchors at stated positions for that."
     ]

@@ -14,7 +14,7 @@ from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_from_vector, skew
-from pisigma.sensors.rotation_difference import rotation_difference
+from pisigma.sensors.pose import rotation_difference
 
 
 @dataclass(frozen=True, eq=False)

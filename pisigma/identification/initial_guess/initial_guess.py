@@ -1,4 +1,4 @@
-"""Where everything but the arm starts: bases, tools, sockets and anchors."""
+"""The initial guess of everything but the arm: bases, tools and the sensors' unknowns."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -8,123 +8,121 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
+from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.identification.initial_guess.base_and_tool import find_base_and_tool
-from pisigma.identification.initial_guess.base_and_tool_closed_form import base_by_points
-from pisigma.identification.initial_guess.frames import (
-    check_frame_names,
-    check_frame_values,
-    check_touched_base,
-    touched_base,
-)
-from pisigma.identification.initial_guess.points import (
-    anchor_from_distances,
-    check_pairs,
-    check_sockets,
-    check_wire,
-    means,
-    tool_from_sockets,
-)
+from pisigma.identification.initial_guess.base_and_tool_closed_form import base_by_points, nearest_rotation
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
-from pisigma.se3 import rpy_from_rotation, transform_from_xyzrpy
-from pisigma.sensors.building import names_of, numbers_of
+from pisigma.se3 import (
+    rotation_from_rpy,
+    rotation_from_vector,
+    rpy_from_rotation,
+    skew,
+    transform_from_xyzrpy,
+)
+from pisigma.sensors.registry import SENSORS
+from pisigma.sensors.sensor import names_of, numbers_of
+from pisigma.sensors.socket import means
 
-START_ROWS = 1_024
-"""Rows that base and tool start from."""
-START_STEPS = 2
-"""Steps by which their closed-form start is polished."""
+GUESS_ROWS = 1_024
+"""Rows from which base and tool are guessed."""
+GUESS_STEPS = 2
+"""Steps by which their closed-form guess is polished."""
 FEW = 9
-"""Positions below which a frame's base starts from tools that other frames told, not from tools of its own."""
+"""Positions below which a frame's base is guessed with tools of other frames, not with tools of its own."""
 ENOUGH = 5
 """Positions in a touched frame from which base and tool are found in closed form."""
+LEAST_TURN = 0.02
+"""Directions of the tool that the orientations in sockets determine less than this stay as drawn."""
+FEWEST_TOUCHES = 4
+"""Touches along an axis from which its direction is found."""
+CLEAR = 0.03
+"""The least spread of the tips, as a share of their largest, from which a direction is found."""
+POLISH = 10
+"""Steps after the linear solution of a touched frame."""
+NEAR = 0.05
+"""A guess must meet the touches to this share of the robot's reach."""
+BASE_UNKNOWNS = 6
 
 
 @dataclass(frozen=True, eq=False)
-class Start:
-    """Starting values in the user's coordinates.
+class InitialGuess:
+    """Initial values in the user's coordinates.
 
     Attributes:
         bases: per frame, x, y, z [m], roll, pitch, yaw [rad].
         tools: per target, the same.
-        sockets: per socket, its place in its frame [m].
-        anchors: per anchor, its place in its frame and its zero [m].
-        places_known: per anchor, whether the measurements tell its place.
+        unknowns: by group of the sensors' unknowns, those of every owner in its frame [m or rad].
+        free_unknowns: which of them are to be identified; the others are stated by the measurements.
     """
 
     bases: Float64[np.ndarray, "frames 6"]
     tools: Float64[np.ndarray, "targets 6"]
-    sockets: Float64[np.ndarray, "sockets 3"]
-    anchors: Float64[np.ndarray, "anchors 4"]
-    places_known: tuple[bool, ...]
+    unknowns: Mapping[str, Float64[Tensor, "owners columns"]]
+    free_unknowns: Mapping[str, Bool[Tensor, "owners columns"]]
 
 
-def find_start(
+def guess(
     space: ParameterSpace,
     measurements: Measurements,
     free_base: bool,
     free_tool: bool,
     turn_tool: bool,
-    given: Mapping[str, tuple[float, ...]],
-) -> Start:
-    """Find where everything starts, the arm being taken as drawn.
+    stated: Mapping[str, tuple[float, ...]],
+) -> InitialGuess:
+    """Guess where everything is, the arm being taken as drawn.
 
-    Frames with positions get base and tool in closed form; then sockets tell the tools that are not known yet;
-    touches tell their frame by the tool; sockets start at the mean of the tool's places, anchors by
-    multilateration. A frame without any of these (sockets and unknown anchors only) starts at the robot's own
-    base, which it cannot tell.
+    Frames with positions get base and tool in closed form; then sockets determine tools that have none yet; touches
+    determine their frame by the tool; then the sensors guess their own unknowns, such as sockets at the mean of the
+    tool's positions and anchors by multilateration. A frame without any of these (sockets and unknown anchors only)
+    starts at the robot's own base, which it cannot determine.
 
     Args:
         space: names and robot.
-        measurements: usable rows.
-        free_base: whether bases are to be found; else they are as given, or the robot's.
+        measurements: usable rows; those of pairs come first.
+        free_base: whether bases are to be identified; else they are as stated, or the robot's.
         free_tool: whether tools are.
         turn_tool: whether their rotations are.
-        given: bases of frames, where the user gives them.
+        stated: bases of frames that the user states.
 
     Raises:
-        IdentificationError: too little was measured for a start, or something that cannot be.
+        IdentificationError: too little was measured for a guess, or something that cannot be.
     """
-    check_frame_names(dict(given), space.frames, measurements.source)
+    _check_frame_names(stated, space.frames, measurements.source)
     if free_base:
-        check_frame_values(measurements, space.frames)
-    bases = {name: np.array(base, dtype=np.float64) for name, base in given.items()}
+        _check_frame_values(measurements, space.frames)
+    bases = {name: np.array(base, dtype=np.float64) for name, base in stated.items()}
     bases, tools = _from_positions(space, measurements, free_base, free_tool, bases)
     touched = {} if not free_base else _touched_rows(space, measurements, bases)
     for name in space.frames:
         if name not in bases and name not in touched:
             bases[name] = space.robot.base
-    T_flange = None
-    if any(part is not None for part in (measurements.touch, measurements.socket, measurements.distance)):
+    poses_alone = measurements.kinds <= {"pose", "position", "rotation"}
+    if not poses_alone:
         arm = space.robot.with_geometry(base=np.zeros(6), tool=np.zeros(6))
         T_flange = forward_kinematics(arm, measurements.q.cpu())
-    if free_tool and T_flange is not None:
-        tools = _from_sockets(space, measurements, T_flange, bases, tools)
+        if free_tool:
+            tools = _from_sockets(space, measurements, T_flange, tools)
     if not turn_tool:
         tools = {name: np.concatenate([tool[:3], space.robot.tool[3:]]) for name, tool in tools.items()}
     all_tools = np.stack([tools.get(name, space.robot.tool) for name in space.targets])
-    if T_flange is None:  # nothing but poses: nothing else has to start
-        all_bases = np.stack([bases[name] for name in space.frames])
-        return Start(all_bases, all_tools, np.zeros((0, 3)), np.zeros((0, 4)), ())
+    if poses_alone:
+        return InitialGuess(np.stack([bases[name] for name in space.frames]), all_tools, {}, {})
     target = numbers_of(measurements.target, space.targets, measurements.rows)
     T_tool = T_flange @ transform_from_xyzrpy(torch.from_numpy(all_tools))[target]
     for name, rows in touched.items():
         bases[name] = _from_touches(space, measurements, name, rows, T_tool[:, :3, 3])
     all_bases = np.stack([bases[name] for name in space.frames])
     frame = numbers_of(measurements.frame, space.frames, measurements.rows)
-    points = (transform_from_xyzrpy(torch.from_numpy(all_bases))[frame] @ T_tool)[:, :3, 3]
-    sockets = numbers_of(measurements.socket, space.sockets, measurements.rows)
-    seen = sockets >= 0
-    check_sockets(measurements, sockets, points, space.robot.reach)
-    anchors, known = _anchors(space, measurements, points)
-    return Start(
-        bases=all_bases,
-        tools=all_tools,
-        sockets=means(points[seen], sockets[seen], len(space.sockets)).numpy(),
-        anchors=anchors,
-        places_known=known,
-    )
+    T = transform_from_xyzrpy(torch.from_numpy(all_bases))[frame] @ T_tool
+    unknowns, free = {}, {}
+    for sensor in SENSORS.values():
+        group, own = sensor.unknowns(measurements), sensor.initial_guess(measurements, T, space.robot.reach)
+        if group is not None and own is not None:
+            unknowns[group.name], free[group.name] = own.values, own.free
+    return InitialGuess(all_bases, all_tools, unknowns, free)
 
 
 def _from_positions(
@@ -132,10 +130,10 @@ def _from_positions(
     measurements: Measurements,
     free_base: bool,
     free_tool: bool,
-    given: dict[str, np.ndarray],
+    stated: dict[str, np.ndarray],
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Bases and tools of frames with positions."""
-    bases, tools = dict(given), dict[str, np.ndarray]()
+    bases, tools = dict(stated), dict[str, np.ndarray]()
     if measurements.position is None:
         return bases, tools
     positions = (measurements.measured("position") | measurements.measured("pose")).cpu()
@@ -146,29 +144,29 @@ def _from_positions(
         name, rows = space.frames[number], (positions & (frame == number)).nonzero()[:, 0]
         if len(rows) == 0 or (len(rows) < ENOUGH and bool((touches & (frame == number)).any())):
             continue
-        robot = space.robot if name not in given else space.robot.with_geometry(base=given[name])
+        robot = space.robot if name not in stated else space.robot.with_geometry(base=stated[name])
         part = measurements
-        if len(rows) < measurements.rows or len(rows) > START_ROWS:
-            part = measurements.select(rows[chosen_rows(len(rows), START_ROWS)].to(measurements.q.device))
+        if len(rows) < measurements.rows or len(rows) > GUESS_ROWS:
+            part = measurements.select(rows[chosen_rows(len(rows), GUESS_ROWS)].to(measurements.q.device))
         if part.pair is not None:
             part = replace(part, pair=None, distance=None)
-        find_base = free_base and name not in given
+        find_base = free_base and name not in stated
         turned = bool(part.measured("pose").any())
         if find_base and 3 <= len(rows) < FEW and not turned and set(part.target) <= set(tools):
             bases[name] = _base_by_tools(robot, part, tools)
             continue
-        base, found = find_base_and_tool(robot, part, find_base, free_tool, START_STEPS)
+        base, own_tools = find_base_and_tool(robot, part, find_base, free_tool, GUESS_STEPS)
         if free_base:
             bases[name] = base if find_base else robot.base
         if free_tool:
-            tools = {**found, **tools}
+            tools = {**own_tools, **tools}
     return bases, tools
 
 
 def _base_by_tools(
     robot: Robot, measurements: Measurements, tools: Mapping[str, np.ndarray]
 ) -> Float64[np.ndarray, " 6"]:
-    """The base of a frame with few positions, by tools that other frames told."""
+    """The base of a frame with few positions, by the tools of other frames."""
     assert measurements.position is not None
     arm = robot.with_geometry(base=np.zeros(6), tool=np.zeros(6))
     T = forward_kinematics(arm, measurements.q.cpu())
@@ -188,38 +186,39 @@ def chosen_rows(rows: int, most: int) -> Int64[Tensor, " chosen"]:
 def _touched_rows(
     space: ParameterSpace, measurements: Measurements, bases: Mapping[str, np.ndarray]
 ) -> dict[str, Bool[Tensor, " rows"]]:
-    """The touches of frames whose base is not known yet."""
+    """The touches of frames that have no base yet."""
     if measurements.touch is None:
         return {}
     touches = measurements.measured("touch").cpu()
     frame = numbers_of(measurements.frame, space.frames, measurements.rows)
-    found = {name: touches & (frame == number) for number, name in enumerate(space.frames)}
-    return {name: rows for name, rows in found.items() if bool(rows.any()) and name not in bases}
+    touched = {name: touches & (frame == number) for number, name in enumerate(space.frames)}
+    return {name: rows for name, rows in touched.items() if bool(rows.any()) and name not in bases}
 
 
 def _from_sockets(
     space: ParameterSpace,
     measurements: Measurements,
     T_flange: Float64[Tensor, "rows 4 4"],
-    bases: Mapping[str, np.ndarray],
     tools: Mapping[str, np.ndarray],
 ) -> dict[str, np.ndarray]:
-    """Tools that are not known yet, by the sockets that their ball sat in."""
-    found = dict(tools)
+    """All tools, those that have no guess yet by the sockets that their ball sat in."""
+    tools = dict(tools)
     socket = numbers_of(measurements.socket, names_of(measurements.socket), measurements.rows)
     target = numbers_of(measurements.target, space.targets, measurements.rows)
     for number, name in enumerate(space.targets):
         rows = (socket >= 0) & (target == number)
-        if name in found or not bool(rows.any()):
+        if name in tools or not bool(rows.any()):
             continue
-        own = space.robot.tool
-        guess = torch.from_numpy(own[:3].copy())
+        drawn = space.robot.tool
         T = T_flange[rows]
-        place = tool_from_sockets(
-            T[:, :3, :3], T[:, :3, 3], torch.unique(socket[rows], return_inverse=True)[1], guess
+        position = tool_from_sockets(
+            T[:, :3, :3],
+            T[:, :3, 3],
+            torch.unique(socket[rows], return_inverse=True)[1],
+            torch.from_numpy(drawn[:3].copy()),
         )
-        found[name] = np.concatenate([place.numpy(), own[3:]])
-    return found
+        tools[name] = np.concatenate([position.numpy(), drawn[3:]])
+    return tools
 
 
 def _from_touches(
@@ -235,31 +234,153 @@ def _from_touches(
     axis = numbers_of(part.touch_axis, ("x", "y", "z"), part.rows)
     assert part.touch is not None
     base, rms = touched_base(tip[rows], axis, part.touch.cpu(), torch.from_numpy(space.robot.base.copy()))
-    check_touched_base(part, name, rms, space.robot.reach)
-    found: np.ndarray = base.numpy()
-    return found
+    _check_touched_base(part, name, rms, space.robot.reach)
+    guessed: np.ndarray = base.numpy()
+    return guessed
 
 
-def _anchors(
-    space: ParameterSpace, measurements: Measurements, points: Float64[Tensor, "rows 3"]
-) -> tuple[np.ndarray, tuple[bool, ...]]:
-    """Places and zeros of the anchors, and which places are known; distances that cannot be are refused."""
-    found, known = np.zeros((len(space.anchors), 4)), []
-    number = numbers_of(measurements.anchor, space.anchors, measurements.rows)
-    for k, name in enumerate(space.anchors):
-        assert measurements.distance is not None
-        rows = (number == k).nonzero()[:, 0]
-        distance = measurements.distance.cpu()[rows]
-        check_wire(measurements, name, rows, points[rows], distance, space.robot.reach)
-        place = None if measurements.anchor_place is None else measurements.anchor_place.cpu()[rows[0]]
-        known.append(place is not None and bool(torch.isfinite(place).all()))
-        if place is not None and known[-1]:
-            zero = (distance - (points[rows] - place).norm(dim=-1)).median()
-            found[k] = np.concatenate([place.numpy(), [float(zero)]])
-        else:
-            found[k] = anchor_from_distances(points[rows], distance).numpy()
-    if measurements.pair is not None and measurements.distance is not None:
-        first = torch.arange(0, 2 * len(names_of(measurements.pair)), 2)
-        apart = (points[first] - points[first + 1]).norm(dim=-1)
-        check_pairs(measurements, first, apart, measurements.distance.cpu()[first], space.robot.reach)
-    return found, tuple(known)
+def tool_from_sockets(
+    R: Float64[Tensor, "rows 3 3"],
+    p: Float64[Tensor, "rows 3"],
+    socket: Int64[Tensor, " rows"],
+    guess: Float64[Tensor, " 3"],
+) -> Float64[Tensor, " 3"]:
+    """Find the ball behind the flange such that the rows of every socket meet best.
+
+    `R · ball + p - socket = 0` is linear in both; the sockets drop out with the means over their rows.
+    Directions that the orientations hardly determine stay at the guess.
+
+    Args:
+        R: orientations of the flange, one target's rows.
+        p: its positions [m].
+        socket: number of every row's socket.
+        guess: where the ball is as drawn [m].
+    """
+    turn = _centred(R.flatten(1), socket).view(-1, 3, 3).flatten(0, 1)
+    off = -_centred(p + (R @ guess), socket).flatten()
+    rtol = LEAST_TURN * len(R) ** 0.5 / max(float(torch.linalg.matrix_norm(turn, 2)), 1e-12)
+    ball: Tensor = guess + torch.linalg.pinv(turn, rtol=min(rtol, 1.0)) @ off
+    return ball
+
+
+def _centred(values: Tensor, number: Tensor) -> Tensor:
+    return values - means(values, number, int(number.max()) + 1)[number]
+
+
+def touched_base(
+    tip: Float64[Tensor, "touches 3"],
+    axis: Int64[Tensor, " touches"],
+    touch: Float64[Tensor, " touches"],
+    guess: Float64[Tensor, " 6"],
+) -> tuple[Float64[Tensor, " 6"], float]:
+    """Find T_frame_robot from touches, the tips being given in the robot's frame.
+
+    `touch = R[axis] · tip + p[axis]` is linear in R and p for every axis on its own; from two axes the third
+    follows. Then all six unknowns are polished together. Where the linear solution is unclear, the guess is
+    polished instead.
+
+    Args:
+        tip: where the robot as drawn has its tip [m].
+        axis: which axis of the frame was touched along.
+        touch: the coordinate there [m].
+        guess: the robot's own base, x, y, z [m], roll, pitch, yaw [rad].
+
+    Returns:
+        The base, and the root mean square by which it misses the touches [m].
+    """
+    starts = [(rotation_from_rpy(guess[3:]), guess[:3])]
+    linear = _linear_rotation(tip, axis, touch)
+    if linear is not None:
+        starts.insert(0, (linear, torch.zeros(3).to(tip)))
+    best, miss = guess, float("inf")
+    for R, p in starts:
+        R, p, rms = _polished(tip, axis, touch, R, p)
+        if rms < miss:
+            best, miss = torch.cat([p, rpy_from_rotation(R)]), rms
+    return best, miss
+
+
+def _linear_rotation(tip: Tensor, axis: Tensor, touch: Tensor) -> Tensor | None:
+    rows: list[Tensor | None] = []
+    for k in range(3):
+        points, values = tip[axis == k], touch[axis == k]
+        rows.append(None)
+        if len(points) < FEWEST_TOUCHES:
+            continue
+        centred = points - points.mean(0)
+        singular = torch.linalg.svdvals(centred)
+        if float(singular[-1]) > CLEAR * float(singular[0]):
+            row = torch.linalg.lstsq(centred, (values - values.mean())[:, None]).solution[:, 0]
+            rows[k] = row / row.norm().clamp(min=1e-12)
+    for k in range(3):
+        following, last = rows[(k + 1) % 3], rows[(k + 2) % 3]
+        if rows[k] is None and following is not None and last is not None:
+            rows[k] = torch.linalg.cross(following, last)
+    directions = [row for row in rows if row is not None]
+    return nearest_rotation(torch.stack(directions)) if len(directions) == 3 else None
+
+
+def _polished(tip: Tensor, axis: Tensor, touch: Tensor, R: Tensor, p: Tensor) -> tuple[Tensor, Tensor, float]:
+    rows = torch.arange(len(tip))
+    eye = torch.eye(3).to(tip)[axis]
+    residual = touch - (tip @ R.mT + p)[rows, axis]
+    for _ in range(POLISH):
+        turned = tip @ R.mT
+        J = torch.cat([eye, (-skew(turned))[rows, axis]], -1)
+        step = torch.linalg.pinv(J, rtol=1e-6) @ residual
+        R, p = rotation_from_vector(step[3:]) @ R, p + step[:3]
+        residual = touch - (tip @ R.mT + p)[rows, axis]
+    return R, p, float(residual.square().mean().sqrt())
+
+
+def _check_touched_base(measurements: Measurements, name: str, rms: float, reach: float) -> None:
+    """Refuse a guess of a touched frame that is nowhere near its touches.
+
+    Raises:
+        IdentificationError: see above.
+    """
+    if rms <= NEAR * reach:
+        return
+    counts = ", ".join(f"{(measurements.touch_axis or ()).count(axis)} along {axis}" for axis in "xyz")
+    raise IdentificationError(
+        f"{measurements.source}: the touches of frame '{name}' ({counts}) do not determine where it stands (the best "
+        f"fit misses them by {rms * 1e3:.3g} mm); check that they are all of this frame, or say about where "
+        f"the robot's base is in it, frames={{'{name}': (x, y, z, roll, pitch, yaw)}}."
+    )
+
+
+def _check_frame_values(measurements: Measurements, names: tuple[str, ...]) -> None:
+    """Refuse frames with touches that are used up by the six unknowns of the frame.
+
+    Raises:
+        IdentificationError: see above.
+    """
+    if measurements.touch is None:
+        return
+    touch = measurements.measured("touch").tolist()
+    other = (measurements.measured("position") | measurements.measured("pose")).tolist()
+    for name in names:
+        rows = [row for row, frame in enumerate(measurements.frame) if frame == name]
+        touches = sum(touch[row] for row in rows)
+        if not touches or any(other[row] for row in rows) or touches > BASE_UNKNOWNS:
+            continue
+        times = "once" if touches == 1 else f"{touches} times"
+        raise IdentificationError(
+            f"{measurements.source}: frame '{name}' was touched {times} only, which does not even determine where it "
+            f"stands ({BASE_UNKNOWNS} unknowns); touch it about {3 * BASE_UNKNOWNS} times along x, y and z, or leave "
+            "its rows out."
+        )
+
+
+def _check_frame_names(stated: Mapping[str, object], frames: tuple[str, ...], source: str) -> None:
+    """Refuse guesses of frames that were not measured in.
+
+    Raises:
+        IdentificationError: see above.
+    """
+    for name in stated:
+        if name not in frames:
+            raise IdentificationError(
+                f"{source}: frames states a guess of '{name}', but no row is in a frame of that name; "
+                f"{nearest_choice(name, frames)}"
+            )

@@ -101,16 +101,19 @@ def information(
     index = torch.tensor(candidates, dtype=torch.int64, device=point.device)
     usual = torch.from_numpy(problem.space.usual_errors).to(point)[index, None, None]
     root = point.new_zeros((0, len(candidates) + 2))
-    own = problem.space.own(point)
+    unknowns = problem.space.sensor_unknowns(point)
     values = 0
     for rows in problem.chunks():
         motion = problem.motion(point, rows, index)
         blocks = [root.t()]
         for k, sensor in enumerate(problem.sensors):
-            J, r = problem.derivative(sensor, motion, own, rows, index), sensor.residual(motion, own, rows)
+            J, r = (
+                problem.derivative(sensor, motion, unknowns, rows, index),
+                sensor.residual(motion, unknowns, rows),
+            )
             weight = torch.full_like(r[0], 1e3) if view is None else problem.row_weights(view, k, rows)
             if not problem.all_seen[k]:
-                seen = sensor.seen[rows]
+                seen = sensor.present[rows]
                 J, r, weight = J[..., seen], r[..., seen], weight[seen]
             block = r.new_empty((len(candidates) + 2, *r.shape))
             block[0] = weight
@@ -119,6 +122,6 @@ def information(
             blocks.append(block.flatten(1))
             values += r.numel()
         root = torch.linalg.qr(torch.cat(blocks, 1).t(), mode="r").R
-    seen = torch.stack([sensor.seen for sensor in problem.sensors]).any(0)
+    seen = torch.stack([sensor.present for sensor in problem.sensors]).any(0)
     parameters = tuple(problem.space.parameters[i] for i in candidates)
     return Information(parameters, root.cpu().numpy(), values, int(seen.sum()))

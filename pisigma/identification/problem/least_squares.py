@@ -6,7 +6,7 @@ from enum import Enum
 from typing import Generic, TypeVar
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
@@ -183,3 +183,17 @@ def solve_damped(
         if not failed:
             return scale * torch.cholesky_solve((scale * linearisation.descent)[:, None], factor)[:, 0]
         damping = max(10 * damping, 1e-6)
+
+
+def covariance_of(normal: Float64[Tensor, "active active"]) -> Float64[Tensor, "active active"]:
+    """Invert a normal matrix, with column scaling; directions that it does not hold get no variance."""
+    diagonal = normal.diagonal()
+    scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
+    scales = scale * scale[:, None]
+    scaled = normal * scales
+    factor, failed = torch.linalg.cholesky_ex(scaled)
+    if not failed and float(factor.diagonal().min()) > 1e-6:
+        inverse = torch.cholesky_inverse(factor)
+    else:
+        inverse = torch.linalg.pinv(scaled, rtol=1e-12, hermitian=True)
+    return inverse * scales

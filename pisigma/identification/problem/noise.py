@@ -129,7 +129,7 @@ def loss_scale(
             continue
         distance = view.sums[k].distance
         if view.sums[k].seen < len(distance):
-            distance = distance[sensor.seen]
+            distance = distance[sensor.present]
         if refine:
             scale = loss.deviation(distance, sensor.components, used[k], view.scale(k))
         else:
@@ -170,9 +170,9 @@ def group_variance_ratio(
         if sensor.certain:
             found.append(1.0)
             continue
-        weight = loss.weight(sums.distance / view.scale(k), sensor.components) * sensor.seen
+        weight = loss.weight(sums.distance / view.scale(k), sensor.components) * sensor.present
         if sensor.sigma is not None:
-            weight = torch.where(sensor.seen, weight / sensor.sigma.square(), 0.0)
+            weight = torch.where(sensor.present, weight / sensor.sigma.square(), 0.0)
         square, values = _group_squares(sums.residual, weight, pose)
         ratio = 1.0
         if pose is not None:

@@ -1,8 +1,10 @@
 """The parameters of an identification: names, units, expected errors, and how they make up a geometry."""
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -14,11 +16,9 @@ from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.kinematics.parameter_jacobian import motion_order
 from pisigma.robot.description import Robot
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS
-from pisigma.sensors.sensor import OwnUnknowns
+from pisigma.sensors.sensor import UnknownGroup, Unknowns
 
-SOCKET_COLUMNS = ("x", "y", "z")
-ANCHOR_COLUMNS = ("x", "y", "z", "zero")
-LENGTHS = frozenset({"d", "a", "x", "y", "z", "zero"})
+LENGTHS = frozenset({"d", "a", "x", "y", "z"})
 EVERYWHERE, NOWHERE = -1, -2
 """Instead of a frame or a target: a parameter that moves the tool in all rows, or in none."""
 USUAL_LENGTH = 1e-3
@@ -69,9 +69,9 @@ class Parameter:
 
     Attributes:
         name: such as "theta_1", "d_EE", "base_x" or, with several targets, "tool_B_x".
-        group: "theta", "d", "a", "alpha", "beta", "base", "tool", "socket" or "anchor".
+        group: "theta", "d", "a", "alpha", "beta", "base", "tool", or that of a sensor's unknowns, such as "socket".
         unit: "m" or "rad".
-        owner: the row, frame, target, socket or anchor it belongs to.
+        owner: the row, frame or target it belongs to, or such as the socket.
     """
 
     name: str
@@ -93,33 +93,38 @@ class ParameterSpace:
         robot: the nominal robot.
         frames: names of the measuring frames, each with its own base.
         targets: names of the targets, each with its own tool.
-        sockets: names of the sockets, each with a place.
-        anchors: names of the anchors, each with a place and a zero offset.
+        unknowns: what the sensors have to find out about themselves, such as where sockets are.
     """
 
     robot: Robot
     frames: tuple[str, ...] = ("",)
     targets: tuple[str, ...] = ("",)
-    sockets: tuple[str, ...] = ()
-    anchors: tuple[str, ...] = ()
+    unknowns: tuple[UnknownGroup, ...] = ()
 
     @cached_property
     def parameters(self) -> tuple[Parameter, ...]:
-        """Rows x (theta, d, a, alpha, beta), frames x base, targets x tool, sockets x 3, anchors x 4."""
-        found = []
+        """Rows x (theta, d, a, alpha, beta), frames x base, targets x tool, then owners x unknowns, group by group."""
+        parameters = []
         for label, row in zip(row_labels(self.robot), self.robot.rows, strict=True):
-            found += [_parameter(column, f"{column}_{label}", column, row.name) for column in DH_COLUMNS]
+            parameters += [_parameter(column, f"{column}_{label}", column, row.name) for column in DH_COLUMNS]
         for group, owners in (("base", self.frames), ("tool", self.targets)):
             for owner in owners:
                 stem = f"{group}_{owner}" if len(owners) > 1 else group
-                found += [_parameter(column, f"{stem}_{column}", group, owner) for column in FRAME_COLUMNS]
-        for group, owners, columns in (
-            ("socket", self.sockets, SOCKET_COLUMNS),
-            ("anchor", self.anchors, ANCHOR_COLUMNS),
-        ):
-            for owner in owners:
-                found += [_parameter(column, f"{group}_{owner}_{column}", group, owner) for column in columns]
-        return tuple(found)
+                parameters += [
+                    _parameter(column, f"{stem}_{column}", group, owner) for column in FRAME_COLUMNS
+                ]
+        for own in self.unknowns:
+            for owner in own.owners:
+                parameters += [
+                    Parameter(
+                        f"{own.name}_{owner}_{column}",
+                        own.name,
+                        "rad" if column in own.angles else "m",
+                        owner,
+                    )
+                    for column in own.columns
+                ]
+        return tuple(parameters)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -152,7 +157,7 @@ class ParameterSpace:
     @property
     def always_moving(self) -> bool:
         """Whether every parameter moves the tool in all rows."""
-        return len(self.frames) == len(self.targets) == 1 and not self.sockets and not self.anchors
+        return len(self.frames) == len(self.targets) == 1 and not self.unknowns
 
     def index(self, name: str) -> int:
         """Where a parameter stands.
@@ -179,35 +184,30 @@ class ParameterSpace:
         return list(self.of(group))[FRAME_COLUMNS.index(column) :: 6]
 
     def of(self, group: str) -> range:
-        """Indices of all parameters of a group behind the arm's: "base", "tool", "socket" or "anchor"."""
+        """Indices of all parameters of a group behind the arm's: "base", "tool", or of sensors' unknowns."""
         return self._stretches[group]
 
     @cached_property
     def _stretches(self) -> dict[str, range]:
-        sizes = {
-            "base": 6 * len(self.frames),
-            "tool": 6 * len(self.targets),
-            "socket": len(SOCKET_COLUMNS) * len(self.sockets),
-            "anchor": len(ANCHOR_COLUMNS) * len(self.anchors),
-        }
-        start, found = self.arm_size, {}
+        sizes = {"base": 6 * len(self.frames), "tool": 6 * len(self.targets)}
+        sizes |= {own.name: len(own.columns) * len(own.owners) for own in self.unknowns}
+        start, stretches = self.arm_size, {}
         for name, size in sizes.items():
-            found[name] = range(start, start + size)
+            stretches[name] = range(start, start + size)
             start += size
-        return found
+        return stretches
 
     def values(
         self,
         bases: Float64[np.ndarray, "frames 6"],
         tools: Float64[np.ndarray, "targets 6"],
-        sockets: Float64[np.ndarray, "sockets 3"] | None = None,
-        anchors: Float64[np.ndarray, "anchors 4"] | None = None,
+        unknowns: Mapping[str, Float64[np.ndarray, "owners columns"]] = MappingProxyType({}),
     ) -> Float64[Tensor, " parameters"]:
-        """All parameters as one vector: the robot's rows, and these; sockets and anchors are 0 if not given."""
-        sockets = np.zeros((len(self.sockets), 3)) if sockets is None else sockets
-        anchors = np.zeros((len(self.anchors), 4)) if anchors is None else anchors
-        parts = (self.robot.dh, bases, tools, sockets, anchors)
-        return torch.from_numpy(np.concatenate([part.ravel() for part in parts]))
+        """All parameters as one vector: the robot's rows, and these; unknowns of groups that are not here are 0."""
+        blocks = [self.robot.dh, bases, tools]
+        for own in self.unknowns:
+            blocks.append(unknowns.get(own.name, np.zeros((len(own.owners), len(own.columns)))))
+        return torch.from_numpy(np.concatenate([block.ravel() for block in blocks]))
 
     def split(
         self, values: Float64[Tensor, " parameters"]
@@ -216,30 +216,30 @@ class ParameterSpace:
         bases, tools = (values[self.of(group).start : self.of(group).stop] for group in ("base", "tool"))
         return values[: self.arm_size].view(-1, 5), bases.view(-1, 6), tools.view(-1, 6)
 
-    def own(self, values: Float64[Tensor, " parameters"]) -> OwnUnknowns:
-        """What a vector of all parameters says of sockets and anchors."""
-        sockets, anchors = (
-            values[self.of(group).start : self.of(group).stop] for group in ("socket", "anchor")
-        )
-        return OwnUnknowns(sockets.view(-1, 3).t(), anchors.view(-1, 4).t())
+    def sensor_unknowns(self, values: Float64[Tensor, " parameters"]) -> Unknowns:
+        """What a vector of all parameters says of the sensors' unknowns."""
+        return {
+            own.name: values[self.of(own.name).start : self.of(own.name).stop].view(-1, len(own.columns)).t()
+            for own in self.unknowns
+        }
 
-    def places_of(
+    def positions_of(
         self, group: str, active: Int64[Tensor, " active"]
     ) -> tuple[Int64[Tensor, " own"], Int64[Tensor, " own"], Int64[Tensor, " own"]]:
-        """Where sockets' or anchors' parameters stand among some: place, number of the owner, and column."""
-        size = len(SOCKET_COLUMNS if group == "socket" else ANCHOR_COLUMNS)
+        """Where a group of unknowns stands among some parameters: position, index of the owner, and column."""
+        size = next(len(own.columns) for own in self.unknowns if own.name == group)
         stretch = self.of(group)
-        places = ((active >= stretch.start) & (active < stretch.stop)).nonzero()[:, 0]
-        number = active[places] - stretch.start
-        return places, number // size, number % size
+        positions = ((active >= stretch.start) & (active < stretch.stop)).nonzero()[:, 0]
+        number = active[positions] - stretch.start
+        return positions, number // size, number % size
 
     def precision(self, prior: Prior | None) -> Float64[np.ndarray, " parameters"]:
-        """1 / variance of every parameter's error before anything is measured; 0 where nothing is known."""
-        found = np.zeros(len(self.parameters))
+        """1 / variance of every parameter's error by the prior; 0 where it says nothing."""
+        precision = np.zeros(len(self.parameters))
         if prior is not None:
             for index, parameter in enumerate(self.parameters[: self.arm_size]):
-                found[index] = getattr(prior, parameter.group) ** -2
-        return found
+                precision[index] = getattr(prior, parameter.group) ** -2
+        return precision
 
 
 def row_labels(robot: Robot) -> tuple[str, ...]:

@@ -1,6 +1,6 @@
 """The calibration as a least-squares problem: normal equations summed over chunks of poses."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -8,8 +8,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.identification.problem.covariance import covariance_of
-from pisigma.identification.problem.least_squares import AbstractLeastSquares, Linearisation
+from pisigma.identification.problem.least_squares import AbstractLeastSquares, Linearisation, covariance_of
 from pisigma.identification.problem.loss import AbstractLoss, SquaredLoss
 from pisigma.identification.problem.noise import (
     ALWAYS_GOOD,
@@ -27,10 +26,29 @@ from pisigma.identification.problem.noise import (
 from pisigma.identification.problem.parameters import EVERYWHERE, ParameterSpace, PriorSizes
 from pisigma.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion, tool_motion
 from pisigma.measurement.conditions import JointState
-from pisigma.sensors.motion_memory import MotionMemory
-from pisigma.sensors.sensor import AbstractSensor, OwnUnknowns
+from pisigma.sensors.sensor import AbstractSensor, Unknowns
 
 CERTAIN_LOSS = SquaredLoss()
+
+
+class MotionMemory:
+    """The motion at the last point, which the rank analysis, the search and its next stage all ask for.
+
+    What the motion was made from is compared by identity; so points are replaced and never changed in place.
+    """
+
+    def __init__(self) -> None:
+        self._made_from: tuple[object, ...] = ()
+        self._motion: ToolMotion | None = None
+
+    def motion(self, made_from: tuple[object, ...], make: Callable[[], ToolMotion]) -> ToolMotion:
+        """Return the motion that was made from the same objects, or else a new one."""
+        same = len(made_from) == len(self._made_from) and all(
+            one is other for one, other in zip(made_from, self._made_from, strict=True)
+        )
+        if not same or self._motion is None:
+            self._made_from, self._motion = made_from, make()
+        return self._motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +98,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     @cached_property
     def values_seen(self) -> tuple[int, ...]:
         """Number of values of every sensor."""
-        return tuple(int(sensor.seen.sum()) * sensor.components for sensor in self.sensors)
+        return tuple(int(sensor.present.sum()) * sensor.components for sensor in self.sensors)
 
     @cached_property
     def prior_group(self) -> Int64[Tensor, " active"]:
@@ -131,11 +149,11 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """Sum up the normal equations; rows are weighted by the noise of `like`."""
         known = None if like is None else view_of(like)
         sums = [self._empty(k) for k in range(len(self.sensors))]
-        own = self.space.own(point)
+        unknowns = self.space.sensor_unknowns(point)
         for rows in self.chunks():
             motion = self.motion(point, rows, self.active)
             for k, total in enumerate(sums):
-                self._add(k, total, float("inf") if known is None else known.noise[k], motion, own, rows)
+                self._add(k, total, float("inf") if known is None else known.noise[k], motion, unknowns, rows)
         ones = (1.0,) * len(sums)
         view = SensorView(tuple(sums), ones, ones) if known is None else replace(known, sums=tuple(sums))
         return self.combined(point, view)
@@ -179,7 +197,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         root = self.loss_of(kind).weight(distance, kind.components).sqrt() / view.variance(sensor) ** 0.5
         if kind.sigma is not None:
             root = root / kind.sigma[rows]
-        return torch.where(kind.seen[rows], root, 0.0)
+        return torch.where(kind.present[rows], root, 0.0)
 
     def loss_of(self, sensor: AbstractSensor) -> AbstractLoss:
         """How a sensor's rows count."""
@@ -219,15 +237,15 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return tool_motion(self.space.robot, *where, self._turning, frame, target)
 
     def derivative(
-        self, sensor: AbstractSensor, motion: ToolMotion, own: OwnUnknowns, rows: slice, active: Tensor
+        self, sensor: AbstractSensor, motion: ToolMotion, unknowns: Unknowns, rows: slice, active: Tensor
     ) -> Tensor:
         """Derivative of a sensor's values by the parameters that the motion was made for."""
-        J = sensor.derivative(motion, own, rows)
-        for part in sensor.own_derivatives(motion, own, rows):
-            places, owner, column = self.space.places_of(part.group, active)
-            if len(places):
-                theirs = (owner[:, None] == part.owner)[:, None, :]
-                J = J.index_add(0, places, part.derivative[column] * theirs)
+        J = sensor.derivative(motion, unknowns, rows)
+        for block in sensor.unknown_derivatives(motion, unknowns, rows):
+            positions, owner, column = self.space.positions_of(block.group, active)
+            if len(positions):
+                theirs = (owner[:, None] == block.owner)[:, None, :]
+                J = J.index_add(0, positions, block.derivative[column] * theirs)
         return J
 
     def combined(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
@@ -279,22 +297,22 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         )
 
     def _add(
-        self, number: int, sums: SensorSums, sigma: float, motion: ToolMotion, own: OwnUnknowns, rows: slice
+        self, number: int, sums: SensorSums, sigma: float, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> None:
         """Add one sensor's part of some rows, in place."""
         sensor = self.sensors[number]
-        residual = sensor.residual(motion, own, rows)
+        residual = sensor.residual(motion, unknowns, rows)
         if not self.all_seen[number]:
-            residual = torch.where(sensor.seen[rows], residual, 0.0)
+            residual = torch.where(sensor.present[rows], residual, 0.0)
         distance = residual.square().sum(0).sqrt()
         if sensor.sigma is not None:
-            distance = torch.where(sensor.seen[rows], distance / sensor.sigma[rows], 0.0)
+            distance = torch.where(sensor.present[rows], distance / sensor.sigma[rows], 0.0)
         root = self.loss_of(sensor).weight(distance / max(sigma, ALWAYS_GOOD), sensor.components).sqrt()
         if sensor.sigma is not None:
             root = root / sensor.sigma[rows]
         if not self.all_seen[number]:
-            root = torch.where(sensor.seen[rows], root, 0.0)
-        A = (self.derivative(sensor, motion, own, rows, self.active) * root).flatten(1)
+            root = torch.where(sensor.present[rows], root, 0.0)
+        A = (self.derivative(sensor, motion, unknowns, rows, self.active) * root).flatten(1)
         sums.normal.addmm_(A, A.t())
         sums.descent.addmv_(A, (residual * root).flatten())
         sums.residual[:, rows] = residual

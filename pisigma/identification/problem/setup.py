@@ -1,5 +1,6 @@
-"""From measurements to a calibration problem with a start: nothing has to be guessed by the user."""
+"""The calibration problem with its initial guess, and points of the problem in the user's coordinates."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
@@ -9,8 +10,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
-from pisigma.identification.identifiability.sufficiency import check_poses
-from pisigma.identification.initial_guess.initial_guess import Start, find_start
+from pisigma.identification.initial_guess.initial_guess import InitialGuess, guess
 from pisigma.identification.problem.loss import AbstractLoss
 from pisigma.identification.problem.noise import renumbered
 from pisigma.identification.problem.parameters import ParameterSpace, Prior, PriorSizes
@@ -20,14 +20,10 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import KINDS
 from pisigma.measurement.readings import READINGS
 from pisigma.robot.description import Robot
-from pisigma.se3 import invert, rotation_from_rpy, transform_from_xyzrpy
-from pisigma.sensors.building import (
-    PairOfSockets,
-    build_sensors,
-    build_socket_distances,
-    names_of,
-    numbers_of,
-)
+from pisigma.se3 import invert, rotation_from_rpy, rpy_from_rotation, transform_from_xyzrpy
+from pisigma.sensors.registry import build_sensors, pairs_first, unknown_groups
+from pisigma.sensors.sensor import SensorRows, numbers_of
+from pisigma.sensors.socket import PairOfSockets, SocketDistanceSensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,8 +31,8 @@ class Anchors:
     """Where base and tool started; parameters are changes from there, so no angle nears its singularity.
 
     Attributes:
-        bases: per frame, what stands before the base of the problem: `base = anchor · base_of_problem`. Places
-            of sockets and anchors in the problem are behind it too.
+        bases: per frame, what stands before the base of the problem: `base = anchor · base_of_problem`. Points that
+            sensors have to find are behind it too.
         tools: per target, what stands behind the tool's rotation: `R_tool = R_of_problem · anchor`.
     """
 
@@ -53,9 +49,8 @@ class CalibrationSetup:
         start: values of all parameters.
         anchors: what base and tool are relative to.
         rows: which rows of the measurements the problem has, in its order.
-        socket_frame: number of every socket's frame.
-        anchor_frame: number of every anchor's frame.
-        places_known: per anchor, whether its place is known.
+        unknown_frames: by group of the sensors' unknowns, the index of every owner's frame.
+        free_unknowns: indices of the sensors' unknowns that are to be identified, such as where sockets are.
         measurements: the rows of the problem, in its order.
     """
 
@@ -63,19 +58,9 @@ class CalibrationSetup:
     start: Float64[Tensor, " parameters"]
     anchors: Anchors
     rows: Tensor
-    socket_frame: Int64[Tensor, " sockets"]
-    anchor_frame: Int64[Tensor, " anchors"]
-    places_known: tuple[bool, ...]
+    unknown_frames: Mapping[str, Int64[Tensor, " owners"]]
+    free_unknowns: list[int]
     measurements: Measurements
-
-    @property
-    def own_candidates(self) -> list[int]:
-        """Indices of the sensors' own unknowns: places of sockets, and of anchors where they are not known."""
-        space = self.problem.space
-        known = [place for place in self.places_known for _ in range(4)]
-        anchors = space.of("anchor")
-        free = [i for i, told in zip(anchors, known, strict=True) if not told or (i - anchors.start) % 4 == 3]
-        return [*space.of("socket"), *free]
 
 
 @dataclass(frozen=True)
@@ -83,12 +68,12 @@ class SetupOptions:
     """What the user says of base, tool and sensors.
 
     Attributes:
-        free_base: whether bases are to be found.
-        free_tool: whether tools are to be found.
+        free_base: whether bases are to be identified.
+        free_tool: whether tools are to be identified.
         turn_tool: whether their rotations are.
-        frames: starts of bases by frame; x, y, z [m], roll, pitch, yaw [rad].
-        socket_distances: known distances between two sockets [m].
-        socket_sigma: how well they are known [m].
+        frames: initial guesses of bases by frame; x, y, z [m], roll, pitch, yaw [rad].
+        socket_distances: distances between two sockets [m].
+        socket_sigma: their standard deviation [m].
         prior_sizes: see `CalibrationProblem`.
     """
 
@@ -108,10 +93,10 @@ def build_setup(
     prior: Prior | None,
     loss: AbstractLoss,
 ) -> CalibrationSetup:
-    """Find a start, and state the problem relative to it.
+    """Guess where everything but the arm is, and state the problem relative to it.
 
     Raises:
-        IdentificationError: nothing usable was measured, too little for what has to be found, or something
+        IdentificationError: nothing usable was measured, too little for what has to be identified, or something
             that cannot be.
         PoseError: the joint values do not fit the robot.
     """
@@ -121,71 +106,70 @@ def build_setup(
         robot,
         tuple(dict.fromkeys(measurements.frame)),
         tuple(dict.fromkeys(measurements.target)),
-        names_of(measurements.socket),
-        names_of(measurements.anchor),
+        unknown_groups(measurements),
     )
-    found = find_start(
+    guessed = guess(
         space, measurements, options.free_base, options.free_tool, options.turn_tool, options.frames
     )
     device = measurements.q.device
     frame = numbers_of(measurements.frame, space.frames, measurements.rows).to(device)
     target = numbers_of(measurements.target, space.targets, measurements.rows).to(device)
-    socket_frame = _frame_of(measurements.socket, space.sockets, frame)
-    anchor_frame = _frame_of(measurements.anchor, space.anchors, frame)
-    anchors, start = _anchored(space, found, options, socket_frame, anchor_frame)
+    unknown_frames = {
+        own.name: torch.tensor([space.frames.index(name) for name in own.frames]) for own in space.unknowns
+    }
+    anchors, start = _anchored(space, guessed, options, unknown_frames)
     start = start.to(device)
-    known = build_socket_distances(measurements, options.socket_distances, options.socket_sigma)
-    sensors = build_sensors(measurements, anchors.bases, anchors.tools, frame, target)
+    sensors = build_sensors(
+        SensorRows(measurements, anchors.bases.to(device)[frame], anchors.tools.to(device)[target])
+    )
+    distances = SocketDistanceSensor.between(measurements, options.socket_distances, options.socket_sigma)
     repeats = repeat_key(measurements)
     problem = CalibrationProblem(
         space=space,
         q=measurements.q,
         frame=frame,
         target=target,
-        sensors=tuple(sensors if known is None else [*sensors, known]),
+        sensors=tuple(sensors if distances is None else [*sensors, distances]),
         loss=loss,
         nominal=start,
         precision=torch.from_numpy(space.precision(prior)).to(device),
         active=torch.zeros(0, dtype=torch.int64, device=device),
         pose=repeated(repeats, frame, target),
         configuration=repeated(repeats, frame) if len(space.targets) > 1 else None,
-        pairs=len(names_of(measurements.pair)),
+        pairs=len(set(measurements.pair or ()) - {""}),
         stated=JointState.of(measurements).stated,
         prior_sizes=options.prior_sizes,
     )
-    return CalibrationSetup(
-        problem, start, anchors, rows, socket_frame, anchor_frame, found.places_known, measurements
-    )
+    free = [
+        space.of(own.name).start + index
+        for own in space.unknowns
+        for index in guessed.free_unknowns[own.name].flatten().nonzero()[:, 0].tolist()
+    ]
+    return CalibrationSetup(problem, start, anchors, rows, unknown_frames, free, measurements)
 
 
 def _usable(measurements: Measurements) -> tuple[Tensor, Measurements]:
-    """The rows in which something was seen; those of pairs come first, side by side."""
-    seen = torch.zeros(measurements.rows, dtype=torch.bool, device=measurements.q.device)
-    for kind in (*KINDS, *READINGS):
-        seen = seen | measurements.measured(kind)
-    if not bool(seen.any()):
+    """The rows in which something was measured; those of pairs come first, side by side.
+
+    Raises:
+        IdentificationError: no row has a measured value, or all are of one pose.
+    """
+    usable = torch.stack([measurements.measured(kind) for kind in (*KINDS, *READINGS)]).any(0)
+    if not bool(usable.any()):
         raise IdentificationError(
-            f"{measurements.source}: none of its {len(seen)} rows has a measured value; give positions or poses "
+            f"{measurements.source}: none of its {len(usable)} rows has a measured value; give positions or poses "
             "(columns x_mm, y_mm, z_mm), touches, sockets or distances."
         )
-    rows = seen.nonzero()[:, 0]
-    if measurements.pair is not None:
-        order = names_of(measurements.pair)
-        place = numbers_of(measurements.pair, order, measurements.rows).to(rows.device)[rows]
-        place = torch.where(place < 0, len(order), place)
-        rows = rows[torch.sort(place, stable=True).indices]
-    whole = len(rows) == len(seen) and measurements.pair is None
+    rows = pairs_first(measurements, usable.nonzero()[:, 0])
+    whole = len(rows) == len(usable) and measurements.pair is None
     chosen = measurements if whole else measurements.select(rows)
-    check_poses(chosen)
+    q = chosen.q
+    if q.shape[0] > 1 and float((q - q[0]).abs().max()) < 1e-9:
+        raise IdentificationError(
+            f"{measurements.source}: all {q.shape[0]} rows are one pose, which determines the noise but no "
+            "parameter; measure at other joint values, spread over the workspace."
+        )
     return rows, chosen
-
-
-def _frame_of(
-    names: tuple[str, ...] | None, order: tuple[str, ...], frame: Tensor
-) -> Int64[Tensor, " names"]:
-    """The frame that every socket or anchor is in."""
-    first = [(names or ()).index(name) for name in order]
-    return frame[torch.tensor(first, dtype=torch.int64, device=frame.device)].cpu()
 
 
 def repeated(q: Tensor, *names: Tensor) -> Tensor | None:
@@ -198,19 +182,18 @@ def repeated(q: Tensor, *names: Tensor) -> Tensor | None:
     mixed = torch.zeros_like(keys[0])
     for key in keys:  # integers wrap around, so equal rows mix equally
         mixed = mixed * 6_364_136_223_846_793_005 + key * 1_442_695_040_888_963_407
-    found = renumbered(mixed)
-    return None if int(found.max()) + 1 == len(q) else found
+    numbers = renumbered(mixed)
+    return None if int(numbers.max()) + 1 == len(q) else numbers
 
 
 def _anchored(
     space: ParameterSpace,
-    found: Start,
+    guessed: InitialGuess,
     options: SetupOptions,
-    socket_frame: Int64[Tensor, " sockets"],
-    anchor_frame: Int64[Tensor, " anchors"],
+    unknown_frames: Mapping[str, Int64[Tensor, " owners"]],
 ) -> tuple[Anchors, Float64[Tensor, " parameters"]]:
-    """Bases start at their anchor, tools at their place, turned like their anchor; what is fixed has none."""
-    bases, tools = found.bases.copy(), found.tools.copy()
+    """Bases start at their anchor, tools where they are, turned like their anchor; what is fixed has none."""
+    bases, tools = guessed.bases.copy(), guessed.tools.copy()
     anchors = Anchors(
         torch.eye(4).double().repeat(len(bases), 1, 1), torch.eye(3).double().repeat(len(tools), 1, 1)
     )
@@ -221,11 +204,99 @@ def _anchored(
         anchors = Anchors(anchors.bases, rotation_from_rpy(torch.from_numpy(tools[:, 3:])))
         tools[:, 3:] = 0
     back = invert(anchors.bases)
-    sockets = _moved(back[socket_frame], torch.from_numpy(found.sockets))
-    places = _moved(back[anchor_frame], torch.from_numpy(found.anchors[:, :3]))
-    ends = np.concatenate([places.numpy(), found.anchors[:, 3:]], 1)
-    return anchors, space.values(bases, tools, sockets.numpy(), ends)
+    unknowns = {
+        own.name: _moved(back[unknown_frames[own.name]], guessed.unknowns[own.name], own.has_point).numpy()
+        for own in space.unknowns
+    }
+    return anchors, space.values(bases, tools, unknowns)
 
 
-def _moved(T: Float64[Tensor, "points 4 4"], points: Float64[Tensor, "points 3"]) -> Tensor:
-    return (T[:, :3, :3] @ points[..., None])[..., 0] + T[:, :3, 3]
+def _moved(
+    T: Float64[Tensor, "owners 4 4"], values: Float64[Tensor, "owners columns"], has_point: bool
+) -> Float64[Tensor, "owners columns"]:
+    """Unknowns of sensors whose points were moved."""
+    if not has_point:
+        return values
+    points = (T[:, :3, :3] @ values[:, :3, None])[..., 0] + T[:, :3, 3]
+    return torch.cat([points, values[:, 3:]], 1)
+
+
+@dataclass(frozen=True, eq=False)
+class IdentifiedGeometry:
+    """A robot, where it stood, what it carried and what its sensors found out about themselves.
+
+    Attributes:
+        robot: with the base of the first frame and the tool of the first target.
+        bases: per frame x, y, z [m], roll, pitch, yaw [rad].
+        tools: the same per target.
+        unknowns: by group and owner, the sensors' unknowns in the owner's frame, such as
+            `unknowns["socket"]["plate/0"]` [m or rad].
+        change: d(all parameters in these coordinates) / d(the problem's).
+    """
+
+    robot: Robot
+    bases: dict[str, Float64[np.ndarray, " 6"]]
+    tools: dict[str, Float64[np.ndarray, " 6"]]
+    unknowns: dict[str, dict[str, Float64[np.ndarray, " columns"]]]
+    change: Float64[Tensor, "parameters parameters"]
+
+    def values(self) -> Float64[Tensor, " parameters"]:
+        """Return all parameters as one vector, in the order of the `ParameterSpace` that they come from."""
+        owned = (values for owners in self.unknowns.values() for values in owners.values())
+        blocks = (self.robot.dh.ravel(), *self.bases.values(), *self.tools.values(), *owned)
+        return torch.from_numpy(np.concatenate(blocks))
+
+
+def identified_geometry(setup: CalibrationSetup, point: Float64[Tensor, " parameters"]) -> IdentifiedGeometry:
+    """Put the anchors back; as rotation vectors, small turns mean the same with and without them."""
+    space, anchors, point = setup.problem.space, setup.anchors, point.cpu()
+    dh, bases, tools = (block.clone() for block in space.split(point))
+    change = torch.eye(len(point), dtype=point.dtype)
+    for k, anchor in enumerate(anchors.bases.cpu()):
+        axes = turning_axes(bases[k, 3:])
+        first = space.of("base").start + 6 * k
+        bases[k, :3] = anchor[:3, :3] @ bases[k, :3] + anchor[:3, 3]
+        bases[k, 3:] = rpy_from_rotation(anchor[:3, :3] @ rotation_from_rpy(bases[k, 3:]))
+        change[first : first + 3, first : first + 3] = anchor[:3, :3]
+        back = torch.linalg.pinv(turning_axes(bases[k, 3:]), rtol=1e-9)
+        change[first + 3 : first + 6, first + 3 : first + 6] = back @ anchor[:3, :3] @ axes
+    for k, R_anchor in enumerate(anchors.tools.cpu()):
+        axes = turning_axes(tools[k, 3:])
+        first = space.of("tool").start + 6 * k + 3
+        tools[k, 3:] = rpy_from_rotation(rotation_from_rpy(tools[k, 3:]) @ R_anchor)
+        back = torch.linalg.pinv(turning_axes(tools[k, 3:]), rtol=1e-9)
+        change[first : first + 3, first : first + 3] = back @ axes
+    for own in space.unknowns:
+        if own.has_point:
+            for k, number in enumerate(setup.unknown_frames[own.name].tolist()):
+                first = space.of(own.name).start + len(own.columns) * k
+                change[first : first + 3, first : first + 3] = anchors.bases[number, :3, :3].cpu()
+    return IdentifiedGeometry(
+        robot=space.robot.with_geometry(dh=dh.numpy(), base=bases[0].numpy(), tool=tools[0].numpy()),
+        bases=dict(zip(space.frames, bases.numpy(), strict=True)),
+        tools=dict(zip(space.targets, tools.numpy(), strict=True)),
+        unknowns={
+            own.name: dict(zip(own.owners, values, strict=True))
+            for own, values in zip(space.unknowns, unknowns_in_frames(setup, point).values(), strict=True)
+        },
+        change=change,
+    )
+
+
+def unknowns_in_frames(
+    setup: CalibrationSetup, point: Float64[Tensor, " parameters"]
+) -> dict[str, Float64[np.ndarray, "owners columns"]]:
+    """Return the sensors' unknowns at a point of the problem by group, in the frames of their owners."""
+    space, bases = setup.problem.space, setup.anchors.bases.cpu()
+    values = space.sensor_unknowns(point.cpu())
+    return {
+        own.name: _moved(bases[setup.unknown_frames[own.name]], values[own.name].t(), own.has_point).numpy()
+        for own in space.unknowns
+    }
+
+
+def turning_axes(rpy: Float64[Tensor, " 3"]) -> Float64[Tensor, "3 3"]:
+    """The axes that roll, pitch and yaw turn about, as columns: `RotZ(roll) · RotY(pitch) · RotX(yaw)`."""
+    roll, pitch, _ = rpy.tolist()
+    (cr, cp), (sr, sp) = ((turn(roll), turn(pitch)) for turn in (math.cos, math.sin))
+    return rpy.new_tensor([[0.0, -sr, cr * cp], [0.0, cr, sr * cp], [1.0, 0.0, -sp]])

@@ -25,6 +25,9 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_document import LearnedSection, ModelDocument, UncertaintySection
 from pisigma.model.row_poses import Frames
 from pisigma.robot.description import Robot
+from pisigma.sensors.anchor import ANCHOR_COLUMNS
+from pisigma.sensors.sensor import UnknownGroup
+from pisigma.sensors.socket import SOCKET_COLUMNS
 
 Shape = tuple[int | None, ...]
 """Wanted shape of a tensor; None is any length."""
@@ -51,8 +54,7 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
         }
     if (known := model.uncertainty) is not None:
         found["uncertainty"] = {
-            "sockets": list(known.space.sockets),
-            "anchors": list(known.space.anchors),
+            **_unknowns_section(known.space.unknowns),
             "free": _free_rows(known),
             "turns": [chosen.turn for chosen in known.features if isinstance(chosen, HeldProducts)],
             "prior_scale": known.prior_scale,
@@ -215,7 +217,7 @@ def _uncertainty(
 ) -> PositionUncertainty:
     """The uncertainty, its root with the rows of the parameters that were not free."""
     robot, bases, tools = place
-    space = ParameterSpace(drawn, tuple(bases), tuple(tools), known.sockets, known.anchors)
+    space = ParameterSpace(drawn, tuple(bases), tuple(tools), _unknowns(known))
     count, free = len(space.parameters), list(known.free)
     products = 0 if hybrid is None else len(hybrid.correction.orders)
     if bool(products) != bool(known.turns):
@@ -226,6 +228,37 @@ def _uncertainty(
     full[[*free, *range(count, len(full))]] = root.double()
     geometry = geometry_of(robot, bases, tools)
     return PositionUncertainty(space, geometry, _weighted(known, hybrid), full, known.prior_scale)
+
+
+def _unknowns_section(groups: Sequence[UnknownGroup]) -> dict[str, object]:
+    """What the sensors had to find out about themselves: of sockets and anchors the names, of others all."""
+    owners = {group.name: list(group.owners) for group in groups}
+    section: dict[str, object] = {
+        "sockets": owners.get("socket", []),
+        "anchors": owners.get("anchor", []),
+    }
+    others = {
+        group.name: {
+            "columns": list(group.columns),
+            "owners": list(group.owners),
+            "angles": sorted(group.angles),
+        }
+        for group in groups
+        if group.name not in ("socket", "anchor")
+    }
+    return section | ({"others": others} if others else {})
+
+
+def _unknowns(known: UncertaintySection) -> tuple[UnknownGroup, ...]:
+    groups = (
+        UnknownGroup("socket", SOCKET_COLUMNS, known.sockets),
+        UnknownGroup("anchor", ANCHOR_COLUMNS, known.anchors),
+        *(
+            UnknownGroup(name, other.columns, other.owners, angles=frozenset(other.angles))
+            for name, other in known.others.items()
+        ),
+    )
+    return tuple(group for group in groups if group.owners)
 
 
 def _weighted(known: UncertaintySection, hybrid: HybridArm | None) -> tuple[AbstractFeature, ...]:

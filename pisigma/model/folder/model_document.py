@@ -51,12 +51,21 @@ class LearnedSection(Section):
     tools: dict[str, _Frame]
 
 
+class UnknownsSection(Section):
+    """What the sensors of one kind had to find out about themselves; see `pisigma.sensors.sensor.UnknownGroup`."""
+
+    columns: tuple[str, ...] = Field(min_length=1)
+    owners: tuple[str, ...] = Field(min_length=1)
+    angles: tuple[str, ...] = ()
+
+
 class UncertaintySection(Section):
     """What the root of the covariance, which stands in the weights file, belongs to.
 
     Attributes:
         sockets: names of the fixed points of the calibration.
         anchors: the same of the ends of distances.
+        others: the unknowns of other sensors by group.
         free: which parameters have a row in the root; the others' rows are 0. Behind them come all weights.
         turns: whose turn it is, for every stretch of weights of product units that stands behind the others: see
             `pisigma.hybrid.held_products.HeldProducts`.
@@ -66,6 +75,7 @@ class UncertaintySection(Section):
 
     sockets: tuple[str, ...]
     anchors: tuple[str, ...]
+    others: dict[str, UnknownsSection] = Field(default_factory=dict)
     free: tuple[Annotated[int, Field(ge=0)], ...]
     turns: tuple[Annotated[int, Field(ge=0)], ...]
     prior_scale: Annotated[float, Field(gt=0)]

@@ -4,11 +4,11 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
-from pisigma.identification.problem.covariance import covariance_of
 from pisigma.identification.problem.least_squares import (
     AbstractLeastSquares,
     Linearisation,
     SolutionStatus,
+    covariance_of,
     levenberg_marquardt,
     solve_damped,
 )

@@ -7,7 +7,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.se3 import rotation_from_vector, rotation_vector
-from pisigma.sensors.rotation_difference import rotation_difference
+from pisigma.sensors.pose import rotation_difference
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, 0.3, 2.9, math.pi - 1e-7, math.pi])
