@@ -115,7 +115,7 @@ def test_derivatives_are_those_of_the_residuals(name: str, shifted: bool) -> Non
     for sensor, expected in zip(values, residuals(problem, point, q), strict=True):
         assert_close(sensor.residual, expected, atol=1e-14)
         assert_close(
-            problem.sensors[[v.name for v in values].index(sensor.name)].seen.nonzero()[:, 0], sensor.row
+            problem.sensors[[v.name for v in values].index(sensor.name)].present.nonzero()[:, 0], sensor.row
         )
     for j in range(q.shape[1]):
         numeric = differences(lambda moved: residuals(problem, point, moved), q, 1e-3, (slice(None), j))
