@@ -57,6 +57,25 @@ class TrainingError(PisigmaError, RuntimeError):
     """A training cannot go on, for example because it diverged."""
 
 
+class MissingExtraError(PisigmaError, ImportError):
+    """A package that comes with an extra of pisigma is not installed."""
+
+
+EXTRAS = {"lightning": "train", "onnx": "onnx", "numba": "compile"}
+"""By the package that is imported on use, the extra that it comes with."""
+
+
+def missing_extra(problem: ImportError) -> MissingExtraError | None:
+    """Say which extra brings the package that could not be imported; None where none does."""
+    package = (problem.name or "").split(".")[0]
+    if package not in EXTRAS:
+        return None
+    return MissingExtraError(
+        f"this needs the package {package}, which is not installed; install it with "
+        f'`pip install "pisigma[{EXTRAS[package]}]"`.'
+    )
+
+
 def nearest_choice(given: str, choices: Iterable[str]) -> str:
     """Say which choices there are and which is nearest to `given`.
 

@@ -16,9 +16,11 @@ from pathlib import Path
 
 import pytest
 import tomllib
+import yaml
 from testing.models import hand_made_model
 
 import pisigma
+from pisigma.errors import EXTRAS
 from pisigma.model.folder.model_folder import save_model
 
 LAYERS = (
@@ -207,19 +209,27 @@ def test_version_is_that_of_the_project(repository):
     assert pisigma.__version__ == project["version"]
 
 
-@pytest.mark.parametrize(
-    "path", sorted(TESTS.rglob("*.py")), ids=lambda path: path.relative_to(TESTS).as_posix()
-)
-def test_tests_compare_numbers_through_the_one_helper(path):
+def test_what_is_published_says_the_same(repository):
+    """Version and licence of pyproject.toml and CITATION.cff; extras that a message names are extras."""
+    project = tomllib.loads((repository / "pyproject.toml").read_text())["project"]
+    citation = yaml.safe_load((repository / "CITATION.cff").read_text())
+    assert (citation["version"], citation["license"]) == (project["version"], project["license"])
+    for package, extra in EXTRAS.items():
+        assert any(wanted.startswith(package) for wanted in project["optional-dependencies"][extra])
+        assert not any(wanted.startswith(package) for wanted in project["dependencies"])
+    hooks = yaml.safe_load((repository / ".pre-commit-config.yaml").read_text())["repos"][0]["hooks"]
+    assert [hook["entry"].split()[0] for hook in hooks] == ["ruff", "ruff", "mypy"]
+
+
+def test_tests_compare_numbers_through_the_one_helper():
     """A bare allclose asserts nothing, and some of them pass NaN."""
-    if path.name == "closeness.py":
-        return
-    calls = {
-        node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Call)
-    }
-    assert not calls & {"allclose", "isclose", "assert_allclose"}
+    for path in TESTS.rglob("*.py"):
+        calls = {
+            node.func.attr if isinstance(node.func, ast.Attribute) else getattr(node.func, "id", "")
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+            if isinstance(node, ast.Call)
+        }
+        assert path.name == "closeness.py" or not calls & {"allclose", "isclose", "assert_allclose"}, path
 
 
 def test_nothing_is_said_about_machines(repository):
@@ -267,6 +277,20 @@ def test_the_wheel_holds_the_package_and_nothing_else(wheel):
     }
     assert shipped == there
     assert {"pisigma/py.typed", "pisigma/robot/catalogue/kiro3.yaml", "pisigma/cli/main.py"} <= shipped
+
+
+def test_the_wheel_shows_a_readme_whose_links_and_pictures_work(wheel, repository):
+    archive = zipfile.ZipFile(wheel)
+    (name,) = (name for name in archive.namelist() if name.endswith("/METADATA"))
+    shown = archive.read(name).decode().partition("\n\n")[2]
+    readme = (repository / "README.md").read_text()
+    assert shown.startswith("# pisigma\n")
+    assert len(shown) > 0.9 * len(readme)
+    assert not re.findall(r"!\[|<!--", shown)
+    assert not [
+        link for link in re.findall(r"\]\(([^)]+)\)", shown) if not link.startswith(("https://", "#"))
+    ]
+    assert re.findall(r"^```.*?^```", shown, re.M | re.S) == re.findall(r"^```.*?^```", readme, re.M | re.S)
 
 
 def test_the_wheel_works_without_lightning(wheel, tmp_path):

@@ -10,7 +10,7 @@ from typing import Any
 
 import typer
 
-from pisigma.errors import AcceptanceError, PisigmaError
+from pisigma.errors import AcceptanceError, PisigmaError, missing_extra
 
 WIDTH_WITHOUT_TERMINAL = 80
 
@@ -102,6 +102,10 @@ def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
             fail(str(problem), NOT_ACCEPTED)
         except PisigmaError as problem:
             fail(str(problem))
+        except ImportError as problem:
+            if (missing := missing_extra(problem)) is None:
+                raise
+            fail(str(missing))
         except KeyboardInterrupt:
             typer.echo("pisigma: interrupted; nothing was left half written.", err=True)
             raise typer.Exit(_INTERRUPTED) from None

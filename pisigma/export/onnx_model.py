@@ -34,7 +34,7 @@ def export_onnx(model: CalibratedModel, model_sha256: str = "") -> bytes:
         model_sha256: hash of its `model.yaml`, for the metadata.
 
     Raises:
-        OutputError: onnx is not installed.
+        MissingExtraError: onnx is not installed.
         ModelError: the model has no network, or one without ONNX form.
     """
     import_onnx()

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from pisigma.errors import OutputError
+from pisigma.errors import missing_extra
 
 OPSET, IR_VERSION = 17, 8
 """Old enough for runtimes of 2022."""
@@ -21,15 +21,12 @@ def import_onnx() -> Any:
     """The package onnx, which is not among the requirements.
 
     Raises:
-        OutputError: it is not installed.
+        MissingExtraError: it is not installed.
     """
     try:
         import onnx
-    except ImportError:
-        raise OutputError(
-            "ONNX files are written with the package onnx, which is not installed; install it with "
-            "`pip install 'pisigma[onnx]'`."
-        ) from None
+    except ImportError as problem:
+        raise missing_extra(problem) or problem from None
     return onnx
 
 
@@ -46,7 +43,7 @@ class OnnxGraph:
         """Begin an empty graph.
 
         Raises:
-            OutputError: onnx is not installed.
+            MissingExtraError: onnx is not installed.
         """
         self._onnx = import_onnx()
         self.nodes: list[Any] = []

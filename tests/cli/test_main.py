@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from testing.models import small_recipe_text
 
 import pisigma
 from pisigma.cli.output import print_table
@@ -120,3 +121,21 @@ def test_tables_are_never_cut(capsys):
     assert any(line.strip().startswith(long) for line in lines)
     assert lines[-2].rstrip().endswith("-12.25")
     assert lines[-3].rstrip().endswith("   1.5")
+
+
+def test_a_missing_extra_is_named_in_one_sentence(tmp_path):
+    """Without lightning, training says how to get it and writes nothing."""
+    (tmp_path / "kiro3.yaml").write_text(small_recipe_text("kiro3"))
+    script = (
+        "import sys\nsys.modules['lightning'] = None  # importing it fails\n"
+        "from pisigma.cli.main import run\nsys.argv = ['pisigma', 'train', 'kiro3.yaml', '--out', 'model']\nrun()\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == (
+        "pisigma: this needs the package lightning, which is not installed; install it with "
+        '`pip install "pisigma[train]"`.\n'
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["kiro3.yaml"]

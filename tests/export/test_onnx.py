@@ -12,7 +12,7 @@ from testing.closeness import assert_close
 from testing.identified import geometric_model, hybrid_model
 from testing.models import hand_made_model, joints_around, with_limits
 
-from pisigma.errors import ModelError, OutputError
+from pisigma.errors import MissingExtraError, ModelError
 from pisigma.export.onnx_model import FORWARD, INVERSE, export_onnx
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -192,5 +192,7 @@ def test_geometry_alone_is_no_network():
 
 def test_without_onnx_it_says_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "onnx", None)
-    with pytest.raises(OutputError, match=r"install it with `pip install 'pisigma\[onnx\]'`"):
+    with pytest.raises(
+        MissingExtraError, match=r'onnx, which is not installed; .*`pip install "pisigma\[onnx\]"`'
+    ):
         export_onnx(hand_made_model("kiro4"))
