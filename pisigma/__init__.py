@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from pisigma.workflow.calibrate import Calibration as Calibration
     from pisigma.workflow.calibrate import CalibrationSettings as CalibrationSettings
     from pisigma.workflow.calibrate import calibrate as calibrate
+    from pisigma.workflow.distill import Distillation as Distillation
+    from pisigma.workflow.distill import DistillationSettings as DistillationSettings
+    from pisigma.workflow.distill import distill as distill
     from pisigma.workflow.evaluate import EvaluationSettings as EvaluationSettings
     from pisigma.workflow.evaluate import Limits as Limits
     from pisigma.workflow.evaluate import evaluate as evaluate
@@ -35,6 +38,8 @@ _HOMES = {
     "CalibrationResult": "pisigma.identification.result",
     "CalibrationSettings": "pisigma.workflow.calibrate",
     "CorrectedIK": "pisigma.inverse.corrected_ik",
+    "Distillation": "pisigma.workflow.distill",
+    "DistillationSettings": "pisigma.workflow.distill",
     "EvaluationSettings": "pisigma.workflow.evaluate",
     "GeometricCalibrator": "pisigma.identification.calibrator",
     "HybridCalibrator": "pisigma.hybrid.calibrator",
@@ -47,6 +52,7 @@ _HOMES = {
     "Solution": "pisigma.inverse.solution",
     "Status": "pisigma.kinematics.status",
     "VerificationSettings": "pisigma.workflow.verify",
+    "distill": "pisigma.workflow.distill",
     "evaluate": "pisigma.workflow.evaluate",
     "calibrate": "pisigma.workflow.calibrate",
     "load": "pisigma.inverse.corrected_ik",
@@ -58,6 +64,8 @@ __all__ = [
     "CalibrationResult",
     "CalibrationSettings",
     "CorrectedIK",
+    "Distillation",
+    "DistillationSettings",
     "EvaluationSettings",
     "GeometricCalibrator",
     "HybridCalibrator",
@@ -71,6 +79,7 @@ __all__ = [
     "Status",
     "VerificationSettings",
     "calibrate",
+    "distill",
     "evaluate",
     "load",
     "verify",

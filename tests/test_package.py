@@ -57,9 +57,6 @@ NOT_YET = (
     ("judging/cross_validation.py", "pisigma.workflow.run"),
     ("model/geometric_model.py", "pisigma.inverse.identified_arm"),
     ("reporting/card.py", "pisigma.workflow.run"),
-    ("reporting/distilled_card.py", "pisigma.workflow.distillation"),
-    ("reporting/distilled_report.py", "pisigma.workflow.distillation"),
-    ("reporting/distilled_report.py", "pisigma.workflow.solved_poses"),
     ("reporting/training_report.py", "pisigma.workflow.run"),
 )
 """Imports that still run upwards after files moved; to be emptied."""

@@ -1,124 +1,115 @@
 """`pisigma distill`: a calibrated model as a small network on nominal joint values."""
 
-import hashlib
-import shlex
-import time
-from dataclasses import replace
+import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pisigma.cli.output import command_line, print_json, print_lines, print_table
+
 if TYPE_CHECKING:
-    from pisigma.model.calibrated_model import CalibratedModel
-    from pisigma.workflow.distilled_sizes import Size
+    from pisigma.workflow.distill import Distillation
+    from pisigma.workflow.distilled_network import Size
     from pisigma.workflow.solved_poses import Region
 
 Box = tuple[float, float, float, float, float, float]
 
+Model = Annotated[Path, typer.Argument(help="Model folder that `pisigma calibrate` wrote.")]
+Out = Annotated[Path, typer.Option(help="Model folder to write.")]
+RegionMm = Annotated[
+    Box | None,
+    typer.Option(
+        help="X_MIN X_MAX Y_MIN Y_MAX Z_MIN Z_MAX of the tool in the base frame [mm], with the orientations of the "
+        "measured poses. [default: where the model was measured]"
+    ),
+]
+Joints = Annotated[
+    Path | None,
+    typer.Option(
+        help="CSV file with q1_deg and so on: the region lies between each of these rows and the rows near it, "
+        "so that the rows have to fill it."
+    ),
+]
+Poses = Annotated[int, typer.Option(help="Number of poses to fit to.")]
+Orders = Annotated[
+    str | None,
+    typer.Option(help="Orders of the product units, such as 1,2,3. [default: several sizes are tried]"),
+]
+Harmonics = Annotated[
+    int | None,
+    typer.Option(
+        help="With --orders: cycles a turn up to which a joint's own value is an input. [default: 1]"
+    ),
+]
+Seed = Annotated[int, typer.Option(help="Seed of poses and starts.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+
 
 def distill(
-    model: Annotated[Path, typer.Argument(help="Model folder that `pisigma calibrate` wrote.")],
-    out: Annotated[Path, typer.Option(help="Model folder to write.")],
-    region: Annotated[
-        Box | None,
-        typer.Option(
-            help="X_MIN X_MAX Y_MIN Y_MAX Z_MIN Z_MAX of the tool in the base frame [mm], with the orientations of the "
-            "measured poses; else the region is where the model was measured."
-        ),
-    ] = None,
-    joints: Annotated[
-        Path | None,
-        typer.Option(
-            help="CSV file with q1_deg and so on: the region lies between each of these rows and the rows near it "
-            "instead, so that the rows have to fill it."
-        ),
-    ] = None,
-    poses: Annotated[int, typer.Option(help="Poses to fit to.")] = 5000,
-    orders: Annotated[
-        str | None,
-        typer.Option(help="Orders of the product units, such as 1,2,3; else several sizes are tried."),
-    ] = None,
-    harmonics: Annotated[
-        int | None,
-        typer.Option(help="With --orders: cycles a turn up to which a joint's own value is an input [1]."),
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of poses and starts.")] = 0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    context: typer.Context,
+    model: Model,
+    out: Out,
+    region: RegionMm = None,
+    joints: Joints = None,
+    poses: Poses = 5000,
+    orders: Orders = None,
+    harmonics: Harmonics = None,
+    seed: Seed = 0,
+    as_json: AsJson = False,
 ) -> None:
     """Distil a calibrated model into a small network for controllers that can only add an offset.
 
-    Its error against the full solution, on poses that it never saw, is printed and on its card.
+    Its error against the full solution, on poses that were not fitted to, is printed and on its card.
     """
-    started = time.perf_counter()
-    from pisigma.cli.output import print_json
     from pisigma.cli.progress import progress_of
-    from pisigma.model.folder.model_folder import load_model, save_model
-    from pisigma.model.folder.staging import check_replaceable, staged_folder
-    from pisigma.reporting.distilled_card import write_distilled_card
-    from pisigma.reporting.distilled_report import report_distillation
-    from pisigma.workflow.distillation import DistillationSettings
-    from pisigma.workflow.distillation import distill as distil
+    from pisigma.errors import RecipeError
+    from pisigma.model.folder.staging import check_replaceable
+    from pisigma.workflow.distill import DistillationSettings
+    from pisigma.workflow.distill import distill as run
 
     check_replaceable(out)
-    parent = load_model(model)
-    settings = DistillationSettings(poses=poses, size=_size(orders, harmonics), seed=_sound(seed))
-    where = _region(parent, region, joints)
-    sha256 = hashlib.sha256((model / "model.yaml").read_bytes()).hexdigest()
+    if not 0 <= seed < 2**63:
+        raise RecipeError(f"--seed {seed}: a whole number from 0 to 2^63 - 1 was wanted.")
+    size, where = _size(orders, harmonics), _region(model, region, joints)
+    settings = DistillationSettings(region=where, poses=poses, size=size, seed=seed)
     with progress_of("distillation") as tell:
-        found = distil(out.resolve().name, parent, where, settings, sha256, tell)
-    report = report_distillation(found)
-    options = {"region": region, "joints": joints, "poses": poses, "orders": orders, "harmonics": harmonics}
-    command = _command(model, out, options | {"seed": seed})
-    with staged_folder(out) as scratch:
-        save_model(replace(found.model, metrics=report), scratch)
-        write_distilled_card(found, command, report, scratch)
-    finished = {"model": str(out), "seconds": round(time.perf_counter() - started, 3), **report}
+        distillation = run(model, settings, tell)
+    distillation.save(out, command=command_line(context, ("out", "joints")))
     if as_json:
-        print_json(finished)
+        print_json({"model": str(out), **distillation.to_json()})
     else:
-        _print(finished)
+        _print(distillation, out)
 
 
 def _size(orders: str | None, harmonics: int | None) -> "Size | None":
     """The one size that was asked for."""
     from pisigma.errors import RecipeError
-    from pisigma.workflow.distilled_sizes import Size
+    from pisigma.workflow.distilled_network import Size
 
     if orders is None:
         if harmonics is not None:
             raise RecipeError("--harmonics goes with --orders; give both or none.")
         return None
-    parts = orders.split(",")
-    if not all(part.strip().isdecimal() and 1 <= int(part) <= 20 for part in parts):
+    numbers = orders.split(",")
+    if not all(number.strip().isdecimal() and 1 <= int(number) <= 20 for number in numbers):
         raise RecipeError(f"--orders '{orders}': whole numbers from 1 to 20 were wanted, such as 1,2,3.")
     if harmonics is not None and not 1 <= harmonics <= 500:
         raise RecipeError(f"--harmonics {harmonics}: a whole number from 1 to 500 was wanted.")
-    return Size(tuple(int(part) for part in parts), harmonics or 1)
+    return Size(tuple(int(number) for number in numbers), harmonics or 1)
 
 
-def _sound(seed: int) -> int:
-    from pisigma.errors import RecipeError
-
-    if not 0 <= seed < 2**63:
-        raise RecipeError(f"--seed {seed}: a whole number from 0 to 2^63 - 1 was wanted.")
-    return seed
-
-
-def _region(parent: "CalibratedModel", box: Box | None, joints: Path | None) -> "Region | None":
+def _region(model: Path, box: Box | None, joints: Path | None) -> "Region | None":
     """Where poses are to be drawn; None: where the model was measured."""
-    import math
-
     from pisigma.errors import PoseError
+    from pisigma.measurement.csv.reading import read_joints
+    from pisigma.model.folder.model_folder import load_model
     from pisigma.workflow.solved_poses import Region
 
     if box is None and joints is None:
         return None
-    q = parent.starts.double()
-    if joints is not None:
-        from pisigma.measurement.csv.reading import read_joints
-
-        q = read_joints(joints, parent.robot)
+    parent = load_model(model)
+    q = parent.starts.double() if joints is None else read_joints(joints, parent.robot)
     if box is None:
         return Region(q)
     if not all(math.isfinite(value) for value in box) or any(box[i] > box[i + 1] for i in (0, 2, 4)):
@@ -130,28 +121,15 @@ def _region(parent: "CalibratedModel", box: Box | None, joints: Path | None) -> 
     return Region(q, (x_min, x_max, y_min, y_max, z_min, z_max))
 
 
-def _command(model: Path, out: Path, options: dict[str, Any]) -> str:
-    """The command line that does the same, with the names of files only."""
-    words = ["pisigma", "distill", model.resolve().name, "--out", out.name]
-    for name, value in options.items():
-        if isinstance(value, tuple):
-            words += [f"--{name}", *(f"{bound:g}" for bound in value)]
-        elif value is not None:
-            words += [f"--{name}", value.name if isinstance(value, Path) else str(value)]
-    return shlex.join(words)
+def _print(distillation: "Distillation", out: Path) -> None:
+    """Print for people how well the model follows the full solution."""
+    from pisigma.reporting.distilled_card import correction_table, size_table, tool_error_table
 
-
-def _print(result: dict[str, Any]) -> None:
-    from pisigma.cli.output import print_table
-    from pisigma.reporting.distilled_card import joint_rows, size_rows
-    from pisigma.reporting.tables import pose_rows
-
-    print_table("sizes tried", *size_rows(result["sizes"]))
-    title = f"tool under the full model, {result['poses']['held_out']} held-out poses"
-    print_table(title, *pose_rows(result["held_out"]))
-    print_table("absolute joint corrections, and errors of the distilled ones", *joint_rows(result["joints"]))
-    for sentence in result["gives_up"]:
-        typer.echo(sentence)
-    for sentence in result["doubts"]:
-        typer.echo(f"Warning: {sentence}")
-    typer.echo(f"Model written to {result['model']} in {result['seconds']:.1f} s; read its README.md.")
+    summary = distillation.summary
+    title = f"tool under the full model, {summary.poses.held_out} held-out poses"
+    print_table(title, *tool_error_table(summary))
+    print_lines(f"Warning: {sentence}" for sentence in summary.warnings)
+    print_table("absolute joint corrections, and errors of the distilled ones", *correction_table(summary))
+    print_table("sizes tried", *size_table(summary))
+    print_lines(summary.limitations)
+    print_lines([f"Model written to {out} in {distillation.seconds:.1f} s; read its README.md."])

@@ -54,7 +54,7 @@ def test_the_report_says_what_was_lost(distilled):
     card = (out / "README.md").read_text()
     assert "`pisigma distill geometric --out small --poses 200 --orders 1,2 --seed 3`" in card
     assert report["parent"]["sha256"] in card
-    for sentence in report["gives_up"]:
+    for sentence in report["limitations"]:
         assert sentence in card
 
 

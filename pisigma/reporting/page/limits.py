@@ -46,7 +46,9 @@ def limit_of(model: CalibratedModel, accuracy: Accuracy | None, rows: JudgedRows
         rows: judged rows, or None.
     """
     if accuracy is not None and accuracy.reference:
-        sentence = " ".join(model.metrics.get("gives_up", ())) or "Ask the full model for its own accuracy."
+        sentence = (
+            " ".join(model.metrics.get("limitations", ())) or "Ask the full model for its own accuracy."
+        )
         return Limit(None, None, "", "the full model that it stands for", sentence)
     noise, source = _repeated(rows), "rows that were measured more than once"
     if noise is None:

@@ -285,7 +285,7 @@ def test_a_distilled_model_is_judged_by_its_parent(tmp_path):
         "poses": {"held_out": 77},
         "held_out": {"nominal": figures[0], "distilled": figures[1], "full": figures[1]},
         "joints": [{"name": "theta_1", "unit": "deg", "error_rms_deg": 0.1}],
-        "gives_up": ["Reach: less."],
+        "limitations": ["Reach: less."],
     }
     content = report_content(replace(hand_made_model("ur10"), kind="distilled", metrics=metrics), tmp_path)
     assert list(content.accuracies[0].models) == ["nominal", "full", "distilled"]

@@ -16,15 +16,13 @@ from pisigma.errors import IdentificationError, ModelError
 from pisigma.inverse.torch_ik import TorchIK
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
+from pisigma.judging.distillation_summary import read_distillation
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.model_folder import save_model
-from pisigma.reporting.distilled_card import write_distilled_card
-from pisigma.reporting.distilled_report import report_distillation
 from pisigma.robot import Robot
-from pisigma.workflow.distillation import DistillationSettings, distill
-from pisigma.workflow.distilled_sizes import Size, sizes_for
+from pisigma.workflow.distill import DistillationSettings, distill
+from pisigma.workflow.distilled_network import Size, sizes_for
 from pisigma.workflow.solved_poses import Region, draw_between, draw_solved_poses
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
@@ -57,7 +55,7 @@ def rippled(name: str) -> CalibratedModel:
 @functools.cache
 def distilled(kind: str, name: str, size: Size | None, poses: int = 600):
     parent = geometric_model(name) if kind == "geometric" else rippled(name)
-    return distill("small", parent, settings=DistillationSettings(poses, size, epochs=30))
+    return distill(parent, DistillationSettings(poses=poses, size=size, epochs=30))
 
 
 def tool_errors(found, q: torch.Tensor) -> torch.Tensor:
@@ -105,7 +103,7 @@ def test_poses_are_those_of_the_nominal_joint_values():
 @pytest.mark.parametrize("size", [Size((1, 2, 3)), Size((1, 2), 24)])
 def test_a_folder_gives_the_same_corrections(size, tmp_path):
     found = distilled("hybrid", "kiro3", size)
-    save_model(replace(found.model, metrics=report_distillation(found)), tmp_path)
+    found.save(tmp_path)
     ik = pisigma.load(tmp_path)
     poses = found.held_out
     solution = ik(poses.T)
@@ -132,7 +130,7 @@ def test_poses_away_from_the_region_are_outside_the_domain(size):
 def test_a_region_of_positions_holds_all_poses():
     parent = geometric_model("kiro3")
     region = Region(parent.starts, BOX)
-    found = distill("boxed", parent, region, DistillationSettings(300, Size((1, 2)), epochs=20))
+    found = distill(parent, DistillationSettings(region, 300, Size((1, 2)), epochs=20))
     place = found.held_out.T[:, :3, 3]
     for axis in range(3):
         assert float(place[:, axis].min()) >= BOX[2 * axis]
@@ -141,10 +139,10 @@ def test_a_region_of_positions_holds_all_poses():
 
 
 def test_a_given_seed_gives_the_same_model():
-    settings = DistillationSettings(200, Size((1, 2)), seed=4, epochs=5)
-    first, second = (distill("again", geometric_model("kiro3"), settings=settings) for _ in range(2))
+    settings = DistillationSettings(poses=200, size=Size((1, 2)), seed=4, epochs=5)
+    first, second = (distill(geometric_model("kiro3"), settings) for _ in range(2))
     assert_close(first.predicted, second.predicted)
-    other = distill("again", geometric_model("kiro3"), settings=replace(settings, seed=5))
+    other = distill(geometric_model("kiro3"), replace(settings, seed=5))
     assert not torch.equal(first.held_out.T, other.held_out.T)
 
 
@@ -186,20 +184,22 @@ def test_between_goes_the_short_way_round():
 
 def test_figures_and_card_are_those_of_the_held_out_poses(tmp_path):
     found = distilled("hybrid", "kiro3", Size((1, 2, 3)))
-    report = report_distillation(found)
+    summary = found.summary
     errors = tool_errors(found, found.held_out.q_nominal + found.predicted) * 1e3
-    assert_close(report["held_out"]["distilled"]["rms_mm"], errors.square().mean().sqrt(), rtol=1e-9)
-    assert_close(report["held_out"]["distilled"]["max_mm"], errors.max(), rtol=1e-9)
+    assert_close(summary.held_out.distilled.rms_mm, errors.square().mean().sqrt(), rtol=1e-9)
+    assert_close(summary.held_out.distilled.max_mm, errors.max(), rtol=1e-9)
     off = (found.predicted - found.held_out.correction)[:, 0].abs().rad2deg()
-    assert_close(report["joints"][0]["error_max_deg"], off.max(), rtol=1e-9)
+    assert_close(summary.joints[0].error.max, off.max(), rtol=1e-9)
     assert_close(
-        report["joints"][2]["correction_mean_mm"],
+        summary.joints[2].correction.mean,
         found.held_out.correction[:, 2].abs().mean() * 1e3,
         rtol=1e-9,
     )
-    write_distilled_card(found, "pisigma distill it", report, tmp_path)
-    card = (tmp_path / "README.md").read_text()
-    assert f"{report['held_out']['distilled']['rms_mm']:.4f} mm RMS" in card
+    written = found.save(tmp_path / "small", command="pisigma distill it")
+    assert read_distillation(written).parent == summary.parent
+    card = (tmp_path / "small" / "README.md").read_text()
+    assert "Made by `pisigma distill it`." in card
+    assert f"{summary.held_out.distilled.rms_mm:.4f} mm RMS" in card
     assert "up to 24 cycles a turn" in card
     assert "`hybrid_kiro3`" in card
     assert not re.search(r"\bnan\b", card)
@@ -211,7 +211,7 @@ def test_a_region_out_of_reach_is_refused():
     with pytest.raises(
         IdentificationError, match=r"between \(3000, 0, 0\) and .* takes only 0 \(640 unreachable\)"
     ):
-        distill("far", parent, region, DistillationSettings(200, Size((1,))))
+        distill(parent, DistillationSettings(region, 200, Size((1,))))
 
 
 def test_poses_near_a_singularity_are_not_drawn():
@@ -231,19 +231,19 @@ def test_poses_near_a_singularity_are_not_drawn():
 )
 def test_models_without_anything_to_distil_are_refused(parent, complaint):
     with pytest.raises(ModelError, match=complaint):
-        distill("nothing", parent())
+        distill(parent())
 
 
 @pytest.mark.parametrize(
     ("name", "settings", "rows", "complaint"),
     [
-        ("kiro3", DistillationSettings(50), 60, "50 poses are too few"),
-        ("ur10", DistillationSettings(120), 60, "120 poses are too few for any size"),
-        ("kiro3", DistillationSettings(120, Size((3, 3), 8)), 60, "rows are there to fit"),
-        ("kiro3", DistillationSettings(200, Size((1,))), 1, "no joint moves"),
+        ("kiro3", DistillationSettings(poses=50), 60, "50 poses are too few"),
+        ("ur10", DistillationSettings(poses=120), 60, "120 poses are too few for any size"),
+        ("kiro3", DistillationSettings(poses=120, size=Size((3, 3), 8)), 60, "rows are there to fit"),
+        ("kiro3", DistillationSettings(poses=200, size=Size((1,))), 1, "no joint moves"),
     ],
 )
 def test_too_little_is_refused(name, settings, rows, complaint):
     parent = geometric_model(name)
     with pytest.raises(IdentificationError, match=complaint):
-        distill("little", parent, Region(parent.starts[:rows]), settings)
+        distill(parent, replace(settings, region=Region(parent.starts[:rows])))

@@ -1,4 +1,4 @@
-"""Sizes of the network that a calibrated model is distilled into, and fitting one of them."""
+"""The network that a calibrated model is distilled into: sizes, fitting one, and choosing among them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -17,6 +17,7 @@ from pisigma.training.networks import fit_networks
 from pisigma.training.pairs import TrainingPairs
 from pisigma.training.patterns import build_network, build_patterns
 from pisigma.training.sections import LevenbergMarquardtSection, NetworkSection
+from pisigma.workflow.solved_poses import SolvedPoses
 
 VALIDATION_SHARE = 0.1
 
@@ -24,6 +25,10 @@ OVERTONE_SCALE = 1e4
 """Overtones are scaled down by so much after the fit, and their weights up: they do not say where a joint is, and the
 domain is measured in scaled inputs."""
 
+ENOUGH = 5e-6
+"""[m] RMS of the tool's error below which no larger size is tried: no robot repeats so well."""
+AS_GOOD = 1.1
+"""A smaller size is taken where its error is not larger than the best one's times this."""
 ROWS_PER_UNKNOWN = 4
 """A size is tried where there are so many poses for each of its unknowns."""
 
@@ -56,24 +61,101 @@ RIPPLED = (Size((1, 2)), Size((1, 2, 3)), Size((1, 2, 3), 8), Size((1, 2, 3), 24
 """Sizes where gears and encoders run out of true as well."""
 
 
+@dataclass(frozen=True)
+class Trial:
+    """A size that was fitted.
+
+    Attributes:
+        size: of the network.
+        unknowns: number of weights and biases per joint.
+        error: RMS of the tool's error against the full solution, over the poses for choosing [m].
+        kept: whether it was chosen.
+    """
+
+    size: Size
+    unknowns: int
+    error: float
+    kept: bool
+
+
 def sizes_for(model: CalibratedModel, poses: int) -> tuple[Size, ...]:
-    """Sizes to try for a model with so many poses to fit, small ones first."""
+    """Give the sizes to try for a model with so many poses to fit, small ones first.
+
+    Raises:
+        IdentificationError: the poses are too few for any size.
+    """
     learned = () if model.hybrid is None else model.hybrid.correction.features
     rippled = any(isinstance(features, FourierSeries) and features.harmonics > 1 for features in learned)
-    return tuple(
+    sizes = tuple(
         size
         for size in (RIPPLED if rippled else SMOOTH)
         if size.unknowns(model.robot) * ROWS_PER_UNKNOWN <= poses
     )
+    if not sizes:
+        raise IdentificationError(
+            f"{poses} poses are too few for any size of network for robot '{model.robot.name}'; give "
+            "more, or the orders of a small one."
+        )
+    return sizes
 
 
-def fit_size(
+def choose_network(
+    parent: CalibratedModel,
+    poses: SolvedPoses,
+    chosen: tuple[slice, slice],
+    sizes: tuple[Size, ...],
+    search: tuple[int, int],
+    progress: Callable[[str], None],
+) -> tuple[CorrectionNetwork, tuple[Trial, ...]]:
+    """Give the smallest network that is about as good as the best, and all that were tried.
+
+    Args:
+        parent: the model that is distilled.
+        poses: with its full solutions.
+        chosen: which of them to fit to, and which to choose by.
+        sizes: to fit, small ones first.
+        search: seed, and largest number of iterations for a joint.
+        progress: called with what is being done.
+    """
+    pairs = _pairs(poses, chosen[0])
+    fits: list[tuple[CorrectionNetwork, Size, float]] = []
+    for size in sizes:
+        about = f"orders {size.orders}, harmonics {size.harmonics}"
+        network = _fit_size(
+            parent.robot,
+            size,
+            pairs,
+            *search,
+            lambda what, about=about: progress(f"{about}: {what}"),  # type: ignore[misc]
+        )
+        T, q = poses.T[chosen[1]], poses.q_nominal[chosen[1]]
+        with torch.no_grad():
+            reached = parent.forward(q + network(T, q))
+        error = float((reached[:, :3, 3] - T[:, :3, 3]).square().sum(-1).mean().sqrt())
+        fits.append((network, size, error))
+        if error < ENOUGH:
+            break
+    best = min(error for *_, error in fits)
+    kept = next(k for k, (*_, error) in enumerate(fits) if error <= max(AS_GOOD * best, ENOUGH))
+    trials = tuple(
+        Trial(size, size.unknowns(parent.robot), error, k == kept) for k, (_, size, error) in enumerate(fits)
+    )
+    return fits[kept][0], trials
+
+
+def _pairs(poses: SolvedPoses, rows: slice) -> TrainingPairs:
+    q_nominal = poses.q_nominal[rows]
+    every = torch.ones(len(q_nominal), dtype=torch.bool)
+    return TrainingPairs(poses.T[rows], q_nominal, poses.correction[rows], every, ~every, ~every, ())
+
+
+def _fit_size(
     robot: Robot,
     size: Size,
     pairs: TrainingPairs,
     seed: int,
     epochs: int,
-    tell: Callable[[str], None] = lambda what: None,
+    progress: Callable[[str], None] = lambda what: None,
 ) -> CorrectionNetwork:
     """Fit a network of a size to corrections by Levenberg-Marquardt.
 
@@ -83,7 +165,7 @@ def fit_size(
         pairs: nominal joint values and their corrections.
         seed: of start and validation rows.
         epochs: largest number of iterations for a joint.
-        tell: is called with the state of the work.
+        progress: called with what is being done.
 
     Raises:
         IdentificationError: no joint moves in the region, or there are too few poses.
@@ -97,7 +179,7 @@ def fit_size(
     networks: list[PiSigma] = []
     rows = torch.arange(len(pairs.target))
     for part in sections:
-        tell(", ".join(part.joints))
+        progress(", ".join(part.joints))
         network = build_network(robot, [part], pairs)
         generator = torch.Generator().manual_seed(seed)
         patterns = build_patterns(network, pairs, VALIDATION_SHARE, rows, generator)

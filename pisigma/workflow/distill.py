@@ -1,0 +1,399 @@
+"""Distil a calibrated model into a small Pi-Sigma network on nominal joint values.
+
+Jeong et al. 1998 learn `Δθ = θ_measured - θ_analytic` from measurements; here the full solution of a model takes the
+role of θ_measured, for poses of a region.
+"""
+
+import hashlib
+import math
+import os
+import platform
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError, ModelError
+from pisigma.inverse.torch_ik import NUMERIC, TorchIK
+from pisigma.joint_correction.conditions import learned_conditions
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.judging.distillation_summary import (
+    KIND,
+    AbsoluteFigures,
+    DistillationSummary,
+    DistilledErrors,
+    JointErrorFigures,
+    JointRange,
+    ParentFigures,
+    PoseFigures,
+    RegionFigures,
+    SizeFigures,
+)
+from pisigma.judging.pose_statistics import PoseErrors
+from pisigma.judging.validation_figures import ErrorFigures
+from pisigma.kinematics.status import Status
+from pisigma.model.calibrated_model import CalibratedModel, Provenance
+from pisigma.model.domain import Domain
+from pisigma.model.folder.folder_files import DESCRIPTION
+from pisigma.model.folder.model_folder import load_model, save_model
+from pisigma.model.folder.staging import staged_folder
+from pisigma.model.stored_starts import spread_rows
+from pisigma.reporting.distilled_card import write_distilled_card
+from pisigma.robot.description import Robot
+from pisigma.se3 import pose_error
+from pisigma.workflow.distilled_network import Size, Trial, choose_network, sizes_for
+from pisigma.workflow.solved_poses import SINGULAR_BELOW, Region, SolvedPoses, draw_solved_poses
+
+POSES = 5_000
+CHOICE_SHARE, HELD_OUT_SHARE = 0.2, 0.4
+"""Poses that sizes are chosen by, and poses that the chosen one is judged by, beside one that is fitted to."""
+
+USEFUL = 0.2
+"""A distilled model whose error against the full solution is larger than this share of the nominal one is warned of."""
+
+DOMAIN_SAMPLES = 512
+FEWEST = 100
+"""Fewer poses are refused."""
+
+_FEW_ROWS = 20
+"""Rows per joint from which a region is taken as filled."""
+
+
+@dataclass(frozen=True)
+class DistillationSettings:
+    """How a model is distilled.
+
+    Attributes:
+        region: where poses are drawn; None for around the joint values that the model was measured at.
+        poses: number of poses to fit to; others are drawn besides for choosing and judging.
+        size: the only one to fit; None tries those of `sizes_for`.
+        seed: of poses and starts.
+        epochs: largest number of iterations for a joint.
+    """
+
+    region: Region | None = None
+    poses: int = POSES
+    size: Size | None = None
+    seed: int = 0
+    epochs: int = 80
+
+
+@dataclass(frozen=True, eq=False)
+class Distillation:
+    """A distilled model and how well it follows the full solution.
+
+    Attributes:
+        model: the distilled model, with all figures as its metrics.
+        parent: the model it was distilled from.
+        region: where.
+        trials: sizes that were fitted, in order.
+        held_out: poses that were neither fitted to nor chosen by.
+        predicted: what the network adds to their nominal joint values [rad or m].
+        summary: all figures.
+        seconds: time it took [s].
+    """
+
+    model: CalibratedModel
+    parent: CalibratedModel
+    region: Region
+    trials: tuple[Trial, ...]
+    held_out: SolvedPoses
+    predicted: Float64[Tensor, "poses dof"]
+    summary: DistillationSummary
+    seconds: float
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Why the model should perhaps not be used, a sentence each."""
+        return self.summary.warnings
+
+    def to_json(self) -> dict[str, Any]:
+        """Give all figures as JSON values, in mm and deg."""
+        return {"seconds": round(self.seconds, 3), **self.summary.to_json()}
+
+    def save(
+        self, folder: str | os.PathLike[str], name: str | None = None, command: str = "pisigma.distill(...)"
+    ) -> CalibratedModel:
+        """Write the model folder with its card, whole or not at all; a model that is there is replaced.
+
+        Args:
+            folder: to write.
+            name: of the model; None for the name of the folder.
+            command: what made the model, for the card.
+
+        Returns:
+            The model as written.
+
+        Raises:
+            OutputError: the folder holds something that is no model, or cannot be written.
+        """
+        summary = self.summary.model_copy(update={"command": command})
+        name = name or Path(folder).resolve().name
+        model = replace(self.model, name=name, metrics=summary.to_json())
+        with staged_folder(folder) as scratch:
+            save_model(model, scratch)
+            write_distilled_card(model, summary, scratch)
+        return model
+
+
+def distill(
+    model: CalibratedModel | str | os.PathLike[str],
+    settings: DistillationSettings = DistillationSettings(),
+    progress: Callable[[str], None] = lambda what: None,
+) -> Distillation:
+    """Fit a small network on nominal joint values to the full solutions of a model.
+
+    Args:
+        model: with an identified geometry, or the folder of such a model.
+        settings: region, number of poses, sizes, seed.
+        progress: called with what is being done.
+
+    Raises:
+        ModelError: the folder holds no model, or the model has nothing that could be distilled.
+        IdentificationError: the robot takes too few poses of the region, or they are too few for the size.
+    """
+    started, sha256 = time.perf_counter(), ""
+    if isinstance(model, CalibratedModel):
+        parent = model
+    else:
+        parent = load_model(model)
+        sha256 = hashlib.sha256((Path(model) / DESCRIPTION).read_bytes()).hexdigest()
+    _check_parent(parent)
+    if settings.poses < FEWEST:
+        raise IdentificationError(
+            f"{settings.poses} poses are too few to distil from; give {FEWEST} or more."
+        )
+    sizes = (settings.size,) if settings.size is not None else sizes_for(parent, settings.poses)
+    region = settings.region or Region(parent.starts.double())
+    generator = torch.Generator().manual_seed(settings.seed)
+    choosing, judging = (round(settings.poses * share) for share in (CHOICE_SHARE, HELD_OUT_SHARE))
+    total = settings.poses + choosing + judging
+    every = draw_solved_poses(TorchIK(parent), region, total, generator, progress)
+    fitted, chosen_by = slice(settings.poses), slice(settings.poses, settings.poses + choosing)
+    network, trials = choose_network(
+        parent, every, (fitted, chosen_by), sizes, (settings.seed, settings.epochs), progress
+    )
+    held_out = _rows(every, slice(settings.poses + choosing, None))
+    with torch.no_grad():
+        predicted = network(held_out.T, held_out.q_nominal)
+        scaled = network.scaled_inputs(every.T[fitted], every.q_nominal[fitted])
+    distilled = CalibratedModel(
+        name=f"{parent.name}_distilled",
+        kind=KIND,
+        robot=parent.robot,
+        network=network,
+        domain=Domain.around(scaled[:DOMAIN_SAMPLES], generator),
+        branches=_frequent(TorchIK(parent), every),
+        starts=spread_rows((every.q_nominal + every.correction)[fitted]),
+        bases=parent.bases,
+        tools=parent.tools,
+        provenance=_provenance(parent, sha256, settings),
+    )
+    summary = _summary(distilled, parent, region, trials, settings.poses, held_out, predicted)
+    distilled = replace(distilled, metrics=summary.to_json())
+    seconds = time.perf_counter() - started
+    return Distillation(distilled, parent, region, trials, held_out, predicted, summary, seconds)
+
+
+def _check_parent(parent: CalibratedModel) -> None:
+    if parent.network is not None:
+        raise ModelError(
+            f"model '{parent.name}' corrects nominal joint values by a network already, so there is nothing to "
+            "distil; export it as it is."
+        )
+    if parent.calibrated is None or not len(parent.starts):
+        raise ModelError(
+            f"model '{parent.name}' has no identified geometry with joint values it was measured at, so there is "
+            "nothing to distil; give a model of `pisigma calibrate`."
+        )
+
+
+def _rows(poses: SolvedPoses, rows: slice) -> SolvedPoses:
+    return SolvedPoses(
+        poses.T[rows],
+        poses.q_nominal[rows],
+        poses.correction[rows],
+        poses.branch[rows],
+        poses.status[rows],
+        poses.drawn,
+        poses.refused,
+    )
+
+
+def _frequent(ik: TorchIK, poses: SolvedPoses) -> tuple[str, ...]:
+    """Branches that the poses lie on, most frequent first; none for a robot without closed-form inverse."""
+    if ik.branches == (NUMERIC,):
+        return ()
+    counts = torch.bincount(poses.branch, minlength=len(ik.branches))
+    order = counts.argsort(descending=True, stable=True).tolist()
+    return tuple(ik.branches[i] for i in order if counts[i] > 0)
+
+
+def _provenance(parent: CalibratedModel, sha256: str, settings: DistillationSettings) -> Provenance:
+    return Provenance(
+        data_source=f"full solutions of model {parent.name}",
+        data_sha256=sha256,
+        rows=settings.poses,
+        seed=settings.seed,
+        versions={name: version(name) for name in ("pisigma", "torch")}
+        | {"python": platform.python_version()},
+    )
+
+
+def _summary(
+    model: CalibratedModel,
+    parent: CalibratedModel,
+    region: Region,
+    trials: tuple[Trial, ...],
+    fitted: int,
+    poses: SolvedPoses,
+    predicted: Float64[Tensor, "poses dof"],
+) -> DistillationSummary:
+    """Figures of held-out poses, whose errors are those of the tool under the full calibrated model."""
+    assert model.network is not None
+    assert model.domain is not None
+    scaled = model.network.scaled_inputs(poses.T, poses.q_nominal)
+    held_out = DistilledErrors(
+        nominal=_tool_errors(parent, poses.T, poses.q_nominal),
+        distilled=_tool_errors(parent, poses.T, poses.q_nominal + predicted),
+        full=_tool_errors(parent, poses.T, poses.q_nominal + poses.correction),
+    )
+    return DistillationSummary(
+        command="",
+        parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=model.provenance.data_sha256),
+        region=_region(region, poses, parent.robot),
+        poses=PoseFigures(
+            fitted=fitted,
+            held_out=len(poses.T),
+            beyond_measured_share=float((poses.status == Status.OUTSIDE_DOMAIN).double().mean()),
+            inside_domain_share=float(model.domain.contains(scaled).double().mean()),
+            drawn=poses.drawn,
+            refused=poses.refused,
+        ),
+        sizes=tuple(
+            SizeFigures(
+                orders=trial.size.orders,
+                harmonics=trial.size.harmonics,
+                unknowns=trial.unknowns,
+                rms_mm=trial.error * 1e3,
+                kept=trial.kept,
+            )
+            for trial in trials
+        ),
+        held_out=held_out,
+        joints=_joint_errors(parent.robot, poses.correction, predicted),
+        warnings=_warnings(held_out, len(region.q), parent.robot.dof),
+        limitations=_limitations(parent, held_out.distilled, trials),
+    )
+
+
+def _warnings(held_out: DistilledErrors, rows: int, joints: int) -> tuple[str, ...]:
+    """Why the distilled model should perhaps not be used; empty where nothing speaks against it."""
+    sentences = []
+    distilled, nominal = held_out.distilled.by_name, held_out.nominal.by_name
+    for key, what, unit in (("rms_mm", "position", "mm"), ("rms_deg", "orientation", "deg")):
+        if distilled[key] > USEFUL * nominal[key]:
+            sentences.append(
+                f"It takes only {max(1 - distilled[key] / nominal[key], 0):.0%} off the nominal error in {what} "
+                f"({distilled[key]:.3g} of {nominal[key]:.3g} {unit} RMS are left): the region is too large for so "
+                "small a network; give a smaller --region, more --poses, or use the parent."
+            )
+    if rows < _FEW_ROWS * joints:
+        sentences.append(
+            f"Only {rows} rows of joint values describe the region, {_FEW_ROWS * joints} or more fill it: between "
+            "few rows it is thin, and the errors hold in there only."
+        )
+    return tuple(sentences)
+
+
+def _limitations(parent: CalibratedModel, errors: ErrorFigures, trials: tuple[Trial, ...]) -> tuple[str, ...]:
+    """What the full solution has and the distilled one lacks."""
+    sentences = [
+        f"Exactness: on held-out poses of the region the tool is {errors.rms_mm:.4f} mm RMS (95 % within "
+        f"{errors.p95_mm:.4f} mm, at most {errors.max_mm:.4f} mm) from where the full solution brings it. "
+        "The errors that the parent itself has come on top."
+    ]
+    features = () if parent.hybrid is None else parent.hybrid.correction.features
+    harmonics = max((one.harmonics for one in features if isinstance(one, FourierSeries)), default=1)
+    inputs = next(trial.size.harmonics for trial in trials if trial.kept)
+    if harmonics > inputs:
+        sentences.append(
+            f"Fast ripple: the parent corrects every joint by a series of up to {harmonics} cycles a turn, this "
+            f"network sees {'sine and cosine' if inputs == 1 else f'up to {inputs} cycles'} of the joint's nominal "
+            f"value and follows what is slower{_without_overtones(trials)}."
+        )
+    conditions = None if parent.hybrid is None else learned_conditions(parent.hybrid.correction)
+    if conditions is not None:
+        names = " and ".join(conditions.names)
+        sentences.append(f"Conditions: {names} are taken as usual when the parent was measured.")
+    return (
+        *sentences,
+        "Reach: poses that only the calibrated robot can take have no nominal joint values to correct, and poses near "
+        f"a singularity (measure below {SINGULAR_BELOW}) were not learned.",
+        "Validity: it holds in its region and on its branches only; beyond, the status is OUTSIDE_DOMAIN. It predicts "
+        "no accuracy; ask the parent for it.",
+    )
+
+
+def _without_overtones(trials: tuple[Trial, ...]) -> str:
+    """What sines and cosines of the joints alone would give, where that was tried and something else taken."""
+    smooth = [trial.error for trial in trials if trial.size.harmonics == 1]
+    if not smooth or any(trial.kept and trial.size.harmonics == 1 for trial in trials):
+        return ""
+    return f" (with sines and cosines of the joints alone it would be {min(smooth) * 1e3:.4f} mm RMS)"
+
+
+def _region(region: Region, poses: SolvedPoses, robot: Robot) -> RegionFigures:
+    """Bounds of the joint values and of the positions."""
+    low, high = poses.q_nominal.amin(0).tolist(), poses.q_nominal.amax(0).tolist()
+    bounds = torch.stack(poses.T[:, :3, 3].aminmax(dim=0), 1).flatten().tolist()
+    return RegionFigures(
+        kind="joints" if region.box is None else "box",
+        rows=len(region.q),
+        box_mm=tuple(value * 1e3 for value in region.box or bounds),
+        joints=tuple(
+            JointRange(name=joint.name, unit=unit, lower=a * factor, upper=b * factor)
+            for joint, a, b, (unit, factor) in zip(robot.joints, low, high, _units(robot), strict=True)
+        ),
+    )
+
+
+def _tool_errors(
+    parent: CalibratedModel, T: Float64[Tensor, "poses 4 4"], q: Float64[Tensor, "poses dof"]
+) -> ErrorFigures:
+    """Errors of the tool at joint values q under the full model, from the poses T."""
+    error = pose_error(T, parent.forward(q))
+    errors = PoseErrors(error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1))
+    return ErrorFigures.model_validate(errors.in_file_units())
+
+
+def _joint_errors(
+    robot: Robot, correction: Float64[Tensor, "poses dof"], predicted: Float64[Tensor, "poses dof"]
+) -> tuple[JointErrorFigures, ...]:
+    """Per joint what the full solution adds, and how far the distilled model is from it."""
+    joints = []
+    for j, (unit, factor) in enumerate(_units(robot)):
+        full, error = correction[:, j] * factor, (correction - predicted)[:, j] * factor
+        joints.append(
+            JointErrorFigures(
+                name=robot.joints[j].name, unit=unit, correction=_absolute(full), error=_absolute(error)
+            )
+        )
+    return tuple(joints)
+
+
+def _absolute(values: Float64[Tensor, " poses"]) -> AbsoluteFigures:
+    size = values.abs()
+    return AbsoluteFigures(
+        mean=float(size.mean()), rms=float(size.square().mean().sqrt()), max=float(size.max())
+    )
+
+
+def _units(robot: Robot) -> list[tuple[str, float]]:
+    return [("deg", math.degrees(1)) if turns else ("mm", 1e3) for turns in robot.revolute]
