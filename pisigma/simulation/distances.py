@@ -123,7 +123,8 @@ class SimulatedDistances(AbstractCommanded):
         q = self.commanded(robot)
         draws = draw_noise(self.noise, len(q))
         anchor = torch.tensor(self.anchor.point_mm, dtype=torch.float64) / 1e3
-        away = robot.forward(q)[:, :3, 3] + draws.robot - anchor
+        approach = robot.draw_approach(q)
+        away = robot.forward(q, approach)[:, :3, 3] + draws.robot - anchor
         shown = away.norm(dim=-1) + self.anchor.zero_mm / 1e3 + draws.sensor[:, 0]
         return Measurements(
             q=q,
@@ -131,6 +132,7 @@ class SimulatedDistances(AbstractCommanded):
             anchor=(self.anchor.name,) * len(q),
             anchor_place=anchor.expand(len(q), 3).clone() if self.anchor.known else None,
             sigma_position=row_sigma(self.noise, len(q)),
+            approach=approach,
             source=f"simulation of {robot.nominal.name}",
         )
 
@@ -165,13 +167,15 @@ class SimulatedPairs(AbstractCommanded):
         if len(q) % 2:
             raise RecipeError(f"pairs: an even number of poses was wanted, got {len(q)}; add or remove one.")
         draws = draw_noise(self.noise, len(q))
-        position = (robot.forward(q)[:, :3, 3] + draws.robot).reshape(-1, 2, 3)
+        approach = robot.draw_approach(q)
+        position = (robot.forward(q, approach)[:, :3, 3] + draws.robot).reshape(-1, 2, 3)
         shown = (position[:, 0] - position[:, 1]).norm(dim=-1) + draws.sensor[::2, 0]
         return Measurements(
             q=q,
             distance=_not_below_zero(shown).repeat_interleave(2),
             pair=tuple(f"{self.name} {row // 2}" for row in range(len(q))),
             sigma_position=row_sigma(self.noise, len(q), points=2),
+            approach=approach,
             source=f"simulation of {robot.nominal.name}",
         )
 

@@ -53,12 +53,14 @@ def simulate(
         noise: of the sensor; None measures exactly.
 
     Returns:
-        One row per commanded joint vector, with the standard deviations of the noise where there is any.
+        One row per commanded joint vector, with the standard deviations of the noise where there is any, and with
+        the sides from which the joints come, drawn at random, where they have play.
 
     Raises:
         PoseError: q has another number of columns than the robot has joints.
     """
-    T = robot.forward(q)
+    approach = robot.draw_approach(q)
+    T = robot.forward(q, approach)
     T = T if noise is None else noise.apply(T)
     pose = sensor == "pose"
     return Measurements(
@@ -67,6 +69,7 @@ def simulate(
         rotation=T[:, :3, :3].clone() if pose else None,
         sigma_position=_sigma(q, 0.0 if noise is None else noise.sigma_position),
         sigma_rotation=_sigma(q, noise.sigma_rotation if noise is not None and pose else 0.0),
+        approach=approach,
         source=f"simulation of {robot.nominal.name}",
     )
 

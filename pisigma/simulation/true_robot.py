@@ -1,11 +1,12 @@
 """The true robot of a simulation: a nominal robot with error sources that add up."""
 
+import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Annotated, TypeVar, get_args
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Float64
 from torch import Tensor
 
 from pisigma.errors import RecipeError, UnreachablePoseError
@@ -13,6 +14,7 @@ from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.numeric import solve_numeric
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
+from pisigma.simulation.errors.backlash import Backlash
 from pisigma.simulation.errors.encoder import EncoderQuantisation
 from pisigma.simulation.errors.geometric import GeometricDeviation, RandomGeometricDeviation
 from pisigma.simulation.errors.joint_compliance import JointCompliance
@@ -21,6 +23,7 @@ from pisigma.simulation.errors.source import (
     AbstractErrorSource,
     AbstractGeometrySource,
     AbstractJointSource,
+    AbstractPlaySource,
     JointErrorFunction,
 )
 from pisigma.simulation.errors.transmission import TransmissionHarmonics
@@ -33,6 +36,7 @@ ERROR_SOURCES: dict[str, type[AbstractErrorSource]] = {
     "joint_compliance": JointCompliance,
     "transmission": TransmissionHarmonics,
     "encoder": EncoderQuantisation,
+    "backlash": Backlash,
 }
 """The registry: every error source by its kind."""
 
@@ -49,7 +53,8 @@ def register_error_source(source: type[Source]) -> type[Source]:
     """Make recipes know an error source by its kind; to be called once, or used as a decorator.
 
     Args:
-        source: subclass of `AbstractJointSource` or `AbstractGeometrySource` whose `kind` is a `Literal`.
+        source: subclass of `AbstractJointSource`, `AbstractGeometrySource` or `AbstractPlaySource` whose `kind` is a
+            `Literal`.
 
     Raises:
         RecipeError: the class states no kind, or another source has it.
@@ -91,7 +96,10 @@ class TrueRobotSection(Section):
 
 @dataclass(frozen=True, eq=False)
 class TrueRobot:
-    """A robot as it really is: `T_base_tool = FK(q + Σ e_i(q); nominal geometry + Σ changes)`.
+    """A robot as it really is: `T_base_tool = FK(q + Σ e_i(q) - half_play · approach; nominal geometry + Σ changes)`.
+
+    The approach of a joint is +1 where its value grew before it stopped, -1 where it fell, and 0, the middle of its
+    play, where that is not stated.
 
     Every joint error e_i, the rounding of the encoder among them, is evaluated at the commanded joints q and
     on the nominal geometry, and then all are added. So their order does not matter, and the effect of one
@@ -101,23 +109,29 @@ class TrueRobot:
         nominal: the robot as drawn.
         errors: the error sources.
         geometry: the robot with the true geometric parameters; takes actual joint values.
+        half_play: `(dof,)`, how far every joint stops short of the commanded value [rad or m].
     """
 
     nominal: Robot
     errors: Sequence[AbstractErrorSource] = ()
     geometry: Robot = field(init=False)
+    half_play: Float64[Tensor, " dof"] = field(init=False, repr=False)
     _joint_errors: tuple[JointErrorFunction, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Add the geometric errors up and bind the joint errors to the robot."""
         dh, base, tool = self.nominal.dh.copy(), self.nominal.base.copy(), self.nominal.tool.copy()
         joint_errors: list[JointErrorFunction] = []
+        half_play = torch.zeros(self.nominal.dof, dtype=torch.float64)
         stepped: set[str] = set()
         for index, source in enumerate(self.errors):
             place = f"errors[{index}] ({source.kind})"
             if isinstance(source, AbstractGeometrySource):
                 change = source.change(self.nominal, place)
                 dh, base, tool = dh + change.dh, base + change.base, tool + change.tool
+                continue
+            if isinstance(source, AbstractPlaySource):
+                half_play += torch.from_numpy(source.half_play(self.nominal, place))
                 continue
             assert isinstance(source, AbstractJointSource)
             joint_errors.append(source.bind(self.nominal, place))
@@ -128,6 +142,7 @@ class TrueRobot:
             stepped |= source.stepped_joints
         object.__setattr__(self, "errors", tuple(self.errors))
         object.__setattr__(self, "geometry", self.nominal.with_geometry(dh, base, tool))
+        object.__setattr__(self, "half_play", half_play)
         object.__setattr__(self, "_joint_errors", tuple(joint_errors))
 
     @property
@@ -139,28 +154,52 @@ class TrueRobot:
         """The same robot, its joints moving continuously."""
         return replace(self, errors=[source for source in self.errors if not _steps(source)])
 
-    def joint_error(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+    def draw_approach(self, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows dof"] | None:
+        """From which side every joint comes, +1 or -1 at random; None where no joint has play.
+
+        It is the same at every call: drawn with the seeds of the sources and the joint values.
+        """
+        if not bool(self.half_play.any()):
+            return None
+        seeds = [source.seed for source in self.errors if isinstance(source, AbstractPlaySource)]
+        drawn = zlib.crc32(q.numpy(force=True).tobytes(), sum(seeds))
+        generator = torch.Generator().manual_seed(drawn)
+        return (2 * torch.randint(0, 2, q.shape, generator=generator) - 1).to(q)
+
+    def joint_error(
+        self, q: Float[Tensor, "*batch dof"], approach: Float[Tensor, "*batch dof"] | None = None
+    ) -> Float[Tensor, "*batch dof"]:
         """How far the joints end up from where they are commanded: actual minus commanded [rad or m].
 
         Args:
             q: commanded joint values [rad or m], as the controller counts.
+            approach: from which side every joint comes; None for the middle of all play.
 
         Raises:
             PoseError: q has another number of columns than the robot has joints.
         """
         self.nominal.check_joint_count(q.shape[-1])
-        total = torch.zeros_like(q)
+        total = torch.zeros_like(q) if approach is None else -self.half_play.to(q) * approach
         for error in self._joint_errors:
             total = total + error(q)
         return total
 
-    def actual_joints(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
-        """Where the joints end up [rad or m] when commanded to q: `q + joint_error(q)`."""
-        return q + self.joint_error(q)
+    def actual_joints(
+        self, q: Float[Tensor, "*batch dof"], approach: Float[Tensor, "*batch dof"] | None = None
+    ) -> Float[Tensor, "*batch dof"]:
+        """Where the joints end up [rad or m] when commanded to q: `q + joint_error(q, approach)`."""
+        return q + self.joint_error(q, approach)
 
-    def forward(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch 4 4"]:
-        """T_base_tool that the robot really takes when commanded to q [rad or m]; no measurement noise."""
-        return forward_kinematics(self.geometry, self.actual_joints(q))
+    def forward(
+        self, q: Float[Tensor, "*batch dof"], approach: Float[Tensor, "*batch dof"] | None = None
+    ) -> Float[Tensor, "*batch 4 4"]:
+        """T_base_tool that the robot really takes when commanded to q [rad or m]; no measurement noise.
+
+        Args:
+            q: commanded joint values [rad or m].
+            approach: from which side every joint comes; None for the middle of all play.
+        """
+        return forward_kinematics(self.geometry, self.actual_joints(q, approach))
 
     def commanded_joints(self, actual: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
         """What to command [rad or m] so that the joints end up at `actual`.

@@ -32,7 +32,7 @@ class GeometryChange:
 
 
 class AbstractErrorSource(Section, ABC):
-    """An error source; every concrete one is an `AbstractGeometrySource` or an `AbstractJointSource`.
+    """An error source; concrete ones are an `AbstractGeometrySource`, `AbstractJointSource` or `AbstractPlaySource`.
 
     Attributes:
         kind: what recipes call it, a `Literal` of one text.
@@ -68,6 +68,28 @@ class AbstractJointSource(AbstractErrorSource):
     @abstractmethod
     def bind(self, robot: Robot, place: str) -> JointErrorFunction:
         """The source as a function of the commanded joint values of one robot.
+
+        Args:
+            robot: the nominal robot.
+            place: where the source stands in its recipe, for complaints.
+
+        Raises:
+            RecipeError: the source does not fit the robot.
+        """
+
+
+class AbstractPlaySource(AbstractErrorSource):
+    """An error source by which a joint stops on the side that it comes from; several sources are added.
+
+    Attributes:
+        seed: of the sides from which simulated rows are approached.
+    """
+
+    seed: int
+
+    @abstractmethod
+    def half_play(self, robot: Robot, place: str) -> Float64[np.ndarray, " dof"]:
+        """How far every joint stops short of the commanded value [rad or m].
 
         Args:
             robot: the nominal robot.
