@@ -27,7 +27,7 @@ def report(
     from pisigma.measurement.dataset import Measurements
     from pisigma.model.folder.model_folder import load_model
     from pisigma.reporting.page.content import report_content
-    from pisigma.reporting.page.figure_files import check_figures, write_figures
+    from pisigma.reporting.page.figures import check_figures, write_figures
     from pisigma.reporting.page.page import draw_figures, render_page
     from pisigma.reporting.page.summary import summary_of
 

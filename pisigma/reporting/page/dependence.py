@@ -5,13 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 
 from pisigma.judging.rank_tests import SIGNIFICANT, groups_differ, rank_correlation
 from pisigma.measurement.conditions import CONDITIONS, conditions_of
 from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.reporting.page.judged_rows import JudgedRows
-from pisigma.reporting.page.regions import binned, root_mean_square
 from pisigma.reporting.tables import figure_text
 from pisigma.robot.description import Robot
 
@@ -19,6 +18,10 @@ NOTABLE = 1.25
 """Parts whose RMS errors differ by a smaller factor are called alike."""
 ORDERED = 0.3
 """From such a rank correlation of a joint with the order of the rows on, time and place cannot be told apart."""
+BINS = 12
+"""Parts of a joint's measured values."""
+LEAST_ROWS = 8
+"""Fewer rows say too little of a region or part."""
 _DEGREES = math.degrees(1.0)
 
 
@@ -216,3 +219,36 @@ def _over_condition(title: str, own: str, values: np.ndarray, errors: np.ndarray
 def chance_text(probability: float) -> str:
     """A probability in words, such as "p = 0.02"."""
     return "p < 1e-12" if probability < 1e-12 else f"p = {probability:.2g}"
+
+
+def root_mean_square(values: Float64[np.ndarray, " values"]) -> float:
+    """Root mean square; NaN of nothing."""
+    return float(np.sqrt(np.mean(values**2))) if len(values) else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Binned:
+    """Errors in parts of a quantity's values.
+
+    Attributes:
+        edges: of the parts, one more than there are parts.
+        rms: of every part; NaN where there are too few rows.
+        number: of every row, in which part it is.
+    """
+
+    edges: Float64[np.ndarray, " edges"]
+    rms: Float64[np.ndarray, " bins"]
+    number: Int64[np.ndarray, " rows"]
+
+
+def binned(
+    values: Float64[np.ndarray, " rows"], errors: Float64[np.ndarray, " rows"], bins: int = BINS
+) -> Binned:
+    """Errors in parts of equal width; of few rows in fewer parts."""
+    bins = int(np.clip(len(values) // LEAST_ROWS, 1, bins))
+    low, high = float(values.min()), float(values.max())
+    edges = np.linspace(low, high if high > low else low + 1.0, bins + 1)
+    number = np.clip(np.searchsorted(edges, values, "right") - 1, 0, bins - 1)
+    parts = [errors[number == k] for k in range(bins)]
+    rms = [root_mean_square(part) if len(part) >= 3 else math.nan for part in parts]
+    return Binned(edges, np.array(rms), number)

@@ -1,31 +1,137 @@
-"""Figures of a report: errors over what they may depend on, correlations, corrections, learning curve."""
+"""Figures of a report, drawn and as SVG and PNG: many dots as pixels, no dates inside, names shown as they are."""
 
-from collections.abc import Mapping, Sequence
+import io
+import os
+import re
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float64
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
+from pisigma.errors import OutputError
 from pisigma.reporting.page.corrections import CorrectionCurve
-from pisigma.reporting.page.dependence import Dependence
-from pisigma.reporting.page.drawing import (
-    AFTER,
-    BEFORE,
-    MANY_DOTS,
-    OTHER,
-    SIZE,
-    Drawing,
-    drawing_style,
-)
+from pisigma.reporting.page.dependence import Dependence, binned
 from pisigma.reporting.page.error_map import ErrorMap
-from pisigma.reporting.page.regions import binned
 
+SIZE = (5.2, 3.1)
+"""Of a panel [inch]."""
+MANY_DOTS = 200
+"""From so many on, dots are drawn as pixels."""
+PIXELS = 130
+"""Of dots, per inch."""
+BEFORE, AFTER, OTHER = "#b35806", "#1f5fa8", "#4d4d4d"
+"""Colours that are told apart by people who see no red or no green, too."""
+_STYLE: dict[Any, Any] = {
+    "text.parse_math": False,
+    "svg.hashsalt": "pisigma",
+    "svg.fonttype": "none",
+    "font.size": 10.0,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.alpha": 0.3,
+    "axes.titlesize": 10.5,
+    "axes.titlelocation": "left",
+    "legend.frameon": False,
+    "legend.fontsize": 9.0,
+}
 MOST_MAP_DOTS = 1_500
 """Of the flat map: the largest errors all, of the others every fourth and as many at most."""
 _MARKS = {"nominal": ("s", ":"), "geometric": ("o", "--"), "hybrid": ("^", "-")}
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """A figure of the report.
+
+    Attributes:
+        key: its file name without ending.
+        title: for the page.
+        alt: what is to be seen, for people who do not see it.
+        figure: the figure.
+    """
+
+    key: str
+    title: str
+    alt: str
+    figure: Figure
+
+    def svg(self) -> str:
+        """The figure as SVG, the same text for the same figure."""
+        stream = io.BytesIO()
+        with drawing_style():
+            FigureCanvasSVG(self.figure)
+            self.figure.savefig(stream, format="svg", dpi=PIXELS, metadata={"Date": None, "Creator": None})
+        return stream.getvalue().decode()
+
+    def png(self) -> bytes:
+        """The figure as PNG."""
+        stream = io.BytesIO()
+        with drawing_style():
+            FigureCanvasAgg(self.figure)
+            self.figure.savefig(stream, format="png", dpi=160, metadata={"Software": None})
+        return stream.getvalue()
+
+
+@contextmanager
+def drawing_style() -> Iterator[None]:
+    """The style of all figures; characters that no font has are no reason to complain."""
+    with mpl.rc_context(_STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Glyph .* missing from")
+        yield
+
+
+def check_figures(folder: Path) -> None:
+    """Make sure that figures may be written into a folder: before the work, not after it.
+
+    Raises:
+        OutputError: it is a file, or it cannot be made or written to.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise OutputError(f"{folder}: is a file; choose another folder for --figures.")
+    if not folder.exists() and not folder.parent.is_dir():
+        raise OutputError(
+            f"{folder}: there is no folder {folder.parent}; make it or choose another --figures."
+        )
+    if not os.access(folder if folder.exists() else folder.parent, os.W_OK):
+        raise OutputError(f"{folder}: cannot be written to; choose another --figures.")
+
+
+def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
+    """Write every figure as PNG and SVG.
+
+    Args:
+        drawings: to write; names that no file can have are changed.
+        folder: made where missing.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    written: list[Path] = []
+    try:
+        folder.mkdir(exist_ok=True)
+        for drawing in drawings:
+            stem = folder / (re.sub(r"[^\w.-]", "_", drawing.key) or "figure")
+            svg, png = Path(f"{stem}.svg"), Path(f"{stem}.png")
+            svg.write_text(drawing.svg(), encoding="utf-8")
+            png.write_bytes(drawing.png())
+            written += [png, svg]
+    except OSError as problem:
+        raise OutputError(
+            f"{folder}: cannot be written ({problem.strerror}); choose another --figures."
+        ) from None
+    return written
 
 
 def draw_dependence(found: Dependence) -> Drawing:

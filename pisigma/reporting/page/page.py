@@ -13,9 +13,9 @@ from markupsafe import Markup
 
 from pisigma.reporting.page.accuracy import LABELS, STATISTICS, Accuracy
 from pisigma.reporting.page.content import ReportContent
-from pisigma.reporting.page.drawing import Drawing
 from pisigma.reporting.page.error_map import ErrorMap
 from pisigma.reporting.page.figures import (
+    Drawing,
     draw_correction,
     draw_correlations,
     draw_dependence,

@@ -1,14 +1,22 @@
-"""The verdict on a calibration: one sentence, and what it rests on."""
+"""The verdict on a calibration: one sentence, what it rests on, and where the calibration is worst."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import numpy as np
+from jaxtyping import Float64
+
+from pisigma.judging.rank_tests import SIGNIFICANT, groups_differ
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.page.accuracy import Accuracy
+from pisigma.reporting.page.dependence import LEAST_ROWS, error_lengths, root_mean_square
 from pisigma.reporting.page.judged_rows import JudgedRows
 from pisigma.reporting.page.limits import Limit
-from pisigma.reporting.page.worst_place import worst_place
 from pisigma.reporting.tables import figure_text
+
+CELLS = 4
+"""Parts of the measured space along every axis."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +36,27 @@ class Verdict:
     worst: str
     limit: str
     held_out: bool
+
+
+@dataclass(frozen=True)
+class Region:
+    """The part of the space with the largest errors.
+
+    Attributes:
+        low: its corner [m].
+        high: the opposite corner [m].
+        rows: how many are in it.
+        rms: of their errors.
+        ratio: RMS over that of all rows.
+        significant: whether errors there are larger than elsewhere more than by chance.
+    """
+
+    low: tuple[float, ...]
+    high: tuple[float, ...]
+    rows: int
+    rms: float
+    ratio: float
+    significant: bool
 
 
 def verdict_of(
@@ -135,3 +164,102 @@ def _without_poses(model: CalibratedModel) -> Verdict:
 
 def _average(figures: Mapping[str, float]) -> float:
     return next(value for name, value in figures.items() if name.startswith("average"))
+
+
+def worst_place(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, str]:
+    """Where errors are largest: a clause for the verdict and a sentence; both empty without rows."""
+    if rows is None:
+        return "", ""
+    _, after, unit = error_lengths(rows)
+    known = np.isfinite(after)
+    if not known.any():
+        return "", ""
+    place, errors = rows.place.numpy()[known], after[known]
+    region = worst_region(place, errors)
+    worst = int(errors.argmax())
+    number = np.flatnonzero(known)[worst]
+    at = ", ".join(str(round(value * 1e3)) for value in place[worst].tolist())
+    q = rows.measurements.q.numpy()[number]
+    joints = ", ".join(
+        f"{np.degrees(value):.1f} deg" if turns else f"{value * 1e3:.1f} mm"
+        for value, turns in zip(q, model.robot.revolute, strict=True)
+    )
+    own = (
+        f"{_AMONG[rows.origin]} the worst is {_row_text(rows, int(number))}: "
+        f"{figure_text(float(errors[worst]))} {unit} at x, y, z = {at} mm of the robot's base, joints {joints}."
+    )
+    return _region_text(region, unit, own, rows)
+
+
+_AMONG = {
+    "held_out": "Of the held-out rows",
+    "training": "Of the rows that the model was made of",
+    "other": "Of the rows of the file",
+}
+
+
+def _row_text(rows: JudgedRows, number: int) -> str:
+    line = rows.measurements.line[number]
+    return (
+        f"line {line} of {rows.measurements.source}"
+        if line
+        else f"row {number + 1} of {rows.measurements.source}"
+    )
+
+
+def _region_text(region: Region | None, unit: str, own: str, rows: JudgedRows) -> tuple[str, str]:
+    if region is None:
+        return "", own
+    seen = " (as far as the rows that it was made of tell)" if rows.origin == "training" else ""
+    if not region.significant:
+        return (
+            f"nowhere in the measured space is it worse than elsewhere by more than chance{seen}",
+            f"No part of the measured space is worse than the others by more than chance. {own}",
+        )
+    ranges = ", ".join(
+        f"{axis} {round(low * 1e3)} to {round(high * 1e3)}"
+        for axis, low, high in zip("xyz", region.low, region.high, strict=True)
+    )
+    clause = f"it is worst around {ranges} mm of the robot's base, {figure_text(region.rms)} {unit} RMS{seen}"
+    sentence = (
+        f"Largest errors in {ranges} mm of the robot's base: {figure_text(region.rms)} {unit} RMS over {region.rows} "
+        f"rows, {region.ratio:.1f} times that of all rows, more than by chance. {own}"
+    )
+    return clause, sentence
+
+
+def worst_region(place: Float64[np.ndarray, "rows 3"], errors: Float64[np.ndarray, " rows"]) -> Region | None:
+    """The cell of a grid over the places whose errors are largest for sure.
+
+    Args:
+        place: of every row [m].
+        errors: their lengths, all finite.
+
+    Returns:
+        None where there are too few rows, or all are in one cell.
+    """
+    low, high = (place.min(0), place.max(0)) if len(place) else (np.zeros(3), np.zeros(3))
+    width = np.where(high > low, (high - low) / CELLS, 1.0)
+    cell = np.clip(((place - low) / width).astype(int), 0, CELLS - 1)
+    number = (cell * [CELLS * CELLS, CELLS, 1]).sum(1)
+    best: tuple[float, int] | None = None
+    counted = [(k, errors[number == k]) for k in np.unique(number)]
+    counted = [(k, own) for k, own in counted if len(own) >= max(LEAST_ROWS, len(errors) // 100)]
+    if len(counted) < 2:
+        return None
+    for k, own in counted:
+        surely = root_mean_square(own) * (1 - 1 / math.sqrt(len(own)))
+        best = max(best, (surely, int(k))) if best else (surely, int(k))
+    assert best is not None
+    inside = number == best[1]
+    _, chance = groups_differ(inside.astype(int), errors)
+    corner = low + width * cell[inside][0]
+    rms = root_mean_square(errors[inside])
+    return Region(
+        tuple(corner.tolist()),
+        tuple((corner + width).tolist()),
+        int(inside.sum()),
+        rms,
+        rms / root_mean_square(errors),
+        chance < SIGNIFICANT / len(counted),
+    )

@@ -16,7 +16,7 @@ from testing.report import HOSTILE, folder_with_held_out, geometric_under_test, 
 
 from pisigma.errors import OutputError
 from pisigma.reporting.page.content import report_content
-from pisigma.reporting.page.figure_files import check_figures, write_figures
+from pisigma.reporting.page.figures import check_figures, write_figures
 from pisigma.reporting.page.page import draw_figures, render_page, script_json
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")

@@ -5,7 +5,8 @@ import pytest
 from testing.closeness import assert_close
 
 from pisigma.judging.rank_tests import SIGNIFICANT
-from pisigma.reporting.page.regions import CELLS, binned, worst_region
+from pisigma.reporting.page.dependence import binned
+from pisigma.reporting.page.verdict import CELLS, worst_region
 
 
 def test_a_planted_region_is_found():
