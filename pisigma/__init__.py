@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from pisigma.workflow.evaluate import EvaluationSettings as EvaluationSettings
     from pisigma.workflow.evaluate import Limits as Limits
     from pisigma.workflow.evaluate import evaluate as evaluate
+    from pisigma.workflow.report import report as report
     from pisigma.workflow.verify import VerificationSettings as VerificationSettings
     from pisigma.workflow.verify import verify as verify
 
@@ -52,10 +53,11 @@ _HOMES = {
     "Solution": "pisigma.inverse.solution",
     "Status": "pisigma.kinematics.status",
     "VerificationSettings": "pisigma.workflow.verify",
+    "calibrate": "pisigma.workflow.calibrate",
     "distill": "pisigma.workflow.distill",
     "evaluate": "pisigma.workflow.evaluate",
-    "calibrate": "pisigma.workflow.calibrate",
     "load": "pisigma.inverse.corrected_ik",
+    "report": "pisigma.workflow.report",
     "verify": "pisigma.workflow.verify",
 }
 
@@ -82,6 +84,7 @@ __all__ = [
     "distill",
     "evaluate",
     "load",
+    "report",
     "verify",
 ]
 

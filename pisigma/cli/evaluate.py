@@ -1,7 +1,5 @@
 """`pisigma evaluate`: how well models explain measurements that they were not trained on."""
 
-import textwrap
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,9 +8,6 @@ import typer
 if TYPE_CHECKING:
     from pisigma.judging.model_comparison import ModelComparison
     from pisigma.workflow.evaluate import Evaluation
-
-
-WIDTH = 80
 
 
 def evaluate(
@@ -71,24 +66,20 @@ def evaluate(
 
 def print_comparison(comparison: "ModelComparison", data: str) -> None:
     """Print the errors of every model and its differences to the first."""
-    from pisigma.cli.output import print_table
+    from pisigma.cli.output import print_table, screen_width
     from pisigma.reporting.comparison_tables import difference_table, error_table
 
     tables = [error_table(comparison)]
     if len(comparison.models) > 1:
         tables.append(difference_table(comparison))
     for table in tables:
-        for head, rows in table.fitting(WIDTH):
+        for head, rows in table.fitting(screen_width()):
             print_table(f"{table.title} of {Path(data).name}", head, rows)
 
 
-def print_lines(lines: Iterable[str]) -> None:
-    """Print sentences, each wrapped."""
-    for line in lines:
-        typer.echo(textwrap.fill(line, WIDTH, break_long_words=False))
-
-
 def _print(evaluation: "Evaluation") -> None:
+    from pisigma.cli.output import print_lines
+
     stated = evaluation.settings.limits.stated
     if stated and evaluation.accepted:
         limits = ", ".join(f"{name} {limit:g}" for name, limit in stated.items())

@@ -43,7 +43,8 @@ def verify(
 
 
 def _print(verification: "Verification") -> None:
-    from pisigma.cli.evaluate import print_comparison, print_lines
+    from pisigma.cli.evaluate import print_comparison
+    from pisigma.cli.output import print_lines
 
     print_lines([verification.sentence])
     print_comparison(verification.comparison, verification.data)

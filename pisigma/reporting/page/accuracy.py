@@ -1,18 +1,20 @@
-"""Figures of accuracy, before and after, and of which rows they are."""
+"""Figures of accuracy, before and after, of which rows they are, and what limits it."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 
+from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.judging.pose_statistics import PoseErrors, error_statistics
-from pisigma.judging.validation_figures import ValidationFigures
+from pisigma.judging.validation_figures import ErrorFigures
+from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_tables import cross_validation_text
 from pisigma.reporting.page.judged_rows import JudgedRows
+from pisigma.reporting.tables import figure_text
 
-STATISTICS = (("mean", "mean"), ("rms", "RMS"), ("p95", "95 %"), ("max", "maximum"))
 LABELS = {
     "nominal": "nominal",
     "geometric": "geometric",
@@ -22,6 +24,10 @@ LABELS = {
     "distilled": "distilled",
 }
 """Models, in the order of the tables, and what they are called there."""
+MOSTLY = 0.8
+"""Share of the squared error from which on scatter is what limits."""
+LEAST_REPEATS = 10
+"""Degrees of freedom from which on repeated rows show the scatter."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +37,9 @@ class Accuracy:
     Attributes:
         title: which rows, in a few words.
         how: which rows and which models, in a sentence.
-        held_out: whether the models never saw the rows.
+        held_out: whether the models were made without the rows.
         rows: how many.
-        models: per model, figures such as "rms_mm" and "max_deg".
+        models: by name; the last is the model of the report.
         reference: what the errors are from, where that is another model instead of a measurement.
     """
 
@@ -41,48 +47,52 @@ class Accuracy:
     how: str
     held_out: bool
     rows: int
-    models: Mapping[str, Mapping[str, float]]
+    models: Mapping[str, ErrorFigures]
     reference: str = ""
 
     @property
-    def quantity(self) -> tuple[str, str]:
-        """Unit of what counts first, and what it is the error of."""
-        first = next(iter(self.models.values()))
-        return ("mm", "position") if "rms_mm" in first else ("deg", "orientation")
+    def unit(self) -> str:
+        """Unit of what counts first: "mm" of positions, else "deg" of orientations."""
+        return "deg" if self.last.rms_mm is None else "mm"
 
     @property
-    def last(self) -> Mapping[str, float]:
+    def last(self) -> ErrorFigures:
         """Figures of the model."""
         return list(self.models.values())[-1]
+
+    def figure(self, statistic: str, model: str = "") -> float:
+        """Give "rms", "mean", "p95" or "max" of what counts first, of the model or of another."""
+        return float(getattr(self.models[model] if model else self.last, f"{statistic}_{self.unit}"))
 
     @property
     def factor(self) -> float | None:
         """How much larger the RMS error of the nominal robot is; None without one."""
-        key = f"rms_{self.quantity[0]}"
-        if "nominal" not in self.models or len(self.models) < 2 or not self.last[key] > 0:
+        if "nominal" not in self.models or len(self.models) < 2 or not self.figure("rms") > 0:
             return None
-        return self.models["nominal"][key] / self.last[key]
+        return self.figure("rms", "nominal") / self.figure("rms")
 
 
-def accuracies(model: CalibratedModel, rows: JudgedRows | None) -> tuple[Accuracy, ...]:
-    """All that is known of a model's accuracy, the figures that say most first.
+def accuracies(
+    model: CalibratedModel, summary: CalibrationSummary | None, rows: JudgedRows | None
+) -> tuple[Accuracy, ...]:
+    """Gather all figures of a model's accuracy, those that say most first.
 
-    Unseen rows of a file come before the model's own held-out rows, and rows that it was made of come last.
+    Other rows of a file come before the model's own held-out rows, and rows that it was made of come last.
     """
-    found = _of_metrics(model)
+    kept = _of_distilled(model) if model.kind == "distilled" else _of_metrics(model, summary)
     if rows is None or rows.origin == "held_out":
-        return tuple(found)
-    own = _of_rows(rows)
-    return (own, *found) if own.held_out else (*found, own)
+        return tuple(kept)
+    of_rows = _of_rows(rows)
+    return (of_rows, *kept) if of_rows.held_out else (*kept, of_rows)
 
 
-def figures_of(errors: PoseErrors) -> dict[str, float]:
-    """Statistics in mm and deg of those of the errors that there are."""
+def figures_of(errors: PoseErrors) -> ErrorFigures:
+    """Compute statistics in mm and deg of those of the errors that there are."""
     figures: dict[str, float] = {}
     for values, unit, factor in ((errors.position, "mm", 1e3), (errors.rotation, "deg", 180 / torch.pi)):
         if values is not None and bool(torch.isfinite(values).any()):
             figures |= {f"{name}_{unit}": value * factor for name, value in error_statistics(values).items()}
-    return figures
+    return ErrorFigures(**figures)
 
 
 def _of_rows(rows: JudgedRows) -> Accuracy:
@@ -98,53 +108,186 @@ def _of_rows(rows: JudgedRows) -> Accuracy:
     return Accuracy("rows of the file", how, True, count, models)
 
 
-def _of_metrics(model: CalibratedModel) -> list[Accuracy]:
-    found = []
+def _of_metrics(model: CalibratedModel, summary: CalibrationSummary | None) -> list[Accuracy]:
+    """Read the figures of held-out rows that a model keeps."""
+    kept = []
     for key, title in (
         ("test", "test set"),
         ("cross_validation", "held-out rows"),
         ("held_out", "held-out rows"),
     ):
-        figures = model.metrics.get(key)
-        if isinstance(figures, Mapping) and (models := _models(figures)):
-            if "distilled" in models:
-                found.append(_of_distilled(model, models))
-                continue
-            rows = int(figures.get("rows", model.provenance.rows))
-            found.append(Accuracy(title, _how(key, figures, rows), True, rows, models))
-    return found
+        if models := _models(model.metrics.get(key)):
+            rows = int(model.metrics[key].get("rows", model.provenance.rows))
+            kept.append(Accuracy(title, _how(key, rows, summary), True, rows, models))
+    return kept
 
 
-def _of_distilled(model: CalibratedModel, models: Mapping[str, Mapping[str, float]]) -> Accuracy:
-    """Errors of a distilled model, which are from its parent's poses."""
-    parent, poses = model.metrics.get("parent", {}), model.metrics.get("poses", {})
-    rows, name = int(poses.get("held_out", 0)), str(parent.get("name", "its parent"))
+def _of_distilled(model: CalibratedModel) -> list[Accuracy]:
+    """Read the errors of a distilled model, which are from its parent's poses."""
+    models, name = _models(model.metrics.get("held_out")), model.metrics["parent"]["name"]
+    rows = int(model.metrics["poses"]["held_out"])
     how = f"{rows} poses that it was not fitted to; errors are from where the full model {name} has the tool."
-    return Accuracy(
-        "held-out poses",
-        how,
-        True,
-        rows,
-        models,
-        f"the poses of the full model {name}, whose own errors come on top",
-    )
+    reference = f"the poses of the full model {name}, whose own errors come on top"
+    return [Accuracy("held-out poses", how, True, rows, models, reference)] if models else []
 
 
-def _models(figures: Mapping[str, Any]) -> dict[str, Mapping[str, float]]:
-    models = {name: figures[name] for name in LABELS if isinstance(figures.get(name), Mapping)}
-    if not models and "rms_mm" in figures:
-        models = {
-            "geometric": {name: value for name, value in figures.items() if name[-3:] in ("_mm", "deg")}
-        }
-    return models
+def _models(figures: object) -> dict[str, ErrorFigures]:
+    if not isinstance(figures, Mapping):
+        return {}
+    kept = {name: figures[name] for name in LABELS if isinstance(figures.get(name), Mapping)}
+    return {name: ErrorFigures.model_validate(errors) for name, errors in kept.items()}
 
 
-def _how(key: str, figures: Mapping[str, Any], rows: int) -> str:
+def _how(key: str, rows: int, summary: CalibrationSummary | None) -> str:
     nominal = "nominal is the robot as drawn, with base and tool fitted to those other rows."
     if key == "test":
         return f"{rows} rows that the file marked as test, with which nothing was calibrated."
     if key == "held_out":
-        return f"{rows} other rows of the simulation, which the model never saw."
-    if figures.get("folds", 1) > 1:
-        return f"{cross_validation_text(ValidationFigures.model_validate(figures))}; {nominal}"
+        return f"{rows} other rows of the simulation, with which nothing was calibrated."
+    figures = None if summary is None else summary.cross_validation
+    if figures is not None and (figures.folds or 1) > 1:
+        return f"{cross_validation_text(figures)}; {nominal}"
     return f"{rows} rows that were held out once, judged by a calibration on the others; {nominal}"
+
+
+@dataclass(frozen=True)
+class JointFigures:
+    """Errors of one joint of a network on some rows; average, deviation and maximum of their sizes.
+
+    Attributes:
+        name: of the joint.
+        held_out: whether the network was made without the rows.
+        unit: "deg" or "mm".
+        before: without the network.
+        after: with it.
+    """
+
+    name: str
+    held_out: bool
+    unit: str
+    before: tuple[float, float, float]
+    after: tuple[float, float, float]
+
+
+def joint_figures(model: CalibratedModel) -> tuple[JointFigures, ...]:
+    """Read the errors of joints that a network was judged by, held-out rows first; none of other models."""
+    figures = []
+    for joint in model.metrics.get("joints") or ():
+        for rows in ("held_out", "training") if "training" in joint else ():
+            if rows in joint:
+                before, after = (tuple(joint[rows][when].values()) for when in ("before", "after"))
+                unit = next(iter(joint[rows]["before"])).rsplit("_", 1)[1]
+                figures.append(JointFigures(joint["name"], rows == "held_out", unit, before, after))
+    return tuple(figures)
+
+
+@dataclass(frozen=True)
+class Limit:
+    """What limits the accuracy.
+
+    Attributes:
+        noise: RMS length of the scatter of a measured position [mm]; None where it is not known.
+        share: of the squared error that it makes up; None where it is not known or the scatter exceeds the error.
+        source: where the figure of the noise is from.
+        clause: to go on "what limits it is ...".
+        sentence: the same with figures.
+    """
+
+    noise: float | None
+    share: float | None
+    source: str
+    clause: str
+    sentence: str
+
+
+def limit_of(
+    model: CalibratedModel,
+    summary: CalibrationSummary | None,
+    accuracy: Accuracy | None,
+    rows: JudgedRows | None,
+) -> Limit:
+    """Compare the error with the scatter of repeated rows, or with the noise that a hybrid identified."""
+    if accuracy is not None and accuracy.reference:
+        sentence = (
+            " ".join(model.metrics.get("limitations", ())) or "Ask the full model for its own accuracy."
+        )
+        return Limit(None, None, "", "the full model that it stands for", sentence)
+    noise, source = _repeated(rows), "rows that were measured more than once"
+    if noise is None:
+        noise, source = _identified_noise(summary), "the noise that the calibration identified"
+    if noise is None or accuracy is None or accuracy.unit != "mm" or not accuracy.figure("rms") > 0:
+        return _unknown(summary)
+    return _compared(noise, accuracy.figure("rms"), source)
+
+
+def _compared(noise: float, error: float, source: str) -> Limit:
+    """Compare the scatter of a measured position with the error [mm]."""
+    scatter = f"By {source}, a measured position scatters by {figure_text(noise)} mm RMS"
+    if noise >= error:
+        clause = "scatter of the measurements, which is as large as the error itself"
+        sentence = (
+            f"{scatter}, no less than the error itself ({figure_text(error)} mm RMS): these rows cannot show what the "
+            "model adds to it."
+        )
+        return Limit(noise, None, source, clause, sentence)
+    share = (noise / error) ** 2
+    percent = f"{100 * share:.0f} % of the squared error"
+    if share >= MOSTLY:
+        gain = f"{100 * (1 - math.sqrt(share)):.0f} %"
+        less = "hardly less error" if gain == "0 %" else f"{gain} less error"
+        sentence = (
+            f"{scatter}, which is {percent}: a perfect model would have {less} on the same rows, no more."
+        )
+        return Limit(noise, share, source, f"scatter of the measurements ({percent})", sentence)
+    sentence = (
+        f"{scatter}, which is {percent}; the other {100 * (1 - share):.0f} % are errors of the model: too few rows, or "
+        "effects that it cannot express."
+    )
+    clause = f"the model more than the measurements, whose scatter is {percent}"
+    return Limit(noise, share, source, clause, sentence)
+
+
+def _unknown(summary: CalibrationSummary | None) -> Limit:
+    noise = () if summary is None else summary.noise
+    rest = next((one.sigma_mm for one in noise if one.sigma_mm is not None), None)
+    clause = "measurement scatter or effects that the model lacks: these rows cannot tell which"
+    if rest is None:
+        sentence = (
+            "How much the measurements scatter by themselves is not known; measure some poses several times."
+        )
+        return Limit(None, None, "", clause, sentence)
+    sentence = (
+        f"What the geometry leaves over, {figure_text(rest)} mm per coordinate, is scatter of the measurements and "
+        "everything that geometry cannot express; measure some poses several times, or calibrate a hybrid, to tell "
+        "them apart."
+    )
+    return Limit(None, None, "", clause, sentence)
+
+
+def _repeated(rows: JudgedRows | None) -> float | None:
+    """Pool the scatter of positions at equal joint values: its RMS length [mm]; None with too few of them."""
+    if rows is None:
+        return None
+    finite = torch.isfinite(rows.residual).all(-1)
+    if int(finite.sum()) <= LEAST_REPEATS:
+        return None
+    measurements = rows.measurements.select(finite)
+    group = groups_of_equal_joints(measurements.q).tolist()
+    names = list(zip(group, measurements.frame, measurements.target, strict=True))
+    index = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    number = torch.tensor([index[name] for name in names])
+    values = rows.residual[finite]
+    counts = torch.bincount(number).double()
+    freedom = float((counts - 1).sum())
+    if freedom < LEAST_REPEATS:
+        return None
+    means = torch.zeros(len(index), 3, dtype=torch.float64).index_add_(0, number, values) / counts[:, None]
+    return math.sqrt(float((values - means[number]).square().sum()) / freedom) * 1e3
+
+
+def _identified_noise(summary: CalibrationSummary | None) -> float | None:
+    """Give the RMS length of a position's noise that a hybrid identified [mm]; of geometry alone it is no noise."""
+    if summary is None or summary.hybrid is None or summary.hybrid.learned is None:
+        return None
+    of_points = [one.sigma_mm for one in summary.hybrid.learned.noise if one.sensor in ("position", "socket")]
+    return None if not of_points or of_points[0] is None else math.sqrt(3) * of_points[0]

@@ -1,8 +1,6 @@
 """What to measure next, as sentences with figures."""
 
 import math
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 import torch
@@ -10,10 +8,11 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.hybrid.coverage import JointCoverage
+from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.page.accuracy import Accuracy
+from pisigma.reporting.calibration_tables import warning_lines
+from pisigma.reporting.page.accuracy import MOSTLY, Accuracy, Limit
 from pisigma.reporting.page.judged_rows import JudgedRows
-from pisigma.reporting.page.limits import MOSTLY, Limit
 from pisigma.reporting.tables import figure_text
 
 Stretch = tuple[float, float]
@@ -34,28 +33,37 @@ COVERAGE_OFF = 0.03
 
 
 def advice_for(
-    model: CalibratedModel, rows: JudgedRows | None, accuracies: tuple[Accuracy, ...], limit: Limit
+    model: CalibratedModel,
+    summary: CalibrationSummary | None,
+    rows: JudgedRows | None,
+    accuracies: tuple[Accuracy, ...],
+    limit: Limit,
 ) -> tuple[str, ...]:
-    """Sentences, the most useful first.
+    """Say what to measure next and what to trust, the most useful first.
 
     Args:
         model: the model.
+        summary: figures of its calibration; None of other models.
         rows: judged rows, or None.
         accuracies: what is known of the accuracy.
         limit: what limits it.
     """
-    metrics = model.metrics
+    warnings: list[str] = []
+    of_calibration: list[str] = []
+    outliers: list[str] = []
+    if summary is not None:
+        of_calibration = [*_weak_parameters(summary), *_more_rows(model, summary, limit), *_trust(summary)]
+        of_calibration += _orientations(model, summary)
+        outliers = _outliers(summary)
+        warnings = [line[:1].upper() + line[1:] for line in warning_lines(summary)]
     return (
-        *(f"{line[:1].upper()}{line[1:].rstrip('.')}." for line in metrics.get("warnings", ())),
+        *warnings,
         *_independent(model, accuracies),
         *_joint_gaps(model, rows),
         *_outside(rows),
-        *_weak_parameters(metrics),
-        *_more_rows(model, limit),
-        *_trust(metrics),
-        *_orientations(model),
+        *of_calibration,
         *_conditions(rows),
-        *_outliers(metrics),
+        *outliers,
     )
 
 
@@ -152,15 +160,15 @@ def _outside(rows: JudgedRows | None) -> list[str]:
     return [f"{text}: calibrate with such rows too."]
 
 
-def _weak_parameters(metrics: Mapping[str, Any]) -> list[str]:
+def _weak_parameters(summary: CalibrationSummary) -> list[str]:
     lines = [
         f"Hardly identified: {line.rstrip('.')}. Choose poses that move more of what it depends on."
-        for line in metrics.get("weak_directions", ())
+        for line in summary.weak_directions
     ]
     unsure = [
-        row["name"]
-        for row in metrics.get("parameters", ())
-        if row["standard_error"] and abs(row["change"]) < SURE * row["standard_error"]
+        row.name
+        for row in summary.parameters
+        if row.standard_error and row.change is not None and abs(row.change) < SURE * row.standard_error
     ]
     if unsure:
         named = ", ".join(unsure[:8]) + (f" and {len(unsure) - 8} others" if len(unsure) > 8 else "")
@@ -171,19 +179,20 @@ def _weak_parameters(metrics: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _more_rows(model: CalibratedModel, limit: Limit) -> list[str]:
-    points = model.metrics.get("learning_curve") or []
-    name = "hybrid" if points and "hybrid" in points[-1] else "geometric"
-    if len(points) > 1 and name in points[-1]:
-        before, last = points[-2], points[-1]
-        gain = 1 - last[name]["rms_mm"] / before[name]["rms_mm"]
-        doublings = math.log2(last["rows"] / before["rows"])
+def _more_rows(model: CalibratedModel, summary: CalibrationSummary, limit: Limit) -> list[str]:
+    points = summary.learning_curve or ()
+    if len(points) > 1:
+        before, last = ((point.rows, list(point.models.values())[-1].rms_mm or 0.0) for point in points[-2:])
+        gain = 1 - last[1] / before[1]
+        doublings = math.log2(last[0] / before[0])
         each = 1 - (1 - gain) ** (1 / doublings) if doublings > 0 and gain < 1 else 0.0
-        first, second = (figure_text(point[name]["rms_mm"]) for point in (before, last))
-        told = f"from {before['rows']} to {last['rows']} rows the error went from {first} to {second} mm RMS"
+        change = (
+            f"from {before[0]} to {last[0]} rows the error went from {figure_text(before[1])} to "
+            f"{figure_text(last[1])} mm RMS, {100 * max(each, 0.0):.0f} % per doubling."
+        )
         if each >= STILL_FALLING:
-            return [f"More rows help: {told}, {100 * each:.0f} % per doubling."]
-        return [f"More rows of the same kind help little: {told}, {100 * max(each, 0.0):.0f} % per doubling."]
+            return [f"More rows help: {change}"]
+        return [f"More rows of the same kind help little: {change}"]
     if limit.share is None or limit.share >= MOSTLY:
         return []
     return [
@@ -192,23 +201,19 @@ def _more_rows(model: CalibratedModel, limit: Limit) -> list[str]:
     ]
 
 
-def _trust(metrics: Mapping[str, Any]) -> list[str]:
-    figures = next(
-        (metrics[k] for k in ("cross_validation", "held_out", "test") if "coverage" in metrics.get(k, ())),
-        None,
-    )
-    if figures is None or abs(figures["coverage"] - 0.95) < COVERAGE_OFF:
+def _trust(summary: CalibrationSummary) -> list[str]:
+    coverage = None if summary.judged is None else summary.judged.coverage
+    if coverage is None or abs(coverage - 0.95) < COVERAGE_OFF:
         return []
-    share = 100 * figures["coverage"]
-    kind = "too good: take it with a factor" if share < 95 else "cautious: errors are smaller than it says"
+    kind = "too good: multiply it" if coverage < 0.95 else "cautious: errors are smaller than it says"
     return [
-        f"{share:.1f} % of held-out coordinates are within the predicted 95 % intervals: the predicted accuracy is "
-        f"{kind}."
+        f"{100 * coverage:.1f} % of held-out coordinates are within the predicted 95 % intervals, so the predicted "
+        f"accuracy is {kind}."
     ]
 
 
-def _orientations(model: CalibratedModel) -> list[str]:
-    sensors = [noise["sensor"] for noise in model.metrics.get("noise", ())]
+def _orientations(model: CalibratedModel, summary: CalibrationSummary) -> list[str]:
+    sensors = [noise.sensor for noise in summary.noise]
     if not sensors or "rotation" in sensors or len(model.tools) > 2:
         return []
     return [
@@ -237,11 +242,11 @@ def _conditions(rows: JudgedRows | None) -> list[str]:
     return lines
 
 
-def _outliers(metrics: Mapping[str, Any]) -> list[str]:
-    outliers = metrics.get("outliers", ())
-    if not outliers:
+def _outliers(summary: CalibrationSummary) -> list[str]:
+    if not summary.outliers:
         return []
-    worst = ", ".join(str(outlier["place"]) for outlier in outliers[:3])
+    worst = ", ".join(outlier.place for outlier in summary.outliers[:3])
     return [
-        f"{len(outliers)} rows counted for less than half as outliers: measure them again, the worst first ({worst})."
+        f"{len(summary.outliers)} rows counted for less than half as outliers: measure them again, the worst first "
+        f"({worst})."
     ]

@@ -1,27 +1,30 @@
 """Everything that a report says, as figures and sentences, before it is drawn and laid out."""
 
-import re
-from dataclasses import dataclass
+import math
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pisigma.judging.calibration_summary import read_summary
+from pisigma.judging.calibration_summary import CalibrationSummary, read_summary
 from pisigma.judging.held_out_rows import read_held_out
+from pisigma.judging.validation_figures import LearningPoint
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_figures import CORRELATION_PNG
 from pisigma.reporting.calibration_files import CORRELATION_CSV
 from pisigma.reporting.calibration_tables import coverage_line, learned_lines
-from pisigma.reporting.page.accuracy import Accuracy, accuracies
+from pisigma.reporting.page.accuracy import Accuracy, JointFigures, Limit, accuracies, joint_figures, limit_of
 from pisigma.reporting.page.advice import advice_for
-from pisigma.reporting.page.corrections import CorrectionCurve, correction_curves
+from pisigma.reporting.page.corrections import (
+    CorrectionCurve,
+    ParameterFindings,
+    correction_curves,
+    parameter_findings,
+)
 from pisigma.reporting.page.dependence import Dependence, NameErrors, by_name, dependences
 from pisigma.reporting.page.error_map import ErrorMap, map_of_rows, map_of_workspace
 from pisigma.reporting.page.judged_rows import JudgedRows, rows_of_file, rows_of_folder
-from pisigma.reporting.page.limits import Limit, limit_of
-from pisigma.reporting.page.parameters import ParameterFindings, parameter_findings
 from pisigma.reporting.page.verdict import Verdict, verdict_of
-from pisigma.reporting.tables import CARD
 
 KINDS = {
     "hybrid_calibration": "Hybrid calibration: geometry, and a learned correction of the joints",
@@ -70,12 +73,51 @@ class ReportContent:
     parameters: ParameterFindings
     curves: tuple[CorrectionCurve, ...]
     learned: tuple[str, ...]
-    learning_curve: tuple[dict[str, Any], ...]
+    learning_curve: tuple[LearningPoint, ...]
     advice: tuple[str, ...]
     provenance: tuple[tuple[str, str], ...]
-    joints: tuple[dict[str, Any], ...]
+    joints: tuple[JointFigures, ...]
     missing: tuple[str, ...]
     correlation_png: bytes = b""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return figures and sentences as plain values, without single rows; what is no number is None."""
+        rows = self.rows
+        values = {
+            "model": self.model.name,
+            "verdict": self.verdict.sentence,
+            "held_out": self.verdict.held_out,
+            "worst": self.verdict.worst,
+            "limit": {
+                "noise_rms_mm": self.limit.noise,
+                "share": self.limit.share,
+                "says": self.limit.sentence,
+            },
+            "accuracy": [
+                {
+                    "of": one.title,
+                    "how": one.how,
+                    "held_out": one.held_out,
+                    "rows": one.rows,
+                    "models": {name: figures.by_name for name, figures in one.models.items()},
+                }
+                for one in self.accuracies
+            ],
+            "rows": None
+            if rows is None
+            else {"count": rows.measurements.rows, "origin": rows.origin, "remarks": list(rows.remarks)},
+            "residuals": [{"over": one.title, "says": one.sentence} for one in self.dependences],
+            "frames": [asdict(one) for one in self.frames[0]],
+            "targets": [asdict(one) for one in self.targets[0]],
+            "not_identified": list(self.parameters.not_identified),
+            "observability": {name: value for name, value, _ in self.parameters.observability},
+            "correlated": [list(pair) for pair in self.parameters.pairs],
+            "advice": list(self.advice),
+            "missing": list(self.missing),
+            "provenance": dict(self.provenance),
+        }
+        plain: dict[str, Any] = _finite(values)
+        return plain
 
 
 def report_content(
@@ -92,74 +134,63 @@ def report_content(
         MeasurementError: the rows cannot be judged.
         ModelError: files of the folder are missing or were changed.
     """
-    held_out = read_held_out(folder, model)
+    summary, held_out = read_summary(model), read_held_out(folder, model)
     rows = None
     if measurements is not None:
         rows = rows_of_file(model, measurements, held_out)
     elif held_out is not None:
         rows = rows_of_folder(model, held_out)
-    found = accuracies(model, rows)
-    limit = limit_of(model, found[0] if found else None, rows)
+    figures, joints = accuracies(model, summary, rows), joint_figures(model)
+    limit = limit_of(model, summary, figures[0] if figures else None, rows)
     return ReportContent(
         model=model,
         kind=KINDS.get(model.kind, model.kind.replace("_", " ")),
-        verdict=verdict_of(model, found, rows, limit),
-        accuracies=found,
+        verdict=verdict_of(model, figures, joints, rows, limit),
+        accuracies=figures,
         limit=limit,
         rows=rows,
         map=map_of_workspace(model) if rows is None else map_of_rows(model, rows),
         dependences=() if rows is None else dependences(rows, model.robot),
         frames=((), "") if rows is None else by_name(rows, rows.measurements.frame),
         targets=((), "") if rows is None else by_name(rows, rows.measurements.target),
-        parameters=parameter_findings(model, folder),
+        parameters=parameter_findings(model, summary, folder),
         curves=correction_curves(model),
-        learned=_learned(model),
-        learning_curve=tuple(model.metrics.get("learning_curve") or ()),
-        advice=advice_for(model, rows, found, limit),
-        provenance=_provenance(model, folder, rows),
-        joints=tuple(joint for joint in model.metrics.get("joints") or () if "training" in joint),
+        learned=_learned(summary),
+        learning_curve=(summary.learning_curve or ()) if summary is not None else (),
+        advice=advice_for(model, summary, rows, figures, limit),
+        provenance=_provenance(model, rows),
+        joints=joints,
         missing=_missing(model, rows),
         correlation_png=_correlation_png(folder),
     )
 
 
-def _learned(model: CalibratedModel) -> tuple[str, ...]:
-    summary = read_summary(model)
+def _learned(summary: CalibrationSummary | None) -> tuple[str, ...]:
     if summary is None:
         return ()
     lines = learned_lines(summary.hybrid) if summary.hybrid is not None else []
-    judged = "" if summary.judged is None else coverage_line(summary.judged)
-    return (*lines, *([judged] if judged else []))
+    coverage = "" if summary.judged is None else coverage_line(summary.judged)
+    return (*lines, *([coverage] if coverage else []))
 
 
-def _provenance(model: CalibratedModel, folder: Path, rows: JudgedRows | None) -> tuple[tuple[str, str], ...]:
-    known = model.provenance
-    recipe = f"{known.recipe}, sha256 {known.recipe_sha256}" if known.recipe else ""
-    left_out = f", {known.rows_left_out} left out ({known.rule})" if known.rows_left_out else ""
-    found = [
+def _provenance(model: CalibratedModel, rows: JudgedRows | None) -> tuple[tuple[str, str], ...]:
+    made = model.provenance
+    recipe = f"{made.recipe}, sha256 {made.recipe_sha256}" if made.recipe else ""
+    left_out = f", {made.rows_left_out} left out ({made.rule})" if made.rows_left_out else ""
+    lines = [
         ("model", f"{model.name}, {model.kind.replace('_', ' ')}"),
         ("robot", f"{model.robot.name} ({model.robot.maker})"),
-        ("made by", str(model.metrics.get("command") or _command(folder))),
+        ("made by", str(model.metrics.get("command", ""))),
         ("recipe", recipe),
-        ("made of", f"{known.rows} rows of {known.data_source}{left_out}"),
-        ("sha256 of these rows", known.data_sha256),
-        ("seed", str(known.seed)),
-        ("versions", ", ".join(f"{name} {value}" for name, value in known.versions.items())),
+        ("made of", f"{made.rows} rows of {made.data_source}{left_out}"),
+        ("sha256 of these rows", made.data_sha256),
+        ("seed", str(made.seed)),
+        ("versions", ", ".join(f"{name} {value}" for name, value in made.versions.items())),
     ]
     if rows is not None and rows.measurements.position is not None:
-        found.append(("judged here", f"{rows.measurements.rows} rows of {rows.measurements.source}"))
-        found.append(("sha256 of those rows", rows.measurements.content_hash()))
-    return tuple((name, value) for name, value in found if value)
-
-
-def _command(folder: Path) -> str:
-    """The command that made the model, as its card says."""
-    try:
-        text = (folder / CARD).read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError):
-        return ""
-    found = re.search(r"^Made by `([^`\n]+)`", text, re.MULTILINE)
-    return found[1] if found else ""
+        lines.append(("judged here", f"{rows.measurements.rows} rows of {rows.measurements.source}"))
+        lines.append(("sha256 of those rows", rows.measurements.content_hash()))
+    return tuple((name, value) for name, value in lines if value)
 
 
 def _correlation_png(folder: Path) -> bytes:
@@ -192,3 +223,11 @@ def _missing(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, ...]
     if model.uncertainty is None:
         lines.append("The model holds no uncertainty, so no accuracy is predicted (hybrid calibrations do).")
     return tuple(lines)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _finite(inner) for name, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(inner) for inner in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -4,7 +4,7 @@ import io
 import os
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +20,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from pisigma.errors import OutputError
+from pisigma.judging.validation_figures import LearningPoint
 from pisigma.reporting.page.corrections import CorrectionCurve
 from pisigma.reporting.page.dependence import Dependence, binned
 from pisigma.reporting.page.error_map import ErrorMap
@@ -48,7 +49,7 @@ _STYLE: dict[Any, Any] = {
 }
 MOST_MAP_DOTS = 1_500
 """Of the flat map: the largest errors all, of the others every fourth and as many at most."""
-_MARKS = {"nominal": ("s", ":"), "geometric": ("o", "--"), "hybrid": ("^", "-")}
+_MODELS = {"nominal": (BEFORE, "s", ":"), "geometric": (OTHER, "o", "--"), "hybrid": (AFTER, "^", "-")}
 
 
 @dataclass(frozen=True, eq=False)
@@ -203,30 +204,22 @@ def draw_correlations(
     return tuple(found)
 
 
-def draw_learning_curve(points: Sequence[Mapping[str, Any]]) -> Drawing:
-    """Error of held-out rows over the number of rows to calibrate with, both logarithmic."""
+def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
+    """Draw errors of held-out rows over the number of rows to calibrate with, both logarithmic."""
     with drawing_style():
         figure, axes = _panel()
-        rows = [point["rows"] for point in points]
-        for name, (mark, line) in _MARKS.items():
-            if name in points[0]:
-                errors = [point[name]["rms_mm"] for point in points]
-                axes.plot(
-                    rows,
-                    errors,
-                    line,
-                    marker=mark,
-                    label=name,
-                    color=BEFORE if name == "nominal" else AFTER if name == "hybrid" else OTHER,
-                )
+        rows = [point.rows for point in points]
+        for name in points[0].models:
+            color, mark, line = _MODELS[name]
+            errors = [point.models[name].rms_mm for point in points]
+            axes.plot(rows, errors, line, marker=mark, label=name, color=color)  # type: ignore[arg-type]
         axes.set(xscale="log", yscale="log", xlabel="rows to calibrate with", ylabel="RMS error [mm]")
         axes.set_xticks(rows, [str(count) for count in rows])
         axes.xaxis.set_minor_formatter(NullFormatter())
         _plain_log(axes)
         axes.legend()
-    return Drawing(
-        "learning_curve", "learning curve", "RMS error of held-out rows over the number of rows.", figure
-    )
+    alt = "RMS error of held-out rows over the number of rows."
+    return Drawing("learning_curve", "learning curve", alt, figure)
 
 
 def draw_map(found: ErrorMap) -> Drawing:

@@ -11,7 +11,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from pisigma.reporting.page.accuracy import LABELS, STATISTICS, Accuracy
+from pisigma.reporting.page.accuracy import LABELS, Accuracy, JointFigures
 from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.error_map import ErrorMap
 from pisigma.reporting.page.figures import (
@@ -26,6 +26,7 @@ from pisigma.reporting.tables import figure_text
 
 _ESCAPED = {ord(mark): f"\\u{ord(mark):04x}" for mark in "<>&\u2028\u2029"}
 _PACKAGE = "pisigma.reporting.page"
+_STATISTICS = (("mean", "mean"), ("rms", "RMS"), ("p95", "95 %"), ("max", "maximum"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +79,7 @@ def render_page(content: ReportContent, figures: ReportFigures) -> str:
         c=content,
         figures=figures,
         tables=[_table(accuracy) for accuracy in content.accuracies],
-        joint_table=_joint_table(content.joints),
+        joint_table=[_joint_line(joint) for joint in content.joints],
         map_data=script_json(
             map_data(
                 content.map,
@@ -152,44 +153,33 @@ def _signed(value: float) -> str:
     return f"{value:+.4f}"
 
 
-def _table(accuracy: Accuracy) -> dict[str, Any]:
-    """A table of errors: names of the models, and per statistic a line."""
-    rows = []
+@dataclass(frozen=True)
+class _ErrorTable:
+    """A table of errors: heads of the columns; lines of a label, cells, and how much better the last is."""
+
+    accuracy: Accuracy
+    heads: tuple[str, ...]
+    lines: tuple[tuple[str, tuple[str, ...], str], ...]
+
+
+def _table(accuracy: Accuracy) -> _ErrorTable:
+    lines = []
     for unit, quantity in (("mm", "position"), ("deg", "orientation")):
-        for key, label in STATISTICS:
-            cells = [figures.get(f"{key}_{unit}") for figures in accuracy.models.values()]
+        for key, label in _STATISTICS:
+            cells = [getattr(figures, f"{key}_{unit}") for figures in accuracy.models.values()]
             if any(cell is not None for cell in cells):
-                texts = ["" if cell is None else figure_text(cell) for cell in cells]
-                better = _better(cells)
-                rows.append((f"{quantity}, {label}", unit, texts, better))
-    names = [LABELS[name] for name in accuracy.models]
-    return {
-        "title": accuracy.title,
-        "how": accuracy.how,
-        "held_out": accuracy.held_out,
-        "rows": accuracy.rows,
-        "names": names,
-        "lines": rows,
-    }
+                texts = tuple("" if cell is None else figure_text(cell) for cell in cells)
+                lines.append((f"{quantity}, {label} [{unit}]", texts, _better(cells)))
+    return _ErrorTable(accuracy, tuple(LABELS[name] for name in accuracy.models), tuple(lines))
 
 
 def _better(cells: Sequence[float | None]) -> str:
-    """How much smaller the last figure is than the first."""
+    """Say how much smaller the last figure is than the first."""
     first, last = cells[0], cells[-1]
     return f"{first / last:.1f} ×" if len(cells) > 1 and first is not None and last else ""
 
 
-def _joint_table(joints: Sequence[dict[str, Any]]) -> list[tuple[str, ...]]:
-    """Errors of joints: name, rows, unit, and average, deviation and maximum before and after."""
-    lines = []
-    for joint in joints:
-        for part in ("held_out", "training"):
-            if part in joint:
-                unit = next(iter(joint[part]["before"])).rsplit("_", 1)[1]
-                figures = [
-                    figure_text(joint[part][when][f"{name}_{unit}"])
-                    for when in ("before", "after")
-                    for name in ("average", "deviation", "maximum")
-                ]
-                lines.append((joint["name"], part.replace("_", "-"), unit, *figures))
-    return lines
+def _joint_line(joint: JointFigures) -> tuple[str, ...]:
+    """Write a joint's name, rows, unit, and average, deviation and maximum before and after."""
+    rows = "held-out" if joint.held_out else "training"
+    return (joint.name, rows, joint.unit, *map(figure_text, (*joint.before, *joint.after)))

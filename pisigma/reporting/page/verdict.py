@@ -1,7 +1,6 @@
 """The verdict on a calibration: one sentence, what it rests on, and where the calibration is worst."""
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,14 +8,28 @@ from jaxtyping import Float64
 
 from pisigma.judging.rank_tests import SIGNIFICANT, groups_differ
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.page.accuracy import Accuracy
+from pisigma.reporting.page.accuracy import Accuracy, JointFigures, Limit
 from pisigma.reporting.page.dependence import LEAST_ROWS, error_lengths, root_mean_square
 from pisigma.reporting.page.judged_rows import JudgedRows
-from pisigma.reporting.page.limits import Limit
 from pisigma.reporting.tables import figure_text
 
 CELLS = 4
-"""Parts of the measured space along every axis."""
+"""Cells of the measured space along every axis."""
+
+_AMONG = {
+    "held_out": "Of the held-out rows",
+    "training": "Of the rows that the model was made of",
+    "other": "Of the rows of the file",
+}
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One figure of a verdict: what it is, the figure, and a remark."""
+
+    name: str
+    value: str
+    remark: str
 
 
 @dataclass(frozen=True)
@@ -25,14 +38,14 @@ class Verdict:
 
     Attributes:
         sentence: how accurate, how much better than nominal, where worst, what limits it.
-        tiles: the figures of it: what, figure, remark.
+        tiles: the figures of it.
         worst: where it is worst, in a sentence.
         limit: what limits it, in a sentence.
-        held_out: whether the sentence rests on rows that the model never saw.
+        held_out: whether the sentence rests on rows that the model was made without.
     """
 
     sentence: str
-    tiles: tuple[tuple[str, str, str], ...]
+    tiles: tuple[Tile, ...]
     worst: str
     limit: str
     held_out: bool
@@ -40,7 +53,7 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Region:
-    """The part of the space with the largest errors.
+    """The cell of the measured space with the largest errors.
 
     Attributes:
         low: its corner [m].
@@ -60,179 +73,150 @@ class Region:
 
 
 def verdict_of(
-    model: CalibratedModel, accuracies: tuple[Accuracy, ...], rows: JudgedRows | None, limit: Limit
+    model: CalibratedModel,
+    accuracies: tuple[Accuracy, ...],
+    joints: tuple[JointFigures, ...],
+    rows: JudgedRows | None,
+    limit: Limit,
 ) -> Verdict:
     """Put the verdict together.
 
     Args:
         model: the model.
         accuracies: the first one counts.
+        joints: errors of joints, which count where no pose was judged.
         rows: judged rows, or None.
         limit: what limits the accuracy.
     """
     if not accuracies:
-        return _without_poses(model)
+        return _without_poses(model, joints)
     best = accuracies[0]
-    clause, worst = worst_place(model, rows)
-    parts = [_how_accurate(model, best)]
-    parts += [clause] if clause else []
-    parts += [f"what limits it is {limit.clause}"] if best.quantity[0] == "mm" else []
+    clause, worst = _worst(model, rows)
+    clauses = [_how_accurate(model, best), *([clause] if clause else [])]
+    clauses += [f"what limits it is {limit.clause}"] if best.unit == "mm" else []
     tiles = _tiles(best)
-    if limit.share is not None and limit.noise is not None:
-        remark = f"of the squared error; {figure_text(limit.noise)} mm RMS"
-        tiles.append(("scatter of a measurement", f"{100 * limit.share:.0f} %", remark))
-    return Verdict(f"{'; '.join(parts)}.", tuple(tiles), worst, limit.sentence, best.held_out)
+    if limit.noise is not None:
+        noise = f"{figure_text(limit.noise)} mm"
+        if limit.share is None:
+            tiles.append(Tile("scatter of a measurement", noise, "RMS; no less than the error itself"))
+        else:
+            remark = f"of the squared error; {noise} RMS"
+            tiles.append(Tile("scatter of a measurement", f"{100 * limit.share:.0f} %", remark))
+    return Verdict(f"{'; '.join(clauses)}.", tuple(tiles), worst, limit.sentence, best.held_out)
 
 
 def _how_accurate(model: CalibratedModel, best: Accuracy) -> str:
-    unit, quantity = best.quantity
-    rms, p95, largest = (figure_text(best.last[f"{name}_{unit}"]) for name in ("rms", "p95", "max"))
+    rms, p95, largest = (figure_text(best.figure(name)) for name in ("rms", "p95", "max"))
     whose = "that it never saw" if best.held_out else "that it was made of"
+    within = f"{rms} {best.unit} RMS (95 % within {p95}, all within {largest})"
     if best.reference:
-        return (
-            f"On {best.rows} poses {whose}, {model.name} keeps the tool to {rms} {unit} RMS (95 % within {p95}, all "
-            f"within {largest}) at {best.reference}"
-        )
-    text = (
-        f"On {best.rows} rows {whose}, {model.name} predicts the {quantity} to {rms} {unit} RMS (95 % within {p95}, "
-        f"all within {largest})"
-    )
+        return f"On {best.rows} poses {whose}, {model.name} keeps the tool to {within} at {best.reference}"
+    quantity = "position" if best.unit == "mm" else "orientation"
+    text = f"On {best.rows} rows {whose}, {model.name} predicts the {quantity} to {within}"
     if best.factor is None:
         return text
-    nominal = figure_text(best.models["nominal"][f"rms_{unit}"])
+    nominal = f"the nominal robot ({figure_text(best.figure('rms', 'nominal'))} {best.unit})"
     if best.factor >= 1:
-        return f"{text}, {best.factor:.1f} times better than the nominal robot ({nominal} {unit})"
+        return f"{text}, {best.factor:.1f} times better than {nominal}"
     return (
-        f"{text}, {1 / best.factor:.1f} times worse than the nominal robot ({nominal} {unit}): check that the rows are "
-        "in the frame and of the target that the model was fitted to"
+        f"{text}, {1 / best.factor:.1f} times worse than {nominal}: check that the rows are in the frame and of the "
+        "target that the model was fitted to"
     )
 
 
-def _tiles(best: Accuracy) -> list[tuple[str, str, str]]:
-    unit, quantity = best.quantity
-    rms, p95, largest = (
-        f"{figure_text(best.last[f'{name}_{unit}'])} {unit}" for name in ("rms", "p95", "max")
-    )
+def _tiles(best: Accuracy) -> list[Tile]:
+    unit = best.unit
+    rms, p95, largest = (f"{figure_text(best.figure(name))} {unit}" for name in ("rms", "p95", "max"))
     tiles = [
-        (f"{quantity}, RMS", rms, f"{best.rows} rows, {best.title}"),
-        ("95 % within", p95, f"largest {largest}"),
+        Tile(f"{'position' if unit == 'mm' else 'orientation'}, RMS", rms, f"{best.rows} rows, {best.title}"),
+        Tile("95 % within", p95, f"largest {largest}"),
     ]
     if best.factor is not None:
-        nominal = f"nominal {figure_text(best.models['nominal'][f'rms_{unit}'])} {unit} RMS"
+        nominal = f"nominal {figure_text(best.figure('rms', 'nominal'))} {unit} RMS"
         better, times = ("better", best.factor) if best.factor >= 1 else ("worse", 1 / best.factor)
-        tiles.append((f"{better} than nominal", f"{times:.1f} ×", nominal))
-    if "rms_deg" in best.last and unit == "mm":
-        turned, most = (f"{figure_text(best.last[f'{name}_deg'])} deg" for name in ("rms", "max"))
-        tiles.append(("orientation, RMS", turned, f"largest {most}"))
+        tiles.append(Tile(f"{better} than nominal", f"{times:.1f} ×", nominal))
+    if unit == "mm" and best.last.rms_deg is not None and best.last.max_deg is not None:
+        largest = f"largest {figure_text(best.last.max_deg)} deg"
+        tiles.append(Tile("orientation, RMS", f"{figure_text(best.last.rms_deg)} deg", largest))
     return tiles
 
 
-def _without_poses(model: CalibratedModel) -> Verdict:
-    """What joint errors say where no pose was judged."""
-    joints = model.metrics.get("joints") or ()
-    if not joints or "training" not in joints[0]:
-        return Verdict(
+def _without_poses(model: CalibratedModel, joints: tuple[JointFigures, ...]) -> Verdict:
+    """Say what joint errors say where no pose was judged."""
+    if not joints:
+        sentence = (
             f"{model.name} holds no figures of its accuracy, and no measurements were given: nothing can be said of "
-            "how accurate it is.",
-            (), "", "Give a file with measurements that the model was not made of.", False,
-        )  # fmt: skip
-    part = "held_out" if "held_out" in joints[0] else "training"
-    worst = max(joints, key=lambda joint: _average(joint[part]["after"]))
-    before, after = (_average(worst[part][when]) for when in ("before", "after"))
-    unit = next(iter(worst[part]["after"])).rsplit("_", 1)[1]
-    whose = "On rows that it never saw" if part == "held_out" else "On the very rows that it was made of"
-    factor = (
-        f", {before / after:.0f} times better than nominal ({figure_text(before)} {unit})"
-        if after > 0
-        else ""
-    )
+            "how accurate it is."
+        )
+        advice = "Give a file with measurements that the model was not made of."
+        return Verdict(sentence, (), "", advice, held_out=False)
+    held_out = joints[0].held_out
+    worst = max((one for one in joints if one.held_out == held_out), key=lambda one: one.after[0])
+    before, after = (f"{figure_text(average)} {worst.unit}" for average in (worst.before[0], worst.after[0]))
+    times = f", {worst.before[0] / worst.after[0]:.0f} times better than nominal ({before})"
     sentence = (
-        f"{whose}, {model.name} gives the joint values of poses to {figure_text(after)} {unit} on average at its worst "
-        f"joint, {worst['name']}{factor}; no pose errors were judged, so nothing is known of a measured robot."
+        f"{'On rows that it never saw' if held_out else 'On the very rows that it was made of'}, {model.name} "
+        f"gives the joint values of poses to {after} on average at its worst joint, {worst.name}"
+        f"{times if worst.after[0] > 0 else ''}; no pose errors were judged, so nothing is known of a measured robot."
     )
-    tiles = (
-        (
-            f"worst joint, {worst['name']}",
-            f"{figure_text(after)} {unit}",
-            f"average, {part.replace('_', '-')} rows",
-        ),
+    tile = Tile(
+        f"worst joint, {worst.name}", after, f"average, {'held-out' if held_out else 'training'} rows"
     )
-    return Verdict(
-        sentence, tiles, "", "Give a file with measured positions or poses to judge them.", part == "held_out"
-    )
+    advice = "Give a file with measured positions or poses to judge them."
+    return Verdict(sentence, (tile,), "", advice, held_out)
 
 
-def _average(figures: Mapping[str, float]) -> float:
-    return next(value for name, value in figures.items() if name.startswith("average"))
-
-
-def worst_place(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, str]:
-    """Where errors are largest: a clause for the verdict and a sentence; both empty without rows."""
+def _worst(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, str]:
+    """Say where errors are largest: a clause for the verdict and a sentence; both empty without rows."""
     if rows is None:
         return "", ""
     _, after, unit = error_lengths(rows)
-    known = np.isfinite(after)
-    if not known.any():
+    finite = np.isfinite(after)
+    if not finite.any():
         return "", ""
-    place, errors = rows.place.numpy()[known], after[known]
-    region = worst_region(place, errors)
-    worst = int(errors.argmax())
-    number = np.flatnonzero(known)[worst]
+    place, errors = rows.place.numpy()[finite], after[finite]
+    region, worst = worst_region(place, errors), int(errors.argmax())
+    number = int(np.flatnonzero(finite)[worst])
+    line = rows.measurements.line[number]
     at = ", ".join(str(round(value * 1e3)) for value in place[worst].tolist())
-    q = rows.measurements.q.numpy()[number]
     joints = ", ".join(
         f"{np.degrees(value):.1f} deg" if turns else f"{value * 1e3:.1f} mm"
-        for value, turns in zip(q, model.robot.revolute, strict=True)
+        for value, turns in zip(rows.measurements.q.numpy()[number], model.robot.revolute, strict=True)
     )
-    own = (
-        f"{_AMONG[rows.origin]} the worst is {_row_text(rows, int(number))}: "
-        f"{figure_text(float(errors[worst]))} {unit} at x, y, z = {at} mm of the robot's base, joints {joints}."
+    row = (
+        f"{_AMONG[rows.origin]} the worst is {f'line {line}' if line else f'row {number + 1}'} of "
+        f"{rows.measurements.source}: {figure_text(float(errors[worst]))} {unit} at x, y, z = {at} mm of the robot's "
+        f"base, joints {joints}."
     )
-    return _region_text(region, unit, own, rows)
+    return _region_text(region, unit, row, rows.origin)
 
 
-_AMONG = {
-    "held_out": "Of the held-out rows",
-    "training": "Of the rows that the model was made of",
-    "other": "Of the rows of the file",
-}
-
-
-def _row_text(rows: JudgedRows, number: int) -> str:
-    line = rows.measurements.line[number]
-    return (
-        f"line {line} of {rows.measurements.source}"
-        if line
-        else f"row {number + 1} of {rows.measurements.source}"
-    )
-
-
-def _region_text(region: Region | None, unit: str, own: str, rows: JudgedRows) -> tuple[str, str]:
+def _region_text(region: Region | None, unit: str, row: str, origin: str) -> tuple[str, str]:
     if region is None:
-        return "", own
-    seen = " (as far as the rows that it was made of tell)" if rows.origin == "training" else ""
+        return "", row
+    as_far = " (as far as the rows that it was made of tell)" if origin == "training" else ""
     if not region.significant:
         return (
-            f"nowhere in the measured space is it worse than elsewhere by more than chance{seen}",
-            f"No part of the measured space is worse than the others by more than chance. {own}",
+            f"nowhere in the measured space is it worse than elsewhere by more than chance{as_far}",
+            f"No part of the measured space is worse than the others by more than chance. {row}",
         )
     ranges = ", ".join(
         f"{axis} {round(low * 1e3)} to {round(high * 1e3)}"
         for axis, low, high in zip("xyz", region.low, region.high, strict=True)
     )
-    clause = f"it is worst around {ranges} mm of the robot's base, {figure_text(region.rms)} {unit} RMS{seen}"
-    sentence = (
-        f"Largest errors in {ranges} mm of the robot's base: {figure_text(region.rms)} {unit} RMS over {region.rows} "
-        f"rows, {region.ratio:.1f} times that of all rows, more than by chance. {own}"
+    rms = f"{figure_text(region.rms)} {unit} RMS"
+    return (
+        f"it is worst around {ranges} mm of the robot's base, {rms}{as_far}",
+        f"Largest errors in {ranges} mm of the robot's base: {rms} over {region.rows} rows, {region.ratio:.1f} times "
+        f"that of all rows, more than by chance. {row}",
     )
-    return clause, sentence
 
 
 def worst_region(place: Float64[np.ndarray, "rows 3"], errors: Float64[np.ndarray, " rows"]) -> Region | None:
-    """The cell of a grid over the places whose errors are largest for sure.
+    """Find the cell of a grid over the measured space whose errors are surely the largest.
 
     Args:
-        place: of every row [m].
+        place: position of every row [m].
         errors: their lengths, all finite.
 
     Returns:
@@ -242,24 +226,22 @@ def worst_region(place: Float64[np.ndarray, "rows 3"], errors: Float64[np.ndarra
     width = np.where(high > low, (high - low) / CELLS, 1.0)
     cell = np.clip(((place - low) / width).astype(int), 0, CELLS - 1)
     number = (cell * [CELLS * CELLS, CELLS, 1]).sum(1)
-    best: tuple[float, int] | None = None
-    counted = [(k, errors[number == k]) for k in np.unique(number)]
-    counted = [(k, own) for k, own in counted if len(own) >= max(LEAST_ROWS, len(errors) // 100)]
-    if len(counted) < 2:
+    least = max(LEAST_ROWS, len(errors) // 100)
+    cells = [(int(k), errors[number == k]) for k in np.unique(number)]
+    cells = [(k, inside) for k, inside in cells if len(inside) >= least]
+    if len(cells) < 2:
         return None
-    for k, own in counted:
-        surely = root_mean_square(own) * (1 - 1 / math.sqrt(len(own)))
-        best = max(best, (surely, int(k))) if best else (surely, int(k))
-    assert best is not None
-    inside = number == best[1]
+    # one standard error less, so that a cell of few rows is not the worst by luck
+    worst, _ = max(cells, key=lambda one: root_mean_square(one[1]) * (1 - 1 / math.sqrt(len(one[1]))))
+    inside = number == worst
     _, chance = groups_differ(inside.astype(int), errors)
     corner = low + width * cell[inside][0]
     rms = root_mean_square(errors[inside])
     return Region(
-        tuple(corner.tolist()),
-        tuple((corner + width).tolist()),
-        int(inside.sum()),
-        rms,
-        rms / root_mean_square(errors),
-        chance < SIGNIFICANT / len(counted),
+        low=tuple(corner.tolist()),
+        high=tuple((corner + width).tolist()),
+        rows=int(inside.sum()),
+        rms=rms,
+        ratio=rms / root_mean_square(errors),
+        significant=chance < SIGNIFICANT / len(cells),
     )

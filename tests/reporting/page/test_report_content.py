@@ -14,15 +14,15 @@ from testing.report import folder_with_held_out, geometric_under_test, hybrid_un
 
 from pisigma.errors import MeasurementError
 from pisigma.judging.calibration_summary import read_summary
+from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.reporting.calibration_tables import parameter_table
+from pisigma.reporting.page.accuracy import limit_of
 from pisigma.reporting.page.advice import measured_stretches
 from pisigma.reporting.page.content import report_content
 from pisigma.reporting.page.corrections import correction_curves
 from pisigma.reporting.page.judged_rows import MOST_PREDICTED, predicted_at
-from pisigma.reporting.page.limits import limit_of
-from pisigma.reporting.page.summary import summary_of
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
@@ -46,14 +46,12 @@ def test_figures_of_unseen_rows_are_numpys(hybrid, tmp_path):
         ("p95_mm", np.quantile(error, 0.95)),
         ("max_mm", error.max()),
     ):
-        assert_close(first.models["hybrid"][name], value, rtol=1e-12)
+        assert_close(getattr(first.models["hybrid"], name), value, rtol=1e-12)
     after = next(layer for layer in content.map.layers if layer.key == "after")
     assert_close(after.values, error, rtol=1e-12)
-    assert_close(
-        first.factor, first.models["nominal"]["rms_mm"] / first.models["hybrid"]["rms_mm"], rtol=0, atol=0
-    )
+    assert_close(first.factor, first.models["nominal"].rms_mm / first.models["hybrid"].rms_mm, rtol=0, atol=0)
     assert "150 rows that it never saw" in content.verdict.sentence
-    assert first.models["nominal"]["rms_mm"] > 2 * first.models["hybrid"]["rms_mm"]
+    assert first.models["nominal"].rms_mm > 2 * first.models["hybrid"].rms_mm
 
 
 def test_rows_of_the_calibration_are_known_by_their_hash(hybrid, tmp_path):
@@ -64,9 +62,7 @@ def test_rows_of_the_calibration_are_known_by_their_hash(hybrid, tmp_path):
     assert not own.held_out
     assert "very rows that the model was made of" in own.how
     assert content.accuracies[0].held_out  # the model's own held-out figures lead
-    assert content.accuracies[0].models == {
-        name: model.metrics["cross_validation"][name] for name in ("nominal", "geometric", "hybrid")
-    }
+    assert content.accuracies[0].models == read_summary(model).cross_validation.models
 
 
 def test_training_rows_alone_are_no_held_out_figures(hybrid, tmp_path):
@@ -180,7 +176,7 @@ def test_a_network_alone_is_reported(name, tmp_path):
     rows = Measurements(q=q, position=T[:, :3, 3], rotation=T[:, :3, :3])
     content = report_content(model, tmp_path, rows)
     assert list(content.accuracies[0].models) == ["nominal", "corrected"]
-    assert content.accuracies[0].last["max_mm"] < 1e-6 < content.accuracies[0].models["nominal"]["rms_mm"]
+    assert content.accuracies[0].last.max_mm < 1e-6 < content.accuracies[0].models["nominal"].rms_mm
     assert {layer.key for layer in content.map.layers} >= {"before", "after", "before_deg", "after_deg"}
 
 
@@ -189,8 +185,8 @@ def test_orientations_alone_are_reported(hybrid, tmp_path):
     q = hybrid[0].measurements.q[:40]
     rows = Measurements(q=q, rotation=poses_of_rows(model, Measurements(q=q))[:, :3, :3])
     content = report_content(model, tmp_path, rows)
-    assert content.accuracies[0].quantity == ("deg", "orientation")
-    assert content.accuracies[0].last["max_deg"] < 1e-6
+    assert content.accuracies[0].unit == "deg"
+    assert content.accuracies[0].last.max_deg < 1e-6
 
 
 def test_repeated_rows_tell_the_scatter(hybrid, tmp_path):
@@ -211,9 +207,24 @@ def test_the_noise_that_a_hybrid_found_is_the_limit(hybrid, tmp_path):
     model = hybrid[1]
     sigma = model.metrics["hybrid"]["learned"]["noise"][0]["sigma_mm"]
     accuracy = report_content(model, tmp_path).accuracies[0]
-    limit = limit_of(model, accuracy, None)
+    limit = limit_of(model, read_summary(model), accuracy, None)
     assert_close(limit.noise, math.sqrt(3) * sigma, rtol=1e-12)
-    assert_close(limit.share, min((limit.noise / accuracy.last["rms_mm"]) ** 2, 1.0), rtol=1e-12)
+    larger = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=2 * limit.noise)})
+    limit = limit_of(model, read_summary(model), larger, None)
+    assert_close(limit.share, 0.25, rtol=1e-12)
+    assert "25 % of the squared error; the other 75 % are errors of the model" in limit.sentence
+
+
+def test_scatter_above_the_error_is_no_share_of_it(hybrid, tmp_path):
+    """Rows that scatter more than the whole error leave nothing to divide."""
+    model = hybrid[1]
+    accuracy = report_content(model, tmp_path).accuracies[0]
+    smaller = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=1e-3)})
+    limit = limit_of(model, read_summary(model), smaller, None)
+    assert limit.noise > 1e-3
+    assert limit.share is None
+    assert "no less than the error itself (0.0010 mm RMS)" in limit.sentence
+    assert "%" not in limit.sentence + limit.clause
 
 
 def test_accuracy_is_predicted_at_many_rows_at_most(hybrid, monkeypatch):
@@ -269,10 +280,8 @@ def test_a_dependence_on_temperature_is_said(hybrid, tmp_path):
 
 def test_the_summary_is_json(hybrid, tmp_path):
     content = report_content(hybrid[1], tmp_path, measured(hybrid[0], 40, seed=9))
-    text = json.dumps(summary_of(content), allow_nan=False)
-    assert (
-        json.loads(text)["accuracy"][0]["models"]["hybrid"]["rms_mm"] == content.accuracies[0].last["rms_mm"]
-    )
+    text = json.dumps(content.to_json(), allow_nan=False)
+    assert json.loads(text)["accuracy"][0]["models"]["hybrid"]["rms_mm"] == content.accuracies[0].last.rms_mm
 
 
 def test_a_distilled_model_is_judged_by_its_parent(tmp_path):

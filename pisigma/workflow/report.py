@@ -1,0 +1,97 @@
+"""Report on a calibration as one HTML page."""
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from pisigma.export.output_file import check_output, write_whole
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.folder.model_folder import load_model
+from pisigma.reporting.page.content import ReportContent, report_content
+from pisigma.reporting.page.figures import check_figures, write_figures
+from pisigma.reporting.page.page import ReportFigures, draw_figures, render_page
+
+
+@dataclass(frozen=True, eq=False)
+class Report:
+    """A report on a calibration: what it says, and its figures.
+
+    Attributes:
+        content: figures and sentences.
+        figures: drawings of them.
+        seconds: that it took.
+    """
+
+    content: ReportContent
+    figures: ReportFigures
+    seconds: float
+
+    @property
+    def verdict(self) -> str:
+        """How accurate the model is, how much better than nominal, where it is worst and what limits it."""
+        return self.content.verdict.sentence
+
+    def to_json(self) -> dict[str, Any]:
+        """Return figures and sentences as plain values, without single rows."""
+        return self.content.to_json() | {"seconds": self.seconds}
+
+    def save(
+        self, page: str | os.PathLike[str], figures: str | os.PathLike[str] | None = None
+    ) -> tuple[Path, ...]:
+        """Write the page, and every figure as PNG and SVG into a folder where one is named.
+
+        Args:
+            page: file of the page (.html); replaced whole or not at all.
+            figures: folder, made where missing.
+
+        Returns:
+            The files of the figures.
+
+        Raises:
+            OutputError: a file cannot be written.
+        """
+        check_report_outputs(page, figures)
+        write_whole(Path(page), render_page(self.content, self.figures))
+        return () if figures is None else tuple(write_figures(self.figures.all, Path(figures)))
+
+
+def check_report_outputs(page: str | os.PathLike[str], figures: str | os.PathLike[str] | None = None) -> None:
+    """Make sure that a report may be written: before the work, not after it.
+
+    Raises:
+        OutputError: the page is no .html file, or a file or folder cannot be written.
+    """
+    check_output(Path(page), (".html", ".htm"), "a report")
+    if figures is not None:
+        check_figures(Path(figures))
+
+
+def report(
+    model: str | os.PathLike[str],
+    data: str | os.PathLike[str] | Measurements | None = None,
+    progress: Callable[[str], None] = lambda what: None,
+) -> Report:
+    """Work out a report on a calibration: how accurate, where worst, what limits it, what to measure next.
+
+    Args:
+        model: folder of the model.
+        data: rows to judge it on, or their file, in the frame that the model was fitted in. None: the held-out rows
+            that the folder keeps.
+        progress: called with what is being done.
+
+    Raises:
+        ModelError: the folder cannot be used.
+        MeasurementError: the rows cannot be judged.
+    """
+    begin, loaded = time.perf_counter(), load_model(model)
+    progress("judging rows")
+    rows = data
+    if rows is not None and not isinstance(rows, Measurements):
+        rows = Measurements.read_csv(rows, loaded.robot)
+    content = report_content(loaded, Path(model), rows)
+    progress("drawing")
+    figures = draw_figures(content)
+    return Report(content, figures, time.perf_counter() - begin)
