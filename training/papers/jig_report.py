@@ -21,11 +21,11 @@ from jig_accuracy import (
 from jig_recipe import JigCalibration, JigRecipe, calibrate_on, nominal_calibration
 from pisigma.errors import RecipeError
 from pisigma.measurement.dataset import Measurements
-from pisigma.planning.touch_planning import PlanningProblem, TouchPlan, plan_touches
+from pisigma.planning.exchange import MeasurementPlan, PlanningProblem, plan_measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS
-from pisigma.simulation.touch_candidates import TouchCandidates
 from straight_lines import TrackedLine, i_move, move_l
+from touch_candidates import TouchCandidates
 
 Progress = Callable[[str], None]
 
@@ -58,7 +58,7 @@ class JigRun:
     lines: dict[str, dict[str, tuple[TrackedLine, TrackedLine]]]
     problem: PlanningProblem
     planned_from: TouchCandidates
-    plan: TouchPlan
+    plan: MeasurementPlan
     seeds: dict[str, dict[str, Float64[np.ndarray, " seeds"]]]
 
 
@@ -79,7 +79,7 @@ def run_jigs(recipe: JigRecipe, progress: Progress = lambda text: None) -> JigRu
     progress("planning touches")
     planned_from = recipe.planning.candidates.find(Robot.load(recipe.robot), recipe.placements)
     problem = recipe.planning_problem(planned_from)
-    plan = plan_touches(problem, recipe.planning.touches)
+    plan = plan_measurements(problem, recipe.planning.touches)
     figures: dict[str, dict[str, list[float]]] = {}
     for seed in range(recipe.seeds):
         progress(f"seed {seed + 1} of {recipe.seeds}")
@@ -209,7 +209,7 @@ def _calibrations(recipe: JigRecipe, measurements: Measurements) -> dict[str, Ji
 
 
 def _planned_and_random(
-    recipe: JigRecipe, candidates: TouchCandidates, plan: TouchPlan, seed: int
+    recipe: JigRecipe, candidates: TouchCandidates, plan: MeasurementPlan, seed: int
 ) -> dict[str, JigCalibration]:
     """With the planned touches, and with as many others drawn from the same candidates."""
     generator = torch.Generator().manual_seed(recipe.planning.candidates.seed + seed)

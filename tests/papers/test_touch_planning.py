@@ -10,15 +10,11 @@ from testing.closeness import assert_close
 from pisigma.errors import IdentificationError
 from pisigma.identification.problem.parameters import ParameterSpace, Prior
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.planning.touch_planning import (
-    PlanningProblem,
-    _best_exchange,
-    build_planning_problem,
-    plan_touches,
-)
+from pisigma.planning.exchange import PlanningProblem, _best_exchange, plan_measurements
 from pisigma.robot import Robot
 from pisigma.se3 import rotation_from_vector, transform, transform_from_xyzrpy
-from pisigma.simulation import JigPlacement, TouchCandidatesSection
+from touch_candidates import JigPlacement, TouchCandidatesSection
+from touch_planning import build_planning_problem
 
 FREE = ("a_1", "a_2", "a_3", "d_4", "theta_2", "theta_3", "theta_4", "theta_5")
 PLACEMENTS = (
@@ -114,7 +110,7 @@ def test_the_best_exchange_is_that_of_trying_them_all(seed: int):
 @pytest.mark.parametrize("seed", range(4))
 def test_no_single_exchange_betters_a_plan(seed: int):
     problem = random_problem(20, 4, seed)
-    plan = plan_touches(problem, 8)
+    plan = plan_measurements(problem, 8)
     gain, _, _ = _best_exchange(problem, plan.chosen)
     assert gain < 1e-3 * problem.criterion(plan.chosen)
     assert list(plan.path) == sorted(plan.path, reverse=True)
@@ -124,7 +120,7 @@ def test_no_single_exchange_betters_a_plan(seed: int):
 
 def test_planned_touches_predict_much_less_than_random_ones():
     problem = problem_of(200)
-    plan, again = plan_touches(problem, 80), plan_touches(problem, 80)
+    plan, again = plan_measurements(problem, 80), plan_measurements(problem, 80)
     assert torch.equal(plan.chosen, again.chosen)
     assert len(set(plan.chosen.tolist())) == 80
     assert bool((plan.chosen.diff() > 0).all())
@@ -138,12 +134,12 @@ def test_a_third_jig_is_six_parameters_more():
     third = JigPlacement(name="middle", base={"x_mm": 700, "y_mm": 250, "roll_deg": 180})
     problem = problem_of(30, (*PLACEMENTS, third))
     assert problem.rows.shape == (90, len(FREE) + 3 + 18)
-    assert len(plan_touches(problem, 40).chosen) == 40
+    assert len(plan_measurements(problem, 40).chosen) == 40
     assert_close(problem.weight[len(FREE) + 3 :].abs().max(), 0.0)
 
 
 def test_all_candidates_can_be_planned():
-    plan = plan_touches(problem_of(20), 40)
+    plan = plan_measurements(problem_of(20), 40)
     assert_close(plan.chosen, torch.arange(40))
     assert len(plan.path) == 1
 
@@ -152,8 +148,10 @@ def test_what_cannot_be_planned_is_refused():
     problem, found = random_problem(5, 2, 0), candidates(3)
     Ts = torch.stack([placement.T_jig_base for placement in PLACEMENTS])
     for count in (0, 6):
-        with pytest.raises(IdentificationError, match=r"1 to 5 touches can be planned from 5 candidates"):
-            plan_touches(problem, count)
+        with pytest.raises(
+            IdentificationError, match=r"1 to 5 measurements can be planned from 5 candidates"
+        ):
+            plan_measurements(problem, count)
     with pytest.raises(IdentificationError, match="got none; state some poses"):
         build_planning_problem(ROBOT, found, Ts, found.q[:0], FREE)
     with pytest.raises(IdentificationError, match="'tool_x' is no parameter of the arm"):

@@ -11,9 +11,10 @@ from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement import Jig, Measurements
 from pisigma.robot import Robot
-from pisigma.simulation import JigPlacement, SimulatedTouches, TouchCandidatesSection, simulate_touches
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
 from pisigma.yaml_file import parse_yaml
+from touch_candidates import JigPlacement, TouchCandidatesSection
+from touching import SimulatedTouches, simulate_touches
 
 # Lim et al., Table 1 and the columns "both" of Table 2; -89 deg and 180 deg are turns about the vertical.
 RIGHT = {
@@ -142,7 +143,7 @@ def test_the_seed_decides_and_nothing_else():
     assert hashes[0] == hashes[1] != hashes[2]
 
 
-def test_noise_is_of_the_size_that_is_told():
+def test_noise_is_of_the_size_that_is_stated():
     robot = true_robot()
     candidates = TouchCandidatesSection(count=150, seed=0).find(robot.nominal, PLACEMENTS)
     noise = section(noise={"sensor_mm": 0.2, "repeatability_mm": 0.15, "seed": 3}).noise

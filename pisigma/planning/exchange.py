@@ -1,0 +1,148 @@
+"""Which measurements to make: those after which the robot's position is known best over its workspace."""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError
+
+LEAST_GAIN = 1e-4
+"""Share of the criterion that an exchange must gain; below it the search ends."""
+DROPPED = 0.02
+"""Share of the measurements that is dropped at a time while there are too many."""
+MOST_EXCHANGES = 500
+"""Exchanges after which the search ends in any case."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlanningProblem:
+    """What measurements tell of the parameters, and what the parameters do to the tool over the workspace.
+
+    Parameters are in millimetres and milliradians, so that rows, weight and precision are of similar size.
+
+    Attributes:
+        rows: derivative of every candidate's measured value over its standard deviation.
+        weight: mean over the workspace of J^T J, J the derivative of the tool's position in the robot's frame
+            [mm].
+        precision: 1 / variance of every parameter before anything is measured.
+    """
+
+    rows: Float64[Tensor, "candidates parameters"]
+    weight: Float64[Tensor, "parameters parameters"]
+    precision: Float64[Tensor, " parameters"]
+
+    def covariance(self, chosen: Int64[Tensor, " chosen"]) -> Float64[Tensor, "parameters parameters"]:
+        """Covariance of the parameters after these measurements: `(P + Σ a aᵀ)⁻¹`."""
+        rows = self.rows[chosen]
+        return torch.cholesky_inverse(torch.linalg.cholesky(torch.diag(self.precision) + rows.mT @ rows))
+
+    def criterion(self, chosen: Int64[Tensor, " chosen"]) -> float:
+        """Mean over the workspace of the predicted squared position error, `tr(C W)` [mm²]."""
+        return float((self.covariance(chosen) * self.weight).sum())
+
+    def predicted_error(self, chosen: Int64[Tensor, " chosen"]) -> float:
+        """Predicted RMS position error over the workspace after these measurements [m]."""
+        return math.sqrt(self.criterion(chosen)) / 1e3
+
+
+@dataclass(frozen=True, eq=False)
+class MeasurementPlan:
+    """The measurements that were chosen.
+
+    Attributes:
+        chosen: index of every chosen candidate, ascending.
+        predicted_error: RMS position error over the workspace that is predicted for them [m].
+        path: the same after dropping and after every exchange [m].
+    """
+
+    chosen: Int64[Tensor, " chosen"]
+    predicted_error: float
+    path: tuple[float, ...]
+
+
+def plan_measurements(problem: PlanningProblem, count: int) -> MeasurementPlan:
+    """Choose measurements that lower the predicted error over the workspace.
+
+    The criterion is `tr(C W)`, the mean variance of the tool's position over the workspace (V- or
+    I-optimality), which says how far off the robot will be; a condition number does not. Starting with all
+    candidates, those that are missed least are dropped, and then measurements are exchanged, each time the pair that
+    gains most. The changes for all candidates and all pairs come at once from rank-one updates of the covariance
+    (Sherman and Morrison 1950). No candidate is chosen twice, and the same problem gives the same plan.
+
+    Source: exchange of Fedorov 1972, "Theory of Optimal Experiments", section 3.3; dropping of
+    Mitchell 1974, "An algorithm for the construction of D-optimal experimental designs" (DETMAX). For robots Borm
+    and Menq 1991 and Daney, Papegay and Madeline 2005 choose poses, by observability instead.
+
+    Args:
+        problem: what the candidates tell.
+        count: measurements to choose.
+
+    Raises:
+        IdentificationError: there are not as many candidates.
+    """
+    total = len(problem.rows)
+    if not 1 <= count <= total:
+        raise IdentificationError(
+            f"1 to {total} measurements can be planned from {total} candidates, {count} were wanted; "
+            "ask for fewer or draw more candidates."
+        )
+    chosen = _thinned(problem, count)
+    best = problem.criterion(chosen)
+    path = [best]
+    for _ in range(MOST_EXCHANGES if count < total else 0):
+        gain, out, into = _best_exchange(problem, chosen)
+        if gain < LEAST_GAIN * best:
+            break
+        trial = chosen.clone()
+        trial[out] = into
+        value = problem.criterion(trial)
+        if value >= best:
+            break
+        chosen, best = trial, value
+        path.append(best)
+    lengths = tuple(math.sqrt(value) / 1e3 for value in path)
+    return MeasurementPlan(chosen.sort().values, lengths[-1], lengths)
+
+
+def _thinned(problem: PlanningProblem, count: int) -> Int64[Tensor, " chosen"]:
+    """Start with all candidates and drop those that are missed least, some percent at a time.
+
+    Adding from nothing would never leave the first frame, as the first measurements in another one only tell where it
+    stands. Without the row a the covariance becomes `C + C a aᵀ C / (1 - aᵀ C a)`, so the criterion rises by
+    `aᵀ C W C a / (1 - aᵀ C a)`.
+    """
+    chosen = torch.arange(len(problem.rows))
+    while (surplus := len(chosen) - count) > 0:
+        A, C = problem.rows[chosen], problem.covariance(chosen)
+        AC = A @ C
+        loss = ((AC @ problem.weight) * AC).sum(-1) / (1 - (AC * A).sum(-1)).clamp(min=1e-12)
+        dropped = max(1, min(surplus, round(DROPPED * len(chosen))))
+        chosen = chosen[loss.argsort(stable=True)[dropped:].sort().values]
+    return chosen
+
+
+def _best_exchange(problem: PlanningProblem, chosen: Int64[Tensor, " chosen"]) -> tuple[float, int, int]:
+    """The exchange that gains most: its gain [mm²], the place in `chosen`, the candidate that comes there.
+
+    Adding j and then dropping i are two rank-one updates. With `d_ij = a_iᵀ C a_j` and `e_ij = a_iᵀ C W C
+    a_j`, and d', e' those of i after j was added, the criterion falls by
+    `e_jj / (1 + d_jj) - e'_ii / (1 - d'_ii)`.
+    """
+    A, C = problem.rows, problem.covariance(chosen)
+    AC = A @ C
+    ACW = AC @ problem.weight
+    d_j, e_j = (AC * A).sum(-1), (ACW * AC).sum(-1)
+    d_i, e_i = d_j[chosen, None], e_j[chosen, None]
+    d = AC[chosen] @ A.mT
+    e = ACW[chosen] @ AC.mT
+    share = d / (1 + d_j)
+    after = e_i - 2 * share * e + share * share * e_j
+    left = (1 - d_i + share * d).clamp(min=1e-12)
+    gain = e_j / (1 + d_j) - after / left
+    gain[:, chosen] = -torch.inf
+    best = int(gain.argmax())
+    out, into = divmod(best, gain.shape[1])
+    return float(gain[out, into]), out, into
