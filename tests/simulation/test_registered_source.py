@@ -82,7 +82,7 @@ def test_complaints_name_file_line_and_key(drift, text, complaint):
 
 
 def test_a_kind_that_is_not_registered_is_refused():
-    with pytest.raises(RecipeError, match=r"'errors.1.kind' cannot be 'drift'; Valid: encoder, geometric,"):
+    with pytest.raises(RecipeError, match=r"'errors.1.kind' cannot be 'drift'; Valid: .*encoder, geometric,"):
         read(RECIPE)
 
 
