@@ -3,16 +3,16 @@
 import hashlib
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import torch
 from jaxtyping import Float64, Int64
+from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 
-from pisigma.errors import TrainingError
 from pisigma.hybrid.refinement import Refined, refine, refined_at
 from pisigma.hybrid.search import Additive
 from pisigma.hybrid.sensor_values import SensorValues, sensor_values
@@ -20,6 +20,7 @@ from pisigma.hybrid.whitened_unknowns import WhitenedUnknowns
 from pisigma.identification.problem.loss import AbstractLoss
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.result_assembly import SolvedCalibration
+from pisigma.yaml_file import Section
 
 if TYPE_CHECKING:
     from pisigma.training.mini_batches import BatchSchedule
@@ -34,9 +35,8 @@ SETTLED = 0.5
 """[standard deviations of what all rows say] The unknowns are that near to the optimum, or more epochs are advised."""
 
 
-@dataclass(frozen=True)
-class MiniBatches:
-    """How the unknowns are trained.
+class MiniBatches(Section):
+    """How the unknowns are trained on mini-batches.
 
     Attributes:
         batch_rows: rows of a mini-batch.
@@ -46,21 +46,10 @@ class MiniBatches:
         seed: of the order of the rows.
     """
 
-    batch_rows: int = 4_096
-    epochs: int | None = None
-    learning_rate: float = 0.3
-    seed: int = 0
-
-    def __post_init__(self) -> None:
-        """Refuse settings that make no sense."""
-        for name, least in (("batch_rows", 1), ("epochs", 1), ("seed", 0)):
-            value = getattr(self, name)
-            if value is not None and (not isinstance(value, int) or value < least):
-                raise TrainingError(f"{name}={value!r}: a whole number of at least {least} was wanted.")
-        if not 0 < self.learning_rate < math.inf:
-            raise TrainingError(
-                f"learning_rate={self.learning_rate:g}: a positive number was wanted; 0.3 suits most data."
-            )
+    batch_rows: PositiveInt = 4_096
+    epochs: PositiveInt | None = None
+    learning_rate: PositiveFloat = 0.3
+    seed: Annotated[int, Field(ge=0)] = 0
 
     def schedule(self, rows: int) -> "BatchSchedule":
         """For so many rows."""

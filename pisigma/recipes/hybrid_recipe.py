@@ -7,6 +7,7 @@ from typing import Annotated, Literal, TypeVar
 from pydantic import Field, PositiveInt
 
 from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.hybrid.mini_batches import MiniBatches
 from pisigma.recipes.geometric_recipe import CalibrationSection
 from pisigma.recipes.recipe import MeasuredData, SimulatedData
 from pisigma.recipes.recipe_checks import Check, where_checks
@@ -27,12 +28,15 @@ class HybridSection(Section):
         harmonics: of the Fourier series, tried in this order.
         orders: numbers of factors of product units, tried in this order.
         gravity: direction in which things fall, in the frame of the robot's first row.
+        mini_batches: whether the unknowns are trained on mini-batches: true, false, or "auto" for many rows only; or
+            their `batch_rows`, `epochs`, `learning_rate` and `seed`.
     """
 
     features: tuple[str, ...] = HybridCalibrator.features
     harmonics: tuple[int, ...] = HybridCalibrator.harmonics
     orders: tuple[tuple[int, ...], ...] = HybridCalibrator.orders
     gravity: tuple[float, float, float] = HybridCalibrator.gravity
+    mini_batches: MiniBatches | bool | Literal["auto"] = HybridCalibrator.mini_batches
 
 
 class LearningCurveSection(Section):
@@ -84,7 +88,7 @@ class HybridRecipe(Section):
 
 
 def _calibrator(recipe: HybridRecipe, robot: Robot) -> HybridCalibrator:
-    return HybridCalibrator(recipe.calibration.calibrator(robot), **recipe.hybrid.model_dump())
+    return HybridCalibrator(recipe.calibration.calibrator(robot), **dict(recipe.hybrid))
 
 
 def hybrid_checks(recipe: HybridRecipe, robot: Robot) -> Iterator[Check]:

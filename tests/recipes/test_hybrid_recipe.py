@@ -6,6 +6,7 @@ from testing.closeness import assert_close
 
 from pisigma.errors import RecipeError
 from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.hybrid.mini_batches import MiniBatches
 from pisigma.recipes.hybrid_recipe import HybridRecipe, repeated
 from pisigma.recipes.recipe import MeasuredData, SimulatedData
 from pisigma.recipes.recipe_data import (
@@ -50,6 +51,8 @@ def test_every_error_source_is_on(repository):
         (HYBRID, "hybrid: {features: [gravty]}\n", "'hybrid': features: 'gravty' is no choice; did you mean 'gravity'"),
         (HYBRID, "hybrid: {harmonics: []}\n", "'hybrid': harmonics"),
         (HYBRID, "hybrid: {orders: [[1]]}\n", "'hybrid': orders"),
+        (HYBRID, "hybrid: {mini_batches: {batch_rows: 0}}\n", "mini_batches.*batch_rows"),
+        (HYBRID, "hybrid: {mini_batches: never}\n", "mini_batches"),
         (HYBRID, "hybrid: {order: [[2]]}\n", "unknown key 'order' in 'hybrid'; did you mean 'orders'"),
         (HYBRID, "repeats: 0\n", "'repeats'"),
         ("rows: [30, 50, 75, 100]", "rows: []", "'learning_curve.rows'"),
@@ -95,3 +98,16 @@ def test_measured_recipes_want_a_file_and_simulated_ones_none(write_recipe, tmp_
         simulate_repeats(recipe)
     with pytest.raises(RecipeError, match="simulates its data and takes no --data"):
         load_measurements(read_hybrid_recipe(write_recipe(RB5)), tmp_path / "rows.csv")
+
+
+@pytest.mark.parametrize(
+    ("stated", "wanted"),
+    [("true", True), ("auto", "auto"), ("{epochs: 3, seed: 1}", MiniBatches(epochs=3, seed=1))],
+)
+def test_a_recipe_may_choose_mini_batches(repository, tmp_path, stated, wanted):
+    recipe = (repository / "training" / f"{RB5}.yaml").read_text(encoding="utf-8")
+    file = tmp_path / "recipe.yaml"
+    file.write_text(
+        recipe.replace(HYBRID, f"repeats: 5\nhybrid: {{mini_batches: {stated}}}\n"), encoding="utf-8"
+    )
+    assert read_hybrid_recipe(file).calibrator().mini_batches == wanted
