@@ -15,6 +15,7 @@ from pisigma.cli.report import report
 from pisigma.cli.robots import robots
 from pisigma.cli.simulate import simulate
 from pisigma.cli.train import train
+from pisigma.cli.upgrade import upgrade
 from pisigma.cli.verify import verify
 
 app = typer.Typer(
@@ -24,7 +25,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (robots, simulate, calibrate, train, evaluate, report, ik, distill, export, verify):
+for command in (robots, simulate, calibrate, train, evaluate, report, ik, distill, export, verify, upgrade):
     app.command()(tell_problems(command))
 
 

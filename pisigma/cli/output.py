@@ -6,7 +6,7 @@ import shlex
 import textwrap
 from collections.abc import Callable, Collection, Iterable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import typer
 
@@ -34,24 +34,32 @@ def print_lines(lines: Iterable[str], indent: str = "") -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
-    """Print a table; columns that hold numbers are set right, and texts are wrapped where the screen is too narrow."""
+    """Print a table; columns of numbers are set right, and where the screen is narrow, headings and texts are wrapped.
+
+    Numbers and words are never cut: a table of too long ones is wider than the screen.
+    """
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
+    cells = list(zip(*rows, strict=True)) or [()] * len(columns)
+    width, gaps = screen_width(), 2 * len(columns)
+    widest = sum(max(map(len, (column, *texts))) for column, texts in zip(columns, cells, strict=True))
     table = Table(box=SIMPLE_HEAD, padding=(0, 1), pad_edge=False, collapse_padding=True, show_edge=False)
-    for index, column in enumerate(columns):
-        number = index > 0 and all(_is_number(row[index]) for row in rows)
-        words = [word for text in (column, *(row[index] for row in rows)) for word in text.split()]
-        table.add_column(
-            Text(column), justify="right" if number else "left", min_width=max(map(len, words), default=0)
-        )
+    narrowest = gaps
+    for index, (column, texts) in enumerate(zip(columns, cells, strict=True)):
+        number = index > 0 and all(_is_number(text) for text in texts)
+        longest = max((len(word) for text in (column, *texts) for word in text.split()), default=0)
+        if widest + gaps > width and number:
+            column = textwrap.fill(column, longest)
+        justify: Literal["right", "left"] = "right" if number else "left"
+        table.add_column(Text(column), justify=justify, no_wrap=number, min_width=longest)
+        narrowest += longest
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
     console = Console(highlight=False)
-    narrowest = console.measure(table, options=console.options.update(max_width=10_000)).minimum
-    console.width = max(screen_width(), narrowest)
+    console.width = max(width, narrowest)
     console.print(Text(title), soft_wrap=True)
     console.print(table)
     console.print()

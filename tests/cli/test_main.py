@@ -123,6 +123,24 @@ def test_tables_are_never_cut(capsys):
     assert lines[-3].rstrip().endswith("   1.5")
 
 
+def test_tables_fit_80_columns(capsys):
+    columns = ("tried", "unknowns", "log evidence", "left-out error", "seconds", "kept")
+    name = "gravity + series 110 + products (2, 2, 2, 2)"
+    print_table(
+        "title",
+        columns,
+        [(name, "1431", "29288.8", "0.488", "0.5", "yes"), ("x", "1", "", "1.0", "0.1", "no")],
+    )
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) == 80
+    assert [line.split() for line in lines[1:3]] == [
+        ["log", "left-out"],
+        [*columns[:2], "evidence", "error", *columns[4:]],
+    ]
+    assert lines[4].split()[-5:] == ["1431", "29288.8", "0.488", "0.5", "yes"]
+    assert lines[5].strip() == "2, 2, 2)"
+
+
 def test_a_missing_extra_is_named_in_one_sentence(tmp_path):
     """Without lightning, training says how to get it and writes nothing."""
     (tmp_path / "kiro3.yaml").write_text(small_recipe_text("kiro3"))

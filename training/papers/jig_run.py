@@ -13,6 +13,7 @@ from jig_recipe import read_jig_recipe
 from jig_report import DEFAULT, report_jigs, run_jigs
 from jig_tables import all_tables
 from pisigma.cli.output import print_table
+from pisigma.judging.calibration_summary import summarise
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.folder.staging import check_replaceable, staged_folder
 from pisigma.model.geometric_model import model_of_calibration
@@ -51,7 +52,7 @@ def run_jigs_recipe(path: Path, out: Path) -> dict[str, Any]:
         "not_validated": recipe.not_validated,
     }
     with staged_folder(out) as scratch:
-        save_model(replace(model, metrics=report), scratch)
+        save_model(replace(model, metrics=summarise(result).to_json()), scratch)
         write_jig_card(model, run, report, texts, scratch)
     for table in all_tables(report):
         print_table(table.title, table.columns, table.rows)

@@ -14,8 +14,8 @@ from pisigma.joint_correction.registry import feature_section
 from pisigma.robot.robot_file import RobotDocument
 from pisigma.yaml_file import Section, parse_yaml
 
-FORMAT = 2
-"""Newest format; folders without anything of a hybrid calibration are written in format 1, which had none."""
+FORMAT = 3
+"""Of this version; folders of earlier formats are upgraded by `pisigma.model.folder.upgrade`."""
 _CHECKSUM = re.compile(r"(.*^)sha256: ([0-9a-f]{64})\n", re.DOTALL | re.MULTILINE)
 
 _Vector = tuple[float, float, float]
@@ -101,7 +101,7 @@ class ModelDocument(Section):
 
     model_config = ConfigDict(protected_namespaces=())
 
-    format: Literal[1, 2]
+    format: Literal[3]
     name: str
     kind: str
     branches: tuple[str, ...]
@@ -119,13 +119,27 @@ class ModelDocument(Section):
 
 def write_document(document: dict[str, Any], path: Path) -> None:
     """Write the document, and as its last line the checksum of all before it."""
-    stated = FORMAT if {"learned", "uncertainty"} & set(document) else 1
-    text = yaml.safe_dump({"format": stated, **document}, sort_keys=False, allow_unicode=True)
+    text = yaml.safe_dump({"format": FORMAT, **document}, sort_keys=False, allow_unicode=True)
     path.write_text(f"{text}sha256: {_digest(text)}\n", encoding="utf-8", newline="\n")
 
 
 def read_document(path: Path) -> ModelDocument:
     """Read the document and check it.
+
+    Raises:
+        ModelError: the file cannot be read, is of another format, truncated, edited, or no model's.
+    """
+    text = read_signed_text(path)
+    stated = stated_format(text)
+    if stated is not None and 1 <= stated < FORMAT:
+        raise ModelError(
+            f"{path}: format {stated} is of an earlier version; run `pisigma upgrade {path.parent}` once to read it."
+        )
+    return parse_yaml(text, ModelDocument, ModelError, source=str(path))
+
+
+def read_signed_text(path: Path) -> str:
+    """Read the lines before the checksum, of this format or an earlier one.
 
     Raises:
         ModelError: the file cannot be read, is of a newer format, truncated, edited, or no model's.
@@ -135,10 +149,10 @@ def read_document(path: Path) -> ModelDocument:
     except (OSError, UnicodeDecodeError) as problem:
         reason = problem.strerror if isinstance(problem, OSError) else "it is no UTF-8 text"
         raise ModelError(f"{path}: cannot be read ({reason}); train or copy the model again.") from None
-    stated = re.match(r"format: ([0-9]{1,9})\n", text)
-    if stated and int(stated[1]) > FORMAT:
+    stated = stated_format(text)
+    if stated is not None and stated > FORMAT:
         raise ModelError(
-            f"{path}: format {stated[1]} is newer than this pisigma reads ({FORMAT}); upgrade pisigma."
+            f"{path}: format {stated} is newer than this pisigma reads ({FORMAT}); upgrade pisigma."
         )
     signed = _CHECKSUM.fullmatch(text)
     if not signed or _digest(signed[1]) != signed[2]:
@@ -146,7 +160,13 @@ def read_document(path: Path) -> ModelDocument:
             f"{path}: is truncated, was edited, or is no model of pisigma (its last line is not the "
             "checksum of the lines before it); train or copy the model again."
         )
-    return parse_yaml(signed[1], ModelDocument, ModelError, source=str(path))
+    return signed[1]
+
+
+def stated_format(text: str) -> int | None:
+    """Give the format in the first line of a document; None where there is none."""
+    stated = re.match(r"format: ([0-9]{1,9})\n", text)
+    return int(stated[1]) if stated else None
 
 
 def _digest(text: str) -> str:

@@ -167,8 +167,20 @@ def test_weights_of_another_model_are_noticed(folder, tmp_path):
 
 def test_a_newer_format_asks_for_an_upgrade(folder):
     path = folder / "model.yaml"
-    path.write_text(path.read_text().replace("format: 1\n", "format: 3\n", 1))
-    assert "model.yaml: format 3 is newer than this pisigma reads (2); upgrade pisigma." in refused(folder)
+    path.write_text(path.read_text().replace("format: 3\n", "format: 4\n", 1))
+    assert "model.yaml: format 4 is newer than this pisigma reads (3); upgrade pisigma." in refused(folder)
+
+
+def test_an_earlier_format_names_the_command_that_upgrades(folder):
+    path = folder / "model.yaml"
+    document = yaml.safe_load(path.read_text().rsplit("sha256: ", 1)[0])
+    text = yaml.safe_dump(document | {"format": 2}, sort_keys=False)
+    path.write_text(f"{text}sha256: {hashlib.sha256(text.encode()).hexdigest()}\n")
+    said = refused(folder)
+    assert (
+        f"model.yaml: format 2 is of an earlier version; run `pisigma upgrade {folder}` once to read it."
+        in said
+    )
 
 
 def _set(key: str, value):

@@ -1,0 +1,135 @@
+"""Model folders of earlier versions made new: keys of `model.yaml` that have another name or form since."""
+
+import os
+import re
+import shutil
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pisigma.errors import ModelError
+from pisigma.model.compiled_model import save_compiled
+from pisigma.model.folder.folder_files import COMPILED, DESCRIPTION, folder_hash
+from pisigma.model.folder.model_document import FORMAT, read_signed_text, stated_format, write_document
+from pisigma.model.folder.model_folder import load_model
+from pisigma.model.folder.staging import staged_folder
+
+_RENAMED = {
+    "dealings": "repeats",
+    "doubts": "warnings",
+    "factor_on_given_sigma": "factor_on_stated_sigma",
+    "gives_up": "limitations",
+    "rms_mm_of_dealings": "rms_mm_of_repeats",
+    "rms_mm_of_parts": "rms_mm_of_simulations",
+    "told_by_the_data": "effective_parameters",
+    "unseen": "weak_directions",
+    "variance_widening": "prior_scale",
+    "widening": "prior_scale",
+}
+"""Old and new names of keys, wherever they stand among metrics and in the section of the uncertainty."""
+
+_LABELS = (
+    (r"^identified; the data hardly .*$", "held by the prior"),
+    (r"^identified at the solution, though redundant at the nominal geometry", "only at solution"),
+    (r"^without effect on what was measured", "no effect"),
+    (r"^too few rows that count show it, the others are outliers", "outliers"),
+    (r"^.* is identified, the single values are not", "in a sum"),
+    (r"; the data hardly .*$", "; prior"),
+)
+"""What earlier versions said of a parameter, and the few words for it that newer ones keep beside."""
+
+
+@dataclass(frozen=True)
+class Upgrade:
+    """A folder that was made new.
+
+    Attributes:
+        name: of the model.
+        before: format that the folder had.
+        after: format that it has now; the same where there was nothing to do.
+    """
+
+    name: str
+    before: int
+    after: int
+
+
+def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
+    """Rewrite a model folder of an earlier version in the form of this one, whole or not at all.
+
+    Tensors, figures, card and all other files stay as they are; the file for the compiled kernels is made again.
+
+    Args:
+        folder: to upgrade.
+
+    Raises:
+        ModelError: the folder holds no model, or it is truncated, was edited or is of a newer format.
+        OutputError: the folder cannot be written.
+    """
+    path = Path(folder)
+    text = read_signed_text(path / DESCRIPTION)
+    before, document = stated_format(text), yaml.safe_load(text)
+    if before is None or not isinstance(document, dict) or not isinstance(document.get("metrics"), dict):
+        raise ModelError(f"{path / DESCRIPTION}: does not describe a model; train or copy the model again.")
+    if before == FORMAT:
+        return Upgrade(load_model(path).name, before, FORMAT)
+    document["metrics"] = _metrics(str(document.get("kind")), _renamed(document["metrics"]))
+    if "uncertainty" in document:
+        document["uncertainty"] = _renamed(document["uncertainty"])
+    with staged_folder(path) as scratch:
+        shutil.copytree(path, scratch, dirs_exist_ok=True)
+        (scratch / COMPILED).unlink(missing_ok=True)
+        write_document(
+            {key: value for key, value in document.items() if key != "format"}, scratch / DESCRIPTION
+        )
+        model = load_model(scratch)
+        with suppress(ModelError):  # the kernels do not know every kind of model
+            save_compiled(model, scratch / COMPILED, folder_hash(scratch) or "")
+    return Upgrade(model.name, before, FORMAT)
+
+
+def _renamed(values: Any) -> Any:
+    """The same values with the keys of today."""
+    if isinstance(values, dict):
+        return {_RENAMED.get(key, key): _renamed(value) for key, value in values.items()}
+    return [_renamed(value) for value in values] if isinstance(values, list) else values
+
+
+def _metrics(kind: str, metrics: dict[str, Any]) -> dict[str, Any]:
+    """Metrics in the form of today; see `pisigma.judging`."""
+    if kind == "distilled":
+        return metrics | {"joints": [_joint(joint) for joint in metrics.get("joints", ())]}
+    if kind not in ("geometric_calibration", "hybrid_calibration"):
+        return metrics
+    if "parameters" not in metrics:  # of a study that kept other figures, which nothing reads
+        return {}
+    metrics = metrics | {"parameters": [_labelled(row) for row in metrics["parameters"]]}
+    held_out = metrics.get("held_out")
+    if isinstance(held_out, Mapping) and "rms_mm" in held_out:
+        errors = {key: value for key, value in held_out.items() if key != "rows"}
+        metrics["held_out"] = {"rows": held_out["rows"], "geometric": errors}
+    return metrics
+
+
+def _labelled(row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row of the parameter table with its label."""
+    label = row["remark"]
+    for pattern, words in _LABELS:
+        label = re.sub(pattern, words, label)
+    return {**row, "label": label}
+
+
+def _joint(joint: Mapping[str, Any]) -> dict[str, Any]:
+    """Corrections of a joint of a distilled model, and their errors, without units in the names."""
+    if "correction" in joint:
+        return dict(joint)
+    names: Sequence[str] = ("mean", "rms", "max")
+    parts = {
+        part: {name: joint[f"{part}_{name}_{joint['unit']}"] for name in names}
+        for part in ("correction", "error")
+    }
+    return {"name": joint["name"], "unit": joint["unit"], **parts}

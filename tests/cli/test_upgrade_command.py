@@ -1,0 +1,18 @@
+"""`pisigma upgrade`."""
+
+import json
+
+
+def test_what_is_new_already_is_said(run, models):
+    result = run("upgrade", models / "kiro3", "--json")
+    assert json.loads(result.stdout) == {
+        "model": str(models / "kiro3"),
+        "name": "hand_made_kiro3",
+        "before": 3,
+        "after": 3,
+    }
+    assert "has the newest format (3) already" in run("upgrade", models / "kiro3").stdout
+
+
+def test_a_folder_without_a_model_is_refused(refuses, tmp_path):
+    assert "model.yaml: cannot be read" in refuses("upgrade", tmp_path)

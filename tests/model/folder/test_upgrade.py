@@ -1,0 +1,105 @@
+"""Folders of earlier versions are made new, whole or not at all."""
+
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from testing.models import hand_made_model
+from testing.report import hybrid_under_test
+
+from pisigma.errors import ModelError
+from pisigma.judging.calibration_summary import read_summary
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import load_model, save_model
+from pisigma.model.folder.upgrade import Upgrade, upgrade_folder
+
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+
+OLD = {
+    "weak_directions": "unseen",
+    "effective_parameters": "told_by_the_data",
+    "repeats": "dealings",
+    "rms_mm_of_repeats": "rms_mm_of_dealings",
+    "prior_scale": "variance_widening",
+    "warnings": "warnings",
+}
+
+
+def old(values: Any, names: dict[str, str] = OLD) -> Any:
+    """The same values with the keys of the earlier version."""
+    if isinstance(values, dict):
+        return {names.get(key, key): old(value, names) for key, value in values.items() if key != "label"}
+    return [old(value, names) for value in values] if isinstance(values, list) else values
+
+
+def write_old(model: CalibratedModel, folder: Path) -> dict[str, bytes]:
+    """Write a model folder as the earlier version did; gives its files."""
+    folder.mkdir()
+    save_model(model, folder)
+    path = folder / "model.yaml"
+    document = yaml.safe_load(path.read_text().rsplit("sha256: ", 1)[0])
+    document["metrics"] = old(document["metrics"])
+    if "uncertainty" in document:
+        document["uncertainty"] = old(document["uncertainty"], {"prior_scale": "widening"})
+    text = yaml.safe_dump(document | {"format": 2 if "uncertainty" in document else 1}, sort_keys=False)
+    path.write_text(f"{text}sha256: {hashlib.sha256(text.encode()).hexdigest()}\n")
+    (folder / "compiled.npz").write_bytes(b"of the earlier version")
+    (folder / "README.md").write_text("the card")
+    return {entry.name: entry.read_bytes() for entry in folder.iterdir()}
+
+
+def test_a_hybrid_calibration_comes_back_with_all_figures(tmp_path):
+    _, model = hybrid_under_test()
+    files = write_old(model, tmp_path / "arm")
+    with pytest.raises(ModelError, match="run `pisigma upgrade"):
+        load_model(tmp_path / "arm")
+    assert upgrade_folder(tmp_path / "arm") == Upgrade("arm", 2, 3)
+    upgraded = load_model(tmp_path / "arm")
+    assert upgraded.metrics == model.metrics
+    assert read_summary(upgraded) == read_summary(model)
+    assert upgraded.uncertainty.prior_scale == model.uncertainty.prior_scale
+    for name in ("model.safetensors", "README.md"):
+        assert (tmp_path / "arm" / name).read_bytes() == files[name]
+    assert (tmp_path / "arm" / "compiled.npz").read_bytes() != files["compiled.npz"]
+    assert [entry.name for entry in tmp_path.iterdir()] == ["arm"]
+    before = (tmp_path / "arm" / "model.yaml").read_bytes()
+    assert upgrade_folder(tmp_path / "arm") == Upgrade("arm", 3, 3)
+    assert (tmp_path / "arm" / "model.yaml").read_bytes() == before
+
+
+def test_figures_of_other_kinds_change_their_form(tmp_path):
+    network = hand_made_model("kiro3")
+    names = ("mean", "rms", "max")
+    flat = {f"{part}_{name}_deg": 1.0 for part in ("correction", "error") for name in names}
+    metrics = {"doubts": ["so"], "gives_up": ["much"], "joints": [{"name": "theta_1", "unit": "deg", **flat}]}
+    write_old(replace(network, kind="distilled", metrics=metrics), tmp_path / "small")
+    upgrade_folder(tmp_path / "small")
+    figures = dict.fromkeys(names, 1.0)
+    assert load_model(tmp_path / "small").metrics == {
+        "warnings": ["so"],
+        "limitations": ["much"],
+        "joints": [{"name": "theta_1", "unit": "deg", "correction": figures, "error": figures}],
+    }
+    write_old(replace(network, metrics={"joints": [{"name": "theta_1"}]}), tmp_path / "net")
+    assert upgrade_folder(tmp_path / "net") == Upgrade("hand_made_kiro3", 1, 3)
+    assert load_model(tmp_path / "net").metrics == {"joints": [{"name": "theta_1"}]}
+
+
+def test_a_folder_that_does_not_load_stays_as_it_was(tmp_path):
+    files = write_old(hand_made_model("kiro3"), tmp_path / "arm")
+    (tmp_path / "arm" / "model.safetensors").write_bytes(files["model.safetensors"][:-8])
+    with pytest.raises(ModelError, match="is truncated"):
+        upgrade_folder(tmp_path / "arm")
+    assert (tmp_path / "arm" / "model.yaml").read_bytes() == files["model.yaml"]
+    (tmp_path / "arm" / "model.yaml").write_bytes(files["model.yaml"][:-80])
+    with pytest.raises(ModelError, match="was edited"):
+        upgrade_folder(tmp_path / "arm")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["arm"]
+
+
+def test_no_model_is_refused(tmp_path):
+    with pytest.raises(ModelError, match="cannot be read"):
+        upgrade_folder(tmp_path)
