@@ -24,12 +24,21 @@ class HybridArm:
         hybrid: the arm whose geometry goes with the correction.
         correction: Δ.
         coverage: the joint values that were measured.
+        approach: `(dof,)`: +1 or -1 for the side from which every joint comes, 0 where that is not stated; None for all
+            of them.
     """
 
     geometric: Robot
     hybrid: Robot
     correction: JointCorrection
     coverage: JointCoverage
+    approach: Float[Tensor, " dof"] | None = None
+
+    def delta(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+        """Δ [rad or m] at commanded joint values q [rad or m], coming from the sides of `approach`."""
+        sides = None if self.approach is None else self.approach.to(q).expand_as(q)
+        delta: Tensor = self.correction(q, sides)
+        return delta
 
     def forward(
         self, q: Float[Tensor, "*batch dof"], approach: Float[Tensor, "*batch dof"] | None = None
@@ -38,10 +47,10 @@ class HybridArm:
 
         Args:
             q: joint values [rad or m].
-            approach: see `JointCorrection.forward`.
+            approach: see `JointCorrection.forward`; None for that of the arm.
         """
         with torch.no_grad():
-            delta = self.correction(q, approach)
+            delta = self.delta(q) if approach is None else self.correction(q, approach)
         return blend(
             forward_kinematics(self.geometric, q),
             forward_kinematics(self.hybrid, q + delta),

@@ -1,35 +1,35 @@
 """Corrected inverse kinematics: joint values that really reach a pose."""
 
 import os
-import sys
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pisigma.errors import ModelError, PoseError
-from pisigma.inverse.posture import Postures
+from pisigma.errors import ModelError
+from pisigma.inverse.joint_input import Postures, as_array, is_tensor, pose_array
 from pisigma.model.folder.folder_files import COMPILED, folder_hash
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import pytorch_kinematics
 
+    import pisigma.inverse.compiled_ik
     import pisigma.inverse.path
+    import pisigma.inverse.reference
     import pisigma.inverse.solution
-    import pisigma.inverse.torch_ik
-    import pisigma.kernels.solution
-    import pisigma.kernels.solver
     import pisigma.model.calibrated_model
 
 
 class CorrectedIK:
     """The corrected inverse kinematics of a model: call it with poses.
 
-    Behind one call there are two routes, which give the same solutions. NumPy arrays and nested lists go through
-    compiled kernels on the CPU, without torch being imported, and come back as NumPy arrays. Tensors go through torch,
-    with gradients by the implicit function theorem, and come back as tensors on their own device.
+    Poses go through compiled kernels on the CPU. NumPy arrays and nested lists come back as NumPy arrays, without torch
+    being imported; tensors come back as tensors on their own device, with gradients by the implicit function theorem
+    (see `pose_gradients`). A model whose correction has no compiled form goes through `ReferenceIK` instead, as every
+    model does where there are no kernels for the machine.
 
     Attributes:
         name: of the model.
@@ -47,34 +47,32 @@ class CorrectedIK:
         Raises:
             ModelError: the model names branches that its robot does not have, or gives the numeric inverse no start.
         """
-        from pisigma.inverse.torch_ik import NUMERIC, TorchIK
+        from pisigma.inverse.reference import NUMERIC, ReferenceIK
 
-        route = TorchIK(model)
+        route = ReferenceIK(model)
         self.name = model.name
-        self.branches = route.branches
-        first = [self.branches.index(name) for name in model.branches]
-        self.order = (*first, *(index for index in range(len(self.branches)) if index not in first))
+        self.branches, self.order = route.branches, route.order
         self.joints = tuple(joint.name for joint in model.robot.joints)
         self.limits, self.revolute = model.robot.limits, np.array(model.robot.revolute)
         self.closed_form = self.branches != (NUMERIC,)
-        self.model, self.torch = model, route
+        self.model, self.reference = model, route
         self._read: Callable[[], pisigma.model.calibrated_model.CalibratedModel] = lambda: model
 
     @classmethod
     def _of_kernels(
         cls,
-        kernels: "pisigma.kernels.solver.CompiledIK",
+        kernels: "pisigma.inverse.compiled_ik.CompiledIK",
         read: "Callable[[], pisigma.model.calibrated_model.CalibratedModel]",
     ) -> "CorrectedIK":
         """The same of kernels, without the model, which is read when it is asked for."""
-        found = cls.__new__(cls)
+        ik = cls.__new__(cls)
         arms, form = kernels.description.arms, kernels.description.closed_form
-        found.name, found.branches, found.joints = kernels.name, kernels.branches, kernels.joints
-        found.order = tuple(int(index) for index in form.order)
-        found.limits, found.revolute = arms.limits, np.asarray(arms.revolute, dtype=bool)
-        found.closed_form = form.kind != 0
-        found._read, found.compiled = read, kernels
-        return found
+        ik.name, ik.branches, ik.joints = kernels.name, kernels.branches, kernels.joints
+        ik.order = tuple(int(index) for index in form.order)
+        ik.limits, ik.revolute = arms.limits, np.asarray(arms.revolute, dtype=bool)
+        ik.closed_form = form.kind != 0
+        ik._read, ik.compiled = read, kernels
+        return ik
 
     @cached_property
     def model(self) -> "pisigma.model.calibrated_model.CalibratedModel":
@@ -82,25 +80,38 @@ class CorrectedIK:
         return self._read()
 
     @cached_property
-    def torch(self) -> "pisigma.inverse.torch_ik.TorchIK":
-        """The route for tensors."""
-        from pisigma.inverse.torch_ik import TorchIK
+    def reference(self) -> "pisigma.inverse.reference.ReferenceIK":
+        """The route without kernels."""
+        from pisigma.inverse.reference import ReferenceIK
 
-        return TorchIK(self.model)
+        return ReferenceIK(self.model)
 
     @cached_property
-    def compiled(self) -> "pisigma.kernels.solver.CompiledIK | None":
-        """The route for arrays; None where the model corrects by something that has no compiled form."""
-        from pisigma.model.compiled_model import compile_model
+    def compiled(self) -> "pisigma.inverse.compiled_ik.CompiledIK | None":
+        """The kernels of the model; None where its correction has no compiled form, or this machine no kernels."""
+        from pisigma.inverse.compiled_ik import CompiledIK
+        from pisigma.model.compiled_model import describe
 
         try:
-            return compile_model(self.model)
+            description, branches = describe(self.model)
+            return CompiledIK(description, branches, self.joints, self.name)
         except ModelError:
             return None
 
+    @cached_property
+    def postures(self) -> Postures:
+        """What `near` may be."""
+        return Postures(self.limits, self.revolute, self.joints)
+
     def __call__(
-        self, T_base_tool: Any, *, near: Any = None, branch: str | None = None, throw: bool = True
-    ) -> "pisigma.inverse.solution.Solution | pisigma.kernels.solution.CompiledSolution":
+        self,
+        T_base_tool: Any,
+        *,
+        near: Any = None,
+        branch: str | None = None,
+        throw: bool = True,
+        approach: Any = None,
+    ) -> "pisigma.inverse.solution.Solution":
         """Find corrected joint values for poses.
 
         Args:
@@ -112,6 +123,8 @@ class CorrectedIK:
                 first in `order` that reaches the pose, inside the joint limits if there is one.
             throw: False for control loops: a matrix that is no pose, or `near` that is not finite or no posture of the
                 robot, raises nothing but gets the status INVALID_POSE and NaN.
+            approach: `(*batch, dof)` or `(dof,)`: +1 or -1 for the side from which every joint will come to the pose,
+                which matters to joints with backlash; 0, or None for all, where that is not stated.
 
         Returns:
             One solution per pose: arrays for arrays, in float64; tensors for tensors, in their dtype and on their
@@ -122,34 +135,38 @@ class CorrectedIK:
                 unknown.
         """
         if near is not None:
-            near = self.postures.checked(near, _is_tensor(near), throw)
-        kernels = None if _is_tensor(T_base_tool) else self.compiled
-        if kernels is not None:
-            return self._by_kernels(kernels, T_base_tool, near, branch, throw)
-        if throw:
-            found = self.torch(T_base_tool, near=near, branch=branch)
-        else:
-            from pisigma.inverse.lenient import solve_what_can_be
-
-            found = solve_what_can_be(self.torch, T_base_tool, near, branch)
-        return found if _is_tensor(T_base_tool) else self._as_arrays(found)
-
-    def all_branches(
-        self, T_base_tool: Any
-    ) -> "pisigma.inverse.solution.Solution | pisigma.kernels.solution.CompiledSolution":
-        """Solutions on every branch, as `(*batch, branches)`; one for a robot without closed-form inverse."""
-        kernels = None if _is_tensor(T_base_tool) else self.compiled
+            near = self.postures.checked(near, throw)
+        kernels = self.compiled
+        if isinstance(T_base_tool, np.ndarray) and T_base_tool.shape == (4, 4) and kernels is not None:
+            return kernels.solve(T_base_tool, near, branch, throw, approach, self)  # the way of control loops
+        T, single = pose_array(T_base_tool)
         if kernels is None:
-            found = self.torch.all_branches(T_base_tool)
-            return found if _is_tensor(T_base_tool) else self._as_arrays(found)
-        T = _as_poses(T_base_tool)
-        every = kernels.all_branches(T.reshape(-1, 4, 4))
-        return every.reshaped((*T.shape[:-2], len(self.branches)))._replace(owner=self)
+            solution = self.reference(
+                T, near=near, branch=branch, throw=throw, approach=approach, single=single
+            )
+            return self._like(T_base_tool, solution)
+        if T.ndim == 2 and not single:
+            solution = kernels.solve(T, near, branch, throw, as_array(approach), self)
+        else:
+            solution = kernels.solve_batch(
+                T, near, branch, throw=throw, approach=as_array(approach), single=single, owner=self
+            )
+        return self._like(T_base_tool, solution)
+
+    def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> "pisigma.inverse.solution.Solution":
+        """Solutions on every branch, as `(*batch, branches)`; one for a robot without closed-form inverse."""
+        T, single = pose_array(T_base_tool)
+        if self.compiled is None:
+            return self._like(T_base_tool, self.reference.all_branches(T, approach=approach, single=single))
+        every = self.compiled.all_branches(T, approach=as_array(approach), single=single, owner=self)
+        return self._like(T_base_tool, every)
 
     def path(
         self, T_base_tool: Any, *, near: Any = None, branch: str | None = None
     ) -> "pisigma.inverse.path.JointPath":
         """Find joint values along a path: one branch as long as possible, and word of every place where that ends.
+
+        From which side every joint comes to a pose follows from the direction in which it moves.
 
         Args:
             T_base_tool: `(poses, 4, 4)` wanted poses in order [m]; as NumPy array or nested lists.
@@ -163,6 +180,36 @@ class CorrectedIK:
 
         return follow_path(self, T_base_tool, near, branch)
 
+    def forward(self, q: Any, *, approach: Any = None) -> Any:
+        """Pose T_base_tool `(*batch, 4, 4)` that the calibrated arm takes at commanded joint values `(*batch, dof)`.
+
+        Args:
+            q: joint values [rad or m]; arrays go through kernels without torch, tensors through torch with gradients.
+            approach: see `__call__`; for arrays.
+
+        Raises:
+            PoseError: q has another number of columns than the robot has joints.
+        """
+        kernels = self._kernels_of(q)
+        if kernels is None:
+            return self._by_model(q, lambda model, values: model.forward(values))
+        values = np.asarray(q, dtype=np.float64)
+        T = kernels.forward(values.reshape(-1, values.shape[-1]), approach=_flat(approach))[0]
+        return T.reshape(*values.shape[:-1], 4, 4)
+
+    def jacobian(self, q: Any) -> Any:
+        """Geometric Jacobian `(*batch, 6, dof)` of the calibrated arm, in the base frame at the tool's origin.
+
+        The slope of the correction, some 1e-3, is left out. For the arguments see `forward`; a network that corrects
+        nominal joint values is left out too.
+        """
+        kernels = self._kernels_of(q, forward=False)
+        if kernels is None:
+            return self._by_model(q, lambda model, values: model.jacobian(values))
+        values = np.asarray(q, dtype=np.float64)
+        J = kernels.forward(values.reshape(-1, values.shape[-1]))[1]
+        return J.reshape(*values.shape[:-1], 6, values.shape[-1])
+
     def under(self, *, payload_kg: float | None = None, temperature_c: float | None = None) -> "CorrectedIK":
         """The same of the robot under other conditions than the usual ones of the calibration rows.
 
@@ -171,93 +218,61 @@ class CorrectedIK:
             temperature_c: of the robot [deg C]; as usual if None.
 
         Raises:
-            ModelError: the model did not learn what a given condition does, or not near the given value.
+            ModelError: the model did not learn what a stated condition does, or not near the stated value.
         """
         from pisigma.model.stated_conditions import under_stated_conditions
 
         return CorrectedIK(under_stated_conditions(self.model, payload_kg, temperature_c))
 
     def accuracy(self, q: Any) -> Any:
-        """Predicted standard deviation [m] of the tool's position at joint values `(*batch, dof)`, as an array."""
+        """Predicted standard deviation [m] of the tool's position at joint values `(*batch, dof)`, in float64.
+
+        A tensor for a tensor, else an array.
+        """
         import torch
 
         from pisigma.model.accuracy import position_accuracy
 
+        if is_tensor(q):
+            return position_accuracy(self.model, q)
         return position_accuracy(self.model, torch.from_numpy(np.array(q, dtype=np.float64))).numpy()
 
     def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
         """The geometry as a chain of pytorch-kinematics; see `CalibratedModel.to_pytorch_kinematics`."""
         return self.model.to_pytorch_kinematics()
 
-    @cached_property
-    def postures(self) -> Postures:
-        """What `near` may be."""
-        return Postures(self.limits, self.revolute, self.joints)
+    def _kernels_of(self, q: Any, forward: bool = True) -> "pisigma.inverse.compiled_ik.CompiledIK | None":
+        """The kernels, where they say where the arm is at such joint values."""
+        if is_tensor(q) or self.compiled is None:
+            return None
+        return None if forward and self.compiled.description.network.used else self.compiled
 
-    def _by_kernels(
-        self,
-        kernels: "pisigma.kernels.solver.CompiledIK",
-        T_base_tool: Any,
-        near: Any,
-        branch: str | None,
-        throw: bool,
-    ) -> "pisigma.kernels.solution.CompiledSolution":
-        T = T_base_tool if isinstance(T_base_tool, np.ndarray) else _as_poses(T_base_tool)
-        if T.ndim == 2:
-            return kernels.solve(T, near, branch, throw)._replace(owner=self)
-        batch, T = T.shape[:-2], _as_poses(T)
-        beside = None if near is None else self._beside(near, batch)
-        found = kernels.solve_batch(T.reshape(-1, 4, 4), beside, branch, throw=throw)
-        return found.reshaped(batch)._replace(owner=self)
+    def _by_model(self, q: Any, function: Callable[[Any, Any], Any]) -> Any:
+        """A function of the model and joint values in torch; of an array as an array."""
+        import torch
 
-    def _beside(self, near: Any, batch: tuple[int, ...]) -> Any:
-        """Joint values for every pose of a batch, or the same for all."""
-        try:
-            values = np.asarray(near, dtype=np.float64)
-        except (TypeError, ValueError):
-            return near  # the kernels say what is wrong
-        if values.ndim <= 1:
-            return values
-        try:
-            return np.broadcast_to(values, (*batch, values.shape[-1])).reshape(-1, values.shape[-1])
-        except ValueError:
-            raise PoseError(
-                f"near has the batch shape {values.shape[:-1]}, which does not broadcast to {batch} of the poses; give "
-                "one row of joint values for each pose, or one for all."
-            ) from None
+        if is_tensor(q):
+            return function(self.model, q)
+        return function(self.model, torch.from_numpy(np.array(q, dtype=np.float64))).numpy()
 
-    def _as_arrays(
-        self, found: "pisigma.inverse.solution.Solution"
-    ) -> "pisigma.kernels.solution.CompiledSolution":
-        """A solution of tensors as one of arrays."""
-        from pisigma.kernels.solution import CompiledSolution
+    def _like(
+        self, poses: Any, solution: "pisigma.inverse.solution.Solution"
+    ) -> "pisigma.inverse.solution.Solution":
+        """The solutions as tensors, with gradients where these are wanted, where the poses are tensors; else as arrays."""
+        if not is_tensor(poses):
+            return (
+                solution
+                if isinstance(solution.q, np.ndarray)
+                else replace(solution.map(as_array), owner=self)
+            )
+        from pisigma.inverse.pose_gradients import as_tensors
 
-        values = (found.q, found.q_nominal, found.branch, found.status)
-        q, nominal, branch, status = (value.numpy(force=True) for value in values)
-        residuals = (found.position_residual, found.rotation_residual, found.domain_measure)
-        position, rotation, measure = (value.numpy(force=True) for value in residuals)
-        return CompiledSolution(q, nominal, branch, self.branches, status, position, rotation, measure, self)
+        return as_tensors(solution, poses, self.model if poses.requires_grad else None, self)
 
 
-def _as_poses(values: Any) -> Any:
-    """Matrices `(*batch, 4, 4)` as an array."""
-    try:
-        T = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise PoseError(
-            "T_base_tool is no array of numbers; give homogeneous transforms of shape (*batch, 4, 4)."
-        ) from None
-    if T.ndim < 2 or T.shape[-2:] != (4, 4):
-        raise PoseError(
-            f"T_base_tool has the shape {T.shape}; give homogeneous transforms of shape (*batch, 4, 4)."
-        )
-    return T
-
-
-def _is_tensor(values: Any) -> bool:
-    """Whether values are a tensor; torch need not be imported to know."""
-    torch = sys.modules.get("torch")
-    return torch is not None and isinstance(values, torch.Tensor)
+def _flat(values: Any) -> Any:
+    """Approaches as rows."""
+    return None if values is None else np.asarray(values).reshape(-1, np.shape(values)[-1])
 
 
 def load(folder: str | os.PathLike[str]) -> CorrectedIK:
@@ -287,12 +302,12 @@ def load(folder: str | os.PathLike[str]) -> CorrectedIK:
     return CorrectedIK._of_kernels(kernels, read)
 
 
-def _stored_kernels(path: Path) -> "pisigma.kernels.solver.CompiledIK | None":
+def _stored_kernels(path: Path) -> "pisigma.inverse.compiled_ik.CompiledIK | None":
     """What stands ready in a model folder; None where that is missing, damaged or of another state of the model."""
     stated = folder_hash(path)
     if stated is None or not (path / COMPILED).is_file():
         return None
-    from pisigma.kernels.solver import CompiledIK
+    from pisigma.inverse.compiled_ik import CompiledIK
 
     try:
         kernels = CompiledIK.load(path / COMPILED)

@@ -6,14 +6,13 @@ import torch
 from torch import Tensor
 
 from pisigma.inverse.identified_arm import search
-from pisigma.inverse.nearest_turn import nearest_turn
+from pisigma.inverse.nearest_turn import as_trained, nearest_turn
 from pisigma.inverse.solution import Solution
 from pisigma.kinematics.joint_limits import wrap_into_limits
-from pisigma.kinematics.numeric import SINGULAR_TOLERANCE
 from pisigma.kinematics.singularity import singularity_measure
 from pisigma.kinematics.status import Status
+from pisigma.kinematics.tolerances import SINGULAR_TOLERANCE
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.hybrid_motion import HybridMotion
 
 
 class Finishing:
@@ -24,7 +23,6 @@ class Finishing:
         model: CalibratedModel,
         branches: tuple[str, ...],
         trained: Sequence[int],
-        motion: HybridMotion | None,
     ) -> None:
         """Prepare for a model.
 
@@ -32,9 +30,8 @@ class Finishing:
             model: the model.
             branches: names of all branches.
             trained: indices of those that training rows lie on.
-            motion: of its hybrid arm, where it has one.
         """
-        self._model, self._branches, self._motion = model, branches, motion
+        self._model, self._branches = model, branches
         self._trained = torch.tensor(trained)
         self._geometric = model.calibrated or model.robot
 
@@ -42,30 +39,29 @@ class Finishing:
         self, T: Tensor, q: Tensor, status: Tensor, branch: Tensor, near: Tensor | None
     ) -> Solution:
         """Add the correction to nominal joint values, and everything that limits the trust in it."""
-        found = torch.isfinite(q).all(-1)
-        safe = torch.where(found[..., None], q, torch.zeros_like(q))
-        seen = as_trained(self._model, safe)
-        correction = torch.where(found[..., None], self._model.correction(T, seen), torch.nan)
+        known = torch.isfinite(q).all(-1)
+        safe = torch.where(known[..., None], q, torch.zeros_like(q))
+        turned = as_trained(self._model, safe)
+        correction = torch.where(known[..., None], self._model.correction(T, turned), torch.nan)
         status = self._without_limits(safe, status)
         corrected = q + correction
         commanded, inside = self._turned(corrected, near)
         measure = torch.full(status.shape, torch.nan, dtype=torch.float64)
         if self._model.network is not None and self._model.domain is not None:
-            measure = self._model.domain.measure(self._model.network.scaled_inputs(T, seen)).where(
-                found, measure
+            measure = self._model.domain.measure(self._model.network.scaled_inputs(T, turned)).where(
+                known, measure
             )
             outside = ~(measure <= 1) | ~torch.isin(branch, self._trained)
             status[(status == Status.REACHED) & outside] = int(Status.OUTSIDE_DOMAIN)
         status[~inside & (status != Status.UNREACHABLE)] = int(Status.OUTSIDE_JOINT_LIMITS)
-        turned = commanded - corrected  # 0 where no turn was made
-        return Solution(commanded, q + turned, correction, branch, self._branches, status, measure)
+        return self._solution(commanded, q + (commanded - corrected), branch, status, measure)
 
     def of_identified(
         self, T: Tensor, q: Tensor, q_nominal: Tensor, status: Tensor, branch: Tensor, near: Tensor | None
     ) -> Solution:
         """Put joint values of the identified arm beside the nominal ones, on the same turns."""
-        found = torch.isfinite(q).all(-1)
-        status = self._without_limits(torch.where(found[..., None], q, 0.0), status)
+        known = torch.isfinite(q).all(-1)
+        status = self._without_limits(torch.where(known[..., None], q, 0.0), status)
         commanded, inside = self._turned(q, near)
         measure = torch.full(status.shape, torch.nan, dtype=torch.float64)
         if self._model.hybrid is not None:
@@ -73,11 +69,17 @@ class Finishing:
             share = self._model.hybrid.coverage.share(commanded)
             measure = 2 - share
             status[(status == Status.REACHED) & (share < 1)] = int(Status.OUTSIDE_DOMAIN)
-        status[~inside & found] = int(Status.OUTSIDE_JOINT_LIMITS)
-        q_nominal = torch.where(found[..., None], q_nominal, torch.nan)
+        status[~inside & known] = int(Status.OUTSIDE_JOINT_LIMITS)
+        q_nominal = torch.where(known[..., None], q_nominal, torch.nan)
         q_nominal = nearest_turn(self._model.robot, q_nominal, commanded, within_limits=False)
-        correction = commanded - q_nominal
-        return Solution(commanded, q_nominal, correction, branch, self._branches, status, measure)
+        return self._solution(commanded, q_nominal, branch, status, measure)
+
+    def _solution(
+        self, q: Tensor, q_nominal: Tensor, branch: Tensor, status: Tensor, measure: Tensor
+    ) -> Solution:
+        """A solution whose residuals are still to be computed."""
+        nothing = torch.full(status.shape, torch.nan, dtype=torch.float64)
+        return Solution(q, q_nominal, branch, self._branches, status, nothing, nothing, measure)
 
     def _on_turn(self, T: Tensor, q: Tensor, inside: Tensor) -> tuple[Tensor, Tensor]:
         """Solve again on the turns to command where a correction is not the same on all turns."""
@@ -86,8 +88,8 @@ class Finishing:
         if hybrid.correction.is_periodic:
             return q, inside
         flat = q.reshape(-1, 1, q.shape[-1])
-        found, status = search(self._geometric, T.reshape(-1, 4, 4), flat, self._motion)
-        settled = torch.where((status == Status.UNREACHABLE)[:, None], flat[:, 0], found).reshape(q.shape)
+        solved, status = search(self._geometric, T.reshape(-1, 4, 4), flat, hybrid)
+        settled = torch.where((status == Status.UNREACHABLE)[:, None], flat[:, 0], solved).reshape(q.shape)
         turned, within = wrap_into_limits(self._model.robot, settled)
         return settled, within & (turned == settled).all(-1)
 
@@ -107,11 +109,3 @@ class Finishing:
             singular = singularity_measure(robot, q[limited]) < SINGULAR_TOLERANCE
             status[limited] = torch.where(singular, int(Status.SINGULAR), int(Status.REACHED))
         return status
-
-
-def as_trained(model: CalibratedModel, q: Tensor) -> Tensor:
-    """Joint values `(*batch, dof)` turned as those of the training rows, which a network knows."""
-    if not len(model.starts):
-        return q
-    lower, upper = model.starts.aminmax(dim=0)
-    return nearest_turn(model.robot, q, (lower + upper).double() / 2, within_limits=False)

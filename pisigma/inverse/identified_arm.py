@@ -1,7 +1,7 @@
 """Inverse kinematics of an identified geometry, which has no closed form of its own."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import partial
 
 import torch
 from jaxtyping import Bool, Float64, Int64
@@ -9,41 +9,36 @@ from torch import Tensor
 
 from pisigma.hybrid.arms import HybridArm
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
-from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.numeric import NumericSolution, solve_numeric
 from pisigma.kinematics.status import Status
-from pisigma.model.hybrid_motion import HybridMotion
-from pisigma.model.stored_starts import StoredStarts
+from pisigma.kinematics.tolerances import (
+    ATTEMPTS,
+    HYBRID_TOLERANCE,
+    ITERATIONS,
+    NEARLY,
+    PULL,
+    REACH_ROUNDING,
+)
+from pisigma.model.hybrid_motion import hybrid_motion
+from pisigma.model.stored_starts import StoredStarts, nearest_branch, wrapped_difference
 from pisigma.robot.description import Robot
-from pisigma.se3 import wrap_to_pi
 
-PULL = 0.02
-"""Share of the reach by which a pose beyond the nominal workspace is drawn towards a measured one."""
-
-ATTEMPTS = 4
-"""Stored starts that are tried for a pose, nearest first."""
-
-HYBRID_TOLERANCE = 1e-12
-"""[m and rad] Residuals of a hybrid arm; blending two arms costs a few more roundings than one."""
-
-ITERATIONS, CHEAP_ITERATIONS, EXACT_ITERATIONS = 60, 10, 25
-
-NEARLY = 0.01
-"""Share of the reach, and angle [rad]: a pose that the geometric arm misses by less the hybrid one may take."""
+CHEAP_ITERATIONS, EXACT_ITERATIONS = 10, 25
+"""Steps of a hybrid arm with the cheap Jacobian, and after these with the exact one."""
 
 
 def within_reach(robot: Robot, T: Float64[Tensor, "*batch 4 4"]) -> Bool[Tensor, "*batch"]:
     """Whether poses T_base_tool are not farther away than the robot is long, whatever its joints do."""
     origin = T.new_tensor(robot.base[:3].tolist())
     distance: Tensor = (T[..., :3, 3] - origin).norm(dim=-1)
-    return distance <= robot.reach * (1 + 1e-9)
+    return distance <= robot.reach * (1 + REACH_ROUNDING)
 
 
 def search(
     robot: Robot,
     T: Float64[Tensor, "poses 4 4"],
     starts: Float64[Tensor, "poses _starts dof"],
-    hybrid: HybridMotion | None = None,
+    hybrid: HybridArm | None = None,
     inside: bool = False,
 ) -> tuple[Float64[Tensor, "poses dof"], Int64[Tensor, " poses"]]:
     """Solve for poses from one start after the other, until one leads there.
@@ -52,7 +47,7 @@ def search(
         robot: the arm, or the geometric part of a hybrid one.
         T: wanted poses.
         starts: joint values to begin with [rad or m].
-        hybrid: how the hybrid arm that is to take the poses moves, where it is one.
+        hybrid: the hybrid arm that is to take the poses, where there is one.
         inside: whether a start that leads there inside the joint limits goes before earlier ones that do not.
 
     Returns:
@@ -79,7 +74,7 @@ def search(
     return q, status
 
 
-def _solve(robot: Robot, T: Tensor, start: Tensor, hybrid: HybridMotion | None) -> NumericSolution:
+def _solve(robot: Robot, T: Tensor, start: Tensor, hybrid: HybridArm | None) -> NumericSolution:
     """Solve for the arm, and from there for the hybrid one, which may reach a little farther.
 
     First with a Jacobian that is cheap; what it does not solve, near singular poses, with the exact one.
@@ -91,9 +86,9 @@ def _solve(robot: Robot, T: Tensor, start: Tensor, hybrid: HybridMotion | None) 
     q, status = found.q.clone(), torch.full_like(found.status, int(Status.NOT_CONVERGED))
     for exact, rounds in ((False, CHEAP_ITERATIONS), (True, EXACT_ITERATIONS)):
         rows = (close & (status == Status.NOT_CONVERGED)).nonzero()[:, 0]
-        motion = partial(hybrid, exact=exact)
+        motion = partial(hybrid_motion, hybrid, exact=exact)
         better = solve_numeric(
-            hybrid.arm.hybrid,
+            hybrid.hybrid,
             T[rows],
             q[rows],
             tolerance=HYBRID_TOLERANCE,
@@ -122,11 +117,6 @@ class IdentifiedArm:
     starts: StoredStarts
     hybrid: HybridArm | None = None
 
-    @cached_property
-    def motion(self) -> HybridMotion | None:
-        """How the hybrid arm moves, where there is one."""
-        return None if self.hybrid is None else HybridMotion(self.hybrid)
-
     def follow(
         self, T: Float64[Tensor, "*batch 4 4"], q: Float64[Tensor, "*batch dof"]
     ) -> tuple[Float64[Tensor, "*batch dof"], Int64[Tensor, "*batch"]]:
@@ -136,7 +126,7 @@ class IdentifiedArm:
             Joint values [rad or m] on the turns of q, and a status.
         """
         found, status = search(
-            self.calibrated, T.reshape(-1, 4, 4), q.reshape(-1, 1, q.shape[-1]), self.motion
+            self.calibrated, T.reshape(-1, 4, 4), q.reshape(-1, 1, q.shape[-1]), self.hybrid
         )
         return self.turned_like(found.reshape(q.shape), q), status.reshape(q.shape[:-1])
 
@@ -172,7 +162,7 @@ class IdentifiedArm:
         first = drawn[torch.arange(len(chosen)), wanted][:, None]
         others = torch.cat([drawn, self.starts.q[index]], 1)
         others = torch.where(anywhere[chosen, None, None], others, torch.nan)
-        found, reached = search(self.calibrated, T_near, torch.cat([first, others], 1), self.motion)
+        found, reached = search(self.calibrated, T_near, torch.cat([first, others], 1), self.hybrid)
         lies = self.branch_of(found)
         lost = (lies != wanted) & ~anywhere[chosen]
         found[lost], reached[lost] = torch.nan, int(Status.UNREACHABLE)
@@ -181,22 +171,13 @@ class IdentifiedArm:
 
     def branch_of(self, q: Float64[Tensor, "poses dof"]) -> Int64[Tensor, " poses"]:
         """Index of the nominal arm's branch that is nearest to joint values; 0 for NaN."""
-        known = torch.isfinite(q).all(-1)
-        safe = torch.where(known[:, None], q, 0.0)
-        every = self.solver.solve(forward_kinematics(self.nominal, safe)).q
-        distance = self._difference(every, safe[:, None].expand_as(every)).square().sum(-1)
-        nearest: Tensor = torch.where(torch.isfinite(distance), distance, torch.inf).argmin(-1)
-        return torch.where(known, nearest, 0)
+        return nearest_branch(self.nominal, self.solver, q)
 
     def turned_like(
         self, q: Float64[Tensor, "*batch dof"], like: Float64[Tensor, "*batch dof"]
     ) -> Float64[Tensor, "*batch dof"]:
         """The same joint values on the turns that are nearest to others."""
-        return like + self._difference(q, like)
-
-    def _difference(self, q: Tensor, other: Tensor) -> Tensor:
-        difference = q - other
-        return torch.where(torch.tensor(self.nominal.revolute), wrap_to_pi(difference), difference)
+        return like + wrapped_difference(self.nominal, q, like)
 
     def drawn(
         self, T: Float64[Tensor, "poses 4 4"], towards: Float64[Tensor, "poses 3"]

@@ -4,7 +4,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pisigma.kinematics.joint_limits import LIMIT_TOLERANCE
+from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
 
 
@@ -28,3 +29,11 @@ def nearest_turn(
         turns = torch.where(lowest <= highest, nearest, torch.zeros_like(turns))
     revolute = torch.tensor(robot.revolute, device=q.device)
     return torch.where(revolute & (turns != 0), q + 2 * torch.pi * turns, q)
+
+
+def as_trained(model: CalibratedModel, q: Tensor) -> Tensor:
+    """Joint values `(*batch, dof)` turned as those of the training rows, which a network knows."""
+    if not len(model.starts):
+        return q
+    lower, upper = model.starts.aminmax(dim=0)
+    return nearest_turn(model.robot, q, (lower + upper).double() / 2, within_limits=False)

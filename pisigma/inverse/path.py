@@ -9,18 +9,21 @@ import numpy as np
 
 from pisigma.errors import PoseError, nearest_choice
 from pisigma.inverse.branch_choice import choose_branches, halfway, is_jump, wrapped
-from pisigma.inverse.path_turns import unroll
 from pisigma.kinematics.status import Status
+from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 
 if TYPE_CHECKING:
     import pisigma.inverse.corrected_ik
 
 Array = Any
 
+_TURN = 2 * math.pi
 _OTHERS = 1e4
 """[rad²] What it costs to begin on another branch than the wanted one; less than a jump."""
 _LATER = 1e-3
 """The same where none is wanted, per place in the order of branches."""
+_STILL = 1e-9
+"""[rad or m] A joint that moves by less stands still."""
 
 
 @dataclass(frozen=True)
@@ -81,13 +84,31 @@ def follow_path(
         raise PoseError(f"there is no branch '{branch}'; {nearest_choice(branch, ik.branches)}")
     beside = None if near is None else np.asarray(ik.postures.checked(near, False), dtype=np.float64)
     guide = _guide(ik, T, beside, branch) if ik.closed_form else _one_by_one(ik, T, beside)
-    solution = _solve(ik, T, guide)
+    solution = _solve(ik, T, guide, _approaches(guide, beside))
     return JointPath(solution, _switches(ik, T, np.asarray(solution.q), solution))
 
 
-def _solve(ik: "pisigma.inverse.corrected_ik.CorrectedIK", T: Array, near: Array | None) -> Any:
+def _solve(
+    ik: "pisigma.inverse.corrected_ik.CorrectedIK",
+    T: Array,
+    near: Array | None,
+    approach: Array | None = None,
+) -> Any:
     """Solutions near joint values, which may be those of a solution far outside the joint limits."""
-    return ik(T, near=None if near is None else ik.postures.clip(near))
+    return ik(T, near=None if near is None else ik.postures.clip(near), approach=approach)
+
+
+def _approaches(q: Array, near: Array | None) -> Array:
+    """From which side every joint comes to its values `(poses, dof)`: +1 where they rise, -1 where they fall.
+
+    A joint that does not move keeps the side that it came from; 0 before it has moved at all.
+    """
+    first = q[:1] if near is None else near[None]
+    step = np.diff(np.concatenate([first, q]), axis=0)
+    sides = np.where(np.abs(step) < _STILL, 0.0, np.sign(step))
+    moved = np.where(sides != 0, np.arange(len(q))[:, None], -1)
+    last = np.maximum.accumulate(moved, axis=0)
+    return np.where(last < 0, 0.0, np.take_along_axis(sides, np.maximum(last, 0), axis=0))
 
 
 def _guide(
@@ -197,3 +218,51 @@ def _gap(index: int, status: Array, reached: Array) -> PathSwitch:
     stop = index + int(behind[0]) if len(behind) else len(reached)
     poses = f"Pose {index} is" if stop == index + 1 else f"Poses {index} to {stop - 1} are"
     return PathSwitch(index, "gap", 0.0, f"{poses} not reached: {Status(int(status[index])).name.lower()}.")
+
+
+def unroll(
+    q: Array, limits: Array, revolute: Array, near: Array | None
+) -> tuple[Array, list[tuple[int, int]]]:
+    """Put the joints of a path on turns so that they go on from pose to pose and stay within their limits.
+
+    Args:
+        q: `(poses, dof)` joint values [rad or m] on any turns, none NaN.
+        limits: `(dof, 2)` [rad or m].
+        revolute: `(dof,)`.
+        near: `(dof,)` joint values whose turns the path should begin on, or None: those next to 0.
+
+    Returns:
+        The joint values, and `(pose, joint)` where a joint must turn back by full turns before it reaches the pose,
+        because a limit is in the way. A value that fits on no turn stays beyond its limit.
+    """
+    rolled = q.copy()
+    rolled[1:] = q[0] + np.cumsum(wrapped(np.diff(q, axis=0), revolute), axis=0)
+    rewinds: list[tuple[int, int]] = []
+    for joint in np.flatnonzero(revolute):
+        meant = 0.0 if near is None else float(near[joint])
+        rolled[:, joint], breaks = _within(rolled[:, joint], limits[joint, 0], limits[joint, 1], meant)
+        rewinds += [(pose, int(joint)) for pose in breaks]
+    return rolled, sorted(rewinds)
+
+
+def _within(values: Array, lower: float, upper: float, meant: float) -> tuple[Array, list[int]]:
+    """One joint's continuous values, moved by turns into its limits; and where that needs another turn than before."""
+    found, breaks, start = values.copy(), [], 0
+    lower, upper = lower - LIMIT_TOLERANCE, upper + LIMIT_TOLERANCE
+    while start < len(values):
+        rest = values[start:]
+        highest = np.floor((upper - np.maximum.accumulate(rest)) / _TURN)
+        lowest = np.ceil((lower - np.minimum.accumulate(rest)) / _TURN)
+        fits = lowest <= highest
+        length = int(fits.argmin()) if not fits.all() else len(rest)
+        if length == 0:
+            turns, length = np.round((meant - rest[0]) / _TURN), 1
+        else:
+            last = length - 1
+            turns = np.clip(np.round((meant - rest[0]) / _TURN), lowest[last], highest[last])
+        found[start : start + length] = rest[:length] + turns * _TURN
+        if start and abs(found[start] - found[start - 1] - (values[start] - values[start - 1])) > 1:
+            breaks.append(start)
+        start += length
+        meant = found[start - 1]
+    return found, breaks

@@ -1,25 +1,63 @@
 """Gradients of joint values with respect to the wanted pose, by the implicit function theorem."""
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pisigma.inverse.finishing import as_trained
+from pisigma.inverse.nearest_turn import as_trained
 from pisigma.inverse.solution import Solution
 from pisigma.kinematics.jacobian import joint_jacobian
-from pisigma.kinematics.numeric import SINGULAR_TOLERANCE
 from pisigma.kinematics.singularity import characteristic_length, dimensionless_jacobian
+from pisigma.kinematics.tolerances import SINGULAR_TOLERANCE
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.hybrid_motion import hybrid_motion
 from pisigma.robot.description import Robot
 
+if TYPE_CHECKING:
+    import pisigma.inverse.corrected_ik
+
+
+def as_tensors(
+    solution: Solution,
+    poses: Float[Tensor, "*batch 4 4"],
+    model: CalibratedModel | None,
+    owner: "pisigma.inverse.corrected_ik.CorrectedIK",
+) -> Solution:
+    """Solutions as they are handed out for tensors: like the poses, and with gradients to them.
+
+    Args:
+        solution: in float64 on the CPU, as arrays or tensors; with a last batch axis more than the poses where it is of
+            all branches.
+        poses: as they were given.
+        model: what solved for the poses, where gradients are wanted.
+        owner: see `Solution`.
+    """
+    found = solution.map(_tensor)
+    if model is not None and torch.is_grad_enabled():
+        every = poses.unsqueeze(-3) if found.status.ndim > poses.ndim - 2 else poses
+        found = differentiable(model, found, every.expand(*found.status.shape, 4, 4))
+    return replace(
+        found,
+        q=found.q.to(poses),
+        q_nominal=found.q_nominal.to(poses),
+        branch=found.branch.to(poses.device),
+        status=found.status.to(poses.device),
+        domain_measure=found.domain_measure.to(poses),
+        owner=owner,
+    )
+
+
+def _tensor(values: Any) -> Tensor:
+    return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values, order="C"))
+
 
 def differentiable(model: CalibratedModel, found: Solution, T: Float[Tensor, "*batch 4 4"]) -> Solution:
-    """The same solutions, from whose `q`, `q_nominal` and `correction` gradients flow to the poses.
+    """The same solutions, from whose `q` and `q_nominal` gradients flow to the poses.
 
     A solution satisfies `FK(q) = T`. When the pose moves by a twist ξ (translation, rotation vector, both in the base
     frame) the joints follow it by `dq = J⁺ ξ`, with J the Jacobian of the whole calibrated arm, the slope of its
@@ -46,14 +84,14 @@ def differentiable(model: CalibratedModel, found: Solution, T: Float[Tensor, "*b
             return joint_jacobian(calibrated, q)[1] if hybrid is None else hybrid_motion(hybrid, q)[1]
 
         q = _attached(model.robot, twist, found.q, jacobian)
-        return replace(found, q=q, q_nominal=q_nominal, correction=q - q_nominal)
+        return replace(found, q=q, q_nominal=q_nominal)
     if model.network is None:
         return replace(found, q=q_nominal + found.correction, q_nominal=q_nominal)
     known = torch.isfinite(found.q).all(-1, keepdim=True)
     safe = torch.where(known, q_nominal, 0.0)
     seen = safe + (as_trained(model, safe.detach()) - safe.detach())
     correction = torch.where(known, model.network(T, seen), torch.nan)
-    return replace(found, q=q_nominal + correction, q_nominal=q_nominal, correction=correction)
+    return replace(found, q=q_nominal + correction, q_nominal=q_nominal)
 
 
 def _twist(T: Float64[Tensor, "*batch 4 4"]) -> Float64[Tensor, "*batch 6"]:

@@ -1,59 +1,172 @@
-"""Corrected inverse kinematics that leaves nothing untried: every model, every pose, at some milliseconds each."""
+"""Corrected inverse kinematics in torch that leaves nothing untried: every model, at some milliseconds a pose.
 
-from collections.abc import Sequence
+It is the oracle that the kernels are tested against, and the route of models whose correction has no compiled form.
+"""
 
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
 import torch
 from torch import Tensor
 
+from pisigma.errors import ModelError, PoseError, nearest_choice
 from pisigma.inverse.finishing import Finishing
-from pisigma.inverse.identified_arm import ATTEMPTS, IdentifiedArm, search
+from pisigma.inverse.identified_arm import IdentifiedArm, search
+from pisigma.inverse.joint_input import as_array, pose_array
 from pisigma.inverse.solution import Solution
-from pisigma.kinematics.closed_form import AbstractClosedForm
+from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.status import Status
+from pisigma.kinematics.tolerances import (
+    ATTEMPTS,
+    AWAY,
+    MORE_ATTEMPTS,
+    POSE_TOLERANCE,
+    POSE_TOLERANCE_SINGLE,
+)
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.hybrid_motion import HybridMotion
 from pisigma.model.stored_starts import StoredStarts
+from pisigma.se3 import check_transforms, pose_error, transform_faults
 
-AWAY = 0.1
-"""[rad or m] A solution farther from where it was to be near to may not be the one that was meant."""
-
-MORE_ATTEMPTS = 128
-"""Starts that are tried in all where there is no closed form."""
+NUMERIC = "numeric"
+"""Name of the only branch of a robot without closed-form inverse: the one of the nearest training rows."""
 
 
 class ReferenceIK:
-    """The ways to solutions of one model.
+    """The corrected inverse kinematics of a model: call it with poses. Solutions are tensors in float64 on the CPU.
 
     Attributes:
         model: the model.
         branches: names of the branches.
+        order: indices of the branches: those that training rows lie on, most frequent first, then the others.
         arm: its identified arm, where it has one and the nominal one a closed form.
     """
 
-    def __init__(
-        self,
-        model: CalibratedModel,
-        solver: AbstractClosedForm | None,
-        branches: tuple[str, ...],
-        trained: Sequence[int],
-    ) -> None:
+    def __init__(self, model: CalibratedModel) -> None:
         """Prepare a model.
 
-        Args:
-            model: the model.
-            solver: closed form of its nominal arm, or None.
-            branches: names of the branches.
-            trained: indices of those that training rows lie on, most frequent first.
+        Raises:
+            ModelError: the model names branches that its robot does not have, or gives the numeric inverse no
+                start.
         """
-        self.model, self._solver, self.branches, self._default = model, solver, branches, trained[0]
+        self.model, self._solver = model, closed_form_solver(model.robot)
+        self.branches: tuple[str, ...] = self._solver.branches if self._solver else (NUMERIC,)
+        for name in model.branches:
+            if name not in self.branches:
+                choices = nearest_choice(name, self.branches)
+                raise ModelError(f"model '{model.name}': its robot has no branch '{name}'; {choices}")
+        if self._solver is None and not len(model.starts):
+            raise ModelError(
+                f"model '{model.name}': its robot has no closed-form inverse, and the model holds no joint "
+                "values to start from; train it again."
+            )
+        trained = [self.branches.index(name) for name in model.branches] or list(range(len(self.branches)))
+        self.order = (*trained, *(index for index in range(len(self.branches)) if index not in trained))
         self._starts = StoredStarts(model.calibrated or model.robot, model.starts)
         self.arm: IdentifiedArm | None = None
-        self._motion = None if model.hybrid is None else HybridMotion(model.hybrid)
-        if model.calibrated is not None and solver is not None:
-            self.arm = IdentifiedArm(model.robot, model.calibrated, solver, self._starts, model.hybrid)
-        self._finishing = Finishing(model, branches, trained, self._motion)
+        if model.calibrated is not None and self._solver is not None:
+            self.arm = IdentifiedArm(model.robot, model.calibrated, self._solver, self._starts, model.hybrid)
+        self._finishing = Finishing(model, self.branches, trained)
 
-    def solve(self, T: Tensor, given: Tensor, near: Tensor | None, order: Sequence[int]) -> Solution:
+    def __call__(
+        self,
+        T_base_tool: Any,
+        *,
+        near: Any = None,
+        branch: str | None = None,
+        throw: bool = True,
+        approach: Any = None,
+        single: bool | None = None,
+    ) -> Solution:
+        """Find corrected joint values for poses; for arguments, errors and what comes back see `CorrectedIK`.
+
+        Where no branch leads to a pose, and none was asked for, it is looked for from stored joint values too, and the
+        branch is that whose nominal joint values are nearest.
+
+        Args:
+            T_base_tool: `(*batch, 4, 4)`.
+            near: `(*batch, dof)` or `(dof,)`.
+            branch: name of the branch to take.
+            throw: whether what is no pose, or no posture, raises.
+            approach: `(*batch, dof)` or `(dof,)`.
+            single: whether the poses were rounded to float32; None to see that from their type.
+        """
+        if branch is not None and branch not in self.branches:
+            raise PoseError(f"there is no branch '{branch}'; {nearest_choice(branch, self.branches)}")
+        T, given, fine = _checked_poses(T_base_tool, single, throw)
+        start = None
+        if near is not None:
+            start, finite = self._joint_rows(near, "near", T.shape[:-2], throw)
+            fine = fine & finite
+        order = self.order if branch is None else (self.branches.index(branch),)
+        found = self._by_approach(approach, T.shape[:-2], lambda ik: ik._solve(T, given, start, order))
+        return _marked(self._with_residuals(found, T), fine)
+
+    def all_branches(self, T_base_tool: Any, *, approach: Any = None, single: bool | None = None) -> Solution:
+        """Solutions on every branch, as `(*batch, branches)`; one for a robot without closed-form inverse."""
+        T, given, _ = _checked_poses(T_base_tool, single, True)
+        found = self._by_approach(approach, T.shape[:-2], lambda ik: ik._solve_branches(T, given))
+        return self._with_residuals(found, T.unsqueeze(-3).expand(*found.status.shape, 4, 4))
+
+    def _by_approach(
+        self, approach: Any, batch: Sequence[int], solve: Callable[["ReferenceIK"], Solution]
+    ) -> Solution:
+        """Solve for poses, once for every combination of sides that some of them are to be reached from."""
+        hybrid = self.model.hybrid
+        if approach is None or hybrid is None:
+            return solve(self)
+        sides, _ = self._joint_rows(approach, "approach", batch, True)
+        kinds, index = sides.reshape(-1, sides.shape[-1]).unique(dim=0, return_inverse=True)
+        found = solve(self) if not len(kinds) else None
+        for kind, side in enumerate(kinds):
+            arm = replace(hybrid, approach=side)
+            solved = solve(ReferenceIK(replace(self.model, hybrid=arm)))
+            found = solved if found is None else _where(index.reshape(tuple(batch)) == kind, solved, found)
+        assert found is not None
+        return found
+
+    def _joint_rows(self, values: Any, what: str, batch: Sequence[int], throw: bool) -> tuple[Tensor, Tensor]:
+        """Joint values for every pose, and where they are finite; elsewhere they are 0.
+
+        Raises:
+            PoseError: they do not fit, or are not finite and `throw`.
+        """
+        try:
+            rows = torch.from_numpy(np.array(as_array(values), dtype=np.float64))
+        except (TypeError, ValueError):
+            raise PoseError(
+                f"{what} is no array of numbers; give joint values of shape (*batch, joints)."
+            ) from None
+        self.model.robot.check_joint_count(rows.shape[-1] if rows.ndim else 0)
+        finite = torch.isfinite(rows)
+        if throw and not finite.all():
+            raise PoseError(
+                f"{what} holds joint values that are no finite numbers; give a number for every joint."
+            )
+        try:
+            rows = torch.where(finite, rows, 0.0).expand(*batch, rows.shape[-1])
+        except RuntimeError:
+            raise PoseError(
+                f"{what} has the batch shape {tuple(rows.shape[:-1])}, which does not broadcast to "
+                f"{tuple(batch)} of the poses; give one row of joint values for each pose, or one for all."
+            ) from None
+        return rows, finite.all(-1).expand(*batch)
+
+    def _with_residuals(self, found: Solution, T: Tensor) -> Solution:
+        """The same with translation [m] and angle [rad] from where the tool goes to where it was to go."""
+        q = found.q.reshape(-1, found.q.shape[-1])
+        left = torch.full((len(q), 6), torch.nan, dtype=torch.float64)
+        rows = torch.isfinite(q).all(-1).nonzero()[:, 0]
+        if len(rows):
+            reached = self.model.forward(q[rows])
+            error = pose_error(T.reshape(-1, 4, 4)[rows], torch.nan_to_num(reached))
+            left[rows] = torch.where(torch.isfinite(reached).flatten(1).all(-1)[:, None], error, torch.nan)
+        left = left.reshape(*found.status.shape, 6)
+        position, rotation = left[..., :3].norm(dim=-1), left[..., 3:].norm(dim=-1)
+        return replace(found, position_residual=position, rotation_residual=rotation)
+
+    def _solve(self, T: Tensor, given: Tensor, near: Tensor | None, order: Sequence[int]) -> Solution:
         """Find a solution for every pose.
 
         Args:
@@ -68,7 +181,7 @@ class ReferenceIK:
         free = len(order) == len(self.branches)
         if near is not None and free:
             every = self._on_branches(T, given, near, range(len(self.branches)))
-            found = every.on_branch(self._nearest(every, near))
+            found = _on_branch(every, self._nearest(every, near))
         else:
             found = self._in_order(T, given, near, order)
         if self.arm is not None:
@@ -77,10 +190,10 @@ class ReferenceIK:
                 found = self._continued(T, found, near)
         return found
 
-    def all_branches(self, T: Tensor, given: Tensor) -> Solution:
+    def _solve_branches(self, T: Tensor, given: Tensor) -> Solution:
         """Solutions on every branch, as a last batch axis."""
         if self._solver is None:
-            return self._numeric(T, None).with_branch_axis()
+            return self._numeric(T, None).map(lambda values: values.unsqueeze(T.ndim - 2))
         every = self._on_branches(T, given, None, range(len(self.branches)))
         if self.arm is None:
             return every
@@ -97,21 +210,21 @@ class ReferenceIK:
         if not len(rows) or len(order) == 1:
             return found
         beside = None if near is None else near.reshape(-1, near.shape[-1])[rows]
-        as_given = given.detach().reshape(-1, 4, 4)[rows.to(given.device)]
+        as_given = given.reshape(-1, 4, 4)[rows]
         every = self._on_branches(T.reshape(-1, 4, 4)[rows], as_given, beside, order)
-        return found.with_rows(rows, self._first(every, range(len(order))))
+        return _with_rows(found, rows, self._first(every, range(len(order))))
 
     def _first(self, every: Solution, order: Sequence[int]) -> Solution:
         """Of solutions on some branches the first in an order that is inside the limits, else outside, else any."""
         status = every.status[..., torch.tensor(tuple(order))]
         rank = (status == Status.OUTSIDE_JOINT_LIMITS).long() + 2 * (status == Status.UNREACHABLE).long()
         place = (torch.arange(len(order)) + len(order) * rank).argmin(-1)
-        return every.on_branch(torch.tensor(tuple(order))[place])
+        return _on_branch(every, torch.tensor(tuple(order))[place])
 
     def _on_branches(self, T: Tensor, given: Tensor, near: Tensor | None, indices: Sequence[int]) -> Solution:
         """Solutions on some branches, as a last batch axis, each from its nominal joint values on."""
         assert self._solver is not None
-        found = self._solver.solve(given.detach().to("cpu"))
+        found = self._solver.solve(given)
         branch = torch.tensor(indices).expand(*T.shape[:-2], len(indices))
         q, status = found.q[..., indices, :].double(), found.status[..., indices]
         each = T.unsqueeze(-3).expand(*branch.shape, 4, 4)
@@ -135,7 +248,7 @@ class ReferenceIK:
         beside = None if near is None else near.reshape(-1, q.shape[-1])[lost]
         nominal = torch.full_like(q, torch.nan)
         finished = self._finishing.of_identified(T_lost, q, nominal, status, branch, beside)
-        return found.with_rows(lost, finished)
+        return _with_rows(found, lost, finished)
 
     def _continued(self, T: Tensor, found: Solution, near: Tensor) -> Solution:
         """Look from `near` itself where nothing was found close to it.
@@ -147,13 +260,13 @@ class ReferenceIK:
         off = (q_found - q_near).norm(dim=-1).nan_to_num(torch.inf)
         away = (off > AWAY).nonzero()[:, 0]
         T_away, start = T.reshape(-1, 4, 4)[away], q_near[away]
-        q, status = search(self.arm.calibrated, T_away, start[:, None], self._motion)
+        q, status = search(self.arm.calibrated, T_away, start[:, None], self.model.hybrid)
         lies = self.arm.branch_of(q)
         nominal, _ = search(self.model.robot, T_away, q[:, None])
         other = self._finishing.of_identified(T_away, q, nominal, status, lies, start)
         good = (other.status != Status.UNREACHABLE) & (other.status != Status.OUTSIDE_JOINT_LIMITS)
         kept = (good & ((other.q - start).norm(dim=-1) < off[away])).nonzero()[:, 0]
-        return found.with_rows(away[kept], other.select(kept))
+        return _with_rows(found, away[kept], other.select(kept))
 
     def _numeric(self, T: Tensor, near: Tensor | None) -> Solution:
         """Numeric inverse from `near`, then from the training rows whose poses are nearest, then from more of them."""
@@ -162,11 +275,11 @@ class ReferenceIK:
         starts = self.model.starts[self._starts.nearest(flat, ATTEMPTS)]
         if near is not None:
             starts = torch.cat([near.reshape(-1, 1, dof), starts], 1)
-        q, status = search(self._starts.robot, flat, starts, self._motion)
+        q, status = search(self._starts.robot, flat, starts, self.model.hybrid)
         left = ((status == Status.UNREACHABLE) | (status == Status.OUTSIDE_JOINT_LIMITS)).nonzero()[:, 0]
         if len(left):
             more = self.model.starts[self._starts.nearest(flat[left], MORE_ATTEMPTS)]
-            other, fate = search(self._starts.robot, flat[left], more, self._motion, inside=True)
+            other, fate = search(self._starts.robot, flat[left], more, self.model.hybrid, inside=True)
             better = (status[left] == Status.UNREACHABLE) | (fate < Status.OUTSIDE_JOINT_LIMITS)
             q[left[better]], status[left[better]] = other[better], fate[better]
         branch = torch.zeros(shape, dtype=torch.int64)
@@ -182,4 +295,77 @@ class ReferenceIK:
         lost = every.status == Status.UNREACHABLE
         rank = (every.status == Status.OUTSIDE_JOINT_LIMITS).long() + 2 * lost.long()
         distance = torch.where(rank == rank.amin(-1, keepdim=True), distance, torch.inf)
-        return torch.where(lost.all(-1), self._default, distance.argmin(-1))
+        return torch.where(lost.all(-1), self.order[0], distance.argmin(-1))
+
+
+def _checked_poses(values: Any, single: bool | None, throw: bool) -> tuple[Tensor, Tensor, Tensor]:
+    """The poses in float64 and in the type that they were given in, and which of them are poses; others are identities.
+
+    Raises:
+        PoseError: see `pose_array`; a matrix is no pose, and `throw`.
+    """
+    array, rounded = pose_array(values)
+    T = torch.from_numpy(np.array(array))
+    single = rounded if single is None else single
+    tolerance = POSE_TOLERANCE_SINGLE if single else POSE_TOLERANCE
+    if throw:
+        check_transforms(T, "T_base_tool", tolerance)
+    fine = ~torch.stack([bad for bad, _ in transform_faults(T, tolerance)]).any(0)
+    T = torch.where(fine[..., None, None], T, torch.eye(4, dtype=torch.float64))
+    return T, T.float() if single else T, fine
+
+
+def _marked(found: Solution, fine: Tensor) -> Solution:
+    """The solutions, INVALID_POSE and NaN where there was no pose to solve for."""
+    if bool(fine.all()):
+        return found
+    nothing = found.map(
+        lambda values: torch.full_like(values, torch.nan) if values.is_floating_point() else values
+    )
+    kept = _where(fine, found, nothing)
+    return replace(kept, status=torch.where(fine, found.status, int(Status.INVALID_POSE)))
+
+
+def _where(condition: Tensor, first: Solution, second: Solution) -> Solution:
+    """One solution where a condition holds, another elsewhere."""
+    rest = iter(vars(second)[name] for name in _VALUES)
+
+    def choose(values: Tensor) -> Tensor:
+        axes = values.ndim - condition.ndim
+        return torch.where(condition.reshape(*condition.shape, *(1,) * axes), values, next(rest))
+
+    return first.map(choose)
+
+
+_VALUES = (
+    "q",
+    "q_nominal",
+    "branch",
+    "status",
+    "position_residual",
+    "rotation_residual",
+    "domain_measure",
+)
+"""The fields of a solution in the order in which `Solution.map` changes them."""
+
+
+def _on_branch(every: Solution, index: Tensor) -> Solution:
+    """Of solutions whose last batch axis is the branch, one per pose."""
+    axis = index.ndim
+
+    def pick(values: Tensor) -> Tensor:
+        place = index.reshape(*index.shape, *(1,) * (values.ndim - axis))
+        return torch.take_along_dim(values, place, axis).squeeze(axis)
+
+    return every.map(pick)
+
+
+def _with_rows(found: Solution, index: Tensor, rows: Solution) -> Solution:
+    """The same with other solutions at an index that counts through all batch axes."""
+    batch, others = found.status.ndim, iter(vars(rows)[name] for name in _VALUES)
+
+    def put(values: Tensor) -> Tensor:
+        flat = values.reshape(-1, *values.shape[batch:])
+        return flat.index_copy(0, index, next(others)).reshape(values.shape)
+
+    return found.map(put)

@@ -1,151 +1,91 @@
 """What corrected inverse kinematics gives back."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
-import torch
-from jaxtyping import Float, Float64, Int64
-from torch import Tensor
+import numpy as np
 
 from pisigma.kinematics.status import Status
-from pisigma.model.accuracy import position_accuracy
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.se3 import pose_error
+
+if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
+    import pisigma.inverse.corrected_ik
 
 
 @dataclass(frozen=True, eq=False)
 class Solution:
     """What the robot has to be commanded to reach poses, and how far that can be trusted.
 
+    All values are NumPy arrays (numbers for a single pose) where the poses were arrays or lists, and tensors on the
+    poses' device where these were tensors: joint values and `domain_measure` in the dtype of the poses, residuals in
+    float64.
+
     Attributes:
-        q: corrected joint values [rad or m], NaN where, and only where, the status is `UNREACHABLE`.
-        q_nominal: joint values of the nominal robot, on the same turn; NaN too where an identified geometry
-            reaches the pose and the nominal one, on the same base and with the same tool, does not.
-        correction: `q - q_nominal`.
-        branch: index into `branches`.
+        q: `(*batch, dof)`: corrected joint values [rad or m], NaN where, and only where, the status is UNREACHABLE or
+            INVALID_POSE.
+        q_nominal: `(*batch, dof)`: joint values of the nominal robot, on the same turns; NaN too where an identified
+            geometry reaches the pose and the nominal one, on the same base and with the same tool, does not.
+        branch: `(*batch,)`: index into `branches`.
         branches: names of the branches.
-        status: a `Status` per pose; the gravest finding counts, in the order unreachable, outside joint
-            limits, singular, outside domain, reached. Limits are those of the corrected values, which are
-            commanded.
-        domain_measure: distance to the training rows over their spacing; above 1 the correction is
-            extrapolated, whatever the status says. For a hybrid 1 where all joint values were measured, rising
-            to 2 where only the geometric calibration holds. NaN where there is no network or no solution.
-        wanted: the poses T_base_tool that were asked for, float64 on the CPU.
-        model: whose solution it is. Residuals and accuracy are computed when they are first read, in float64 on
-            the CPU.
+        status: `(*batch,)`: a `Status` as a number; the gravest finding counts, in the order unreachable, outside joint
+            limits, singular, outside domain, reached. Limits are those of the corrected values, which are commanded.
+        position_residual: `(*batch,)`: distance of the tool from the wanted position [m], as far as the model knows and
+            before joint values are rounded to float32; NaN without solution.
+        rotation_residual: `(*batch,)`: the same of the angle to the wanted orientation [rad].
+        domain_measure: `(*batch,)`: distance to the training rows over their spacing; above 1 the correction is
+            extrapolated, whatever the status says. For a hybrid 1 where all joint values were measured, rising to 2
+            where only the geometric calibration holds. NaN where nothing is learned or there is no solution.
+        owner: whose solution it is, which knows how accurate that is.
     """
 
-    q: Float[Tensor, "*batch dof"]
-    q_nominal: Float[Tensor, "*batch dof"]
-    correction: Float[Tensor, "*batch dof"]
-    branch: Int64[Tensor, "*batch"]
+    q: Any
+    q_nominal: Any
+    branch: Any
     branches: tuple[str, ...]
-    status: Int64[Tensor, "*batch"]
-    domain_measure: Float[Tensor, "*batch"]
-    wanted: Float64[Tensor, "*batch 4 4"] | None = None
-    model: CalibratedModel | None = None
+    status: Any
+    position_residual: Any
+    rotation_residual: Any
+    domain_measure: Any
+    owner: "pisigma.inverse.corrected_ik.CorrectedIK | None" = None
 
     @property
-    def position_residual(self) -> Float64[Tensor, "*batch"]:
-        """Distance of the tool from the wanted position [m], as far as the model knows; NaN without solution."""
-        length: Tensor = torch.linalg.vector_norm(self._residual[..., :3], dim=-1)
-        return length
-
-    @property
-    def rotation_residual(self) -> Float64[Tensor, "*batch"]:
-        """Angle of the tool to the wanted orientation [rad], as far as the model knows; NaN without solution."""
-        angle: Tensor = torch.linalg.vector_norm(self._residual[..., 3:], dim=-1)
-        return angle
+    def correction(self) -> Any:
+        """`q - q_nominal` [rad or m]."""
+        return self.q - self.q_nominal
 
     @cached_property
-    def accuracy(self) -> Float64[Tensor, "*batch"]:
-        """Predicted standard deviation of the tool's position [m]; NaN where the model does not know it."""
-        if self.model is None:
-            return torch.full(self.status.shape, torch.nan, dtype=torch.float64)
-        return position_accuracy(self.model, self.q)
+    def accuracy(self) -> Any:
+        """Predicted standard deviation of the tool's position [m], `(*batch,)`; NaN where the model does not know it.
+
+        It is computed with torch when it is first read, in float64.
+        """
+        return np.full(np.shape(self.status), np.nan) if self.owner is None else self.owner.accuracy(self.q)
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """What every status means and what to do about it, all batch axes in a row."""
-        return tuple(Status(status).sentence for status in self.status.flatten().tolist())
+        return tuple(Status(status).sentence for status in np.ravel(self.status).tolist())
 
-    @cached_property
-    def _residual(self) -> Float64[Tensor, "*batch 6"]:
-        """Translation [m] and rotation vector [rad] from where the tool goes to where it was to go."""
-        found = torch.full((self.status.numel(), 6), torch.nan, dtype=torch.float64)
-        q = self.q.detach().to("cpu", torch.float64).reshape(len(found), self.q.shape[-1])
-        rows = torch.isfinite(q).all(-1).nonzero()[:, 0]
-        if self.model is not None and self.wanted is not None and len(rows):
-            T = self.model.forward(q[rows])
-            error = pose_error(self.wanted.reshape(-1, 4, 4)[rows], torch.nan_to_num(T))
-            found[rows] = torch.where(torch.isfinite(T).flatten(1).all(-1)[:, None], error, torch.nan)
-        return found.reshape(*self.status.shape, 6)
+    def select(self, index: Any) -> "Solution":
+        """The solutions at an index of the first batch axes."""
+        return self.map(lambda values: values[index])
 
-    def select(self, index: int | Tensor | slice) -> "Solution":
-        """The solutions at an index of the first batch axis."""
-        return self._map(lambda values: values[index], lambda values: values[index])
-
-    def on_branch(self, index: Int64[Tensor, "*batch"]) -> "Solution":
-        """Of solutions whose last batch axis is the branch, one per pose."""
-
-        def vector(values: Tensor) -> Tensor:
-            place = index[..., None, None].expand(*index.shape, 1, values.shape[-1])
-            return values.gather(-2, place)[..., 0, :]
-
-        return self._map(vector, lambda values: values.gather(-1, index[..., None])[..., 0])
-
-    def reshaped(self, batch: Sequence[int]) -> "Solution":
+    def reshaped(self, batch: tuple[int, ...]) -> "Solution":
         """The same with other batch axes."""
-        return self._map(
-            lambda values: values.reshape((*batch, values.shape[-1])),
-            lambda values: values.reshape(tuple(batch)),
-        )
+        axes = np.ndim(self.status)
+        return self.map(lambda values: values.reshape(*batch, *values.shape[axes:]))
 
-    def with_branch_axis(self) -> "Solution":
-        """The same with a last batch axis of one branch."""
-        return self._map(lambda values: values.unsqueeze(-2), lambda values: values.unsqueeze(-1))
-
-    def with_rows(self, index: Int64[Tensor, " _rows"], rows: "Solution") -> "Solution":
-        """The same with other solutions at an index that counts through all batch axes."""
-        batch = self.status.ndim
-
-        def put(values: Tensor, others: Tensor) -> Tensor:
-            flat = values.reshape(-1, *values.shape[batch:])
-            return flat.index_copy(0, index, others).reshape(values.shape)
-
-        return replace(
-            self,
-            q=put(self.q, rows.q),
-            q_nominal=put(self.q_nominal, rows.q_nominal),
-            correction=put(self.correction, rows.correction),
-            branch=put(self.branch, rows.branch),
-            status=put(self.status, rows.status),
-            domain_measure=put(self.domain_measure, rows.domain_measure),
-        )
-
-    def like(self, poses: Tensor) -> "Solution":
-        """The same in the dtype and on the device of the poses."""
-        other = self._map(
-            lambda values: values.to(poses),
-            lambda values: values.to(poses) if values.is_floating_point() else values.to(poses.device),
-        )
-        return replace(other, wanted=self.wanted)
-
-    def _map(self, vector: Callable[[Tensor], Tensor], single: Callable[[Tensor], Tensor]) -> "Solution":
-        """Apply one function to what has an axis of joints and another to what has none."""
+    def map(self, change: Callable[[Any], Any]) -> "Solution":
+        """The same with all values changed by one function, which keeps an axis of joints last."""
         return Solution(
-            q=vector(self.q),
-            q_nominal=vector(self.q_nominal),
-            correction=vector(self.correction),
-            branch=single(self.branch),
+            q=change(self.q),
+            q_nominal=change(self.q_nominal),
+            branch=change(self.branch),
             branches=self.branches,
-            status=single(self.status),
-            domain_measure=single(self.domain_measure),
-            wanted=None if self.wanted is None else _as_matrices(vector(self.wanted.flatten(-2))),
-            model=self.model,
+            status=change(self.status),
+            position_residual=change(self.position_residual),
+            rotation_residual=change(self.rotation_residual),
+            domain_measure=change(self.domain_measure),
+            owner=self.owner,
         )
-
-
-def _as_matrices(values: Float64[Tensor, "*batch 16"]) -> Float64[Tensor, "*batch 4 4"]:
-    return values.reshape(*values.shape[:-1], 4, 4)

@@ -18,7 +18,6 @@ from pisigma.kinematics.components import (
     subtract,
 )
 from pisigma.kinematics.forward import Geometry, iterate_chunks, iterate_rows
-from pisigma.kinematics.matrix_chain import FEW, matrix_chain
 from pisigma.robot.description import Robot
 
 
@@ -45,9 +44,6 @@ def joint_jacobian(
     """
     robot.check_joint_count(q.shape[-1])
     batch = q.shape[:-1]
-    if q[..., 0].numel() < FEW:
-        T, J = matrix_chain(robot).motion(q.reshape(-1, q.shape[-1]))
-        return T.reshape(*batch, 4, 4), J.reshape(*batch, 6, robot.dof)
     geometry = Geometry.of(robot)
     chunks = [_jacobian_chunk(robot, geometry, chunk) for chunk in iterate_chunks(q)]
     T, J = chunks[0]

@@ -4,10 +4,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.robot.description import Robot
-
-LIMIT_TOLERANCE = 1e-9
-"""How far [rad or m] a value may lie beyond a limit and still count as on it; it is not moved."""
 
 
 def wrap_into_limits(

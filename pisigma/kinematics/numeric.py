@@ -18,17 +18,22 @@ from pisigma.kinematics.singularity import (
     smallest_singular_value,
 )
 from pisigma.kinematics.status import Status
+from pisigma.kinematics.tolerances import (
+    DAMPING_DOWN,
+    DAMPING_UP,
+    FIRST_DAMPING,
+    ITERATIONS,
+    LEAST_DAMPING,
+    MOST_DAMPING,
+    SINGULAR_TOLERANCE,
+    TOLERANCE,
+)
 from pisigma.robot.description import Robot
 from pisigma.se3 import check_transforms, pose_error
-
-SINGULAR_TOLERANCE = 1e-5
-"""A solution is SINGULAR where `singularity_measure` is smaller (in float32: than 3e-3). Iteration comes
-within some 1e-6 rad of a singular solution, as residuals there grow with the square of the joint error."""
 
 Motion = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Pose T_base_tool and joint Jacobian of an arm at joint values, as `joint_jacobian` gives them."""
 
-_FIRST_DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 0.1, 1e-6, 1e12
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +92,7 @@ def solve_numeric(
     start: Float[Tensor, "*starts dof"],
     *,
     tolerance: float | None = None,
-    max_iterations: int = 100,
+    max_iterations: int = ITERATIONS,
     motion: Motion | None = None,
 ) -> NumericSolution:
     """Joint values near a start that take the tool to the poses.
@@ -117,7 +122,7 @@ def solve_numeric(
     check_transforms(T, "T_base_tool")
     _check_start(robot, T, start)
     if tolerance is None:
-        tolerance = 1e-13 if T.dtype == torch.float64 else 1e-5
+        tolerance = TOLERANCE if T.dtype == torch.float64 else 1e-5
     batch = np.broadcast_shapes(T.shape[:-2], start.shape[:-1])
     T_flat = T.detach().expand(*batch, 4, 4).reshape(-1, 4, 4)
     with torch.no_grad():
@@ -128,7 +133,7 @@ def solve_numeric(
             if active.numel() == 0:
                 break
             _iterate(robot, moving, T_flat, state, active)
-            stalled = state.damping[active] > _MOST_DAMPING
+            stalled = state.damping[active] > MOST_DAMPING
             active = active[~(state.converged(tolerance)[active] | stalled)]
         return _finish(robot, state, tolerance, batch)
 
@@ -154,7 +159,7 @@ def _check_start(robot: Robot, T: Tensor, start: Tensor) -> None:
 
 def _begin(motion: Motion, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]) -> _Iterate:
     T_now, J = motion(q)
-    damping = torch.full_like(q[:, 0], _FIRST_DAMPING)
+    damping = torch.full_like(q[:, 0], FIRST_DAMPING)
     return _Iterate(
         q.clone(), pose_error(T, T_now), J.clone(), damping, torch.ones_like(damping, dtype=torch.int64)
     )
@@ -174,8 +179,8 @@ def _iterate(
     error = pose_error(T[active], T_trial)
     better = _scaled(robot, error).square().sum(-1) < old.square().sum(-1)
     state.iterations[active] += 1
-    factor = torch.where(better, 0.2, 8.0).to(state.damping)
-    state.damping[active] = (state.damping[active] * factor).clamp(min=_LEAST_DAMPING)
+    factor = torch.where(better, DAMPING_DOWN, DAMPING_UP).to(state.damping)
+    state.damping[active] = (state.damping[active] * factor).clamp(min=LEAST_DAMPING)
     kept = active[better]
     state.q[kept], state.error[kept], state.J[kept] = trial[better], error[better], J[better]
 

@@ -11,17 +11,15 @@ from torch import Tensor
 from pisigma.hybrid.arms import HybridArm
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.jacobian import joint_jacobian
+from pisigma.kinematics.tolerances import FORWARD_ACCEPTED, FORWARD_ITERATIONS, FORWARD_TOLERANCE
 from pisigma.model.domain import Domain
-from pisigma.model.hybrid_motion import hybrid_poses
+from pisigma.model.hybrid_motion import hybrid_motion, hybrid_poses
 from pisigma.network.correction_network import CorrectionNetwork
 from pisigma.robot.description import Robot
 
 if TYPE_CHECKING:
     import pytorch_kinematics
-
-FORWARD_ITERATIONS = 100
-FORWARD_TOLERANCE = 1e-12
-"""[rad or m] Joint values have settled when none moves more than this in an iteration."""
 
 
 @dataclass(frozen=True)
@@ -147,6 +145,16 @@ class CalibratedModel:
         """
         return (self.calibrated or self.robot).to_pytorch_kinematics()
 
+    def jacobian(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch 6 dof"]:
+        """Geometric Jacobian of the arm at commanded joint values q [rad or m], see `joint_jacobian`.
+
+        The slope of the correction, some 1e-3, is left out, and so is a network that corrects nominal joint values.
+        """
+        if self.hybrid is None:
+            return joint_jacobian(self.calibrated or self.robot, q)[1]
+        J = hybrid_motion(self.hybrid, q.reshape(-1, q.shape[-1]), exact=False)[1]
+        return J.reshape(*q.shape[:-1], 6, q.shape[-1])
+
     def nominal_joints(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
         """Joint values `q_nominal = q - Δ(FK(q_nominal), q_nominal)` [rad or m] that `network` corrects to q.
 
@@ -159,5 +167,5 @@ class CalibratedModel:
             moved, q_nominal = (following - q_nominal).abs(), following
             if bool((moved <= FORWARD_TOLERANCE).all()):
                 break
-        settled = (moved <= 1e-9).all(-1, keepdim=True)
+        settled = (moved <= FORWARD_ACCEPTED).all(-1, keepdim=True)
         return torch.where(settled, q_nominal, torch.nan)

@@ -2,7 +2,6 @@
 
 import math
 import os
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -43,24 +42,9 @@ from pisigma.model.stored_starts import StoredStarts
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert, transform_from_xyzrpy
 
-if TYPE_CHECKING:
-    from pisigma.kernels.solver import CompiledIK
-
 _KINDS = {"fixed": FIXED, "revolute": REVOLUTE, "prismatic": PRISMATIC}
 _FORMS = {Scara: SCARA, SphericalWristArm: SPHERICAL_WRIST, ThreeParallelArm: THREE_PARALLEL}
 _NUMERIC = ("numeric",)
-
-
-def compile_model(model: CalibratedModel) -> "CompiledIK":
-    """The compiled inverse kinematics of a model.
-
-    Raises:
-        ModelError: the model corrects by something that has no compiled form; see `describe`.
-    """
-    from pisigma.kernels.solver import CompiledIK
-
-    description, branches = describe(model)
-    return CompiledIK(description, branches, [joint.name for joint in model.robot.joints], model.name)
 
 
 def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_to: str = "") -> None:

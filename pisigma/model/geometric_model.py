@@ -12,13 +12,12 @@ from torch import Tensor
 from pisigma.hybrid.result import HybridResult, unexplained_length
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.result import CalibrationResult
-from pisigma.inverse.identified_arm import IdentifiedArm
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.accuracy import geometry_of
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.row_poses import Frames
-from pisigma.model.stored_starts import StoredStarts, spread_rows
+from pisigma.model.stored_starts import nearest_branch, spread_rows
 from pisigma.robot.description import Robot
 
 
@@ -49,7 +48,7 @@ def model_of_calibration(
         robot=robot,
         network=None,
         domain=None,
-        branches=_branches(robot, result.robot, starts),
+        branches=_branches(robot, starts),
         starts=starts,
         calibrated=result.robot,
         bases=dict(result.bases),
@@ -105,12 +104,12 @@ def _kept(
     return replace(uncertainty, geometry=geometry, root=uncertainty.root.float().double())
 
 
-def _branches(nominal: Robot, calibrated: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:
+def _branches(nominal: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:
     """Branches of the nominal arm that joint values lie on, most frequent first; empty without closed form."""
     solver = closed_form_solver(nominal)
     if solver is None:
         return ()
-    index = IdentifiedArm(nominal, calibrated, solver, StoredStarts(calibrated, q)).branch_of(q)
+    index = nearest_branch(nominal, solver, q)
     counts = torch.bincount(index, minlength=len(solver.branches))
     order = counts.argsort(descending=True, stable=True).tolist()
     return tuple(solver.branches[i] for i in order if counts[i] > 0)

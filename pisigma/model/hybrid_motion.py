@@ -7,14 +7,10 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from pisigma.hybrid.arms import HybridArm, blend
-from pisigma.joint_correction.batched_correction import BatchedCorrection
 from pisigma.kinematics.jacobian import joint_jacobian
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.se3 import rotation_vector
-
-Correct = Callable[[Tensor], Tensor]
-"""Corrections `(*batch, dof)` of joint values `(*batch, dof)` [rad or m]."""
 
 CHUNK = 4_096
 """Poses whose features are in memory at a time: a few hundred columns a joint."""
@@ -42,7 +38,7 @@ def corrected_joints(arm: HybridArm, measurements: Measurements) -> Float64[Tens
 
 
 def hybrid_motion(
-    arm: HybridArm, q: Float[Tensor, "poses dof"], exact: bool = True, correct: Correct | None = None
+    arm: HybridArm, q: Float[Tensor, "poses dof"], exact: bool = True
 ) -> tuple[Float[Tensor, "poses 4 4"], Float[Tensor, "poses 6 dof"]]:
     """Poses and joint Jacobian of a hybrid arm.
 
@@ -54,42 +50,18 @@ def hybrid_motion(
         q: commanded joint values [rad or m].
         exact: whether dΔ/dq is computed, which costs some times as much as Δ. Without it Newton steps contract by
             |dΔ/dq|, of the order of 1e-2.
-        correct: Δ, where something gives it faster than the arm's correction itself.
     """
     chunk = CHUNK // (2 * q.shape[1]) if exact else CHUNK
     with torch.no_grad():
-        parts = [_motion(arm, part, exact, correct or arm.correction) for part in torch.split(q, chunk)]
+        parts = [_motion(arm, part, exact) for part in torch.split(q, chunk)]
     T, J = zip(*parts, strict=True)
     return torch.cat(T), torch.cat(J)
 
 
-class HybridMotion:
-    """`hybrid_motion` of one arm, with what its correction needs prepared.
-
-    Attributes:
-        arm: the arm.
-    """
-
-    def __init__(self, arm: HybridArm) -> None:
-        """Prepare for an arm whose weights stay."""
-        self.arm = arm
-        self._batched = BatchedCorrection(arm.correction)
-
-    def __call__(
-        self, q: Float[Tensor, "poses dof"], exact: bool = True
-    ) -> tuple[Float[Tensor, "poses 4 4"], Float[Tensor, "poses 6 dof"]]:
-        """See `hybrid_motion`."""
-        return hybrid_motion(self.arm, q, exact, self._correct)
-
-    def _correct(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
-        delta, _ = self._batched(q.reshape(-1, q.shape[-1]).T.contiguous())
-        return delta.T.reshape(q.shape)
-
-
-def _motion(arm: HybridArm, q: Tensor, exact: bool, correct: Correct) -> tuple[Tensor, Tensor]:
-    T_hybrid, J_hybrid = joint_jacobian(arm.hybrid, q + correct(q))
+def _motion(arm: HybridArm, q: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
+    T_hybrid, J_hybrid = joint_jacobian(arm.hybrid, q + arm.delta(q))
     if exact:
-        J_hybrid = J_hybrid + J_hybrid @ _slope(correct, q)
+        J_hybrid = J_hybrid + J_hybrid @ _slope(arm.delta, q)
     share = arm.coverage.share(q)
     if bool((share == 1).all()):
         return T_hybrid, J_hybrid

@@ -8,9 +8,9 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
-from pisigma.inverse.torch_ik import TorchIK
+from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.joint_limits import LIMIT_TOLERANCE
+from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.kinematics.singularity import singularity_measure
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
@@ -70,7 +70,7 @@ class SolvedPoses:
 
 
 def draw_solved_poses(
-    ik: TorchIK,
+    ik: CorrectedIK,
     region: Region,
     count: int,
     generator: torch.Generator,
@@ -132,7 +132,7 @@ def draw_between(
 
 
 def _solve(
-    ik: TorchIK, region: Region, count: int, generator: torch.Generator
+    ik: CorrectedIK, region: Region, count: int, generator: torch.Generator
 ) -> tuple[tuple[Tensor, ...], dict[str, int]]:
     """Some poses with their solutions, and why others were refused."""
     robot = ik.model.robot
@@ -164,7 +164,7 @@ def _solve(
     return tuple(part[good] for part in parts), counts
 
 
-def _complaint(ik: TorchIK, region: Region, have: int, drawn: int, refused: dict[str, int]) -> str:
+def _complaint(ik: CorrectedIK, region: Region, have: int, drawn: int, refused: dict[str, int]) -> str:
     """Say that the region is not one for the robot."""
     reasons = ", ".join(f"{number} {name}" for name, number in refused.items() if number)
     where = "around the joint values given"

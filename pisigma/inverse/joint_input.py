@@ -1,5 +1,6 @@
-"""What joint values a robot may be at: the others are in degrees or millimetres."""
+"""What users give as poses and joint values, as arrays; known without torch."""
 
+import sys
 from collections.abc import Sequence
 from typing import Any
 
@@ -7,12 +8,43 @@ import numpy as np
 
 from pisigma.errors import PoseError
 
+_POSES = "homogeneous transforms of shape (*batch, 4, 4)"
+
+
+def is_tensor(values: Any) -> bool:
+    """Whether values are a tensor; torch need not be imported to know."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(values, torch.Tensor)
+
+
+def as_array(values: Any) -> Any:
+    """The values, of which a tensor becomes an array without its gradients."""
+    return values.detach().numpy(force=True) if is_tensor(values) else values
+
+
+def pose_array(values: Any) -> tuple[Any, bool]:
+    """Matrices `(*batch, 4, 4)` as a float64 array, and whether they were rounded to float32 before.
+
+    Raises:
+        PoseError: they are no numbers, of another type, or of another shape.
+    """
+    if is_tensor(values) and str(values.dtype) not in ("torch.float32", "torch.float64"):
+        raise PoseError(f"T_base_tool holds {values.dtype}; give float64 or float32, lengths in metres.")
+    try:
+        given = np.asarray(as_array(values))
+        T = given.astype(np.float64, copy=False)
+    except (TypeError, ValueError):
+        raise PoseError(f"T_base_tool is no array of numbers; give {_POSES}.") from None
+    if T.ndim < 2 or T.shape[-2:] != (4, 4):
+        raise PoseError(f"T_base_tool has the shape {T.shape}; give {_POSES}.")
+    return T, given.dtype == np.float32
+
 
 class Postures:
-    """Joint values that lie a full turn beyond the joint limits at most, or the stroke and 1 m at least.
+    """What joint values a robot may be at: a full turn beyond the joint limits at most, or the stroke and 1 m at least.
 
     Solutions may lie outside the limits, and a robot may stand a little beyond them; what lies farther off is no
-    posture of the robot.
+    posture of the robot, but a value in degrees or millimetres.
     """
 
     def __init__(self, limits: np.ndarray, revolute: np.ndarray, joints: Sequence[str]) -> None:
@@ -27,34 +59,32 @@ class Postures:
         clipped: np.ndarray = np.clip(q, self._lowest, self._highest)
         return clipped
 
-    def checked(self, near: Any, tensor: bool, throw: bool = True) -> Any:
-        """`near`, with NaN for values that are in no posture; what does not fit at all as it came.
+    def checked(self, near: Any, throw: bool = True) -> Any:
+        """`near` as a float64 array, with NaN for values that are in no posture; what does not fit at all as it came.
 
         Args:
-            near: joint values `(*batch, dof)` [rad or m].
-            tensor: whether they are a tensor.
+            near: joint values `(*batch, dof)` [rad or m]: a tensor, an array or nested lists.
             throw: whether to raise instead.
 
         Raises:
             PoseError: a value is in no posture, and `throw`.
         """
         try:
-            values = near.numpy(force=True) if tensor else np.asarray(near, dtype=np.float64)
+            values = np.asarray(as_array(near), dtype=np.float64)
         except (TypeError, ValueError):
             return near
         if values.shape[-1:] != (len(self._joints),):
-            return near
+            return values
         if values.ndim == 1 and all(
             low <= value <= high for value, (low, high) in zip(values.tolist(), self._bounds, strict=True)
         ):  # some times as fast as the comparison of arrays
-            return near if tensor else values
+            return values
         beyond = (values < self._lowest) | (values > self._highest)
         if not beyond.any():
-            return near if tensor else values
+            return values
         if throw:
             raise PoseError(self._complaint(values, tuple(int(index) for index in np.argwhere(beyond)[0])))
-        marked = np.where(beyond, np.nan, values)
-        return near.new_tensor(marked) if tensor else marked
+        return np.where(beyond, np.nan, values)
 
     def _complaint(self, values: np.ndarray, row: tuple[int, ...]) -> str:
         joint = row[-1]

@@ -1,0 +1,378 @@
+"""Corrected inverse kinematics for control loops: NumPy in, NumPy out, some microseconds a pose."""
+
+import os
+import sys
+import threading
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pisigma.errors import PoseError, nearest_choice
+from pisigma.inverse.solution import Solution
+from pisigma.kernels.arrays import (
+    ANY_BRANCH,
+    BLENDED,
+    EVALUATE,
+    EVERY_BRANCH,
+    GEOMETRIC,
+    LAST_ROW,
+    LEFT_HANDED,
+    NEAR_NOT_FINITE,
+    NOT_FINITE,
+    NOT_ORTHONORMAL,
+    SOLVE,
+    Description,
+)
+from pisigma.kernels.description_file import read_description
+from pisigma.kernels.layout import make_memory, pack
+from pisigma.kernels.machine_code import address_of, load_kernels
+
+if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
+    import pisigma.inverse.corrected_ik
+
+CHUNK = 2_048
+"""Poses that a thread takes at a time."""
+
+_WRONG = {
+    NOT_FINITE: "T_base_tool{} has entries that are not finite numbers; give 16 finite numbers.",
+    LAST_ROW: "T_base_tool{} does not end with the row 0 0 0 1; give a homogeneous transform.",
+    NOT_ORTHONORMAL: (
+        "T_base_tool{} has a rotation part that is not orthonormal; normalise it or check its source."
+    ),
+    LEFT_HANDED: (
+        "T_base_tool{} has a left-handed rotation part (determinant -1); a reflection is no pose, check its axes."
+    ),
+    NEAR_NOT_FINITE: "near{} holds joint values that are no finite numbers; give a number for every joint.",
+}
+
+_PATIENCE = 2.0
+"""[s] Kernels that are on disk are loaded in far less."""
+_COMPILING = (
+    "pisigma: preparing the inverse kinematics for this processor, once; that takes some seconds ...\n"
+)
+
+
+def _kernels() -> Callable[..., int]:
+    """The kernels; where machine code has to be made first, somebody at a terminal reads why it takes so long."""
+    notice = threading.Timer(_PATIENCE, sys.stderr.write, (_COMPILING,))
+    notice.daemon = True
+    if sys.stderr.isatty():
+        notice.start()
+    try:
+        return load_kernels()
+    finally:
+        notice.cancel()
+
+
+class CompiledIK:
+    """The corrected inverse kinematics of one arm, compiled. It may be called from several threads at a time.
+
+    Attributes:
+        description: the arm as arrays.
+        name: of the model.
+        branches: names of the branches.
+        joints: names of the joints.
+        belongs_to: SHA-256 of the model folder that says the same; "" where there is none.
+    """
+
+    def __init__(
+        self,
+        description: Description,
+        branches: Sequence[str],
+        joints: Sequence[str],
+        name: str = "model",
+        belongs_to: str = "",
+    ) -> None:
+        """Take a description such as `model.compiled_model.describe` makes.
+
+        Raises:
+            ModelError: the arm is larger than the compiled kernels allow, or there are no kernels for this machine.
+        """
+        self.description = description
+        self._packed = pack(description, name)
+        self._address = address_of(self._packed)
+        self.branches = tuple(branches)
+        self.joints = tuple(joints)
+        self.name = name
+        self.belongs_to = belongs_to
+        self._none = np.zeros((0, len(self.joints)))
+        self._kernels = _kernels()
+        self._threads = threading.local()
+
+    @staticmethod
+    def load(file: str | os.PathLike[str]) -> "CompiledIK":
+        """Read a file that `model.compiled_model.save_compiled` wrote.
+
+        Raises:
+            ModelError: the file is missing, truncated, foreign, changed or of another format.
+        """
+        description, names = read_description(file)
+        return CompiledIK(description, **names)
+
+    def solve(
+        self,
+        T_base_tool: Any,
+        near: Any = None,
+        branch: str | None = None,
+        throw: bool = True,
+        approach: Any = None,
+        owner: "pisigma.inverse.corrected_ik.CorrectedIK | None" = None,
+    ) -> Solution:
+        """Find corrected joint values for one pose.
+
+        Args:
+            T_base_tool: `(4, 4)`: wanted pose of the tool in the base frame [m].
+            near: `(dof,)` joint values [rad or m] such as the present ones: of the branches that reach the pose the
+                nearest is taken, on the nearest turns within the limits.
+            branch: name of the branch to take. With neither, branches are tried in the order of how many training
+                rows lie on them, then the others; the first that reaches the pose inside the joint limits is taken,
+                else the first that reaches it.
+            throw: whether a matrix that is no pose, and joint values `near` that are not finite, raise; else the
+                status is INVALID_POSE.
+            approach: `(dof,)`: +1 or -1 for the side from which every joint comes, 0 where that is not stated.
+            owner: see `Solution`.
+
+        Raises:
+            PoseError: the matrix is no pose, a shape does not fit, or there is no such branch.
+        """
+        T = self._numbers(T_base_tool, "T_base_tool", throw)
+        if T.shape != (4, 4):
+            raise PoseError(
+                f"T_base_tool has the shape {T.shape}; give one homogeneous transform of shape (4, 4)."
+            )
+        dof = len(self.joints)
+        beside = self._none if near is None else self._rows(near, (), "near", throw)
+        sides = self._none if approach is None else self._rows(approach, (), "approach", True)
+        out = np.empty((1, 1, 2 * dof + 5))
+        wrong = self._run(SOLVE, T, 0, 1, beside, sides, self._branch(branch), not throw, out)
+        if wrong >= 0:
+            raise PoseError(_WRONG[wrong % 8].format(""))
+        row = out[0, 0]
+        position, rotation, measure, status, index = row[2 * dof :].tolist()
+        q, nominal = row[:dof], row[dof : 2 * dof]
+        return Solution(
+            q, nominal, int(index), self.branches, int(status), position, rotation, measure, owner
+        )
+
+    def solve_batch(
+        self,
+        T_base_tool: Any,
+        near: Any = None,
+        branch: str | None = None,
+        threads: int | None = None,
+        throw: bool = True,
+        approach: Any = None,
+        single: bool = False,
+        owner: "pisigma.inverse.corrected_ik.CorrectedIK | None" = None,
+    ) -> Solution:
+        """Find corrected joint values for poses `(*batch, 4, 4)`, several threads at a time.
+
+        Args:
+            T_base_tool: `(*batch, 4, 4)`: wanted poses [m].
+            near: `(*batch, dof)` or `(dof,)`: see `solve`.
+            branch: see `solve`.
+            threads: how many; None for one per processor that this process may use.
+            throw: see `solve`; with False bad rows get the status INVALID_POSE and the others are solved.
+            approach: `(*batch, dof)` or `(dof,)`: see `solve`.
+            single: whether the poses were rounded to float32, which widens what counts as rounding.
+            owner: see `Solution`.
+
+        Raises:
+            PoseError: a matrix is no pose (the message gives its index), or see `solve`.
+        """
+        T = self._poses(T_base_tool, throw)
+        batch = T.shape[:-2]
+        beside = self._none if near is None else self._rows(near, batch, "near", throw)
+        sides = self._none if approach is None else self._rows(approach, batch, "approach", True)
+        out = self._solve_rows(T, beside, sides, self._branch(branch), 1, threads, throw, single)
+        return self._solution(out.reshape(*batch, out.shape[-1]), owner)
+
+    def all_branches(
+        self,
+        T_base_tool: Any,
+        threads: int | None = None,
+        throw: bool = True,
+        approach: Any = None,
+        single: bool = False,
+        owner: "pisigma.inverse.corrected_ik.CorrectedIK | None" = None,
+    ) -> Solution:
+        """Solutions `(*batch, branches)` of poses `(*batch, 4, 4)` on every branch; for the rest see `solve_batch`."""
+        T = self._poses(T_base_tool, throw)
+        sides = self._none if approach is None else self._rows(approach, T.shape[:-2], "approach", True)
+        count = len(self.branches)
+        out = self._solve_rows(T, self._none, sides, EVERY_BRANCH, count, threads, throw, single)
+        return self._solution(out.reshape(*T.shape[:-2], count, out.shape[-1]), owner)
+
+    def forward(self, q: Any, arm: int | None = None, approach: Any = None) -> tuple[Any, Any, Any, Any]:
+        """Where the calibrated arm goes.
+
+        Args:
+            q: `(poses, dof)` commanded joint values [rad or m].
+            arm: another of the arms in `kernels.arrays`.
+            approach: `(poses, dof)` or `(dof,)`: see `solve`.
+
+        Returns:
+            T_base_tool `(poses, 4, 4)` [m], Jacobian `(poses, 6, dof)` without the slope of the correction, the
+            correction `(poses, dof)` [rad or m], and how much of it is in force `(poses,)`.
+        """
+        dof = len(self.joints)
+        rows = self._rows(q, (len(q),), "q", True)
+        sides = self._none if approach is None else self._rows(approach, (len(rows),), "approach", True)
+        T, out = np.empty((len(rows), 4, 4)), np.empty((len(rows), 7 * dof + 1))
+        default = BLENDED if self.description.arms.hybrid else GEOMETRIC
+        self._run(EVALUATE, T, 0, len(rows), rows, sides, default if arm is None else arm, False, out)
+        J = out[:, : 6 * dof].reshape(-1, 6, dof)
+        return T, J, out[:, 6 * dof : 7 * dof], out[:, 7 * dof]
+
+    def _solution(self, out: Any, owner: "pisigma.inverse.corrected_ik.CorrectedIK | None") -> Solution:
+        """The solutions of poses, `(*batch, 2 · dof + 5)`."""
+        dof = len(self.joints)
+        position, rotation, measure, status, branch = np.moveaxis(out[..., 2 * dof :], -1, 0)
+        q, nominal = out[..., :dof], out[..., dof : 2 * dof]
+        return Solution(
+            q,
+            nominal,
+            branch.astype(int),
+            self.branches,
+            status.astype(int),
+            position,
+            rotation,
+            measure,
+            owner,
+        )
+
+    def _solve_rows(
+        self,
+        T: Any,
+        near: Any,
+        approach: Any,
+        branch: int,
+        count: int,
+        threads: int | None,
+        throw: bool,
+        single: bool,
+    ) -> Any:
+        """What the kernels write, `(poses, count, 2 · dof + 5)`."""
+        if threads is not None and threads < 1:
+            raise PoseError(f"threads={threads}: at least one is needed; give None for one per processor.")
+        rows = T.reshape(-1, 4, 4)
+        out = np.empty((len(rows), count, 2 * len(self.joints) + 5))
+
+        def solve_chunk(start: int) -> int:
+            stop = min(start + CHUNK, len(rows))
+            return self._run(SOLVE, rows, start, stop, near, approach, branch, not throw, out, single)
+
+        starts = range(0, len(rows), CHUNK)
+        workers = min(threads or _processors(), len(starts))
+        if workers > 1:
+            with ThreadPoolExecutor(workers) as pool:
+                results = list(pool.map(solve_chunk, starts))
+        else:
+            results = [solve_chunk(start) for start in starts]
+        wrong = next((result for result in results if result >= 0), -1)
+        if wrong >= 0:
+            index = tuple(int(i) for i in np.unravel_index(wrong // 8, T.shape[:-2])) if T.ndim > 2 else ()
+            at = f" at index {index if len(index) > 1 else index[0]}" if index else ""
+            raise PoseError(_WRONG[wrong % 8].format(at))
+        return out
+
+    def _run(
+        self,
+        task: int,
+        T: Any,
+        start: int,
+        stop: int,
+        near: Any,
+        approach: Any,
+        branch: int,
+        mark: bool,
+        out: Any,
+        single: bool = False,
+    ) -> int:
+        """Have the kernels work on the rows from `start` to `stop`; what they say, with the row of the whole."""
+        pairs = []
+        for values in (near, approach):
+            beside, rows = address_of(values), len(values)
+            pairs += [beside, rows] if rows < 2 else [beside + start * values.strides[0], stop - start]
+        said = self._kernels(
+            self._address,
+            self._memory(),
+            task,
+            stop - start,
+            address_of(T) + start * 128,
+            *pairs,
+            branch,
+            mark,
+            single,
+            address_of(out) + start * out.strides[0],
+            out.shape[1],
+        )
+        return int(said) if said < 0 else int(said) + 8 * start
+
+    def _memory(self) -> int:
+        """Address of memory to work in that no other thread uses."""
+        address: int | None = getattr(self._threads, "address", None)
+        if address is None:
+            self._threads.memory = make_memory()
+            address = self._threads.address = address_of(self._threads.memory)
+        return address
+
+    def _branch(self, name: str | None) -> int:
+        if name is None:
+            return ANY_BRANCH
+        if name not in self.branches:
+            raise PoseError(f"there is no branch '{name}'; {nearest_choice(name, self.branches)}")
+        return self.branches.index(name)
+
+    def _poses(self, T_base_tool: Any, throw: bool) -> Any:
+        T = self._numbers(T_base_tool, "T_base_tool", throw)
+        if T.ndim < 2 or T.shape[-2:] != (4, 4):
+            raise PoseError(
+                f"T_base_tool has the shape {T.shape}; give homogeneous transforms of shape (*batch, 4, 4)."
+            )
+        return T
+
+    def _numbers(self, values: Any, what: str, throw: bool) -> Any:
+        """The values as a contiguous float64 array, itself where it is one; NaN for what is none, or a complaint."""
+        try:
+            return np.ascontiguousarray(values, dtype=np.float64)
+        except (TypeError, ValueError):
+            shape = None if throw else _shape(values)
+            if shape is None:
+                raise PoseError(
+                    f"{what} is no array of numbers; give real numbers, lengths in metres."
+                ) from None
+            return np.full(shape, np.nan)
+
+    def _rows(self, values: Any, batch: tuple[int, ...], what: str, throw: bool) -> Any:
+        """Joint values, or approaches, as `(1 or poses, dof)`."""
+        rows, dof = self._numbers(values, what, throw), len(self.joints)
+        if rows.shape[-1:] != (dof,):
+            raise PoseError(
+                f"{what} has the shape {rows.shape}; give {dof} joint values ({', '.join(self.joints)}), once or for "
+                "every pose."
+            )
+        if rows.ndim == 1:
+            return rows.reshape(1, dof)
+        try:
+            return np.ascontiguousarray(np.broadcast_to(rows, (*batch, dof))).reshape(-1, dof)
+        except ValueError:
+            raise PoseError(
+                f"{what} has the batch shape {rows.shape[:-1]}, which does not broadcast to {batch} of the poses; give "
+                "one row of joint values for each pose, or one for all."
+            ) from None
+
+
+def _processors() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _shape(values: Any) -> tuple[int, ...] | None:
+    """Shape of nested values, None where they are ragged."""
+    try:
+        return tuple(np.shape(values))
+    except ValueError:
+        return None
