@@ -16,10 +16,10 @@ import torch
 from inverse_speed import draw_joints, make_model
 
 from pisigma.errors import ModelError
-from pisigma.inverse.torch_ik import TorchIK
+from pisigma.inverse.compiled_ik import CompiledIK
+from pisigma.inverse.reference import ReferenceIK
 from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.compiled_model import compile_model
 from pisigma.model.folder.model_folder import load_model
 
 MODELS = Path(__file__).parents[1] / "models"
@@ -73,11 +73,11 @@ def report(name: str, model: CalibratedModel, rows: int) -> None:
     width = torch.tensor([NEAR if revolute else NEAR / 10 for revolute in model.robot.revolute])
     beside = q + width * torch.from_numpy(rng.uniform(-1, 1, q.shape))
     for label, near in (("no near", None), (f"near within {NEAR} rad", beside)):
-        found = TorchIK(model)(T, near=near)
+        found = ReferenceIK(model)(T, near=near)
         line = figures(found.status.numpy(), found.position_residual.numpy(), found.rotation_residual.numpy())
         print(f"{name:9s} {label:20s} torch    {len(T):6d} poses, {line}", flush=True)
         try:
-            kernels = compile_model(model)
+            kernels = CompiledIK.of(model)
         except ModelError:
             continue
         done = kernels.solve_batch(T.numpy(), near=None if near is None else near.numpy())

@@ -23,13 +23,13 @@ from scipy.optimize import least_squares
 
 from pisigma.hybrid.arms import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
-from pisigma.inverse.torch_ik import TorchIK
+from pisigma.inverse.reference import ReferenceIK
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.compiled_model import compile_model, save_compiled
+from pisigma.model.compiled_model import save_compiled
 from pisigma.model.folder.model_folder import load_model
 from pisigma.robot import Robot
 
@@ -39,7 +39,7 @@ COLD = """
 import time
 start, began = time.perf_counter(), time.process_time()
 import numpy as np
-from pisigma.kernels.solver import CompiledIK
+from pisigma.inverse.compiled_ik import CompiledIK
 CompiledIK.load({file!r}).solve(np.load({pose!r}))
 print(time.perf_counter() - start, time.process_time() - began)
 """
@@ -100,7 +100,7 @@ def main() -> None:
     rng = np.random.default_rng(0)
     folder = Path(options.robot).is_dir()
     model = load_model(options.robot) if folder else make_model(options.robot, options.harmonics, rng)
-    kernels = compile_model(model)
+    kernels = CompiledIK.of(model)
     drawn = (
         draw_between(model.starts, options.poses, rng)
         if folder
@@ -138,7 +138,7 @@ def main() -> None:
     scipy = time_scipy(kernels, T[:few], q[:few])
     print(f"scipy: {scipy * 1e6:,.0f} us a pose, {scipy * 1e6 / median:,.0f} times a compiled call")
     torch.set_num_threads(os.cpu_count() or 1)
-    solver, tensors, rate = TorchIK(model), torch.from_numpy(T), 0.0
+    solver, tensors, rate = ReferenceIK(model), torch.from_numpy(T), 0.0
     for _ in range(REPEATS):
         start = time.perf_counter()
         solver(tensors)

@@ -19,7 +19,6 @@ from pisigma.export.output_file import writing_whole
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.inverse.path import PathSwitch
 from pisigma.inverse.solution import Solution
-from pisigma.kernels.solution import CompiledSolution
 from pisigma.kinematics.status import Status
 from pisigma.measurement.csv.poses import CHUNK_ROWS, PoseChunk, read_pose_chunks
 from pisigma.measurement.fields import LeftOut
@@ -181,7 +180,7 @@ def _solved_rows(
 
 def _solve(
     solver: CorrectedIK, T: Tensor, branch: str | None, path: bool
-) -> tuple[Solution | CompiledSolution, Sequence[PathSwitch]]:
+) -> tuple[Solution, Sequence[PathSwitch]]:
     """The one place where poses of a file meet the solver."""
     if path:
         followed = solver.path(T.numpy(), branch=branch)
@@ -202,9 +201,7 @@ def _too_far(chunk: PoseChunk, robot: Robot) -> list[str]:
     return reasons
 
 
-def _cells(
-    solution: Solution | CompiledSolution, lines: Sequence[int], robot: Robot, accuracy: bool
-) -> Iterator[list[str]]:
+def _cells(solution: Solution, lines: Sequence[int], robot: Robot, accuracy: bool) -> Iterator[list[str]]:
     """The cells of solved poses; empty where a value is not known."""
     per_file_unit = np.array([180 / math.pi if revolute else 1e3 for revolute in robot.revolute])
     joints = np.concatenate([np.asarray(q) * per_file_unit for q in (solution.q, solution.q_nominal)], -1)

@@ -98,7 +98,7 @@ def _write(request: ExportRequest) -> Exported:
     if not table:
         check_program(request.out, solver.model.robot, cartesian, request.config)
     wanted = read_poses(request.poses)
-    solution = solver.torch(wanted.T, branch=request.branch)
+    solution = solver(wanted.T, branch=request.branch)
     targets = targets_of(solution, str(request.poses), wanted.line, accuracy=table)
     statuses = Counter(status.name.lower() for status in targets.status).most_common()
     return Exported(

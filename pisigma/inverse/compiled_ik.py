@@ -27,10 +27,11 @@ from pisigma.kernels.arrays import (
 )
 from pisigma.kernels.description_file import read_description
 from pisigma.kernels.layout import make_memory, pack
-from pisigma.kernels.machine_code import address_of, load_kernels
+from pisigma.kernels.machine_code import address_of, kernel_features, load_kernels
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import pisigma.inverse.corrected_ik
+    import pisigma.model.calibrated_model
 
 CHUNK = 2_048
 """Poses that a thread takes at a time."""
@@ -54,14 +55,14 @@ _COMPILING = (
 )
 
 
-def _kernels() -> Callable[..., int]:
+def _kernels(features: tuple[str, ...]) -> Callable[..., int]:
     """The kernels; where machine code has to be made first, somebody at a terminal reads why it takes so long."""
     notice = threading.Timer(_PATIENCE, sys.stderr.write, (_COMPILING,))
     notice.daemon = True
     if sys.stderr.isatty():
         notice.start()
     try:
-        return load_kernels()
+        return load_kernels(features)
     finally:
         notice.cancel()
 
@@ -91,15 +92,28 @@ class CompiledIK:
             ModelError: the arm is larger than the compiled kernels allow, or there are no kernels for this machine.
         """
         self.description = description
-        self._packed = pack(description, name)
+        self._packed = pack(description, name, kernel_features(description.features))
         self._address = address_of(self._packed)
         self.branches = tuple(branches)
         self.joints = tuple(joints)
         self.name = name
         self.belongs_to = belongs_to
         self._none = np.zeros((0, len(self.joints)))
-        self._kernels = _kernels()
+        self._kernels = _kernels(description.features)
         self._threads = threading.local()
+
+    @staticmethod
+    def of(model: "pisigma.model.calibrated_model.CalibratedModel") -> "CompiledIK":
+        """Take a model.
+
+        Raises:
+            ModelError: it corrects by something that has no compiled form, see `model.compiled_model.describe`; or see
+                `__init__`.
+        """
+        from pisigma.model.compiled_model import describe
+
+        description, branches = describe(model)
+        return CompiledIK(description, branches, [joint.name for joint in model.robot.joints], model.name)
 
     @staticmethod
     def load(file: str | os.PathLike[str]) -> "CompiledIK":
@@ -351,8 +365,8 @@ class CompiledIK:
         rows, dof = self._numbers(values, what, throw), len(self.joints)
         if rows.shape[-1:] != (dof,):
             raise PoseError(
-                f"{what} has the shape {rows.shape}; give {dof} joint values ({', '.join(self.joints)}), once or for "
-                "every pose."
+                f"{what} has the shape {rows.shape}, but the robot has {dof} joints; give a value for each of "
+                f"{', '.join(self.joints)}, once or for every pose."
             )
         if rows.ndim == 1:
             return rows.reshape(1, dof)

@@ -90,11 +90,9 @@ class CorrectedIK:
     def compiled(self) -> "pisigma.inverse.compiled_ik.CompiledIK | None":
         """The kernels of the model; None where its correction has no compiled form, or this machine no kernels."""
         from pisigma.inverse.compiled_ik import CompiledIK
-        from pisigma.model.compiled_model import describe
 
         try:
-            description, branches = describe(self.model)
-            return CompiledIK(description, branches, self.joints, self.name)
+            return CompiledIK.of(self.model)
         except ModelError:
             return None
 
@@ -258,7 +256,7 @@ class CorrectedIK:
     def _like(
         self, poses: Any, solution: "pisigma.inverse.solution.Solution"
     ) -> "pisigma.inverse.solution.Solution":
-        """The solutions as tensors, with gradients where these are wanted, where the poses are tensors; else as arrays."""
+        """The solutions of tensors as tensors, with gradients where these are wanted; other ones as arrays."""
         if not is_tensor(poses):
             return (
                 solution

@@ -82,7 +82,7 @@ def follow_path(
         raise PoseError(f"a path of shape (poses, 4, 4) was wanted, got {T.shape}; give at least one pose.")
     if branch is not None and branch not in ik.branches:
         raise PoseError(f"there is no branch '{branch}'; {nearest_choice(branch, ik.branches)}")
-    beside = None if near is None else np.asarray(ik.postures.checked(near, False), dtype=np.float64)
+    beside = None if near is None else np.asarray(ik.postures.checked(near), dtype=np.float64)
     guide = _guide(ik, T, beside, branch) if ik.closed_form else _one_by_one(ik, T, beside)
     solution = _solve(ik, T, guide, _approaches(guide, beside))
     return JointPath(solution, _switches(ik, T, np.asarray(solution.q), solution))

@@ -117,7 +117,7 @@ class ReferenceIK:
         if approach is None or hybrid is None:
             return solve(self)
         sides, _ = self._joint_rows(approach, "approach", batch, True)
-        kinds, index = sides.reshape(-1, sides.shape[-1]).unique(dim=0, return_inverse=True)
+        kinds, index = torch.unique(sides.reshape(-1, sides.shape[-1]), dim=0, return_inverse=True)
         found = solve(self) if not len(kinds) else None
         for kind, side in enumerate(kinds):
             arm = replace(hybrid, approach=side)

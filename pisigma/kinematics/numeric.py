@@ -35,7 +35,6 @@ Motion = Callable[[Tensor], tuple[Tensor, Tensor]]
 """Pose T_base_tool and joint Jacobian of an arm at joint values, as `joint_jacobian` gives them."""
 
 
-
 @dataclass(frozen=True, eq=False)
 class NumericSolution:
     """What the iteration found for every pose.

@@ -20,7 +20,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError, ModelError
-from pisigma.inverse.torch_ik import NUMERIC, TorchIK
+from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.inverse.reference import NUMERIC
 from pisigma.joint_correction.conditions import learned_conditions
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.judging.distillation_summary import (
@@ -174,7 +175,7 @@ def distill(
     generator = torch.Generator().manual_seed(settings.seed)
     choosing, judging = (round(settings.poses * share) for share in (CHOICE_SHARE, HELD_OUT_SHARE))
     total = settings.poses + choosing + judging
-    every = draw_solved_poses(TorchIK(parent), region, total, generator, progress)
+    every = draw_solved_poses(CorrectedIK(parent), region, total, generator, progress)
     fitted, chosen_by = slice(settings.poses), slice(settings.poses, settings.poses + choosing)
     network, trials = choose_network(
         parent, every, (fitted, chosen_by), sizes, (settings.seed, settings.epochs), progress
@@ -189,7 +190,7 @@ def distill(
         robot=parent.robot,
         network=network,
         domain=Domain.around(scaled[:DOMAIN_SAMPLES], generator),
-        branches=_frequent(TorchIK(parent), every),
+        branches=_frequent(CorrectedIK(parent), every),
         starts=spread_rows((every.q_nominal + every.correction)[fitted]),
         bases=parent.bases,
         tools=parent.tools,
@@ -226,7 +227,7 @@ def _rows(poses: SolvedPoses, rows: slice) -> SolvedPoses:
     )
 
 
-def _frequent(ik: TorchIK, poses: SolvedPoses) -> tuple[str, ...]:
+def _frequent(ik: CorrectedIK, poses: SolvedPoses) -> tuple[str, ...]:
     """Branches that the poses lie on, most frequent first; none for a robot without closed-form inverse."""
     if ik.branches == (NUMERIC,):
         return ()

@@ -10,9 +10,9 @@ from torch import Tensor
 from pisigma.errors import IdentificationError
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.kinematics.singularity import singularity_measure
 from pisigma.kinematics.status import Status
+from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.robot.description import Robot
 from pisigma.se3 import wrap_to_pi
 

@@ -13,7 +13,7 @@ from testing.models import hand_made_model, joints_around
 
 from pisigma.export.programs.targets import Targets, targets_of
 from pisigma.export.targets import targets_csv
-from pisigma.inverse.torch_ik import TorchIK
+from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel
@@ -37,7 +37,7 @@ def pose_in(row: dict[str, str]) -> torch.Tensor:
 def test_both_kinds_of_targets_reach_the_pose(name):
     model = hand_made_model(name)
     T = forward_kinematics(model.robot, joints_around(name, 7, seed=5, spread=0.1))
-    targets = targets_of(TorchIK(model)(T), "poses.csv", tuple(range(2, 9)))
+    targets = targets_of(CorrectedIK(model)(T), "poses.csv", tuple(range(2, 9)))
     rows = rows_of(targets)
     assert [row["line"] for row in rows] == ["2", "3", "4", "5", "6", "7", "8"]
     assert {(row["status"], row["branch"], row["sigma_mm"]) for row in rows} == {
@@ -88,7 +88,7 @@ def test_a_pose_out_of_reach_gets_no_target():
     model = hand_made_model("kiro4")
     T = forward_kinematics(model.robot, joints_around("kiro4", 2, seed=5, spread=0.1))
     T[1, 0, 3] = 9.0
-    targets = targets_of(TorchIK(model)(T), "poses.csv", (2, 5))
+    targets = targets_of(CorrectedIK(model)(T), "poses.csv", (2, 5))
     first, second = rows_of(targets)
     assert (first["status"], second["status"], second["q1_deg"], second["x_mm"]) == (
         "reached",
@@ -103,7 +103,7 @@ def test_a_hybrid_tells_its_accuracy_and_frames():
     arm = hybrid_of(name="rb5", frames=True)
     model = model_of_hybrid("cell", arm.true.nominal, arm.result, arm.measurements)
     T = model.forward(arm.measurements.q[:4])
-    solution = TorchIK(model)(T)
+    solution = CorrectedIK(model)(T)
     targets = targets_of(solution, "poses.csv", (2, 3, 4, 5))
     rows = rows_of(targets)
     assert_close([float(row["sigma_mm"]) for row in rows], solution.accuracy * 1e3, rtol=1e-12)
@@ -130,7 +130,7 @@ def test_what_is_said_of_the_nominal_robot_fits_in_comment_lines():
         starts=joints_around("ur10", 5),
     )
     q = joints_around("ur10", 1)
-    text = targets_csv(targets_of(TorchIK(model)(forward_kinematics(robot, q)), "poses.csv", (2,)))
+    text = targets_csv(targets_of(CorrectedIK(model)(forward_kinematics(robot, q)), "poses.csv", (2,)))
     head, columns, row = text.splitlines()[:-2], text.splitlines()[-2], text.splitlines()[-1]
     assert all(line.startswith("# ") for line in head)
     assert "base: x_mm 100, y_mm 0, z_mm 0, roll_deg 0, pitch_deg 0, yaw_deg -90; tool: x_mm 0," in "".join(

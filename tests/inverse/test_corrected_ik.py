@@ -11,7 +11,7 @@ from testing.models import HOMES, hand_made_model, joints_around, poses_around, 
 
 from pisigma.errors import ModelError, PoseError
 from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.inverse.torch_ik import NUMERIC
+from pisigma.inverse.reference import NUMERIC
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status

@@ -6,7 +6,7 @@ from testing.calibrated_arm import calibrated_arm, joints_of
 from testing.closeness import assert_close
 from testing.models import HOMES, hand_made_model, joints_around
 
-from pisigma.inverse.torch_ik import TorchIK
+from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.jacobian import joint_jacobian
 from pisigma.kinematics.singularity import singularity_measure
@@ -34,7 +34,7 @@ def directions(model, T, q) -> torch.Tensor:
 
 
 def check(model, T, near, names=("q", "q_nominal", "correction")) -> None:
-    ik = TorchIK(model)
+    ik = CorrectedIK(model)
     plain = ik(T, near=near)
     fine = (plain.status == Status.REACHED) | (plain.status == Status.OUTSIDE_DOMAIN)
     assert float(fine.double().mean()) > 0.8
@@ -87,7 +87,7 @@ def test_seven_joints_follow_with_the_least_motion():
     model = calibrated_arm("panda", hybrid=False)
     q = joints_of(model.robot, 10, seed=2, share=0.6)
     T = model.forward(q).requires_grad_()
-    solution = TorchIK(model)(T, near=q)
+    solution = CorrectedIK(model)(T, near=q)
     _, J = joint_jacobian(model.calibrated, solution.q.detach())
     way = torch.randn(10, 6, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     rows = [torch.autograd.grad(column.sum(), T, retain_graph=True)[0] for column in solution.q.unbind(-1)]
@@ -106,7 +106,7 @@ def test_changes_that_are_no_motion_count_as_none():
     model = calibrated_arm("ur5")
     q = joints_of(model.robot, 5, seed=3, share=0.4)
     T = model.forward(q).requires_grad_()
-    solution = TorchIK(model)(T, near=q)
+    solution = CorrectedIK(model)(T, near=q)
     (slope,) = torch.autograd.grad(solution.q.sum(), T)
     assert_close((slope[:, :3, :3] * T.detach()[:, :3, :3]).sum((-1, -2)), 0.0, atol=1e-9)  # scale
     assert_close(slope[:, 3], 0.0)
@@ -115,7 +115,7 @@ def test_changes_that_are_no_motion_count_as_none():
 def test_what_is_not_reached_has_no_gradient_and_what_is_singular_a_finite_one():
     model = calibrated_arm("ur5", hybrid=False)
     stretched = torch.tensor([0.3, -0.7, 0.0, 0.5, 0.6, 0.2], dtype=torch.float64)
-    singular = TorchIK(model)
+    singular = CorrectedIK(model)
     T = torch.stack([model.forward(stretched[None])[0], torch.eye(4, dtype=torch.float64)])
     T[1, :3, 3] = 9.0
     T.requires_grad_()
@@ -131,11 +131,11 @@ def test_gradients_have_the_dtype_of_the_poses_and_none_are_kept_without_need(dt
     model = calibrated_arm("ur5")
     q = joints_of(model.robot, 3, seed=3, share=0.4)
     T = model.forward(q).to(dtype)
-    assert not TorchIK(model)(T).q.requires_grad
+    assert not CorrectedIK(model)(T).q.requires_grad
     T.requires_grad_()
     with torch.no_grad():
-        assert not TorchIK(model)(T).q.requires_grad
-    solution = TorchIK(model)(T)
+        assert not CorrectedIK(model)(T).q.requires_grad
+    solution = CorrectedIK(model)(T)
     assert solution.q.dtype == dtype
     solution.q.sum().backward()
     assert T.grad.dtype == dtype
@@ -145,7 +145,7 @@ def test_gradients_have_the_dtype_of_the_poses_and_none_are_kept_without_need(dt
 def test_second_derivatives_are_refused():
     model = calibrated_arm("ur5")
     T = model.forward(joints_of(model.robot, 1, share=0.4)).requires_grad_()
-    q = TorchIK(model)(T).q
+    q = CorrectedIK(model)(T).q
     (slope,) = torch.autograd.grad((q**2).sum(), T, create_graph=True)
     with pytest.raises(RuntimeError, match="once_differentiable"):
         slope.sum().backward()
@@ -154,6 +154,6 @@ def test_second_derivatives_are_refused():
 def test_all_branches_have_gradients():
     model = calibrated_arm("ur5", hybrid=False)
     T = model.forward(joints_of(model.robot, 2, share=0.4)).requires_grad_()
-    every = TorchIK(model).all_branches(T)
+    every = CorrectedIK(model).all_branches(T)
     (slope,) = torch.autograd.grad(every.q.nan_to_num().sum(), T)
     assert float(slope.abs().max()) > 0.1

@@ -11,12 +11,12 @@ from testing.models import no_type_checker
 
 from pisigma.hybrid.arms import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
+from pisigma.inverse.compiled_ik import CompiledIK
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.shared_features import ScaledJoints, SinesCosines
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.compiled_model import compile_model
 from pisigma.robot import Robot
 
 BASE, TOOL = np.array([0.1, -0.2, 0.3, 0.4, 0.1, -0.2]), np.array([0.02, 0.03, 0.1, 0.1, 0.2, 0.3])
@@ -79,7 +79,7 @@ def calibrated(name: str, hybrid: bool = True, covered: float = 1.0, joints: boo
 def compiled(name: str, hybrid: bool = True, covered: float = 1.0, joints: bool = False):
     """The compiled inverse kinematics of `calibrated`."""
     with no_type_checker():
-        return compile_model(calibrated(name, hybrid, covered, joints))
+        return CompiledIK.of(calibrated(name, hybrid, covered, joints))
 
 
 @pytest.fixture(scope="session")

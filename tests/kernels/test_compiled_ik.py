@@ -12,19 +12,19 @@ from testing.models import hand_made_model, no_type_checker, with_limits
 
 from pisigma.errors import ModelError, PoseError
 from pisigma.hybrid.arms import HybridArm
-from pisigma.inverse.torch_ik import TorchIK
+from pisigma.inverse.compiled_ik import CompiledIK
+from pisigma.inverse.reference import ReferenceIK
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.shared_features import NominalPose
-from pisigma.kernels.solver import CompiledIK
 from pisigma.kinematics.status import Status
-from pisigma.model.compiled_model import compile_model, describe, save_compiled
+from pisigma.model.compiled_model import describe, save_compiled
 
 NAMES = ["kiro3", "kiro4", "ur5", "rb5", "panda"]
 
 
 def _torch_solutions(model, T, near=None, branch=None):
     with no_type_checker():
-        return TorchIK(model)(T, near=near, branch=branch)
+        return ReferenceIK(model)(T, near=near, branch=branch)
 
 
 def _both(name, arms, rows=60, near=False, **kind):
@@ -135,7 +135,7 @@ def test_statuses_say_what_became_of_a_pose(arms):
     geometric = arms.calibrated("ur5", hybrid=False)
     nominal = replace(geometric, calibrated=None)
     T = nominal.forward(stretched[None])[0].numpy()
-    assert compile_model(nominal).solve(T, near=stretched.numpy()).status == Status.SINGULAR
+    assert CompiledIK.of(nominal).solve(T, near=stretched.numpy()).status == Status.SINGULAR
 
 
 def test_limits_bind_what_is_commanded(arms):
@@ -150,7 +150,7 @@ def test_limits_bind_what_is_commanded(arms):
         (1.0, 2.0, Status.OUTSIDE_JOINT_LIMITS, 0.2),
     ):
         robots = [with_limits(robot, 5, lower, upper) for robot in (model.robot, model.calibrated)]
-        kernels = compile_model(replace(model, robot=robots[0], calibrated=robots[1]))
+        kernels = CompiledIK.of(replace(model, robot=robots[0], calibrated=robots[1]))
         branch = kernels.branches[arms.compiled("ur5", hybrid=False).solve(T, near=q.numpy()).branch]
         found = kernels.solve(T, near=q.numpy(), branch=branch)
         assert found.status == status
@@ -234,7 +234,7 @@ def test_models_without_compiled_form_are_refused(arms):
     with pytest.raises(ModelError, match="no closed-form inverse"):
         describe(replace(panda, starts=panda.starts[:0]))
     with pytest.raises(ModelError, match=r"starts\.q has the shape"):
-        compile_model(replace(panda, starts=panda.starts.repeat(2, 1)))
+        CompiledIK.of(replace(panda, starts=panda.starts.repeat(2, 1)))
 
 
 @pytest.mark.parametrize("name", ["ur5", "panda"])
@@ -246,7 +246,7 @@ def test_a_file_gives_the_same_back_without_torch(name, arms, tmp_path):
     np.save(tmp_path / "T.npy", T)
     script = (
         "import sys\nimport numpy as np\n"
-        "from pisigma.kernels.solver import CompiledIK\n"
+        "from pisigma.inverse.compiled_ik import CompiledIK\n"
         f"found = CompiledIK.load({str(file)!r}).solve(np.load({str(tmp_path / 'T.npy')!r}))\n"
         "heavy = ('torch', 'lightning', 'jaxtyping', 'matplotlib', 'pydantic', 'numba')\n"
         "assert not [name for name in heavy if name in sys.modules]\n"

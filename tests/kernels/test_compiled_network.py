@@ -11,11 +11,11 @@ from testing.closeness import assert_close
 from testing.models import hand_made_model, joints_around, no_type_checker
 
 from pisigma.errors import ModelError
-from pisigma.inverse.torch_ik import TorchIK
-from pisigma.kernels.solver import CompiledIK
+from pisigma.inverse.compiled_ik import CompiledIK
+from pisigma.inverse.reference import ReferenceIK
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
-from pisigma.model.compiled_model import compile_model, describe, save_compiled
+from pisigma.model.compiled_model import describe, save_compiled
 from pisigma.model.domain import Domain
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
@@ -76,7 +76,7 @@ def _model(name):
 @functools.cache
 def _kernels(name):
     with no_type_checker():
-        return compile_model(_model(name))
+        return CompiledIK.of(_model(name))
 
 
 def _poses(name, rows=80, spread=0.6):
@@ -109,7 +109,7 @@ def test_solutions_near_to_joint_values_are_those_of_torch(name):
     near = q + 0.1 * torch.sin(17 * q)
     near[::2, 0] += 2 * math.pi
     with no_type_checker():
-        expected = TorchIK(model)(T, near=near)
+        expected = ReferenceIK(model)(T, near=near)
     found = _kernels(name).solve_batch(T.numpy(), near=near.numpy())
     _assert_same(found, expected)
     assert {Status.REACHED, Status.OUTSIDE_DOMAIN} <= set(found.status.tolist())
@@ -120,7 +120,7 @@ def test_solutions_near_to_joint_values_are_those_of_torch(name):
 def test_every_branch_is_that_of_torch(name):
     _, T = _poses(name)
     with no_type_checker():
-        expected = TorchIK(_model(name)).all_branches(T)
+        expected = ReferenceIK(_model(name)).all_branches(T)
     found = _kernels(name).all_branches(T.numpy())
     _assert_same(found, expected)
     for index, branch in enumerate(found.branches):
@@ -132,7 +132,7 @@ def test_every_branch_is_that_of_torch(name):
 def test_without_branches_stored_joint_values_are_the_start():
     _, T = _poses("numeric", spread=0.2)
     with no_type_checker():
-        expected = TorchIK(_model("numeric"))(T)
+        expected = ReferenceIK(_model("numeric"))(T)
     found = _kernels("numeric").solve_batch(T.numpy())
     _assert_same(found, expected)
     every = _kernels("numeric").all_branches(T.numpy())
@@ -147,7 +147,7 @@ def test_poses_at_ninety_degrees_of_pitch_are_seen_as_in_torch():
     T[:3, :3] = torch.from_numpy(model.network.groups[0].inputs.reference) @ T[:3, :3]
     T[:3, 3] = torch.tensor([0.5, 0.3, 0.4], dtype=torch.float64)
     with no_type_checker():
-        expected = TorchIK(model).all_branches(T[None])
+        expected = ReferenceIK(model).all_branches(T[None])
     assert np.isfinite(expected.q.numpy()).all(-1).any()
     found = _kernels("grouped").all_branches(T[None].numpy())
     _assert_same(
@@ -158,7 +158,7 @@ def test_poses_at_ninety_degrees_of_pitch_are_seen_as_in_torch():
 def test_a_model_without_domain_has_no_measure():
     model = replace(_model("ur10"), domain=None)
     _, T = _poses("ur10", rows=3)
-    found = compile_model(model).solve_batch(T.numpy())
+    found = CompiledIK.of(model).solve_batch(T.numpy())
     assert np.isnan(found.domain_measure).all()
     assert np.isfinite(found.q).all()
 
@@ -174,5 +174,5 @@ def test_networks_that_are_too_large_are_refused():
     model = _model("ur10")
     domain = Domain(model.domain.samples.repeat(40, 1), model.domain.radius)
     with pytest.raises(ModelError, match=r"2560 training rows, .* use pisigma\.load"):
-        compile_model(replace(model, domain=domain))
+        CompiledIK.of(replace(model, domain=domain))
     assert describe(replace(model, domain=domain))[0].network.samples == 40 * 64

@@ -8,10 +8,10 @@ from testing.closeness import assert_close
 from testing.models import hand_made_model, joints_around, no_type_checker, with_limits
 
 from pisigma.errors import PoseError
-from pisigma.inverse.torch_ik import TorchIK
+from pisigma.inverse.compiled_ik import CompiledIK
+from pisigma.inverse.reference import ReferenceIK
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
-from pisigma.model.compiled_model import compile_model
 
 FINE = (Status.REACHED, Status.SINGULAR, Status.OUTSIDE_DOMAIN)
 
@@ -43,9 +43,9 @@ def test_branches_are_tried_in_the_order_of_training_rows_and_limits_count(case,
         model = arms.calibrated("ur5", hybrid=case == "hybrid")
         T = model.forward(arms.draw_joints(model.robot, 150, seed=21)).numpy()
         model = _narrow(model)
-    names = compile_model(model).branches
+    names = CompiledIK.of(model).branches
     trained = (5, 2, 6)
-    kernels = compile_model(replace(model, branches=tuple(names[index] for index in trained)))
+    kernels = CompiledIK.of(replace(model, branches=tuple(names[index] for index in trained)))
     order = [*trained, *(index for index in range(len(names)) if index not in trained)]
     every, found = kernels.all_branches(T), kernels.solve_batch(T)
     chosen = _first(every, order)
@@ -68,7 +68,7 @@ def test_all_branches_are_those_of_torch_and_those_asked_for_by_name(arms):
     T = model.forward(arms.draw_joints(model.robot, 30, seed=22))
     found = kernels.all_branches(T.numpy())
     with no_type_checker():
-        expected = TorchIK(model).all_branches(T)
+        expected = ReferenceIK(model).all_branches(T)
     assert found.q.shape == (30, 8, 6)
     assert len(found.sentences) == 240
     both = np.isfinite(found.q).all(-1) & np.isfinite(expected.q.numpy()).all(-1)

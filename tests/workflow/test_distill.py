@@ -13,7 +13,7 @@ from testing.models import HOMES, hand_made_model, no_type_checker
 
 import pisigma
 from pisigma.errors import IdentificationError, ModelError
-from pisigma.inverse.torch_ik import TorchIK
+from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.judging.distillation_summary import read_distillation
@@ -219,7 +219,7 @@ def test_poses_near_a_singularity_are_not_drawn():
     straight = parent.starts.clone()
     straight[:, 4] = 0.02
     with pytest.raises(IdentificationError, match="20 singular"):
-        draw_solved_poses(TorchIK(parent), Region(straight), 10, torch.Generator().manual_seed(0))
+        draw_solved_poses(CorrectedIK(parent), Region(straight), 10, torch.Generator().manual_seed(0))
 
 
 @pytest.mark.parametrize(

@@ -114,8 +114,8 @@ def targets_of(solution: Solution, source: str, line: tuple[int, ...], accuracy:
         line: line of every pose in it.
         accuracy: whether to predict how accurate the targets are, which is slow with a hybrid.
     """
-    model = solution.model
-    assert model is not None, "a solution as it is handed out knows its model"
+    assert solution.owner is not None, "a solution as it is handed out knows its model"
+    model = solution.owner.model
     status = tuple(Status(value) for value in solution.status.tolist())
     given = torch.tensor([s in GIVEN for s in status])
     deviation = torch.as_tensor(solution.accuracy) if accuracy else torch.full(given.shape, torch.nan)

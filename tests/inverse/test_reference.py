@@ -1,0 +1,123 @@
+"""The reference, which models without kernels go through, and choices that both it and the kernels make."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from testing.calibrated_arm import calibrated_arm, joints_of
+from testing.closeness import assert_close
+from testing.models import with_limits
+
+from pisigma.errors import PoseError
+from pisigma.hybrid.arms import HybridArm
+from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.inverse.reference import ReferenceIK
+from pisigma.kinematics.status import Status
+
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+
+
+@pytest.fixture(scope="module")
+def without_kernels():
+    """An arm whose correction has features without compiled form, joint values and poses."""
+    model = calibrated_arm("ur5", shared=("pose",))
+    q = joints_of(model.robot, 24, seed=7)
+    return CorrectedIK(model), q, model.forward(q)
+
+
+@pytest.mark.parametrize("way", ["in order", "near", "branch"])
+def test_a_model_without_kernels_is_solved_all_the_same(without_kernels, way):
+    ik, q, T = without_kernels
+    assert ik.compiled is None
+    options = {"near": {"near": q + 0.01}, "branch": {"branch": ik.branches[1]}}.get(way, {})
+    tensors = ik(
+        T.reshape(4, 6, 4, 4), **{k: v.reshape(4, 6, 6) if k == "near" else v for k, v in options.items()}
+    )
+    arrays = ik(T.numpy(), **options)
+    reached = arrays.status != Status.UNREACHABLE
+    assert isinstance(arrays.q, np.ndarray)
+    assert isinstance(tensors.q, torch.Tensor)
+    assert reached.mean() > (0.9 if way != "branch" else 0.3)
+    assert_close(tensors.q.reshape(-1, 6).nan_to_num(), np.nan_to_num(arrays.q), atol=1e-9)
+    assert_close(arrays.position_residual[reached], 0.0, atol=1e-10)
+    assert_close(ik.forward(arrays.q[reached]), T[torch.from_numpy(reached)], atol=1e-10)
+    if way == "near":
+        assert_close(arrays.q[reached], q[torch.from_numpy(reached)], atol=1e-6)
+
+
+def test_without_kernels_nothing_need_raise(without_kernels):
+    ik, q, T = without_kernels
+    bad = T.numpy().copy()
+    bad[2, 0, 0] = np.nan
+    near = q.numpy().copy()
+    near[4, 1] = 100.0
+    found = ik(bad, near=near, throw=False)
+    assert np.flatnonzero(found.status == Status.INVALID_POSE).tolist() == [2, 4]
+    assert np.isnan(found.q[[2, 4]]).all()
+    assert np.isfinite(found.q[[0, 1, 3]]).all()
+    for options, complaint in (({"branch": "up"}, "no branch 'up'"), ({"near": near[:, :3]}, "6 joints")):
+        with pytest.raises(PoseError, match=complaint):
+            ik(T.numpy(), **options)
+
+
+def test_gradients_without_kernels(without_kernels):
+    ik, q, T = without_kernels
+    wanted = T[:3].clone().requires_grad_()
+    ik(wanted, near=q[:3]).q.sum().backward()
+    assert bool(torch.isfinite(wanted.grad).all())
+    assert float(wanted.grad.abs().max()) > 0.1
+
+
+def test_the_side_from_which_joints_come_is_part_of_the_correction(monkeypatch):
+    model = calibrated_arm("ur5")
+    q, plain = joints_of(model.robot, 6, seed=2, share=0.8), HybridArm.delta
+
+    def with_backlash(arm, q):
+        return plain(arm, q) + (0.0 if arm.approach is None else 1e-3 * arm.approach)
+
+    monkeypatch.setattr(HybridArm, "delta", with_backlash)
+    ik, T = ReferenceIK(model), model.forward(q)
+    near, sides = (
+        ik(T, near=q),
+        torch.tensor([[1.0, 1, 1, -1, -1, 0], [-1.0, 1, 0, 0, 1, 1]]).repeat(3, 1).double(),
+    )
+    found = ik(T, near=q, approach=sides)
+    assert_close(found.q - near.q, -1e-3 * sides, atol=1e-4)
+    assert_close(found.position_residual, 0.0, atol=2e-3)  # forward is as it comes from no stated side
+    assert_close(ik(T, near=q, approach=sides[0]).q[::2], found.q[::2], atol=1e-12)
+    assert_close(ik(T, near=q, approach=np.zeros(6)).q, near.q, atol=1e-12)
+
+
+def test_of_branches_the_first_inside_the_limits_is_taken():
+    model = calibrated_arm("ur5", hybrid=False)
+    T = model.forward(joints_of(model.robot, 200, seed=5))
+    every = CorrectedIK(model).all_branches(T)
+    robots = [with_limits(robot, 2, 0.0, 3.2) for robot in (model.robot, model.calibrated)]
+    limited = CorrectedIK(
+        replace(model, robot=robots[0], calibrated=robots[1], branches=("back/elbow_up/flip",))
+    )
+    assert limited.branches[limited.order[0]] == "back/elbow_up/flip"
+    assert sorted(limited.order) == list(range(8))
+    solution = limited(T)
+    elbow = every.q[..., 2].remainder(2 * torch.pi)
+    inside = (every.status != Status.UNREACHABLE) & (elbow <= 3.2)
+    rank = torch.where(inside[:, torch.tensor(limited.order)], torch.arange(8), 8)
+    wanted = torch.tensor([*limited.order, -1])[rank.amin(-1)]
+    clear = wanted >= 0
+    assert float((solution.branch[clear] == wanted[clear]).double().mean()) > 0.94
+    outside = ~clear & (every.status != Status.UNREACHABLE).any(-1)
+    assert bool((solution.status[outside] == Status.OUTSIDE_JOINT_LIMITS).all())
+
+
+@pytest.mark.parametrize("kind", [CorrectedIK, ReferenceIK])
+def test_poses_in_millimetres_and_near_misses_are_unreachable(kind):
+    model = calibrated_arm("ur5")
+    ik, T = kind(model), model.forward(joints_of(model.robot, 40, seed=7))
+    T[:20, :3, 3] *= 1e3
+    T[20:, :3, 3] *= 1.5 * model.robot.reach / T[20:, :3, 3].norm(dim=-1, keepdim=True)
+    for near in (None, torch.zeros(6, dtype=torch.float64)):
+        solution = ik(T, near=near)
+        assert bool((solution.status == Status.UNREACHABLE).all())
+        assert bool(solution.q.isnan().all())
+        assert bool((solution.branch == ik.order[0]).all())
