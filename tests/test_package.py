@@ -55,7 +55,6 @@ LAYERS = (
 NOT_YET = (
     ("judging/cross_validation.py", "pisigma.recipes.recipe"),
     ("judging/cross_validation.py", "pisigma.workflow.run"),
-    ("model/geometric_model.py", "pisigma.inverse.identified_arm"),
     ("reporting/card.py", "pisigma.workflow.run"),
     ("reporting/training_report.py", "pisigma.workflow.run"),
 )

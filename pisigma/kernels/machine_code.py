@@ -21,7 +21,7 @@ import llvmlite.binding as llvm  # type: ignore[import-untyped]
 from pisigma.errors import ModelError
 from pisigma.kernels.build import ARGUMENTS, ENTRY, intermediate_code
 from pisigma.kernels.features import FORMS
-from pisigma.kernels.ready import read_ready, source_hash
+from pisigma.kernels.ready import read_ready, ready_features, source_hash
 
 _ALLOWED = frozenset(
     (
@@ -48,8 +48,8 @@ _kept: list[Any] = []
 
 
 @functools.cache
-def _ready() -> tuple[str, tuple[str, ...]] | None:
-    return read_ready()
+def _ready_features() -> tuple[str, ...] | None:
+    return ready_features()
 
 
 def kernel_features(wanted: Collection[str] = ()) -> tuple[str, ...]:
@@ -58,8 +58,8 @@ def kernel_features(wanted: Collection[str] = ()) -> tuple[str, ...]:
     They are those of the code that comes with the package where that has all that are wanted; else those that are
     registered.
     """
-    ready = _ready()
-    return ready[1] if ready is not None and set(wanted) <= set(ready[1]) else tuple(FORMS)
+    ready = _ready_features()
+    return ready if ready is not None and set(wanted) <= set(ready) else tuple(FORMS)
 
 
 def load_kernels(wanted: Collection[str] = ()) -> Callable[..., int]:
@@ -105,10 +105,10 @@ def _call(native: Any, *arguments: int) -> int:
 
 def _key(features: tuple[str, ...]) -> str:
     """What the machine code depends on: sources, options, the versions of the compiler, and the processor."""
-    digest, ready = hashlib.sha256(), _ready()
+    digest, ready = hashlib.sha256(), _ready_features() or ()
     for word in (
         source_hash(),
-        *(name if ready is not None and name in ready[1] else FORMS[name].fingerprint for name in features),
+        *(name if name in ready else FORMS[name].fingerprint for name in features),
         _OPTIONS,
         llvmlite.__version__,
         str(llvm.llvm_version_info),
@@ -122,9 +122,9 @@ def _key(features: tuple[str, ...]) -> str:
 
 def _intermediate_code(features: tuple[str, ...]) -> str:
     """What comes with the package, where it is of the present sources and features; else what numba makes."""
-    ready = _ready()
-    if ready is not None and ready[1] == features:
-        return ready[0]
+    ready = read_ready() if _ready_features() == features else None
+    if ready is not None:
+        return ready
     try:
         return intermediate_code()
     except ImportError:

@@ -6,6 +6,7 @@ import re
 import zlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 FILE = Path(__file__).parent / "kernels.ll.zlib"
 """A line of JSON and the code as compressed text; `python -m pisigma.joint_correction.registry` writes it."""
@@ -54,17 +55,26 @@ def write_ready(code: str, features: Sequence[str], **made_with: str) -> None:
     FILE.write_bytes(header.encode() + b"\n" + zlib.compress(code.encode(), 9))
 
 
-def read_ready() -> tuple[str, tuple[str, ...]] | None:
-    """The intermediate code, and the names of the features that it evaluates.
+def ready_features() -> tuple[str, ...] | None:
+    """Names of the features that the code evaluates; None where `read_ready` gives None, but for damaged code."""
+    header, _ = _content()
+    return None if header is None else tuple(header["features"])
 
-    Returns:
-        None where there is none, it is damaged, or the sources have changed since.
-    """
+
+def read_ready() -> str | None:
+    """The intermediate code; None where there is none, it is damaged, or the sources have changed since."""
+    header, code = _content()
     try:
-        stated, _, content = FILE.read_bytes().partition(b"\n")
-        header = json.loads(stated)
-        if header["sources"] != source_hash():
-            return None
-        return zlib.decompress(content).decode(), tuple(header["features"])
-    except (OSError, ValueError, KeyError, TypeError, zlib.error):
+        return None if header is None else zlib.decompress(code).decode()
+    except (ValueError, zlib.error):
         return None
+
+
+def _content() -> tuple[dict[str, Any] | None, bytes]:
+    """The first line of the file, where it is of the present sources, and the compressed code."""
+    try:
+        stated, _, code = FILE.read_bytes().partition(b"\n")
+        header = json.loads(stated)
+        return (header, code) if header["sources"] == source_hash() else (None, b"")
+    except (OSError, ValueError, KeyError, TypeError):
+        return None, b""

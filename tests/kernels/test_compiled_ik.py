@@ -214,8 +214,8 @@ def test_what_does_not_fit_is_refused(options, words, arms):
 
 def test_batches_refuse_what_is_no_batch(arms):
     kernels = arms.compiled("ur5")
-    with pytest.raises(PoseError, match=r"shape \(4, 4\)"):
-        kernels.solve_batch(GOOD)
+    with pytest.raises(PoseError, match=r"shape \(3, 4\)"):
+        kernels.solve_batch(GOOD[:3])
     with pytest.raises(PoseError, match="threads=0"):
         kernels.solve_batch(GOOD[None], threads=0)
     with pytest.raises(PoseError, match="no array of numbers"):

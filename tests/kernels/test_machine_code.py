@@ -42,7 +42,7 @@ def test_code_of_other_sources_or_damaged_code_is_not_used(tmp_path, monkeypatch
     monkeypatch.setattr(ready, "FILE", tmp_path / "kernels.ll.zlib")
     assert ready.read_ready() is None
     ready.write_ready("define", ("series",), numba="1")
-    assert ready.read_ready() == ("define", ("series",))
+    assert (ready.read_ready(), ready.ready_features()) == ("define", ("series",))
     whole = ready.FILE.read_bytes()
     for wrong in (whole[:-3], b"", b"[1]\nx", whole.replace(b'"sources": "', b'"sources": "0')):
         ready.FILE.write_bytes(wrong)
@@ -53,7 +53,7 @@ def test_without_code_and_without_numba_one_sentence_says_what_to_install(monkey
     def missing() -> str:
         raise ImportError
 
-    monkeypatch.setattr(machine_code, "_ready", lambda: None)
+    monkeypatch.setattr(machine_code, "_ready_features", lambda: None)
     monkeypatch.setattr(machine_code, "intermediate_code", missing)
     with pytest.raises(ModelError, match=r"install pisigma\[compile\]"):
         machine_code._intermediate_code(())
@@ -156,4 +156,4 @@ def test_loading_kernels_on_a_fresh_cache_needs_no_compiler(tmp_path):
 
 def test_the_code_names_its_compilers():
     assert b'"numba"' in ready.FILE.read_bytes().partition(b"\n")[0]
-    assert build.ENTRY in (ready.read_ready() or ("",))[0]
+    assert build.ENTRY in (ready.read_ready() or "")
