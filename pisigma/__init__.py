@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pisigma.measurement.dataset import Measurements as Measurements
     from pisigma.network.pi_sigma import PiSigma as PiSigma
     from pisigma.robot.description import Robot as Robot
+    from pisigma.sensors.registry import register_sensor as register_sensor
     from pisigma.workflow.calibrate import Calibration as Calibration
     from pisigma.workflow.calibrate import CalibrationSettings as CalibrationSettings
     from pisigma.workflow.calibrate import calibrate as calibrate
@@ -46,7 +47,7 @@ _HOMES = {
     "HybridCalibrator": "pisigma.hybrid.calibrator",
     "HybridResult": "pisigma.hybrid.result",
     "Limits": "pisigma.workflow.evaluate",
-    "Measurements": "pisigma.measurement.dataset",
+    "Measurements": "pisigma.sensors.registry",  # not its own home, so that files have the columns of all sensors
     "PiSigma": "pisigma.network.pi_sigma",
     "PisigmaError": "pisigma.errors",
     "Robot": "pisigma.robot.description",
@@ -57,6 +58,7 @@ _HOMES = {
     "distill": "pisigma.workflow.distill",
     "evaluate": "pisigma.workflow.evaluate",
     "load": "pisigma.inverse.corrected_ik",
+    "register_sensor": "pisigma.sensors.registry",
     "report": "pisigma.workflow.report",
     "verify": "pisigma.workflow.verify",
 }
@@ -84,6 +86,7 @@ __all__ = [
     "distill",
     "evaluate",
     "load",
+    "register_sensor",
     "report",
     "verify",
 ]
