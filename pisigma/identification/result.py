@@ -1,6 +1,7 @@
 """What a calibration comes to: the robot, its parameters with their errors, and what the data cannot determine."""
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -58,6 +59,8 @@ class SensorNoise:
         values: number of measured values.
         used: how many of them the parameters used up.
         rms: root mean square of the residuals' lengths, all rows [m or rad].
+        quantity: "m" where the sensor measures lengths, "rad" where it measures angles.
+        components: values a row.
     """
 
     sensor: str
@@ -66,6 +69,8 @@ class SensorNoise:
     values: int
     used: float
     rms: float
+    quantity: Literal["m", "rad"]
+    components: int
 
 
 @dataclass(frozen=True)
@@ -78,6 +83,7 @@ class Outlier:
         sensor: which value of the row.
         residual: length of the residual [m or rad].
         deviations: the same in standard deviations of one value.
+        unit: "m" or "rad".
     """
 
     row: int
@@ -85,6 +91,7 @@ class Outlier:
     sensor: str
     residual: float
     deviations: float
+    unit: Literal["m", "rad"]
 
 
 @dataclass(frozen=True, eq=False)

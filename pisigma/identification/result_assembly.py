@@ -279,7 +279,9 @@ def _outliers(
         ):
             row = int(setup.rows[k])
             length = float(sums.residual[:, k].norm())
-            found.append(Outlier(row, measurements.place(row), sensor.name, length, float(deviations[k])))
+            found.append(
+                Outlier(row, measurements.place(row), sensor.name, length, float(deviations[k]), sensor.unit)
+            )
     return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
 
 
@@ -290,5 +292,16 @@ def _noise(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[Se
     for k, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
         sigma = view.noise[k]
         unit = sensor.unit if sensor.sigma is None else "given"
-        found.append(SensorNoise(sensor.name, sigma, unit, problem.values_seen[k], used[k], sums.rms))
+        found.append(
+            SensorNoise(
+                sensor=sensor.name,
+                sigma=sigma,
+                unit=unit,
+                values=problem.values_seen[k],
+                used=used[k],
+                rms=sums.rms,
+                quantity=sensor.unit,
+                components=sensor.components,
+            )
+        )
     return tuple(found)

@@ -323,7 +323,7 @@ def _parameters(result: CalibrationResult) -> tuple[ParameterFigures, ...]:
 def _outliers(result: CalibrationResult) -> tuple[OutlierFigures, ...]:
     rows = []
     for outlier in result.outliers:
-        unit, factor = _UNITS["rad" if outlier.sensor == "rotation" else "m"]
+        unit, factor = _UNITS[outlier.unit]
         figures = {"deviations": outlier.deviations, f"residual_{unit}": outlier.residual * factor}
         rows.append(OutlierFigures(row=outlier.row, place=outlier.place, sensor=outlier.sensor, **figures))
     return tuple(rows)

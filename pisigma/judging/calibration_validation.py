@@ -18,6 +18,7 @@ from pisigma.judging.trained_calibrations import Calibrator, Result, geometric_o
 from pisigma.judging.validation_figures import ErrorFigures, ValidationFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import TrainTest
+from pisigma.sensors.registry import SENSORS
 
 Progress = Callable[[str], None]
 
@@ -114,7 +115,8 @@ class _Judged:
     """What is gathered of all models: errors of held-out rows, and of known distances of held-out sockets."""
 
     def __init__(self, measurements: Measurements) -> None:
-        self._turned = measurements.rotation is not None
+        units = {SENSORS[kind].unit for kind in measurements.kinds if kind in SENSORS}
+        self._turned = measurements.rotation is not None or "rad" in units
         self._rows = measurements.rows
         self._errors: dict[str, PoseErrors] = {}
         self._distances: dict[str, list[Tensor]] = {}
@@ -251,7 +253,7 @@ def errors_under(result: Result, measurements: Measurements) -> PoseErrors:
 
     Returns:
         As "position" the length of the error of whatever length a row has: of a position or a ball in a socket the
-        distance, of a touch, a wire or a pair the difference [m].
+        distance, of a touch, a wire or a pair the difference [m]. As "rotation" the same of whatever angle it has.
 
     Raises:
         IdentificationError: a row has a frame, target or anchor that was not calibrated.
@@ -260,8 +262,8 @@ def errors_under(result: Result, measurements: Measurements) -> PoseErrors:
     rotation: Tensor | None = None
     for sensor, errors in result.errors_of(measurements).items():
         size = torch.as_tensor(errors).norm(dim=-1)
-        if sensor == "rotation":
-            rotation = size
+        if SENSORS[sensor].unit == "rad":
+            rotation = size if rotation is None else torch.where(torch.isfinite(size), size, rotation)
         else:
             lengths = torch.where(torch.isfinite(size), size, lengths)
     return PoseErrors(lengths, rotation)

@@ -74,10 +74,10 @@ def predicted_spread(result: HybridResult, measurements: Measurements) -> Predic
         IdentificationError: a row has a target that was not calibrated.
     """
     found = PredictedSpread.none(measurements.rows)
-    if measurements.position is None:
+    errors = result.errors_of(measurements).get("position")
+    if measurements.position is None or errors is None:
         return found
     frames = result.uncertainty.space.frames
-    errors = result.errors_of(measurements)["position"]
     rows = torch.isfinite(measurements.position).all(-1)
     rows &= torch.tensor([name in frames for name in measurements.frame], dtype=torch.bool)
     chosen = rows.nonzero()[:, 0]

@@ -298,3 +298,12 @@ def test_a_gauge_that_was_not_calibrated_is_named() -> None:
     result = pisigma.GeometricCalibrator(robot).fit(data.select(only_a))
     with pytest.raises(IdentificationError, match=r"row 41: 'b' of the sensor 'height' was not calibrated"):
         result.errors_of(data)
+
+
+def test_the_workflow_judges_them_by_cross_validation() -> None:
+    robot, data = measured(40)
+    calibration = pisigma.calibrate(robot, data, pisigma.CalibrationSettings(model="geometric", folds=2))
+    figures = calibration.to_json()["cross_validation"]
+    assert isinstance(figures, dict)
+    assert figures["geometric"]["rms_mm"] < 0.02 < figures["nominal"]["rms_mm"]
+    assert figures["geometric"]["rms_deg"] < 0.002 < figures["nominal"]["rms_deg"]
