@@ -53,7 +53,7 @@ def test_without_data_the_workspace_is_shown(run, arm, tmp_path):
     assert json.loads(result.stdout)["rows"] is None
 
 
-@pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur10"])
+@pytest.mark.parametrize("name", ["kiro3", "ur10"])
 def test_networks_alone_are_reported(run, models, tmp_path, name):
     with no_type_checker():
         model = hand_made_model(name)

@@ -231,7 +231,7 @@ def _compared(noise: float, error: float, source: str) -> Limit:
         )
         return Limit(noise, None, source, clause, sentence)
     share = (noise / error) ** 2
-    percent = f"{100 * share:.0f} % of the squared error"
+    percent = f"{percent_text(share)} of the squared error"
     if share >= MOSTLY:
         gain = f"{100 * (1 - math.sqrt(share)):.0f} %"
         less = "hardly less error" if gain == "0 %" else f"{gain} less error"
@@ -240,11 +240,18 @@ def _compared(noise: float, error: float, source: str) -> Limit:
         )
         return Limit(noise, share, source, f"scatter of the measurements ({percent})", sentence)
     sentence = (
-        f"{scatter}, which is {percent}; the other {100 * (1 - share):.0f} % are errors of the model: too few rows, or "
+        f"{scatter}, which is {percent}; the rest, {percent_text(1 - share)}, comes of the model: too few rows, or "
         "effects that it cannot express."
     )
     clause = f"the model more than the measurements, whose scatter is {percent}"
     return Limit(noise, share, source, clause, sentence)
+
+
+def percent_text(share: float) -> str:
+    """Write a share as a percentage; "less than 1 %" where rounding would make it none or all."""
+    if share < 0.005:
+        return "less than 1 %"
+    return "more than 99 %" if share > 0.995 else f"{100 * share:.0f} %"
 
 
 def _unknown(summary: CalibrationSummary | None) -> Limit:

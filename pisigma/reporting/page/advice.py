@@ -11,7 +11,7 @@ from pisigma.hybrid.coverage import JointCoverage
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_tables import warning_lines
-from pisigma.reporting.page.accuracy import MOSTLY, Accuracy, Limit
+from pisigma.reporting.page.accuracy import MOSTLY, Accuracy, Limit, percent_text
 from pisigma.reporting.page.judged_rows import JudgedRows
 from pisigma.reporting.tables import figure_text
 
@@ -196,7 +196,7 @@ def _more_rows(model: CalibratedModel, summary: CalibrationSummary, limit: Limit
     if limit.share is None or limit.share >= MOSTLY:
         return []
     return [
-        f"Scatter of the measurements is {100 * limit.share:.0f} % of the squared error only: more than the present "
+        f"Scatter of the measurements is only {percent_text(limit.share)} of the squared error: more than the present "
         f"{model.provenance.rows} rows would bring the rest down where it comes of too few of them."
     ]
 

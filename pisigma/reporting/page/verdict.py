@@ -8,7 +8,7 @@ from jaxtyping import Float64
 
 from pisigma.judging.rank_tests import SIGNIFICANT, groups_differ
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.page.accuracy import Accuracy, JointFigures, Limit
+from pisigma.reporting.page.accuracy import Accuracy, JointFigures, Limit, percent_text
 from pisigma.reporting.page.dependence import LEAST_ROWS, error_lengths, root_mean_square
 from pisigma.reporting.page.judged_rows import JudgedRows
 from pisigma.reporting.tables import figure_text
@@ -101,7 +101,7 @@ def verdict_of(
             tiles.append(Tile("scatter of a measurement", noise, "RMS; no less than the error itself"))
         else:
             remark = f"of the squared error; {noise} RMS"
-            tiles.append(Tile("scatter of a measurement", f"{100 * limit.share:.0f} %", remark))
+            tiles.append(Tile("scatter of a measurement", percent_text(limit.share), remark))
     return Verdict(f"{'; '.join(clauses)}.", tuple(tiles), worst, limit.sentence, best.held_out)
 
 

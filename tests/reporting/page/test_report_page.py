@@ -1,7 +1,6 @@
 """The page of a report: whole in itself, the same for the same input, and safe from what a file holds."""
 
 import base64
-import hashlib
 import json
 import re
 from dataclasses import replace
@@ -12,11 +11,12 @@ import pytest
 import torch
 from testing.closeness import assert_close
 from testing.hybrid import hybrid_of
+from testing.models import no_type_checker
 from testing.report import HOSTILE, folder_with_held_out, geometric_under_test, hybrid_under_test, measured
 
 from pisigma.errors import OutputError
 from pisigma.reporting.page.content import report_content
-from pisigma.reporting.page.figures import check_figures, write_figures
+from pisigma.reporting.page.figures import check_figures, draw_dependence, write_figures
 from pisigma.reporting.page.page import draw_figures, render_page, script_json
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
@@ -53,11 +53,8 @@ def page_of(content):
     return render_page(content, draw_figures(content))
 
 
-@pytest.fixture(scope="module")
-def hostile_page(tmp_path_factory):
-    """The page of measurements whose source, frames and targets have hostile names."""
-    from testing.models import no_type_checker
-
+def hostile_content(folder):
+    """The report of measurements whose source, frames and targets have hostile names."""
     with no_type_checker():
         arm, model = hybrid_under_test(frames=True)
         names = {"wall": HOSTILE, "floor": "</table><b>floor"}
@@ -73,7 +70,14 @@ def hostile_page(tmp_path_factory):
             frame=tuple(rename[name] for name in arm.measurements.frame),
             source=HOSTILE.replace("/", ""),
         )
-        content = report_content(model, tmp_path_factory.mktemp("none"), rows)
+        return report_content(model, folder, rows)
+
+
+@pytest.fixture(scope="module")
+def hostile_page(tmp_path_factory):
+    """This report and its page."""
+    content = hostile_content(tmp_path_factory.mktemp("none"))
+    with no_type_checker():
         return content, page_of(content)
 
 
@@ -118,13 +122,8 @@ def test_the_map_holds_what_the_content_says(hostile_page):
     assert tuple(named) == content.map.frame
 
 
-def test_the_same_input_gives_the_same_bytes(tmp_path):
-    arm, model = hybrid_under_test()
-    digests = set()
-    for _ in range(2):
-        content = report_content(model, tmp_path, measured(arm, 60, seed=9))
-        digests.add(hashlib.sha256(page_of(content).encode()).hexdigest())
-    assert len(digests) == 1
+def test_the_same_input_gives_the_same_bytes(hostile_page, tmp_path):
+    assert page_of(hostile_content(tmp_path)) == hostile_page[1]
 
 
 def test_every_section_stands_there(tmp_path):
@@ -136,23 +135,23 @@ def test_every_section_stands_there(tmp_path):
     ]
     kept = replace(kept, metrics=kept.metrics | {"learning_curve": curve})
     content = report_content(kept, tmp_path / "arm", arm.measurements)
-    text = page_of(content)
+    figures = draw_figures(content)
+    text = render_page(content, figures)
     for section in ("verdict", "accuracy", "map", "residuals", "parameters", "observability", "corrections"):
         assert f'<section id="{section}">' in text
     for section in ("learning", "next", "provenance"):
         assert f'<section id="{section}">' in text
     assert "More rows" in " ".join(content.advice)
     assert model.provenance.data_sha256 in text
-    figures = draw_figures(content)
     assert [drawing.title for drawing in figures.correlations] == ["lengths", "angles"]
     assert text.count('src="data:image/svg+xml') == len(figures.all)
 
 
 def test_a_page_of_many_rows_is_small(tmp_path):
     arm, model = geometric_under_test()
-    content = report_content(model, tmp_path, measured(arm, 10_000, seed=9))
-    assert len(content.map.place) == 10_000
-    assert len(page_of(content).encode()) < 15e6
+    content = report_content(model, tmp_path, measured(arm, 4_000, seed=9))
+    assert len(content.map.place) == 4_000
+    assert len(page_of(content).encode()) < 6e6
 
 
 def test_of_very_many_rows_the_worst_are_shown(tmp_path, monkeypatch):
@@ -168,7 +167,7 @@ def test_of_very_many_rows_the_worst_are_shown(tmp_path, monkeypatch):
 
 def test_figures_are_written_as_png_and_svg(tmp_path):
     arm, model = geometric_under_test()
-    drawings = draw_figures(report_content(model, tmp_path, measured(arm, 60, seed=9))).all
+    drawings = draw_figures(report_content(model, tmp_path, measured(arm, 60, seed=9))).all[:3]
     written = write_figures(drawings, tmp_path / "figures")
     assert len(written) == 2 * len(drawings)
     assert all(path.stat().st_size > 1000 for path in written)
@@ -180,7 +179,7 @@ def test_figures_are_written_as_png_and_svg(tmp_path):
         check_figures(tmp_path / "none" / "figures")
 
 
-@pytest.mark.parametrize("name", ["$x$", "a$b", r"\frac{$", "theta_1", "$$", "\u6f22$"])
+@pytest.mark.parametrize("name", ["$x$", r"\frac{$", "theta_1", "\u6f22$"])
 def test_names_are_no_formulas(name, tmp_path):
     arm = hybrid_of("rb5", 200)
     model = geometric_under_test()[1]
@@ -191,7 +190,7 @@ def test_names_are_no_formulas(name, tmp_path):
         replace(model, robot=replace(model.robot, rows=tuple(rows))), tmp_path, measured(arm, 30, 9)
     )
     assert content.dependences[0].title == name
-    svg = draw_figures(content).dependences[0].svg()
+    svg = draw_dependence(content.dependences[0]).svg()
     assert (name if name != "\u6f22$" else "$") in svg.replace("&#36;", "$")
 
 
