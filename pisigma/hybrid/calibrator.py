@@ -6,16 +6,13 @@ from pathlib import Path
 from typing import Literal
 
 from pisigma.errors import IdentificationError, nearest_choice
-from pisigma.hybrid.common_frames import with_frames_of
-from pisigma.hybrid.coverage import JointCoverage
+from pisigma.hybrid.coverage import JointCoverage, fade_angle
+from pisigma.hybrid.design import Rows
 from pisigma.hybrid.evidence import effective_share
-from pisigma.hybrid.extrapolation import fade_angle
 from pisigma.hybrid.mini_batches import MANY_ROWS, MiniBatches, batch_checkpoints, refine_in_batches
-from pisigma.hybrid.product_search import best_products
-from pisigma.hybrid.refinement import refine, with_held_factors
+from pisigma.hybrid.refinement import Refined, refine, with_frames_of, with_held_factors
 from pisigma.hybrid.result import HybridResult, LearnedPart
-from pisigma.hybrid.rows import Rows
-from pisigma.hybrid.search import LARGEST_EFFECTIVE_SHARE, Additive, Search
+from pisigma.hybrid.search import LARGEST_EFFECTIVE_SHARE, Additive, Search, best_products
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
@@ -142,11 +139,8 @@ class HybridCalibrator:
         if batches is not None and checkpoints is not None:
             kept = batch_checkpoints(checkpoints, f"{self}|{measurements.content_hash()}", resume)
         solved = self.geometric.solve(measurements)
-        geometric = solved.result()
         search, additive, orders = self._chosen(solved, progress)
-        features = additive.design.features
-        trials = tuple(search.trials)
-        if not features and not orders:
+        if not additive.design.features and not orders:
             verdict = "Nothing beyond the geometry was found in the data: the geometric calibration stands."
             return _geometric_alone(solved, search, verdict)
         progress("solving for everything")
@@ -154,46 +148,44 @@ class HybridCalibrator:
         if batches is None:
             refined = refine(solved, additive, orders, loss)
         else:
+            few = searched_rows(solved.problem)
             refined, trained = refine_in_batches(
-                solved,
-                searched_rows(solved.problem),
-                additive,
-                orders,
-                loss,
-                batches=batches,
-                progress=progress,
-                checkpoints=kept,
+                solved, few, additive, orders, loss, batches=batches, progress=progress, checkpoints=kept
             )
         if effective_share(refined.sums, refined.posterior) > LARGEST_EFFECTIVE_SHARE:
             verdict = (
-                "A joint correction would take up nearly all that the few rows tell, so the geometric calibration "
+                "A joint correction would take up nearly all that the few rows say, so the geometric calibration "
                 "stands; measure more poses."
             )
             return _geometric_alone(solved, search, verdict)
-        geometry = with_frames_of(solved, refined, identified_geometry(solved.setup, refined.point))
         progress("looking beyond the measured joint values")
-        fade = fade_angle(refined.rows, refined.design, refined.posterior, refined.sums)
-        learned = LearnedPart(
-            geometry=geometry,
-            correction=refined.correction,
-            coverage=JointCoverage.of(self.geometric.robot, solved.problem.q, fade),
-            noise={
-                n.sensor: sigma for n, sigma in zip(geometric.noise, refined.posterior.noise, strict=True)
-            },
-            unknowns=refined.design.unknowns,
-            effective=refined.effective,
-            rounds=refined.rounds,
-        )
-        names = [feature.label for feature in features]
+        learned = self._learned(solved, refined)
+        names = [feature.label for feature in additive.design.features]
         names += [f"product units of orders {orders}"] if orders else []
-        share = [trial.left_out for trial in trials if trial.kept][-1]
+        share = [trial.left_out for trial in search.trials if trial.kept][-1]
         verdict = (
             f"A joint correction was kept ({' + '.join(names)}): left-out rows are predicted with {share:.2f} "
             f"times the error of the geometric calibration. {trained}".rstrip()
         )
         whole = with_held_factors(refined)
-        known = position_uncertainty(whole.rows, whole.design, whole.posterior, whole.sums, geometry)
-        return HybridResult(geometric, learned, known, trials, verdict)
+        uncertainty = position_uncertainty(
+            whole.rows, whole.design, whole.posterior, whole.sums, learned.geometry
+        )
+        return HybridResult(solved.result(), learned, uncertainty, tuple(search.trials), verdict)
+
+    def _learned(self, solved: SolvedCalibration, refined: Refined) -> LearnedPart:
+        """The correction with the geometry that belongs to it, and how far it holds."""
+        fade = fade_angle(refined.rows, refined.design, refined.posterior, refined.sums)
+        noise = zip(solved.result().noise, refined.posterior.noise, strict=True)
+        return LearnedPart(
+            geometry=with_frames_of(solved, refined, identified_geometry(solved.setup, refined.point)),
+            correction=refined.correction,
+            coverage=JointCoverage.of(self.geometric.robot, solved.problem.q, fade),
+            noise={geometric.sensor: sigma for geometric, sigma in noise},
+            unknowns=refined.design.unknowns,
+            effective=refined.effective,
+            rounds=refined.rounds,
+        )
 
     def _batches(self, rows: int) -> MiniBatches | None:
         """How so many rows are trained on mini-batches; None where they are not."""

@@ -7,9 +7,8 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.hybrid.design import Design, sum_up
+from pisigma.hybrid.design import Design, Rows, sum_up
 from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence
-from pisigma.hybrid.rows import Rows
 
 CHUNK = 2_048
 """Values that are worked on together."""

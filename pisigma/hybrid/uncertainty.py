@@ -7,10 +7,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.hybrid.design import Design
+from pisigma.hybrid.design import Design, Rows
 from pisigma.hybrid.evidence import Posterior, Sums, effective_share
 from pisigma.hybrid.left_out import LeftOut, folds_left_out, left_out
-from pisigma.hybrid.rows import Rows
 from pisigma.hybrid.sensor_values import joint_columns
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.problem.setup import IdentifiedGeometry

@@ -9,7 +9,7 @@ from testing.closeness import assert_close
 from testing.hybrid import joints_in, true_robot
 
 from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.hybrid.common_frames import nearest_motion
+from pisigma.hybrid.refinement import nearest_motion
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.prediction import predicted_poses
 from pisigma.measurement.dataset import Measurements

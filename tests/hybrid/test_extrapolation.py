@@ -8,9 +8,9 @@ import torch
 from testing.closeness import assert_close
 from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data
 
+from pisigma.hybrid.coverage import DENSE_FADE, FADES, fade_angle
 from pisigma.hybrid.design import Design, sum_up
 from pisigma.hybrid.evidence import Posterior, solve_posterior
-from pisigma.hybrid.extrapolation import DENSE_FADE, FADES, fade_angle
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.measurement.dataset import Measurements

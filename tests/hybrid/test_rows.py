@@ -7,8 +7,7 @@ import torch
 from testing.closeness import assert_close
 from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data
 
-from pisigma.hybrid.design import Design
-from pisigma.hybrid.rows import weigh
+from pisigma.hybrid.design import Design, weigh
 from pisigma.identification.problem.loss import HampelLoss, SquaredLoss
 from pisigma.robot import Robot
 

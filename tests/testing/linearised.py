@@ -7,9 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pisigma.hybrid.design import Design, sum_up
+from pisigma.hybrid.design import Design, Rows, sum_up
 from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence
-from pisigma.hybrid.rows import Rows
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import SquaredLoss
