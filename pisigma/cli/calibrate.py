@@ -91,16 +91,15 @@ def calibrate(
 
     Geometry, base and tool, and with them a correction of the joints where it predicts left-out rows better.
     """
-    from pisigma.cli.progress import progress_of
+    from pisigma.cli.output import progress_of
     from pisigma.model.folder.staging import check_replaceable
     from pisigma.robot.description import Robot
-    from pisigma.workflow.calibrate import CalibrationSettings
-    from pisigma.workflow.calibrate import calibrate as run
+    from pisigma.workflow import calibrate as workflow
 
     check_replaceable(out)
     stated: dict[str, Any] = {"model": model, "folds": folds, "hold_out": hold_out, "split": split}
     stated |= {"repeats": repeats, "seed": seed, "train_rows": train_rows, "robust": robust}
-    settings = CalibrationSettings(
+    settings = workflow.CalibrationSettings(
         free=_free(free),
         prior_length=prior_mm / 1e3,
         prior_angle=prior_mrad / 1e3,
@@ -109,7 +108,7 @@ def calibrate(
     )
     nominal = Robot.load(robot, base, tip)
     with progress_of("calibrate") as tell:
-        calibration = run(nominal, data, settings, tell)
+        calibration = workflow.calibrate(nominal, data, settings, tell)
     calibration.save(out, command=command_line(context))
     if as_json:
         print_json({"model": str(out), **calibration.to_json()})

@@ -62,7 +62,7 @@ def distill(
 
     Its error against the full solution, on poses that were not fitted to, is printed and on its card.
     """
-    from pisigma.cli.progress import progress_of
+    from pisigma.cli.output import progress_of
     from pisigma.errors import RecipeError
     from pisigma.model.folder.staging import check_replaceable
     from pisigma.workflow.distill import DistillationSettings

@@ -101,8 +101,7 @@ def _write_file(
 ) -> None:
     """Write the joint values of a file of poses, of any length."""
     from pisigma.cli.joint_file import write_joint_file
-    from pisigma.cli.output import fail, print_json
-    from pisigma.cli.progress import progress_of
+    from pisigma.cli.output import fail, print_json, progress_of
 
     with progress_of(f"solving {poses}") as tell:
         outcome = write_joint_file(solver, poses, out, branch, tell, accuracy, path)

@@ -4,7 +4,8 @@ import functools
 import json
 import shlex
 import textwrap
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
 
@@ -63,6 +64,15 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
     console.print(Text(title), soft_wrap=True)
     console.print(table)
     console.print()
+
+
+@contextmanager
+def progress_of(title: str) -> Iterator[Callable[[str], None]]:
+    """Show a line that changes; gives what to call with what is being done now."""
+    from rich.console import Console
+
+    with Console(stderr=True).status(title) as status:
+        yield lambda what: status.update(f"{title}: {what}")
 
 
 def screen_width() -> int:

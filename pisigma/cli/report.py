@@ -21,8 +21,7 @@ def report(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Write a report as one HTML page: how accurate, where worst, what limits it, what to measure next."""
-    from pisigma.cli.output import print_json, print_lines
-    from pisigma.cli.progress import progress_of
+    from pisigma.cli.output import print_json, print_lines, progress_of
     from pisigma.workflow import report as workflow
 
     workflow.check_report_outputs(out, figures)

@@ -32,8 +32,7 @@ def train_hybrid(
     """
     started = time.perf_counter()
     from pisigma.cli.calibrate import print_calibration
-    from pisigma.cli.output import print_json
-    from pisigma.cli.progress import progress_of
+    from pisigma.cli.output import print_json, progress_of
     from pisigma.errors import RecipeError
     from pisigma.judging.calibration_validation import judge, validate
     from pisigma.model.folder.staging import check_replaceable
@@ -95,7 +94,7 @@ def _summary(
     parts: "tuple[TrainTest, ...]",
 ) -> "CalibrationSummary":
     """Figures of the calibration, of held-out rows and of the learning curve."""
-    from pisigma.cli.progress import progress_of
+    from pisigma.cli.output import progress_of
     from pisigma.judging.calibration_summary import summarise
     from pisigma.judging.learning_curve import learning_curve
     from pisigma.recipes.recipe import MeasuredData

@@ -26,8 +26,7 @@ def verify(
     signs or zeros of the joints, a correction that was applied twice or not at all. Rows of the set "train" are
     left out. Exit status 3 where the corrected model does not explain the measurements better.
     """
-    from pisigma.cli.output import print_json
-    from pisigma.cli.progress import progress_of
+    from pisigma.cli.output import print_json, progress_of
     from pisigma.errors import AcceptanceError
     from pisigma.workflow.verify import VerificationSettings
     from pisigma.workflow.verify import verify as run
