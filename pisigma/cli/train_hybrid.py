@@ -96,7 +96,7 @@ def _summary(
     """Figures of the calibration, of held-out rows and of the learning curve."""
     from pisigma.cli.output import progress_of
     from pisigma.judging.calibration_summary import summarise
-    from pisigma.judging.learning_curve import learning_curve
+    from pisigma.judging.calibration_validation import learning_curve
     from pisigma.recipes.recipe import MeasuredData
 
     validation, test = judged

@@ -1,4 +1,4 @@
-"""Calibrations judged on rows that they never saw: nominal, geometric and hybrid side by side."""
+"""Calibrations judged on held-out rows: nominal, geometric and hybrid side by side."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -11,13 +11,20 @@ from pisigma.errors import IdentificationError
 from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.prediction import predicted_poses
-from pisigma.judging.held_out_frames import judgeable, with_frames
 from pisigma.judging.pose_statistics import PoseErrors, error_statistics
 from pisigma.judging.predicted_spread import PredictedSpread, predicted_spread
-from pisigma.judging.trained_calibrations import Calibrator, Result, geometric_of, trained, without_missing
-from pisigma.judging.validation_figures import ErrorFigures, ValidationFigures
+from pisigma.judging.trained_calibrations import (
+    Calibrator,
+    Result,
+    geometric_of,
+    judgeable,
+    trained,
+    with_frames,
+    without_missing,
+)
+from pisigma.judging.validation_figures import ErrorFigures, LearningPoint, ValidationFigures
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.splits import TrainTest
+from pisigma.measurement.splits import TrainTest, with_fewer
 from pisigma.sensors.registry import SENSORS
 
 Progress = Callable[[str], None]
@@ -25,7 +32,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, eq=False)
 class CalibrationValidation:
-    """Errors of held-out rows, each under calibrations that never saw it.
+    """Errors of held-out rows, each under calibrations without it.
 
     In rows that were never held out they are NaN.
 
@@ -40,7 +47,7 @@ class CalibrationValidation:
         sockets_held_out: how many sockets were held out whole; their errors are from where their own rows put the
             ball on average.
         not_judged: how many held-out rows have a target or an anchor that the rows calibrated with lack.
-        again: the same of the rows dealt to the folds anew, whose errors count in the figures too.
+        again: the same for other folds, whose errors count in the figures too.
     """
 
     folds: int
@@ -54,7 +61,7 @@ class CalibrationValidation:
 
     @property
     def repeats(self) -> tuple["CalibrationValidation", ...]:
-        """One validation for every time that the rows were dealt to the folds."""
+        """One validation for every repeat."""
         return (replace(self, again=()), *self.again)
 
     @property
@@ -144,50 +151,50 @@ class _Judged:
         self, folds: int, frames: int = 0, sockets: int = 0, left_out: int = 0
     ) -> CalibrationValidation:
         """Everything together."""
-        distances = {name: torch.cat(found) for name, found in self._distances.items()}
+        distances = {name: torch.cat(errors) for name, errors in self._distances.items()}
         return CalibrationValidation(folds, self._errors, self._spread, distances, frames, sockets, left_out)
 
 
 def validate(
     calibrator: Calibrator,
     measurements: Measurements,
-    parts: Sequence[TrainTest],
+    splits: Sequence[TrainTest],
     progress: Progress = lambda what: None,
 ) -> CalibrationValidation:
-    """Calibrate on the training rows of every part and judge on its test rows.
+    """Calibrate on the training rows of every split and judge on its test rows.
 
     Args:
         calibrator: the calibration; "nominal" is the geometric one with no parameter of the arm free and no row
             downweighted. Whatever it chooses, it chooses on the training rows.
         measurements: the rows.
-        parts: from `k_folds` or `holdout`.
-        progress: called with the part that is being judged, and what is being tried.
+        splits: from `k_folds` or `holdout`.
+        progress: called with the fold that is being judged, and what is being tried.
 
     Raises:
-        IdentificationError: the training rows of a part do not determine what is asked for, or no test row has a
+        IdentificationError: the training rows of a split do not determine what is asked for, or no test row has a
             target or anchor that its training rows have too.
     """
     judged = _Judged(measurements)
     frames = sockets = left_out = 0
-    for done, (train, test) in enumerate(parts):
-        fold = f"fold {done + 1} of {len(parts)}"
+    for done, (train, test) in enumerate(splits):
+        fold = f"fold {done + 1} of {len(splits)}"
         progress(fold)
-        seen, held_out = measurements.select(train), len(test)
-        test = test[judgeable(measurements, test, seen)]
-        left_out += held_out - len(test)
-        held_out_rows = measurements.select(test)
-        frames += len(set(held_out_rows.frame) - set(seen.frame))
-        sockets += len(_sockets(held_out_rows) - _sockets(seen))
-        chosen = without_missing(calibrator, seen, measurements)
+        training = measurements.select(train)
+        judged_rows = test[judgeable(measurements, test, training)]
+        left_out += len(test) - len(judged_rows)
+        held_out = measurements.select(judged_rows)
+        frames += len(set(held_out.frame) - set(training.frame))
+        sockets += len(_sockets(held_out) - _sockets(training))
+        chosen = without_missing(calibrator, training, measurements)
         try:
-            results = trained(chosen, seen, lambda what, fold=fold: progress(f"{fold}: {what}"))  # type: ignore[misc]
+            results = trained(chosen, training, lambda what, fold=fold: progress(f"{fold}: {what}"))  # type: ignore[misc]
         except IdentificationError as problem:
             raise IdentificationError(
-                f"{fold}, calibrated with {seen.rows} of the {measurements.rows} rows: {problem} All rows at once may "
-                "do: leave out the cross-validation, or ask for more folds."
+                f"{fold}, calibrated with {training.rows} of the {measurements.rows} rows: {problem} All rows at once "
+                "may do: leave out the cross-validation, or ask for more folds."
             ) from None
-        _judge(judged, geometric_of(calibrator), results, seen, (held_out_rows, test))
-    return judged.validation(len(parts), frames, sockets, left_out)
+        _judge(judged, geometric_of(calibrator), results, training, (held_out, judged_rows))
+    return judged.validation(len(splits), frames, sockets, left_out)
 
 
 def validate_repeatedly(
@@ -196,38 +203,100 @@ def validate_repeatedly(
     repeats: Sequence[Sequence[TrainTest]],
     progress: Progress = lambda what: None,
 ) -> CalibrationValidation:
-    """The same for rows that were dealt to folds several times over; see `pisigma.measurement.splits.repeats`."""
+    """Validate on several repeats of folds; see `validate` and `pisigma.measurement.splits.repeats`."""
     if len(repeats) == 1:
         return validate(calibrator, measurements, repeats[0], progress)
     first, *again = (
         validate(
             calibrator,
             measurements,
-            parts,
+            splits,
             lambda what, done=done: progress(f"repeat {done + 1} of {len(repeats)}, {what}"),  # type: ignore[misc]
         )
-        for done, parts in enumerate(repeats)
+        for done, splits in enumerate(repeats)
     )
     return replace(first, again=tuple(again))
 
 
+@dataclass(frozen=True, eq=False)
+class CurvePoint:
+    """Errors of held-out rows by calibrations with `rows` training rows.
+
+    Attributes:
+        rows: number of training rows.
+        validation: errors of the held-out rows of all splits.
+    """
+
+    rows: int
+    validation: CalibrationValidation
+
+    def figures(self) -> LearningPoint:
+        """The figures in mm and deg."""
+        figures = self.validation.figures().model_dump(exclude_unset=True)
+        return LearningPoint.model_validate({**figures, "rows": self.rows, "held_out": figures["rows"]})
+
+
+def learning_curve(
+    calibrator: Calibrator,
+    measurements: Measurements,
+    splits: Sequence[TrainTest],
+    sizes: Sequence[int],
+    seed: int,
+    progress: Progress = lambda what: None,
+    whole: CalibrationValidation | None = None,
+) -> tuple[CurvePoint, ...]:
+    """Calibrate with fewer and fewer of the training rows of every split, and judge on all its test rows.
+
+    Args:
+        calibrator: see `validate`.
+        measurements: the rows.
+        splits: training and test rows.
+        sizes: numbers of training rows.
+        seed: decides which rows are drawn; smaller draws are subsets of larger ones.
+        progress: called with what is being done.
+        whole: what all training rows gave, as the last point of the curve; None for none.
+
+    Returns:
+        The points, fewest rows first.
+
+    Raises:
+        MeasurementError: a split has fewer training rows than are wanted.
+        IdentificationError: so few rows do not determine what is asked for.
+    """
+    points = [
+        CurvePoint(
+            rows,
+            validate(
+                calibrator,
+                measurements,
+                with_fewer(measurements, splits, rows, seed),
+                lambda what, rows=rows: progress(f"{rows} training rows: {what}"),  # type: ignore[misc]
+            ),
+        )
+        for rows in sorted(sizes)
+    ]
+    if whole is not None:
+        points.append(CurvePoint(min(len(train) for train, _ in splits), whole))
+    return tuple(points)
+
+
 def judge(
-    calibrator: Calibrator, result: Result, seen: Measurements, test: Measurements
+    calibrator: Calibrator, result: Result, training: Measurements, test: Measurements
 ) -> CalibrationValidation:
-    """Judge a calibration on rows that were kept aside.
+    """Judge a calibration on rows that were kept apart.
 
     Args:
         calibrator: what calibrated, for the "nominal" figures; see `validate`.
         result: what it gave.
-        seen: the rows that it was given.
+        training: the rows that it was fitted to.
         test: other rows.
 
     Raises:
         IdentificationError: a test row has a frame or target that was not calibrated.
     """
     judged = _Judged(test)
-    results = trained(calibrator, seen, known=result)
-    _judge(judged, None, results, seen, (test, torch.arange(test.rows)))
+    results = trained(calibrator, training, result=result)
+    _judge(judged, None, results, training, (test, torch.arange(test.rows)))
     return judged.validation(0)
 
 
@@ -235,15 +304,15 @@ def _judge(
     judged: _Judged,
     calibrator: GeometricCalibrator | None,
     results: Mapping[str, Result],
-    seen: Measurements,
+    training: Measurements,
     held_out: tuple[Measurements, Tensor],
 ) -> None:
     """Judge all models on held-out rows, with frames that they lack fitted by a calibrator, if there is one."""
     rows, test = held_out
-    for name, found in results.items():
-        result = found if calibrator is None else with_frames(calibrator, found, rows)
-        known = {} if calibrator is None else calibrator.socket_distances
-        judged.add(name, errors_under(result, rows), _distance_errors(known, result, seen, rows), test)
+    for name, fitted in results.items():
+        result = fitted if calibrator is None else with_frames(calibrator, fitted, rows)
+        stated = {} if calibrator is None else calibrator.socket_distances
+        judged.add(name, errors_under(result, rows), _distance_errors(stated, result, training, rows), test)
         if isinstance(result, HybridResult):
             judged.add_spread(predicted_spread(result, rows), test)
 
@@ -270,22 +339,22 @@ def errors_under(result: Result, measurements: Measurements) -> PoseErrors:
 
 
 def _distance_errors(
-    known: Mapping[tuple[str, str], float], result: Result, seen: Measurements, rows: Measurements
+    stated: Mapping[tuple[str, str], float], result: Result, training: Measurements, rows: Measurements
 ) -> Float64[Tensor, " pairs"]:
-    """Predicted minus known distance of sockets that are in these rows but not among those seen [m].
+    """Predicted minus known distance of sockets that are in these rows but not in the training rows [m].
 
     A socket is where its rows put the ball on average.
     """
-    names, held_out = rows.socket or (), _sockets(rows) - _sockets(seen)
-    pairs = {pair: distance for pair, distance in known.items() if set(pair) <= held_out}
+    names, held_out = rows.socket or (), _sockets(rows) - _sockets(training)
+    pairs = {pair: distance for pair, distance in stated.items() if set(pair) <= held_out}
     if not pairs:
         return torch.zeros(0, dtype=torch.float64)
     ball = _poses(result, rows)[:, :3, 3].detach().cpu()
-    place = {
+    centre = {
         name: ball[torch.tensor([other == name for other in names])].mean(0)
         for name in {name for pair in pairs for name in pair}
     }
-    return torch.stack([(place[a] - place[b]).norm() - distance for (a, b), distance in pairs.items()])
+    return torch.stack([(centre[a] - centre[b]).norm() - distance for (a, b), distance in pairs.items()])
 
 
 def _poses(result: Result, rows: Measurements) -> Float64[Tensor, "rows 4 4"]:

@@ -34,10 +34,10 @@ class PredictedSpread:
         return PredictedSpread(nothing, nothing.clone())
 
     @staticmethod
-    def joined(parts: Sequence["PredictedSpread"]) -> "PredictedSpread":
-        """Rows of one part after the other."""
+    def joined(spreads: Sequence["PredictedSpread"]) -> "PredictedSpread":
+        """Rows of one after the other."""
         return PredictedSpread(
-            torch.cat([part.error for part in parts]), torch.cat([part.sigma for part in parts])
+            torch.cat([spread.error for spread in spreads]), torch.cat([spread.sigma for spread in spreads])
         )
 
     @property
@@ -73,21 +73,21 @@ def predicted_spread(result: HybridResult, measurements: Measurements) -> Predic
     Raises:
         IdentificationError: a row has a target that was not calibrated.
     """
-    found = PredictedSpread.none(measurements.rows)
+    spread = PredictedSpread.none(measurements.rows)
     errors = result.errors_of(measurements).get("position")
     if measurements.position is None or errors is None:
-        return found
+        return spread
     frames = result.uncertainty.space.frames
     rows = torch.isfinite(measurements.position).all(-1)
     rows &= torch.tensor([name in frames for name in measurements.frame], dtype=torch.bool)
     chosen = rows.nonzero()[:, 0]
     if not len(chosen):
-        return found
+        return spread
     judged = measurements.select(chosen)
     noise = _noise(result, judged)
-    found.error[chosen] = errors[chosen].detach().cpu()
-    found.sigma[chosen] = (result.deviation(judged).square() + noise.square()[:, None]).sqrt()
-    return found
+    spread.error[chosen] = errors[chosen].detach().cpu()
+    spread.sigma[chosen] = (result.deviation(judged).square() + noise.square()[:, None]).sqrt()
+    return spread
 
 
 def _noise(result: HybridResult, measurements: Measurements) -> Float64[Tensor, " rows"]:

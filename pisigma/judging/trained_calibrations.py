@@ -1,14 +1,21 @@
-"""Calibrations that are judged side by side, trained on the same rows."""
+"""Calibrations that are judged side by side, trained on the same rows, and what of held-out rows they can predict."""
 
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import SquaredLoss
 from pisigma.identification.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
 
 Calibrator = GeometricCalibrator | HybridCalibrator
 Result = CalibrationResult | HybridResult
@@ -41,15 +48,15 @@ def trained(
     calibrator: Calibrator,
     rows: Measurements,
     progress: Callable[[str], None] = lambda what: None,
-    known: Result | None = None,
+    result: Result | None = None,
 ) -> dict[str, Result]:
-    """The calibrations of some rows that are compared, by name.
+    """Give the calibrations of some rows that are compared, by name.
 
     Args:
         calibrator: of either kind.
         rows: to calibrate with.
         progress: called with what is being tried.
-        known: what the calibrator gave for these rows, where that is known already.
+        result: what the calibrator gave for these rows; None to calibrate.
 
     Returns:
         "nominal": the arm as drawn, base and tool fitted and every row counted in full; "geometric"; and "hybrid"
@@ -58,24 +65,24 @@ def trained(
     Raises:
         IdentificationError: the rows do not determine what is asked for.
     """
-    found: dict[str, Result] = {"nominal": base_and_tool(geometric_of(calibrator)).fit(rows)}
-    result = fit(calibrator, rows, progress) if known is None else known
-    found["geometric"] = geometric_result(result)
-    return found | ({"hybrid": result} if isinstance(result, HybridResult) else {})
+    nominal = base_and_tool(geometric_of(calibrator)).fit(rows)
+    result = fit(calibrator, rows, progress) if result is None else result
+    results: dict[str, Result] = {"nominal": nominal, "geometric": geometric_result(result)}
+    return results | ({"hybrid": result} if isinstance(result, HybridResult) else {})
 
 
 def base_and_tool(calibrator: GeometricCalibrator) -> GeometricCalibrator:
-    """The arm as drawn; only base and tool are fitted, and every row counts in full."""
+    """Give the calibrator of the arm as drawn: only base and tool are fitted, and every row counts in full."""
     return replace(calibrator, free=(), loss=SquaredLoss())
 
 
 def without_missing(calibrator: Calibrator, rows: Measurements, of: Measurements) -> Calibrator:
-    """The calibrator without what it knows of frames and sockets that some of the rows lack.
+    """Give the calibrator without stated frames and socket distances that some of the rows lack.
 
     Args:
         calibrator: for all rows.
-        rows: which it is to be given.
-        of: all rows; what these lack too stays, so that the calibrator complains of it.
+        rows: those that it will be fitted to.
+        of: all rows; what these lack too stays, so that the calibrator refuses it.
     """
     if isinstance(calibrator, HybridCalibrator):
         geometric = without_missing(calibrator.geometric, rows, of)
@@ -87,6 +94,94 @@ def without_missing(calibrator: Calibrator, rows: Measurements, of: Measurements
         calibrator,
         frames={name: base for name, base in calibrator.frames.items() if name not in no_frame},
         socket_distances={
-            pair: known for pair, known in calibrator.socket_distances.items() if not no_socket & set(pair)
+            pair: distance
+            for pair, distance in calibrator.socket_distances.items()
+            if not no_socket & set(pair)
         },
     )
+
+
+def with_frames(calibrator: GeometricCalibrator, result: Result, rows: Measurements) -> Result:
+    """Fit the bases of frames that a calibration lacks to the rows of these frames, and nothing else.
+
+    Args:
+        calibrator: what gave the geometric calibration.
+        result: the calibration; of a hybrid, the bases of either arm are fitted.
+        rows: held-out rows, some of them in frames that were not calibrated.
+
+    Returns:
+        The calibration with these bases too.
+
+    Raises:
+        IdentificationError: there are several targets, or the rows do not determine where the base is in their frame.
+    """
+    geometric = geometric_result(result)
+    missing = set(rows.frame) - set(geometric.bases)
+    if not missing:
+        return result
+    if len(geometric.tools) > 1:
+        raise IdentificationError(
+            f"frame '{min(missing)}' is held out, which needs a single target, but there are "
+            f"{', '.join(sorted(geometric.tools))}; split by joints or by time."
+        )
+    chosen = torch.tensor([name in missing for name in rows.frame]).nonzero()[:, 0]
+    missed = rows.select(chosen)
+    bases = geometric.bases | _bases(calibrator, geometric.robot, missed)
+    if not isinstance(result, HybridResult):
+        return replace(result, bases=bases)
+    learned = result.learned
+    if learned is not None:
+        with torch.no_grad():
+            moved = replace(missed, q=missed.q + learned.correction.of_rows(missed))
+        learned_bases = learned.geometry.bases | _bases(calibrator, learned.geometry.robot, moved)
+        learned = replace(learned, geometry=replace(learned.geometry, bases=learned_bases))
+    return replace(result, geometric=replace(geometric, bases=bases), learned=learned)
+
+
+def _bases(
+    calibrator: GeometricCalibrator, robot: Robot, rows: Measurements
+) -> dict[str, Float64[np.ndarray, " 6"]]:
+    """Where an arm stands in the frames of some rows; every row counts in full."""
+    frames = set(rows.frame)
+    only_bases = replace(
+        calibrator,
+        robot=robot,
+        free=(),
+        base="free",
+        tool="fixed",
+        loss=SquaredLoss(),
+        frames={name: base for name, base in calibrator.frames.items() if name in frames},
+        socket_distances={},
+    )
+    return only_bases.fit(rows).bases
+
+
+def judgeable(measurements: Measurements, test: Tensor, training: Measurements) -> Tensor:
+    """Say which test rows have a target, and an anchor or its place, that the training rows have too.
+
+    Args:
+        measurements: all rows.
+        test: numbers of the test rows.
+        training: the training rows.
+
+    Returns:
+        One bool per test row.
+
+    Raises:
+        IdentificationError: none has.
+    """
+    targets, anchors = set(training.target), {*(training.anchor or ()), ""}
+    names = measurements.anchor or ("",) * measurements.rows
+    place = measurements.anchor_place
+    placed = torch.zeros(len(test), dtype=torch.bool) if place is None else place[test].isfinite().all(-1)
+    rows = test.tolist()
+    rows_judged = [
+        measurements.target[row] in targets and (names[row] in anchors or is_placed)
+        for row, is_placed in zip(rows, placed.tolist(), strict=True)
+    ]
+    if not any(rows_judged):
+        raise IdentificationError(
+            f"{measurements.place(rows[0])}: neither this row nor any other that is held out with it has a target and "
+            "an anchor that other rows have; measure more poses with each, or leave out the cross-validation."
+        )
+    return torch.tensor(rows_judged, device=test.device)

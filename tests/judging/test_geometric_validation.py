@@ -12,7 +12,7 @@ from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import SquaredLoss
 from pisigma.judging.calibration_validation import validate
-from pisigma.judging.held_out_frames import with_frames
+from pisigma.judging.trained_calibrations import with_frames
 from pisigma.measurement import Measurements, k_folds
 from pisigma.measurement.dataset import join
 from pisigma.reporting.calibration_tables import held_out_lines

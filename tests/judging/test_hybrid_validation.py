@@ -12,11 +12,10 @@ from testing.sensors import true_robot as true_arm
 
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.judging.calibration_validation import judge, validate
-from pisigma.judging.held_out_frames import with_frames
-from pisigma.judging.learning_curve import learning_curve
+from pisigma.judging.calibration_validation import judge, learning_curve, validate
 from pisigma.judging.pose_statistics import PoseErrors
 from pisigma.judging.predicted_spread import PredictedSpread, predicted_spread
+from pisigma.judging.trained_calibrations import with_frames
 from pisigma.measurement import holdout, k_folds
 from pisigma.robot import Robot
 
