@@ -11,12 +11,15 @@ from pisigma.simulation.distances import (
 from pisigma.simulation.measure import SimulatedMeasurements, SimulatedSensor, SimulatedSensors, simulate
 from pisigma.simulation.noise import MeasurementNoise, SensorNoise
 from pisigma.simulation.poses import WhereToMeasure
+from pisigma.simulation.touch_candidates import JigPlacement, TouchCandidates, TouchCandidatesSection
+from pisigma.simulation.touching import SimulatedTouches, simulate_touches
 from pisigma.simulation.true_robot import ErrorSource, TrueRobot, TrueRobotSection, register_error_source
 
 __all__ = [
     "AnchorSection",
     "BranchSection",
     "ErrorSource",
+    "JigPlacement",
     "MeasurementNoise",
     "SensorNoise",
     "SimulatedDistances",
@@ -25,11 +28,15 @@ __all__ = [
     "SimulatedSensor",
     "SimulatedSensors",
     "SimulatedSockets",
+    "SimulatedTouches",
     "SocketSection",
+    "TouchCandidates",
+    "TouchCandidatesSection",
     "TrueRobot",
     "TrueRobotSection",
     "WhereToMeasure",
     "joints_for_poses",
     "register_error_source",
     "simulate",
+    "simulate_touches",
 ]

@@ -12,6 +12,7 @@ from pisigma.measurement.dataset import Measurements, join
 from pisigma.simulation.commanded import AbstractCommanded
 from pisigma.simulation.distances import SimulatedDistances, SimulatedPairs, SimulatedSockets
 from pisigma.simulation.noise import MeasurementNoise
+from pisigma.simulation.touching import SimulatedTouches
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.yaml_file import Section
 
@@ -78,10 +79,10 @@ def _sigma(q: Float64[Tensor, "rows dof"], sigma: float) -> Float64[Tensor, " ro
 
 
 SimulatedSensor = Annotated[
-    SimulatedMeasurements | SimulatedSockets | SimulatedDistances | SimulatedPairs,
+    SimulatedMeasurements | SimulatedTouches | SimulatedSockets | SimulatedDistances | SimulatedPairs,
     Field(discriminator="kind"),
 ]
-"""What one sensor measures, told apart by `kind`: tracker, sockets, distances or pairs."""
+"""What one sensor measures, told apart by `kind`: tracker, touches, sockets, distances or pairs."""
 
 
 class SimulatedSensors(Section):

@@ -16,7 +16,7 @@ from jig_recipe import (
 from pisigma.errors import IdentificationError, RecipeError
 from pisigma.recipes.recipe_kinds import read_any_recipe
 from pisigma.se3 import wrap_to_pi
-from touch_candidates import JigPlacement
+from pisigma.simulation.touch_candidates import JigPlacement
 
 
 @pytest.fixture(scope="module")

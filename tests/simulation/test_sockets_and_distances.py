@@ -118,11 +118,16 @@ def test_the_seed_of_the_noise_decides(robot, stated: dict):
 
 def test_several_sensors_measure_the_same_robot(robot, tmp_path):
     tracker = {"kind": "tracker", "poses": JOINTS | {"count": 5}, "sensor": "position", "frame": "tracker"}
+    touches = {
+        "kind": "touches",
+        "placements": ({"name": "left", "base": {"x_mm": 1000, "y_mm": 445, "roll_deg": 180}},),
+        "candidates": {"count": 6, "seed": 0},
+    }
     wire = {"kind": "distances", "poses": JOINTS | {"seed": 9}, "anchor": WIRE}
-    data = SimulatedSensors(sensors=(tracker, SOCKETS, wire)).measure(robot)
-    assert data.rows == 5 + 40 + 40
-    assert data.kinds == {"position", "socket", "distance"}
-    assert set(data.frame) == {"tracker", ""}
+    data = SimulatedSensors(sensors=(tracker, touches, SOCKETS, wire)).measure(robot)
+    assert data.rows == 5 + 6 + 40 + 40
+    assert data.kinds == {"position", "touch", "socket", "distance"}
+    assert set(data.frame) == {"tracker", "left", ""}
     assert_close(data.position[:5], robot.forward(data.q[:5])[:, :3, 3])
     data.write_csv(tmp_path / "data.csv", robot.nominal)
     again = type(data).read_csv(tmp_path / "data.csv", robot.nominal)

@@ -18,8 +18,8 @@ from torch import Tensor
 from jig_accuracy import Accuracy
 from pisigma.measurement.jig import Jig
 from pisigma.reporting.figures import save_figure
+from pisigma.simulation.touch_candidates import TouchCandidates
 from straight_lines import TrackedLine
-from touch_candidates import TouchCandidates
 
 TOUCHES_PNG = "touches.png"
 ERRORS_PNG = "errors.png"

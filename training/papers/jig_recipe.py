@@ -19,22 +19,21 @@ from pisigma.identification.problem.parameters import Prior
 from pisigma.identification.result import CalibrationResult
 from pisigma.kinematics.singularity import singularity_measure
 from pisigma.measurement.dataset import Measurements
-from pisigma.planning.exchange import PlanningProblem
+from pisigma.planning.touch_planning import PlanningProblem, build_planning_problem
 from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_from_rpy, transform
 from pisigma.simulation.commanded import BranchSection
 from pisigma.simulation.noise import SensorNoise
 from pisigma.simulation.poses import CubeRandom
-from pisigma.simulation.true_robot import ErrorSource, TrueRobot
-from pisigma.yaml_file import Section, read_yaml
-from touch_candidates import (
+from pisigma.simulation.touch_candidates import (
     JigPlacement,
     TouchCandidates,
     TouchCandidatesSection,
     check_names,
 )
-from touch_planning import build_planning_problem
-from touching import simulate_touches
+from pisigma.simulation.touching import simulate_touches
+from pisigma.simulation.true_robot import ErrorSource, TrueRobot
+from pisigma.yaml_file import Section, read_yaml
 
 Triple = tuple[float, float, float]
 Free = Literal["paper", "default"]

@@ -17,9 +17,9 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import LeftOut
 from pisigma.se3 import invert, transform
 from pisigma.simulation.noise import NoiseDraws, SensorNoise, draw_noise, row_sigma
+from pisigma.simulation.touch_candidates import JigPlacement, TouchCandidates, TouchCandidatesSection
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.yaml_file import Section
-from touch_candidates import JigPlacement, TouchCandidates, TouchCandidatesSection
 
 OnMiss = Literal["error", "leave_out"]
 

@@ -11,10 +11,10 @@ from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement import Jig, Measurements
 from pisigma.robot import Robot
+from pisigma.simulation.touch_candidates import JigPlacement, TouchCandidatesSection
+from pisigma.simulation.touching import SimulatedTouches, simulate_touches
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection
 from pisigma.yaml_file import parse_yaml
-from touch_candidates import JigPlacement, TouchCandidatesSection
-from touching import SimulatedTouches, simulate_touches
 
 # Lim et al., Table 1 and the columns "both" of Table 2; -89 deg and 180 deg are turns about the vertical.
 RIGHT = {
