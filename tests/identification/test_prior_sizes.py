@@ -1,5 +1,7 @@
 """Sizes of the prior that the data tell: which parameters share one, and what that does."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from testing.simulated_arm import dh_errors, mean_error, simulate
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.noise import PriorGroup, prior_group_of
 from pisigma.identification.problem.parameters import Prior
+from pisigma.identification.result import CalibrationResult
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
@@ -58,8 +61,8 @@ def test_parameters_without_a_prior_have_a_group_that_exists(column: str) -> Non
     assert prior_group_of(column, drawn=True) in set(PriorGroup)
 
 
-def calibrated(theta: float, length: float) -> tuple[str, ...]:
-    """Warnings of a calibration of an arm with errors in theta and in the lengths that are drawn."""
+def calibrated(theta: float, length: float) -> list[str]:
+    """Warnings of an arm's errors, where theta and the lengths that are drawn have some."""
     rng = np.random.default_rng(3)
     nominal = Robot.load("ur10")
     errors = dh_errors(nominal, length, theta, rng) * (np.abs(nominal.dh) > 0)
@@ -69,14 +72,36 @@ def calibrated(theta: float, length: float) -> tuple[str, ...]:
     q = torch.from_numpy(rng.uniform(-3, 3, (100, 6)))
     noise = 5e-5 * torch.from_numpy(rng.normal(size=(100, 3)))
     position = forward_kinematics(true, q)[:, :3, 3] + noise
-    return GeometricCalibrator(nominal).fit(Measurements(q=q, position=position)).warnings
+    return prior_warnings(GeometricCalibrator(nominal).fit(Measurements(q=q, position=position)))
+
+
+def prior_warnings(result: CalibrationResult) -> list[str]:
+    return [warning for warning in result.warnings if "times as large as the prior" in warning]
+
+
+@pytest.mark.parametrize(
+    ("robot", "file"),
+    [("ur5", "ur5/grid.csv"), ("ur10", "ur10/series_c_train.csv"), ("panda", "panda_sockets/panda_3.csv")],
+)
+def test_healthy_robots_get_no_warning_of_their_errors(shared_data: Path, robot: str, file: str) -> None:
+    data = Measurements.read_csv(shared_data / file).split_sets()[0]
+    placements = {name.rpartition("/")[0] for name in data.socket or ()}
+    distances = {(f"{name}/0", f"{name}/1"): 0.05 for name in placements}
+    result = GeometricCalibrator(Robot.load(robot), socket_distances=distances).fit(data)
+    assert not prior_warnings(result)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_usual_errors_get_no_warning(seed: int) -> None:
+    arm = simulate("ur10", seed, 60, 5e-5)
+    assert not prior_warnings(GeometricCalibrator(arm.nominal).fit(arm.measurements))
 
 
 def test_large_errors_are_told_apart_by_kind() -> None:
-    angles = [warning for warning in calibrated(8e-3, 3e-4) if "times as large as the prior" in warning]
+    angles = calibrated(15e-3, 3e-4)
     assert len(angles) == 1
     assert angles[0].startswith("the angle errors are about")
-    lengths = [warning for warning in calibrated(5e-4, 6e-3) if "times as large as the prior" in warning]
+    lengths = calibrated(5e-4, 12e-3)
     assert len(lengths) == 1
     assert lengths[0].startswith("the length errors are about")
 

@@ -75,11 +75,11 @@ def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor
         here: its linearisation at the solution.
     """
     view, stated = view_of(here), problem.precision[problem.active]
-    precision = view.widened(stated, problem.prior_group)
+    precision = view.scaled(stated, problem.prior_group)
     held = bool((precision > 0).any())
     data = here.normal - torch.diag(precision)
     wide = replace(view, prior_scale=tuple(max(factor, 1.0) for factor in view.prior_scale))
-    precision = wide.widened(stated, problem.prior_group)
+    precision = wide.scaled(stated, problem.prior_group)
     usual = torch.where(precision > 0, precision.clamp(min=1e-30).rsqrt(), problem.step_scale)
     data = data * usual * usual[:, None]
     arm = problem.active < problem.space.arm_size

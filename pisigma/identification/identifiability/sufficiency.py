@@ -118,7 +118,7 @@ def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[str]:
     which = f"target {names[int(np.argmax(offs))]}" if len(names) > 1 else "the target"
     return [
         f"{which} is {max(offs) * 1e3:.2g} mm from the axis of joint {robot.joints[-1].name}, so positions "
-        "say next to nothing about that joint and of its axis; mount it "
+        "say next to nothing about that joint and its axis; mount it "
         f"{0.05 * robot.reach * 1e3:.0f} mm or more beside the axis, or measure orientations too."
     ]
 

@@ -21,7 +21,7 @@ ALWAYS_GOOD = 1e-10
 class PriorGroup(IntEnum):
     """Parameters whose errors are believed to be of one size, because they come from the same cause.
 
-    Few groups, because a size is only told by several parameters: one for every parameter (relevance vectors,
+    Few groups, because only several parameters determine a size: one for every parameter (relevance vectors,
     Tipping 2001) fits the noise. Lengths that are drawn and that are not are apart, because joining them made
     weak data worse, while it made no difference whether d and a, or alpha and beta, are apart.
     """
@@ -37,7 +37,7 @@ class PriorGroup(IntEnum):
 
 
 LEAST_EFFECTIVE = 0.1
-"""A prior of which the data tell less than so many parameters stays as it is."""
+"""The prior of a group of which the data determine less than so many parameters stays as it is."""
 SMALLEST_PRIOR = 0.03
 """An estimated prior is not narrower than this share of the stated one."""
 
@@ -74,7 +74,7 @@ class SensorView:
         sums: per sensor.
         noise: per sensor, its standard deviation [m or rad], or a factor of 1 or more where the rows give
             their own.
-        repetition: per sensor, 1 or more: by how much repeats of a pose, and several targets in it, tell less than
+        repetition: per sensor, 1 or more: by how much repeats of a pose, and several targets in it, say less than
             so many poses, because what the model gets wrong there is the same in all of them.
         prior_scale: of the prior's standard deviations, per group of parameters.
     """
@@ -92,8 +92,8 @@ class SensorView:
         """What a sensor's sums are divided by."""
         return self.noise[sensor] ** 2 * self.repetition[sensor]
 
-    def widened(self, precision: Float64[Tensor, " active"], group: Tensor) -> Float64[Tensor, " active"]:
-        """1 / variance of parameters by the prior, as far as it was widened."""
+    def scaled(self, precision: Float64[Tensor, " active"], group: Tensor) -> Float64[Tensor, " active"]:
+        """1 / variance of parameters by the prior at its present scale."""
         return precision / precision.new_tensor(self.prior_scale).square()[group]
 
 
@@ -211,32 +211,51 @@ def prior_group_of(column: str, drawn: bool) -> int:
     return PriorGroup.BETWEEN_AXES if column in ("alpha", "beta") else PriorGroup.JOINT_OFFSET
 
 
-def prior_widening(
+def effective_parameters(
+    precision: Float64[Tensor, " active"],
+    group: Int64[Tensor, " active"],
+    view: SensorView,
+    covariance: Float64[Tensor, "active active"],
+) -> tuple[float, ...]:
+    """How many parameters with a prior the data determine, per group: each counts by how much of it they do.
+
+    `γ = Σ (1 - variance after / variance before)` of MacKay 1992, Neural Computation 4(3), eq. 4.5.
+
+    Args:
+        precision: 1 / variance as the prior states it, 0 where it says nothing.
+        group: every parameter's group.
+        view: the scale of the prior.
+        covariance: of the parameters.
+    """
+    share = (1 - view.scaled(precision, group) * covariance.diagonal()) * (precision > 0)
+    totals = share.new_zeros(len(view.prior_scale)).index_add(0, group, share)
+    return tuple(totals.tolist())
+
+
+def prior_scales(
     off: Float64[Tensor, " active"],
     precision: Float64[Tensor, " active"],
-    group: Tensor,
+    group: Int64[Tensor, " active"],
     view: SensorView,
     covariance: Float64[Tensor, "active active"],
     floor: float = 1.0,
 ) -> tuple[float, ...]:
-    """How much larger than stated the parameters' errors turn out, per group of parameters.
+    """How many times as large as stated the parameters' errors turn out, per group of parameters.
 
-    MacKay's update (1992, Neural Computation 4(3), eq. 4.7): every parameter counts by how much of it the
-    data tell.
+    MacKay's update (1992, Neural Computation 4(3), eq. 4.7) with the `effective_parameters` of every group.
 
     Args:
         off: distance of the parameters from their nominal values [m or rad].
-        precision: 1 / variance as stated, 0 where nothing is known.
-        group: number of every parameter's group.
-        view: how far the prior is widened now.
+        precision: 1 / variance as the prior states it, 0 where it says nothing.
+        group: every parameter's group.
+        view: the scale of the prior so far.
         covariance: of the parameters.
         floor: smallest answer; 1 where smaller errors than stated do not tighten the prior.
     """
-    told = (1 - view.widened(precision, group) * covariance.diagonal()) * (precision > 0)
-    square = off.square() * precision
-    sums = off.new_zeros((2, len(view.prior_scale))).index_add(1, group, torch.stack([told, square]))
+    square = off.new_zeros(len(view.prior_scale)).index_add(0, group, off.square() * precision)
     least = 1.0 if floor == 1.0 else LEAST_EFFECTIVE
+    effective = effective_parameters(precision, group, view, covariance)
     return tuple(
-        max(off_square / total, floor**2) ** 0.5 if total > least else now
-        for total, off_square, now in zip(*sums.tolist(), view.prior_scale, strict=True)
+        max(off_square / count, floor**2) ** 0.5 if count > least else now
+        for count, off_square, now in zip(effective, square.tolist(), view.prior_scale, strict=True)
     )

@@ -18,7 +18,7 @@ from pisigma.identification.problem.noise import (
     group_variance_ratio,
     loss_scale,
     prior_group_of,
-    prior_widening,
+    prior_scales,
     renumbered,
     values_used,
     view_of,
@@ -183,7 +183,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         prior_scale = view.prior_scale
         if self.prior_sizes != "stated":
             floor = 1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR
-            prior_scale = prior_widening(off, self._prior, self.prior_group, view, covariance, floor)
+            prior_scale = prior_scales(off, self._prior, self.prior_group, view, covariance, floor)
         old, new = (*view.noise, *view.repetition, *view.prior_scale), (*noise, *repetition, *prior_scale)
         settled = all(abs(b / a - 1) < 1e-2 for a, b in zip(old, new, strict=True))
         return self.combined(
@@ -251,7 +251,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def combined(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
         """Divide the sums by their variances and add the prior."""
         off = (point - self.nominal)[self.active]
-        precision = view.widened(self._prior, self.prior_group)
+        precision = view.scaled(self._prior, self.prior_group)
         pull = off * precision
         normal, descent, misfit, rounding = torch.diag(precision), -pull, 0.0, 0.0
         for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True)):
