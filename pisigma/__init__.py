@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from pisigma.inverse.corrected_ik import CorrectedIK as CorrectedIK
     from pisigma.inverse.corrected_ik import load as load
     from pisigma.inverse.solution import Solution as Solution
+    from pisigma.kernels.array_kinematics import forward_kinematics as forward_kinematics
+    from pisigma.kernels.array_kinematics import joint_jacobian as joint_jacobian
     from pisigma.kinematics.status import Status as Status
     from pisigma.measurement.dataset import Measurements as Measurements
     from pisigma.network.pi_sigma import PiSigma as PiSigma
@@ -57,6 +59,8 @@ _HOMES = {
     "calibrate": "pisigma.workflow.calibrate",
     "distill": "pisigma.workflow.distill",
     "evaluate": "pisigma.workflow.evaluate",
+    "forward_kinematics": "pisigma.kernels.array_kinematics",
+    "joint_jacobian": "pisigma.kernels.array_kinematics",
     "load": "pisigma.inverse.corrected_ik",
     "register_sensor": "pisigma.sensors.registry",
     "report": "pisigma.workflow.report",
@@ -85,6 +89,8 @@ __all__ = [
     "calibrate",
     "distill",
     "evaluate",
+    "forward_kinematics",
+    "joint_jacobian",
     "load",
     "register_sensor",
     "report",

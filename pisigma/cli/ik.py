@@ -1,5 +1,6 @@
 """`pisigma ik`: corrected joint values for poses."""
 
+import math
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -9,7 +10,7 @@ import typer
 from pisigma.cli.conditions import PayloadKg, TemperatureC, given_conditions
 
 if TYPE_CHECKING:
-    from torch import Tensor
+    import numpy as np
 
     from pisigma.inverse.corrected_ik import CorrectedIK
 
@@ -73,7 +74,6 @@ def _print_pose(
     """Print the solutions of one pose."""
     from pisigma.cli.output import fail, print_json
     from pisigma.cli.solutions import failure, print_solutions, solution_records
-    from pisigma.inverse.solution import Solution
 
     T, places = _transform(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
     if all_branches:
@@ -81,11 +81,10 @@ def _print_pose(
         places = [f"{places[0]}, branch {name}" for name in solver.branches]
     else:
         solution = solver(T, branch=branch)
-    assert isinstance(solution, Solution)  # of a tensor
     if as_json:
-        print_json({"solutions": solution_records(solution, solver.model.robot)})
+        print_json({"solutions": solution_records(solution, solver)})
     else:
-        print_solutions(solution, solver.model.robot)
+        print_solutions(solution, solver)
     if problem := failure(solution, places, any_will_do=all_branches):
         fail(problem)
 
@@ -136,11 +135,8 @@ def _check_options(
         raise typer.BadParameter("it goes with --pose and without --branch", param_hint="'--all-branches'")
 
 
-def _transform(pose: Pose) -> "Tensor":
+def _transform(pose: Pose) -> "np.ndarray":
     """The wanted pose T_base_tool as a batch of one."""
-    import torch
+    from pisigma.kernels.array_kinematics import transform_of
 
-    from pisigma.se3 import transform_from_xyzrpy
-
-    values = torch.tensor(pose, dtype=torch.float64)
-    return transform_from_xyzrpy(torch.cat([values[:3] / 1e3, torch.deg2rad(values[3:])]))[None]
+    return transform_of([*(value / 1e3 for value in pose[:3]), *map(math.radians, pose[3:])])[None]

@@ -119,10 +119,10 @@ def write_joint_file(
         raise OutputError(f"{out}: cannot be written (Is a directory); choose another --out.")
     if out.exists() and poses.exists() and out.samefile(poses):
         raise OutputError(f"{out}: is the file of poses itself; choose another --out.")
-    robot, outcome, begun = solver.model.robot, Outcome(), time.monotonic()
+    outcome, begun = Outcome(), time.monotonic()
     with writing_whole(out) as file:
         writer = csv.writer(file, lineterminator="\n")
-        header = _header(robot, accuracy)
+        header = _header(solver, accuracy)
         writer.writerow(header)
         for chunk in read_pose_chunks(poses, sys.maxsize if path else CHUNK_ROWS):
             chunk_rows = _solved_rows(solver, chunk, branch, accuracy, outcome, path)
@@ -133,8 +133,8 @@ def write_joint_file(
     return outcome
 
 
-def _header(robot: Robot, accuracy: bool) -> list[str]:
-    units = file_units(robot)
+def _header(solver: CorrectedIK, accuracy: bool) -> list[str]:
+    units = file_units(solver)
     joints = [f"q{i}_{unit}" for i, unit in enumerate(units, 1)]
     nominal = [f"q{i}_nominal_{unit}" for i, unit in enumerate(units, 1)]
     return ["line", "status", "branch", *joints, *nominal, *_MEASURES, *((_ACCURACY,) if accuracy else ())]
@@ -149,8 +149,7 @@ def _solved_rows(
     path: bool,
 ) -> Iterator[list[str]]:
     """The first cells of the rows to write for a chunk, in the order of the file; counts them in the outcome."""
-    robot = solver.model.robot
-    too_far = _too_far(chunk, robot)
+    too_far = _too_far(chunk, solver.model.robot)
     near = [line for line, far in zip(chunk.line, too_far, strict=True) if not far]
     bad = [*chunk.bad, *(LeftOut(line, far) for line, far in zip(chunk.line, too_far, strict=True) if far)]
     rows: list[tuple[int, list[str]]] = []
@@ -159,7 +158,7 @@ def _solved_rows(
         kept = torch.tensor([not far for far in too_far])
         solution, switches = _solve(solver, chunk.T[kept], branch, path)
         outcome.switches.extend((near[switch.index], switch) for switch in switches)
-        rows.extend(zip(near, _cells(solution, near, robot, accuracy), strict=True))
+        rows.extend(zip(near, _cells(solution, near, solver, accuracy), strict=True))
         statuses = [Status(status) for status in solution.status.tolist()]
         outcome.statuses.update(status.name.lower() for status in statuses)
         failed.extend(
@@ -201,9 +200,11 @@ def _too_far(chunk: PoseChunk, robot: Robot) -> list[str]:
     return reasons
 
 
-def _cells(solution: Solution, lines: Sequence[int], robot: Robot, accuracy: bool) -> Iterator[list[str]]:
+def _cells(
+    solution: Solution, lines: Sequence[int], solver: CorrectedIK, accuracy: bool
+) -> Iterator[list[str]]:
     """The cells of solved poses; empty where a value is not known."""
-    per_file_unit = np.array([180 / math.pi if revolute else 1e3 for revolute in robot.revolute])
+    per_file_unit = np.array([180 / math.pi if revolute else 1e3 for revolute in solver.revolute])
     joints = np.concatenate([np.asarray(q) * per_file_unit for q in (solution.q, solution.q_nominal)], -1)
     measures = [
         np.asarray(solution.position_residual) * 1e3,

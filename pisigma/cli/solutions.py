@@ -4,9 +4,9 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.inverse.solution import Solution
 from pisigma.kinematics.status import Status
-from pisigma.robot.description import Robot
 
 _QUANTITIES = ("q", "q_nominal", "correction")
 _LISTED = 10
@@ -15,7 +15,7 @@ FAILURES = tuple(status for status in Status if status not in (Status.REACHED, S
 """What ends a command with exit status 2."""
 
 
-def solution_records(solution: Solution, robot: Robot) -> list[dict[str, Any]]:
+def solution_records(solution: Solution, solver: CorrectedIK) -> list[dict[str, Any]]:
     """One record per solution: status, joint values, branch.
 
     A robot whose joints all turn gets `q_deg`, `q_nominal_deg`, `correction_deg` as lists; with a prismatic
@@ -26,13 +26,13 @@ def solution_records(solution: Solution, robot: Robot) -> list[dict[str, Any]]:
     for row, status in enumerate(_statuses(solution)):
         record: dict[str, Any] = {"status": status.name.lower(), "sentence": status.sentence}
         for name in _QUANTITIES:
-            values = [_or_none(v) for v in _in_file_units(getattr(solution, name)[row].tolist(), robot)]
-            if all(robot.revolute):
+            values = [_or_none(v) for v in _in_file_units(getattr(solution, name)[row].tolist(), solver)]
+            if all(solver.revolute):
                 record[f"{name}_deg"] = values
             else:
                 record[name] = [
-                    {"joint": joint.name, "value": value, "unit": unit}
-                    for joint, value, unit in zip(robot.joints, values, file_units(robot), strict=True)
+                    {"joint": joint, "value": value, "unit": unit}
+                    for joint, value, unit in zip(solver.joints, values, file_units(solver), strict=True)
                 ]
         record["branch"] = solution.branches[int(solution.branch[row])]
         record["domain_measure"] = _or_none(measures[row])
@@ -40,15 +40,15 @@ def solution_records(solution: Solution, robot: Robot) -> list[dict[str, Any]]:
     return records
 
 
-def print_solutions(solution: Solution, robot: Robot) -> None:
+def print_solutions(solution: Solution, solver: CorrectedIK) -> None:
     """Print a table per solution."""
     from pisigma.cli.output import print_table
 
     for row, status in enumerate(_statuses(solution)):
-        values = [_in_file_units(getattr(solution, name)[row].tolist(), robot) for name in _QUANTITIES]
+        values = [_in_file_units(getattr(solution, name)[row].tolist(), solver) for name in _QUANTITIES]
         lines = [
-            (joint.name, *(f"{value:.6f}" for value in figures), unit)
-            for joint, unit, *figures in zip(robot.joints, file_units(robot), *values, strict=True)
+            (joint, *(f"{value:.6f}" for value in figures), unit)
+            for joint, unit, *figures in zip(solver.joints, file_units(solver), *values, strict=True)
         ]
         title = f"{status.name.lower()}, branch {solution.branches[int(solution.branch[row])]}"
         print_table(title, ("joint", "corrected", "nominal", "correction", "unit"), lines)
@@ -81,14 +81,14 @@ def _statuses(solution: Solution) -> list[Status]:
     return [Status(status) for status in solution.status.tolist()]
 
 
-def file_units(robot: Robot) -> list[str]:
+def file_units(solver: CorrectedIK) -> list[str]:
     """Unit of every joint where values enter or leave."""
-    return ["deg" if revolute else "mm" for revolute in robot.revolute]
+    return ["deg" if revolute else "mm" for revolute in solver.revolute]
 
 
-def _in_file_units(values: Sequence[float], robot: Robot) -> list[float]:
+def _in_file_units(values: Sequence[float], solver: CorrectedIK) -> list[float]:
     return [
-        math.degrees(v) if revolute else v * 1e3 for v, revolute in zip(values, robot.revolute, strict=True)
+        math.degrees(v) if revolute else v * 1e3 for v, revolute in zip(values, solver.revolute, strict=True)
     ]
 
 

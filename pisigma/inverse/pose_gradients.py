@@ -9,7 +9,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pisigma.inverse.nearest_turn import as_trained
+from pisigma.inverse.finishing import as_trained
 from pisigma.inverse.solution import Solution
 from pisigma.kinematics.jacobian import joint_jacobian
 from pisigma.kinematics.singularity import characteristic_length, dimensionless_jacobian

@@ -2,25 +2,27 @@
 
 import math
 import os
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 
 from pisigma.errors import ModelError
 from pisigma.hybrid.arms import HybridArm
 from pisigma.joint_correction.feature import scaled_joints, turning_rate
 from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.kernels.array_kinematics import KINDS, arm_ends, arm_rows
 from pisigma.kernels.arrays import (
+    ANGLE,
+    COSINE,
     DRAWN,
-    FIXED,
     GEOMETRIC,
     HYBRID,
     NO_CLOSED_FORM,
     NOMINAL,
-    PRISMATIC,
-    REVOLUTE,
     SCARA,
+    SINE,
     SPHERICAL_WRIST,
     THREE_PARALLEL,
     Arms,
@@ -28,23 +30,26 @@ from pisigma.kernels.arrays import (
     Correction,
     Coverage,
     Description,
+    Network,
     Starts,
 )
 from pisigma.kernels.description_file import write_description
 from pisigma.kinematics.closed_form import AbstractClosedForm, closed_form_solver
-from pisigma.kinematics.closed_form.scara import Scara
-from pisigma.kinematics.closed_form.spherical_wrist import SphericalWristArm
-from pisigma.kinematics.closed_form.three_parallel import ThreeParallelArm
-from pisigma.kinematics.components import cosine_sine
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.compiled_network import describe_network
 from pisigma.model.stored_starts import StoredStarts
+from pisigma.network.correction_network import JointGroup
+from pisigma.network.inputs import POSE_INPUTS
+from pisigma.network.pi_sigma import PiSigma
 from pisigma.robot.description import Robot
-from pisigma.se3 import invert, transform_from_xyzrpy
+from pisigma.se3 import invert
 
-_KINDS = {"fixed": FIXED, "revolute": REVOLUTE, "prismatic": PRISMATIC}
-_FORMS = {Scara: SCARA, SphericalWristArm: SPHERICAL_WRIST, ThreeParallelArm: THREE_PARALLEL}
+_FORMS = {"scara": SCARA, "spherical_wrist": SPHERICAL_WRIST, "three_parallel": THREE_PARALLEL}
 _NUMERIC = ("numeric",)
+_Input = tuple[int, list[float]]
+_Member = tuple[JointGroup, PiSigma]
+_COARSE = 0.01
+"""Coordinates that vary by less, of the one that varies most, say next to nothing about a distance."""
+_FUNCTIONS = {"": ANGLE, "sin": SINE, "cos": COSINE}
 
 
 def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_to: str = "") -> None:
@@ -90,7 +95,7 @@ def describe(model: CalibratedModel) -> tuple[Description, tuple[str, ...]]:
         correction=correction,
         features=features,
         coverage=_coverage(geometric, model.hybrid),
-        network=describe_network(model),
+        network=_network(model),
         closed_form=_closed_form(model, solver),
         starts=_starts(geometric, model),
     )
@@ -102,27 +107,16 @@ def _arms(nominal: Robot, geometric: Robot, hybrid: HybridArm | None) -> Arms:
     if hybrid is not None:
         arms |= {GEOMETRIC: hybrid.geometric, HYBRID: hybrid.hybrid, DRAWN: hybrid.correction.robot}
     ordered = [arms[index] for index in range(4)]
-    ends = [
-        [transform_from_xyzrpy(torch.from_numpy(end.copy()))[:3].numpy() for end in (arm.base, arm.tool)]
-        for arm in ordered
-    ]
     return Arms(
-        kind=np.array([_KINDS[row.type] for row in nominal.rows]),
-        rows=np.stack([_rows(arm) for arm in ordered]),
-        ends=np.array(ends),
+        kind=np.array([KINDS[row.type] for row in nominal.rows]),
+        rows=np.stack([arm_rows(arm) for arm in ordered]),
+        ends=np.stack([arm_ends(arm) for arm in ordered]),
         reach=np.array([arm.reach or 1.0 for arm in ordered]),
         direction=nominal.directions,
         revolute=np.array(nominal.revolute, dtype=np.int64),
         limits=nominal.limits,
         hybrid=int(hybrid is not None),
     )
-
-
-def _rows(arm: Robot) -> Float64[np.ndarray, "rows 9"]:
-    rows = []
-    for theta, d, a, alpha, beta in arm.dh.tolist():
-        rows.append([theta, d, a, *cosine_sine(alpha), *cosine_sine(beta), *cosine_sine(theta)])
-    return np.array(rows, dtype=np.float64)
 
 
 def _correction(model: CalibratedModel) -> tuple[Correction, tuple[str, ...]]:
@@ -174,27 +168,19 @@ def _coverage(robot: Robot, hybrid: HybridArm | None) -> Coverage:
 
 
 def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> ClosedForm:
-    dof, none = model.robot.dof, np.zeros((3, 4))
     if solver is None:
-        zeros = np.zeros(dof)
-        return ClosedForm(
-            NO_CLOSED_FORM,
-            1,
-            np.zeros(1, dtype=np.int64),
-            1,
-            none,
-            none,
-            zeros,
-            zeros,
-            zeros,
-            zeros,
-            zeros,
-            zeros,
+        none, zeros = np.zeros((3, 4)), np.zeros(model.robot.dof)
+        first = np.zeros(1, dtype=np.int64)
+        return ClosedForm(NO_CLOSED_FORM, 1, first, 1, none, none, *[zeros] * 6)
+    if solver.compiled not in _FORMS:
+        raise ModelError(
+            f"model '{model.name}': the closed form {type(solver).__name__} of its robot has no compiled form; use "
+            "pisigma.load, which solves without kernels."
         )
     rows, names = solver.rows, solver.branches
     trained = [names.index(name) for name in model.branches] or list(range(len(names)))
     return ClosedForm(
-        kind=_FORMS[type(solver)],
+        kind=_FORMS[solver.compiled],
         branches=len(names),
         order=np.array([*trained, *(index for index in range(len(names)) if index not in trained)]),
         trained=len(trained),
@@ -215,3 +201,102 @@ def _starts(robot: Robot, model: CalibratedModel) -> Starts:
     T = stored.T.numpy()
     points = np.concatenate([T[:, :3, 3], lever * T[:, :3, :3].reshape(-1, 9)], axis=1)
     return Starts(stored.q.numpy(), points, lever)
+
+
+def _network(model: CalibratedModel) -> Network:
+    """The network of a model and its domain; one that is not used where the model has none."""
+    dof = model.robot.dof
+    members = model.network.members() if model.network else []
+    inputs = [_input(group, name) for group, _ in members for name in group.inputs.names]
+    counts = [net.inputs for _, net in members]
+    first = np.cumsum([0, *counts])
+    orders = np.zeros((len(members), max((len(net.orders) for _, net in members), default=0)), dtype=np.int64)
+    factors = max((sum(net.orders) for _, net in members), default=0)
+    weight, bias = np.zeros((dof, factors, max(counts, default=0))), np.zeros((dof, factors))
+    group_of, scaling = np.full(dof, -1), np.zeros((2, dof))
+    for index, (group, net) in enumerate(members):
+        orders[index, : len(net.orders)] = net.orders
+        fixed = net.fixed.numpy()
+        for output, joint in enumerate(group.joints):
+            used = slice(len(fixed[output]))
+            group_of[joint] = index
+            weight[joint, used, : net.inputs] = net.weight.detach().numpy()[output] * fixed[output][:, None]
+            bias[joint, used] = net.bias.detach().numpy()[output] * fixed[output]
+            scaling[:, joint] = float(net.output_offset[output]), float(net.output_scale[output])
+    domain = _Domain.of(model, inputs, members)
+    return Network(
+        used=int(model.network is not None),
+        source=np.array([source for source, _ in inputs], dtype=np.int64),
+        factors=np.array([terms for _, terms in inputs]).reshape(-1, dof),
+        offset=_joined([net.input_offset.numpy() for _, net in members]),
+        scale=_joined([net.input_scale.numpy() for _, net in members]),
+        reference=np.array([group.inputs.reference for group, _ in members]).reshape(-1, 3, 3),
+        first=first.astype(np.int64),
+        orders=orders,
+        group=group_of.astype(np.int64),
+        weight=weight,
+        bias=bias,
+        output_offset=scaling[0],
+        output_scale=scaling[1],
+        centre=_centre(model),
+        samples=len(domain.samples),
+        column=domain.column,
+        times=domain.times,
+        coarse=domain.coarse,
+        rows=domain.samples.T.ravel().copy(),
+        radius=float(model.domain.radius) if model.domain is not None else 1.0,
+    )
+
+
+class _Domain(NamedTuple):
+    """Rows of a domain by the coordinates that differ, those that vary most first; see `compiled.arrays.Network`."""
+
+    samples: np.ndarray
+    column: np.ndarray
+    times: np.ndarray
+    coarse: int
+
+    @staticmethod
+    def of(model: CalibratedModel, inputs: Sequence[_Input], members: Sequence[_Member]) -> "_Domain":
+        """The domain of a model; one without rows where it has none."""
+        none = np.zeros(0, dtype=np.int64)
+        if model.network is None or model.domain is None:
+            return _Domain(np.zeros((0, 0)), none, np.zeros(0), 0)
+        references = [group.inputs.reference.tobytes() for group, _ in members for _ in group.inputs.names]
+        scaling = [
+            scale
+            for _, net in members
+            for scale in zip(net.input_offset.tolist(), net.input_scale.tolist(), strict=True)
+        ]
+        meanings = [
+            (source, *terms, *scale, reference if source < ANGLE else b"")
+            for (source, terms), scale, reference in zip(inputs, scaling, references, strict=True)
+        ]
+        column = np.array([index for index, own in enumerate(meanings) if meanings.index(own) == index])
+        times = np.sqrt([meanings.count(meanings[index]) for index in column])
+        samples = model.domain.samples.double().cpu().numpy()[:, column] * times
+        spread = np.ptp(samples, axis=0)
+        order = np.argsort(-spread, kind="stable")
+        coarse = int((spread > _COARSE * spread.max()).sum())
+        return _Domain(samples[:, order], column[order].astype(np.int64), times[order], coarse)
+
+
+def _input(group: JointGroup, name: str) -> _Input:
+    """What kind of input a name means, and the factor of every joint in it."""
+    function, factors = group.inputs.combination(name)
+    if not factors:
+        return POSE_INPUTS.index(name), [0.0] * len(group.inputs.joint_names)
+    return _FUNCTIONS[function], factors
+
+
+def _joined(parts: list[np.ndarray]) -> np.ndarray:
+    return np.concatenate([np.zeros(0), *parts])
+
+
+def _centre(model: CalibratedModel) -> np.ndarray:
+    """Middle of the joint values of training rows [rad or m]."""
+    if not len(model.starts):
+        return np.zeros(model.robot.dof)
+    q = model.starts.double().cpu().numpy()
+    centre: np.ndarray = (q.min(0) + q.max(0)) / 2
+    return centre

@@ -2,6 +2,8 @@
 
 import csv
 import json
+import subprocess
+import sys
 
 import pytest
 import torch
@@ -330,3 +332,17 @@ def test_an_out_that_cannot_be_written(refuses, models, tmp_path):
         sentence = refuses("ik", models / "kiro3", "--poses", tmp_path / "poses.csv", "--out", out)
         assert sentence.startswith(f"{out}: cannot be written (")
     assert [entry.name for entry in tmp_path.iterdir()] == ["poses.csv"]
+
+
+def test_a_pose_needs_no_torch(models):
+    """One pose from a shell, which somebody waits for."""
+    pose = [str(value) for value in home_pose("kiro4")]
+    script = (
+        "import sys\nsys.modules['torch'] = sys.modules['numba'] = None  # importing them fails\n"
+        "from pisigma.cli.main import app\napp()\n"
+    )
+    for more in ([], ["--all-branches"], ["--json"]):
+        command = [sys.executable, "-c", script, "ik", str(models / "kiro4"), "--pose", *pose, *more]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0 or more == ["--all-branches"], done.stderr
+        assert "reached" in done.stdout

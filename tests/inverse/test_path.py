@@ -9,9 +9,8 @@ from testing.closeness import assert_close
 from testing.models import hand_made_model, no_type_checker, with_limits
 
 from pisigma.errors import PoseError
-from pisigma.inverse.branch_choice import JUMP, choose_branches, halfway, is_jump, wrapped
 from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.inverse.path import unroll
+from pisigma.inverse.path import JUMP, choose_branches, halfway, is_jump, unroll, wrapped
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel

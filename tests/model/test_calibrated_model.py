@@ -7,7 +7,7 @@ import torch
 from testing.closeness import assert_close
 from testing.models import HOMES, hand_made_model, joints_around
 
-from pisigma.inverse.nearest_turn import nearest_turn
+from pisigma.inverse.finishing import nearest_turn
 from pisigma.kinematics.forward import forward_kinematics
 
 

@@ -4,7 +4,7 @@ import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import ClassVar, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int64
@@ -43,8 +43,10 @@ class AbstractClosedForm(ABC):
     Attributes:
         robot: the robot it belongs to.
         rows: its rows with canonical twists.
+        compiled: name of the compiled form of the same formulas, see `model.compiled_model`; None where there is none.
     """
 
+    compiled: ClassVar[str | None] = None
     robot: Robot
     rows: CanonicalRows
 

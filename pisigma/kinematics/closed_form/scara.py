@@ -31,6 +31,8 @@ class Scara(AbstractClosedForm):
     0.
     """
 
+    compiled = "scara"
+
     @classmethod
     def of(cls, robot: Robot) -> "Scara | None":
         """The solver, or None where the rows are no R R P R with parallel axes and links longer than 0."""

@@ -40,6 +40,8 @@ class SphericalWristArm(AbstractClosedForm):
     values are given.
     """
 
+    compiled = "spherical_wrist"
+
     @classmethod
     def of(cls, robot: Robot) -> "SphericalWristArm | None":
         """The solver, or None where the rows are no such arm or a link has no length."""

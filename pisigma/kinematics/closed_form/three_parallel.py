@@ -44,6 +44,8 @@ class ThreeParallelArm(AbstractClosedForm):
     Near, but not at, such a place the exact values are given.
     """
 
+    compiled = "three_parallel"
+
     @classmethod
     def of(cls, robot: Robot) -> "ThreeParallelArm | None":
         """The solver, or None where the rows are no such arm or a link has no length."""
