@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from pisigma.workflow.evaluate import Limits as Limits
     from pisigma.workflow.evaluate import evaluate as evaluate
     from pisigma.workflow.report import report as report
+    from pisigma.workflow.train import TrainSettings as TrainSettings
+    from pisigma.workflow.train import train as train
     from pisigma.workflow.verify import VerificationSettings as VerificationSettings
     from pisigma.workflow.verify import verify as verify
 
@@ -55,6 +57,7 @@ _HOMES = {
     "Robot": "pisigma.robot.description",
     "Solution": "pisigma.inverse.solution",
     "Status": "pisigma.kinematics.status",
+    "TrainSettings": "pisigma.workflow.train",
     "VerificationSettings": "pisigma.workflow.verify",
     "calibrate": "pisigma.workflow.calibrate",
     "distill": "pisigma.workflow.distill",
@@ -64,6 +67,7 @@ _HOMES = {
     "load": "pisigma.inverse.corrected_ik",
     "register_sensor": "pisigma.sensors.registry",
     "report": "pisigma.workflow.report",
+    "train": "pisigma.workflow.train",
     "verify": "pisigma.workflow.verify",
 }
 
@@ -85,6 +89,7 @@ __all__ = [
     "Robot",
     "Solution",
     "Status",
+    "TrainSettings",
     "VerificationSettings",
     "calibrate",
     "distill",
@@ -94,6 +99,7 @@ __all__ = [
     "load",
     "register_sensor",
     "report",
+    "train",
     "verify",
 ]
 

@@ -16,7 +16,8 @@ sys.path.append(str(Path(__file__).parent.parent / "training" / "papers"))
 
 from testing.models import no_type_checker
 
-from pisigma.recipes.recipe import Recipe, read_recipe
+from pisigma.recipes.reader import read_recipe
+from pisigma.recipes.recipe import InverseRecipe
 
 REPOSITORY = Path(__file__).parent.parent
 
@@ -66,6 +67,6 @@ def write_recipe(repository: Path, tmp_path: Path) -> Callable[..., Path]:
 
 
 @pytest.fixture
-def small_recipe(write_recipe: Callable[..., Path]) -> Callable[..., Recipe]:
+def small_recipe(write_recipe: Callable[..., Path]) -> Callable[..., InverseRecipe]:
     """A shipped recipe with replacements, read."""
     return lambda name, *replacements: read_recipe(write_recipe(name, *replacements))

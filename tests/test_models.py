@@ -11,8 +11,9 @@ from testing.models import no_type_checker
 import pisigma
 from pisigma.judging.pose_statistics import JointStatistics
 from pisigma.model.folder.model_folder import load_model
-from pisigma.recipes.recipe import SimulatedData, read_recipe, recipe_hash
-from pisigma.recipes.recipe_data import simulate_held_out, simulate_training
+from pisigma.recipes.data import simulate_held_out, simulate_training
+from pisigma.recipes.reader import read_recipe, recipe_hash
+from pisigma.recipes.recipe import SimulatedData
 from pisigma.reporting.tables import joint_table
 from pisigma.training.pairs import build_pairs
 

@@ -13,14 +13,12 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
-from pisigma.recipes.geometric_recipe import GeometricRecipe
-from pisigma.recipes.hybrid_recipe import HybridRecipe
-from pisigma.recipes.recipe import Recipe
+from pisigma.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe
 from pisigma.yaml_file import OneOf
 
 PAGE = Path(__file__).parent.parent / "reference" / "recipes.md"
 BEGIN, END = "<!-- begin: keys -->", "<!-- end: keys -->"
-KINDS = (Recipe, GeometricRecipe, HybridRecipe)
+KINDS = (InverseRecipe, GeometricRecipe, HybridRecipe)
 
 _PLAIN = {
     float: "number",

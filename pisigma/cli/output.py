@@ -71,8 +71,16 @@ def progress_of(title: str) -> Iterator[Callable[[str], None]]:
     """Show a line that changes; gives what to call with what is being done now."""
     from rich.console import Console
 
-    with Console(stderr=True).status(title) as status:
-        yield lambda what: status.update(f"{title}: {what}")
+    status = Console(stderr=True).status(title)
+
+    def tell(what: str) -> None:
+        status.update(f"{title}: {what}")
+        status.start()  # not before there is something to say: another bar may be drawn until then
+
+    try:
+        yield tell
+    finally:
+        status.stop()
 
 
 def screen_width() -> int:

@@ -16,11 +16,11 @@ def simulate(
 ) -> None:
     """Write the simulated measurements of a recipe as a CSV file."""
     from pisigma.cli.output import print_json
-    from pisigma.recipes.recipe_data import simulate_held_out, simulate_training
-    from pisigma.recipes.recipe_kinds import read_any_recipe
+    from pisigma.recipes.data import simulate_held_out, simulate_training
+    from pisigma.recipes.reader import read_recipe
     from pisigma.robot import Robot
 
-    stated = read_any_recipe(recipe)
+    stated = read_recipe(recipe)
     rows = simulate_held_out(stated) if held_out else simulate_training(stated)
     rows.write_csv(out, Robot.load(stated.robot))
     if as_json:

@@ -1,110 +1,137 @@
 """`pisigma train`: from a recipe to a model folder."""
 
 import shlex
+import shutil
+import textwrap
 import time
-from dataclasses import replace
+from collections.abc import Sequence
+from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pisigma.cli.calibrate import print_calibration
+from pisigma.cli.output import print_json, print_lines, print_table, progress_of
+
 if TYPE_CHECKING:
-    from pisigma.judging.cross_validation import CrossValidation
-    from pisigma.measurement.dataset import Measurements
-    from pisigma.recipes.recipe import Recipe
+    from pisigma.judging.calibration_summary import CalibrationSummary
+    from pisigma.judging.training_summary import TrainingSummary
+
+_WIDTH = 24
+"""Columns of a list of parameters."""
 
 
 def train(
     recipe: Annotated[Path, typer.Argument(help="Recipe (YAML), such as training/kiro3.yaml.")],
     data: Annotated[
-        Path | None, typer.Option(help="Measured data (CSV), for recipes that ask for it.")
+        Path | None, typer.Option(help="Measured data (CSV), for recipes that ask for them.")
     ] = None,
-    out: Annotated[Path | None, typer.Option(help="Model folder to write [runs/NAME].")] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Model folder to write. [default: runs/NAME, or the next free name]")
+    ] = None,
     resume: Annotated[
         bool,
         typer.Option("--resume", help="Go on from where an interrupted training of this folder stopped."),
     ] = False,
+    logs: Annotated[
+        Path | None,
+        typer.Option(help="Folder for metrics.csv of every epoch, and TensorBoard's events if it is there."),
+    ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Train the model of a recipe and write it as a model folder with card and figures."""
     started = time.perf_counter()
-    from pisigma.recipes.geometric_recipe import GeometricRecipe
-    from pisigma.recipes.hybrid_recipe import HybridRecipe
-    from pisigma.recipes.recipe_kinds import read_any_recipe
+    from pisigma.model.folder.staging import check_replaceable
+    from pisigma.recipes.reader import read_recipe
+    from pisigma.workflow.train import InverseTraining, TrainSettings
+    from pisigma.workflow.train import train as train_recipe
 
-    stated = read_any_recipe(recipe)
-    if isinstance(stated, GeometricRecipe):
-        from pisigma.cli.train_geometric import train_geometric
-
-        return train_geometric(stated, recipe, data, out, resume, as_json)
-    if isinstance(stated, HybridRecipe):
-        from pisigma.cli.train_hybrid import train_hybrid
-
-        return train_hybrid(stated, recipe, data, out, resume, as_json)
-    import shutil
-
-    from pisigma.cli.output import print_json
-    from pisigma.model.folder.model_folder import save_model
-    from pisigma.model.folder.staging import check_replaceable, staged_folder
-    from pisigma.recipes.recipe import recipe_hash
-    from pisigma.recipes.recipe_data import load_measurements
-    from pisigma.reporting.card import write_card
-    from pisigma.reporting.training_report import report_training
-    from pisigma.workflow.run import RunOptions, train_recipe
-
-    folder = out or Path("runs") / stated.name
+    name = read_recipe(recipe).name
+    folder = out or _next_free(name)
     check_replaceable(folder)
-    measurements, test = load_measurements(stated, data).split_sets()
     checkpoints = folder.parent / f".{folder.name}.training"
-    run = train_recipe(stated, measurements, RunOptions(checkpoints, resume, True, recipe_hash(recipe)))
-    report = report_training(stated, run, _cross_validate(stated, measurements), test)
-    command = shlex.join(["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])])
-    with staged_folder(folder) as scratch:
-        save_model(replace(run.model, metrics=report), scratch)
-        write_card(stated, command, run, report, scratch)
+    settings = TrainSettings(checkpoints, resume, show_progress=True, logs=logs)
+    with progress_of("training") as progress:
+        training = train_recipe(recipe, data, settings, progress)
+    command = ["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])]
+    training.save(folder, name, shlex.join(command))
     shutil.rmtree(checkpoints, ignore_errors=True)
-    result = {"model": str(folder), "seconds": round(time.perf_counter() - started, 3), **report}
+    seconds = time.perf_counter() - started
     if as_json:
-        print_json(result)
+        print_json({"model": str(folder), **training.to_json(), "seconds": round(seconds, 3)})
+    elif isinstance(training, InverseTraining):
+        _print_training(training.summary)
+        typer.echo(f"Model written to {folder} in {seconds:.1f} s; read its README.md.")
     else:
-        _print_report(result)
+        _print_redundancy(training.summary)
+        print_calibration(training.summary, folder, seconds)
 
 
-def _cross_validate(recipe: "Recipe", measurements: "Measurements") -> "CrossValidation | None":
-    """Cross-validate a recipe for measured data; a simulated one has held-out rows of its own."""
-    from rich.console import Console
-
-    from pisigma.judging.cross_validation import cross_validate
-    from pisigma.recipes.recipe import MeasuredData
-
-    if not isinstance(recipe.data, MeasuredData):
-        return None
-    with Console(stderr=True).status("cross-validation") as status:
-        return cross_validate(
-            recipe,
-            measurements,
-            lambda done, folds: status.update(f"cross-validation: fold {done + 1} of {folds}"),
-        )
+def _next_free(name: str) -> Path:
+    """`runs/NAME`, or with a number behind it the first that is not there."""
+    names = (name, *(f"{name}-{number}" for number in range(2, 1_000)))
+    return next(path for path in (Path("runs") / free for free in names) if not path.exists())
 
 
-def _print_report(result: dict[str, Any]) -> None:
-    from pisigma.cli.output import print_table
+def _print_training(summary: "TrainingSummary") -> None:
+    """Print the errors of joints and of held-out poses."""
     from pisigma.reporting.tables import joint_rows, pose_rows
 
     columns = [
         f"{when}\n{name}" for when in ("before", "after") for name in ("average", "deviat.", "maximum")
     ]
-    print_table("absolute joint errors", ("joint", "unit", "rows", *columns), joint_rows(result["joints"]))
-    if "cross_validation" in result:
-        figures = result["cross_validation"]
-        title = f"pose errors of held-out rows, {figures['folds']}-fold cross-validation"
-        print_table(title, *pose_rows({name: figures[name] for name in ("nominal", "corrected")}))
-        typer.echo(result["verdict"])
-    if "test" in result:
-        test = result["test"]
-        title = f"pose errors of the {test['rows']} rows of the set 'test', which were kept aside"
-        print_table(title, *pose_rows({name: test[name] for name in ("nominal", "corrected")}))
-    rows = result["rows"]
-    reason = f" ({rows['rule']})" if rows["left_out"] else ""
-    typer.echo(f"{rows['used']} rows used, {rows['left_out']} left out{reason}.")
-    typer.echo(f"Model written to {result['model']} in {result['seconds']:.1f} s; read its README.md.")
+    print_table("absolute joint errors", ("joint", "unit", "rows", *columns), joint_rows(summary.joints))
+    if summary.cross_validation is not None:
+        title = f"pose errors of held-out rows, {summary.cross_validation.folds}-fold cross-validation"
+        print_table(title, *pose_rows(summary.cross_validation.by_model))
+        print_lines([summary.verdict or ""])
+    if summary.test is not None:
+        title = f"pose errors of the {summary.test.rows} rows of the set 'test', which were kept aside"
+        print_table(title, *pose_rows(summary.test.by_model))
+    rows = summary.rows
+    reason = f" ({rows.rule})" if rows.left_out else ""
+    print_lines([f"{rows.used} rows used, {rows.left_out} left out{reason}."])
+
+
+def _print_redundancy(summary: "CalibrationSummary") -> None:
+    """Print what is redundant beside the paper's, and how the calibration converged."""
+    if summary.redundant_sets is None:
+        return
+    paper = summary.paper or {}
+    rows = _sets_side_by_side(summary.redundant_sets, paper.get("redundant_sets", ()))  # type: ignore[arg-type]
+    rows += _wrapped("no effect", _in_braces(summary.no_effect or ()), _in_braces(paper.get("no_effect", ())))  # type: ignore[arg-type]
+    for label, value, key, form in (
+        ("left by pairs", summary.pairwise_parameters, "pairwise_parameters", "{}"),
+        ("rank", summary.rank, "rank", "{}"),
+        ("iterations", summary.iterations, "iterations_to_converge", "{}"),
+        ("RMSE after [mm]", summary.rmse_mm[-1], "rmse_after_mm", "{:.2e}"),
+    ):
+        rows.append((label, form.format(value), form.format(paper[key]) if key in paper else ""))
+    print_table("redundancy and convergence", ("what", "pisigma", "paper"), rows)
+
+
+def _sets_side_by_side(
+    ours: Sequence[Sequence[str]], papers: Sequence[Sequence[str]]
+) -> list[tuple[str, str, str]]:
+    """A line per set, equal sets on one line."""
+    rows: list[tuple[str, str, str]] = []
+    left = list(papers)
+    for members in ours:
+        same = next((other for other in left if set(other) == set(members)), None)
+        if same is not None:
+            left.remove(same)
+        rows += _wrapped("", _in_braces(members), _in_braces(same or ()))
+    for members in left:
+        rows += _wrapped("", "", _in_braces(members))
+    return [("redundant sets", *row[1:]) if number == 0 else row for number, row in enumerate(rows)]
+
+
+def _in_braces(names: Sequence[str]) -> str:
+    return f"{{{', '.join(names)}}}" if names else ""
+
+
+def _wrapped(label: str, *cells: str) -> list[tuple[str, str, str]]:
+    """One row of a table as lines of bounded width."""
+    columns = [[label], *(textwrap.wrap(cell, _WIDTH) or [""] for cell in cells)]
+    return [(line[0], line[1], line[2]) for line in zip_longest(*columns, fillvalue="")]

@@ -1,75 +1,213 @@
-"""What a training gave, as figures for tables, cards and `--json`."""
+"""What a training of networks on joint differences gave: joint errors, and all figures as one typed value."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
+from jaxtyping import Float64
+from torch import Tensor
+
 from pisigma.judging.cross_validation import CrossValidation
-from pisigma.judging.pose_statistics import JointStatistics, compare_on
+from pisigma.judging.pose_statistics import Comparison, JointStatistics
+from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.measurement.dataset import Measurements
-from pisigma.recipes.recipe import Recipe
-from pisigma.workflow.run import JointErrors, TrainingRun
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.training.history import TrainingHistory
+from pisigma.training.pairs import TrainingPairs
+from pisigma.yaml_file import Section
 
-JointReport = dict[str, Any]
 
+@dataclass(frozen=True, eq=False)
+class JointErrors:
+    """Joint errors before and after the correction, of the same rows.
 
-def report_joints(recipe: Recipe, run: TrainingRun) -> list[JointReport]:
-    """Figures of every corrected joint: on training rows, on held-out rows, and the paper's.
-
-    Returns:
-        Per joint ``{"name", "training": {"before", "after"}, "held_out": {...}, "paper": {...}}``; what does
-        not exist is left out.
+    Attributes:
+        T: the poses T_base_tool.
+        before: `Δ = q - q_nominal` [rad or m].
+        after: `Δ` minus its prediction.
     """
-    robot = run.model.robot
-    names = [joint.name for joint in robot.joints]
-    reports: list[JointReport] = []
-    for name in (joint for section in recipe.network for joint in section.joints):
-        index = names.index(name)
-        report: JointReport = {"name": name}
-        for part, errors in (("training", run.training), ("held_out", run.held_out)):
-            if errors is not None:
-                report[part] = _before_after(errors, index, robot.revolute[index])
-        if name in recipe.paper:
-            report["paper"] = recipe.paper[name].model_dump()
-        reports.append(report)
-    return reports
+
+    T: Float64[Tensor, "rows 4 4"]
+    before: Float64[Tensor, "rows dof"]
+    after: Float64[Tensor, "rows dof"]
+
+    @staticmethod
+    def of(model: CalibratedModel, pairs: TrainingPairs) -> "JointErrors":
+        """Joint errors of the used rows, before and after the model's correction."""
+        T, q, before = pairs.T[pairs.used], pairs.q_nominal[pairs.used], pairs.target[pairs.used]
+        return JointErrors(T, before, before - model.correction(T, q))
 
 
-def report_training(
-    recipe: Recipe,
+@dataclass(frozen=True, eq=False)
+class TrainingRun:
+    """What training the networks of a model gave.
+
+    Attributes:
+        model: the model, without figures.
+        history: the energies of the training.
+        pairs: the training pairs.
+        training: joint errors on the training rows.
+        held_out: joint errors on simulated rows that the fit did not see; None for measured data.
+        measurements: the training rows.
+    """
+
+    model: CalibratedModel
+    history: TrainingHistory
+    pairs: TrainingPairs
+    training: JointErrors
+    held_out: JointErrors | None
+    measurements: Measurements
+
+
+class JointErrorFigures(Section):
+    """Average, standard deviation and maximum of the absolute error of a joint, in degrees or millimetres."""
+
+    average_deg: float | None = None
+    deviation_deg: float | None = None
+    maximum_deg: float | None = None
+    average_mm: float | None = None
+    deviation_mm: float | None = None
+    maximum_mm: float | None = None
+
+    @property
+    def unit(self) -> str:
+        """Unit of the figures: "deg" for a joint that turns, "mm" for one that slides."""
+        return "mm" if self.average_deg is None else "deg"
+
+    @property
+    def values(self) -> tuple[float, ...]:
+        """Average, standard deviation and maximum."""
+        return tuple(value for value in self.model_dump().values() if value is not None)
+
+
+class BeforeAfter(Section):
+    """Errors of a joint before and after the correction."""
+
+    before: JointErrorFigures
+    after: JointErrorFigures
+
+
+class JointFigures(Section):
+    """Errors of one corrected joint.
+
+    Attributes:
+        name: of the joint.
+        training: on the training rows.
+        held_out: on simulated rows that the fit did not see.
+        paper: published.
+    """
+
+    name: str
+    training: BeforeAfter | None = None
+    held_out: BeforeAfter | None = None
+    paper: BeforeAfter | None = None
+
+
+class RowFigures(Section):
+    """Numbers of rows: used for training, left out of it by a rule, and kept apart as the set "test"."""
+
+    used: int
+    left_out: int
+    rule: str | None = None
+    kept_aside: int | None = None
+
+
+class ComparisonFigures(Section):
+    """Pose errors without and with the correction, of the same rows.
+
+    Attributes:
+        folds: of a cross-validation.
+        rows: number of rows of a test set.
+        rows_not_predicted: rows that count in neither, because the model predicts nothing there.
+        nominal: without the correction, base and tool as fitted.
+        corrected: with it.
+    """
+
+    folds: int | None = None
+    rows: int | None = None
+    rows_not_predicted: int
+    nominal: ErrorFigures
+    corrected: ErrorFigures
+
+    @staticmethod
+    def of(comparison: Comparison, **counts: int) -> "ComparisonFigures":
+        """The figures of a comparison, with numbers of folds or rows."""
+        return ComparisonFigures.model_validate(
+            {**counts, "rows_not_predicted": comparison.not_predicted, **comparison.in_file_units()}
+        )
+
+    @property
+    def by_model(self) -> dict[str, dict[str, float]]:
+        """The errors of both by name."""
+        return {"nominal": self.nominal.by_name, "corrected": self.corrected.by_name}
+
+
+class TrainingSummary(Section):
+    """All figures of a training of networks.
+
+    Attributes:
+        command: what made the model: a command line or a call.
+        rows: how many there were.
+        joints: errors of every corrected joint.
+        cross_validation: pose errors of rows that were held out in turn, for measured data.
+        verdict: whether the correction helps on them, in a sentence.
+        test: pose errors of the rows that the file marks as test.
+    """
+
+    command: str = ""
+    rows: RowFigures
+    joints: tuple[JointFigures, ...]
+    cross_validation: ComparisonFigures | None = None
+    verdict: str | None = None
+    test: ComparisonFigures | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Everything that is set as JSON values, by name."""
+        return self.model_dump(mode="json", exclude_unset=True)
+
+
+def summarise_training(
     run: TrainingRun,
-    cross_validation: CrossValidation | None,
-    test: Measurements | None = None,
-) -> dict[str, Any]:
-    """Everything that is said of a training, apart from where it was written and how long it took.
+    paper: Mapping[str, BeforeAfter],
+    validation: CrossValidation | None = None,
+    test: Comparison | None = None,
+    test_rows: int = 0,
+) -> TrainingSummary:
+    """Gather the figures of a training.
 
     Args:
-        recipe: what was trained.
         run: what came out.
-        cross_validation: errors of held-out rows, for measured data.
-        test: rows of the file that were kept aside.
-
-    Raises:
-        MeasurementError: the test rows hold no positions.
+        paper: published figures, by joint.
+        validation: errors of rows that were held out in turn.
+        test: errors of the rows of the set "test".
+        test_rows: how many these are.
     """
-    report: dict[str, Any] = {
-        "rows": {"used": run.model.provenance.rows, "left_out": run.model.provenance.rows_left_out},
-        "joints": report_joints(recipe, run),
-    }
-    if run.model.provenance.rule:
-        report["rows"]["rule"] = run.model.provenance.rule
-    if cross_validation is not None:
-        report["cross_validation"] = cross_validation.in_file_units()
-        report["verdict"] = cross_validation.verdict
+    provenance = run.model.provenance
+    counts: dict[str, Any] = {"used": provenance.rows, "left_out": provenance.rows_left_out}
+    counts |= {"rule": provenance.rule} if provenance.rule else {}
+    figures: dict[str, Any] = {"joints": tuple(_joint(run, name, paper) for name in run.history.joints)}
+    if validation is not None:
+        figures["cross_validation"] = ComparisonFigures.of(validation.comparison, folds=validation.folds)
+        figures["verdict"] = validation.verdict
     if test is not None:
-        report["rows"]["kept_aside"] = test.rows
-        comparison = compare_on(run.model, test)
-        counts = {"rows": test.rows, "rows_not_predicted": comparison.not_predicted}
-        report["test"] = {**counts, **comparison.in_file_units()}
-    return report
+        counts["kept_aside"] = test_rows
+        figures["test"] = ComparisonFigures.of(test, rows=test_rows)
+    return TrainingSummary(rows=RowFigures(**counts), **figures)
 
 
-def _before_after(errors: JointErrors, joint: int, revolute: bool) -> Mapping[str, dict[str, float]]:
-    return {
-        "before": JointStatistics.of(errors.before[:, joint]).in_file_units(revolute),
-        "after": JointStatistics.of(errors.after[:, joint]).in_file_units(revolute),
-    }
+def _joint(run: TrainingRun, name: str, paper: Mapping[str, BeforeAfter]) -> JointFigures:
+    robot = run.model.robot
+    index = [joint.name for joint in robot.joints].index(name)
+    figures: dict[str, BeforeAfter] = {}
+    for rows, errors in (("training", run.training), ("held_out", run.held_out)):
+        if errors is not None:
+            before, after = (
+                JointErrorFigures.model_validate(
+                    JointStatistics.of(values[:, index]).in_file_units(robot.revolute[index])
+                )
+                for values in (errors.before, errors.after)
+            )
+            figures[rows] = BeforeAfter(before=before, after=after)
+    if name in paper:
+        figures["paper"] = paper[name]
+    return JointFigures(name=name, **figures)

@@ -1,24 +1,33 @@
 """The rows of a recipe: simulated, or read from a file."""
 
-from pathlib import Path
+import os
+from typing import TypeVar
 
 import torch
 
 from pisigma.errors import RecipeError
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.splits import TrainTest
-from pisigma.recipes.geometric_recipe import GeometricRecipe
-from pisigma.recipes.hybrid_recipe import HybridRecipe, repeated
-from pisigma.recipes.recipe import Recipe, SimulatedData
+from pisigma.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe, Recipe, SimulatedData
 from pisigma.robot.description import Robot
+from pisigma.simulation.measure import SimulatedMeasurements
 from pisigma.simulation.true_robot import TrueRobot
+from pisigma.yaml_file import Section
+
+Seeded = TypeVar("Seeded", bound=Section)
 
 
-def load_measurements(recipe: Recipe | HybridRecipe, data: Path | None) -> Measurements:
-    """Give the rows of a recipe: the simulated training rows, or all rows of a file, the set "test" among them.
+def load_measurements(
+    recipe: InverseRecipe | HybridRecipe, data: Measurements | str | os.PathLike[str] | None
+) -> Measurements:
+    """Give the rows of a recipe: the simulated training rows, or all measured rows, the set "test" among them.
+
+    Args:
+        recipe: the recipe.
+        data: for measured data: these, or a CSV file of them.
 
     Raises:
-        RecipeError: a simulated recipe was given a file, or a measured one none.
+        RecipeError: a simulated recipe got data, or a measured one none.
         MeasurementError: the file cannot be used.
     """
     robot = Robot.load(recipe.robot)
@@ -28,10 +37,10 @@ def load_measurements(recipe: Recipe | HybridRecipe, data: Path | None) -> Measu
         return simulate_training(recipe)
     if data is None:
         raise RecipeError(f"recipe '{recipe.name}' is for measured data; give the file with --data FILE.csv.")
-    return Measurements.read_csv(data, robot)
+    return data if isinstance(data, Measurements) else Measurements.read_csv(data, robot)
 
 
-def simulate_training(recipe: Recipe | GeometricRecipe | HybridRecipe) -> Measurements:
+def simulate_training(recipe: Recipe) -> Measurements:
     """Measure the training rows of a recipe on its true robot.
 
     Raises:
@@ -41,7 +50,7 @@ def simulate_training(recipe: Recipe | GeometricRecipe | HybridRecipe) -> Measur
     return section.measure(_true_robot(recipe))
 
 
-def simulate_held_out(recipe: Recipe | GeometricRecipe | HybridRecipe) -> Measurements:
+def simulate_held_out(recipe: Recipe) -> Measurements:
     """Measure the held-out rows of a recipe on its true robot.
 
     Raises:
@@ -72,7 +81,7 @@ def simulate_repeats(recipe: HybridRecipe) -> tuple[Measurements, tuple[TrainTes
     return join(rows), tuple(parts)
 
 
-def simulated_data(recipe: Recipe | HybridRecipe) -> SimulatedData:
+def simulated_data(recipe: InverseRecipe | HybridRecipe) -> SimulatedData:
     """The section of a recipe that simulates its data.
 
     Raises:
@@ -83,6 +92,27 @@ def simulated_data(recipe: Recipe | HybridRecipe) -> SimulatedData:
     return recipe.data
 
 
-def _true_robot(recipe: Recipe | GeometricRecipe | HybridRecipe) -> TrueRobot:
+def _true_robot(recipe: Recipe) -> TrueRobot:
     errors = recipe.errors if isinstance(recipe, GeometricRecipe) else simulated_data(recipe).errors
     return TrueRobot(Robot.load(recipe.robot), errors)
+
+
+def repeated(data: SimulatedData, repeat: int) -> SimulatedData:
+    """A simulation with everything that is random drawn anew: all its seeds higher by the number of the repeat."""
+    return data.model_copy(
+        update={
+            "errors": tuple(_reseeded(source, repeat) for source in data.errors),
+            "training": _measured_anew(data.training, repeat),
+            "held_out": _measured_anew(data.held_out, repeat),
+        }
+    )
+
+
+def _measured_anew(section: SimulatedMeasurements, repeat: int) -> SimulatedMeasurements:
+    noise = None if section.noise is None else _reseeded(section.noise, repeat)
+    return section.model_copy(update={"poses": _reseeded(section.poses, repeat), "noise": noise})
+
+
+def _reseeded(section: Seeded, repeat: int) -> Seeded:
+    seed = getattr(section, "seed", None)
+    return section if seed is None else section.model_copy(update={"seed": seed + repeat})

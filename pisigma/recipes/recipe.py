@@ -1,19 +1,36 @@
-"""Recipes: what to train, on what, and which published figures to hold it against."""
+"""Recipes: what to train, on what, how, and which published figures to hold it against."""
 
-import hashlib
-import os
-from functools import partial
-from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import Field, NonNegativeFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat, PositiveInt
 
-from pisigma.errors import RecipeError
-from pisigma.recipes.recipe_checks import check_fit, inverse_checks
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.hybrid.mini_batches import MiniBatches
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.problem.loss import HampelLoss, SquaredLoss
+from pisigma.identification.problem.parameters import Prior
+from pisigma.judging.training_summary import BeforeAfter
+from pisigma.robot.description import Robot
 from pisigma.simulation.measure import SimulatedMeasurements
 from pisigma.simulation.true_robot import ErrorSource
 from pisigma.training.sections import FitSection, NetworkSection, Seed
-from pisigma.yaml_file import Section, read_yaml
+from pisigma.yaml_file import Section
+
+
+class AbstractRecipe(Section):
+    """What every recipe states.
+
+    Attributes:
+        name: of the recipe and, by default, of the model.
+        description: what it shows, for the model's card.
+        not_validated: what a reader must not take from it, for the card.
+        robot: catalogue name or robot file of the nominal robot.
+    """
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+    description: str
+    not_validated: str
+    robot: str
 
 
 class SimulatedData(Section):
@@ -58,26 +75,11 @@ class SingularRows(Section):
     below: NonNegativeFloat = 0.02
 
 
-class ErrorFigures(Section):
-    """Average, standard deviation and maximum of the absolute joint error."""
-
-    average_deg: NonNegativeFloat
-    deviation_deg: NonNegativeFloat
-    maximum_deg: NonNegativeFloat
-
-
-class BeforeAfter(Section):
-    """Published figures of one joint."""
-
-    before: ErrorFigures
-    after: ErrorFigures
-
-
-class Recipe(Section):
-    """A whole recipe of inverse calibration.
+class InverseRecipe(AbstractRecipe):
+    """An inverse calibration: networks on nominal joint values.
 
     Attributes:
-        kind: "inverse_calibration"; recipes of the geometric calibrator are `GeometricRecipe`.
+        kind: "inverse_calibration", which need not be stated.
         name: of the recipe and, by default, of the model.
         description: what it shows, for the model's card.
         not_validated: what a reader must not take from it, for the card.
@@ -90,10 +92,6 @@ class Recipe(Section):
     """
 
     kind: Literal["inverse_calibration"] = "inverse_calibration"
-    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
-    description: str
-    not_validated: str
-    robot: str
     data: Annotated[SimulatedData | MeasuredData, Field(discriminator="kind")]
     network: Annotated[tuple[NetworkSection, ...], Field(min_length=1)]
     fit: Annotated[FitSection, Field(discriminator="method")]
@@ -101,18 +99,151 @@ class Recipe(Section):
     paper: dict[str, BeforeAfter] = Field(default_factory=dict)
 
 
-def read_recipe(path: str | os.PathLike[str]) -> Recipe:
-    """Read a recipe and check it against its robot.
+class PriorSection(Section):
+    """Standard deviations of the parameters' errors: what the maker's tolerances say.
 
-    Raises:
-        RecipeError: the file cannot be read or does not fit; the message names file, line and key.
-        RobotError: its robot cannot be used; the message names file, line and key too.
+    Attributes:
+        length_mm: of a and d [mm].
+        angle_mrad: of theta, alpha and beta [mrad].
     """
-    recipe = read_yaml(path, Recipe, RecipeError)
-    check_fit(path, recipe.robot, partial(inverse_checks, recipe))
-    return recipe
+
+    length_mm: PositiveFloat = 1.0
+    angle_mrad: PositiveFloat = 1.0
+
+    def prior(self) -> Prior:
+        """The same in SI units."""
+        length, angle = self.length_mm / 1e3, self.angle_mrad / 1e3
+        return Prior(theta=angle, d=length, a=length, alpha=angle, beta=angle)
 
 
-def recipe_hash(path: str | os.PathLike[str]) -> str:
-    """SHA-256 (hexadecimal) of the recipe file, for provenance."""
-    return hashlib.sha256(Path(path).read_bytes()).hexdigest()
+class CalibrationSection(Section):
+    """Settings of `GeometricCalibrator`.
+
+    Attributes:
+        free: "identifiable", "joint_offsets" or names of parameters.
+        base: "free", or "fixed" to the robot's own.
+        tool: the same for the tool.
+        elimination: how redundant parameters are left out: "exact", "pairwise" (the paper's) or "none".
+        prior: None for none.
+        robust: whether rows that are far off count less.
+        maximum_iterations: steps tried at most.
+    """
+
+    free: Literal["identifiable", "joint_offsets"] | tuple[str, ...] = "identifiable"
+    base: Literal["free", "fixed"] = "free"
+    tool: Literal["free", "fixed"] = "free"
+    elimination: Literal["exact", "pairwise", "none"] = "exact"
+    prior: PriorSection | None = PriorSection()
+    robust: bool = True
+    maximum_iterations: PositiveInt = 100
+
+    def calibrator(self, robot: Robot) -> GeometricCalibrator:
+        """The calibrator for a robot."""
+        return GeometricCalibrator(
+            robot,
+            free=self.free,
+            base=self.base,
+            tool=self.tool,
+            elimination=self.elimination,
+            prior=self.prior.prior() if self.prior else None,
+            loss=HampelLoss() if self.robust else SquaredLoss(),
+            maximum_iterations=self.maximum_iterations,
+        )
+
+
+class GeometricRecipe(AbstractRecipe):
+    """A geometric calibration of a simulated robot.
+
+    Attributes:
+        kind: "geometric_calibration".
+        name: of the recipe and, by default, of the model.
+        description: what it shows, for the model's card.
+        not_validated: what a reader must not take from it, for the card.
+        robot: catalogue name or robot file of the nominal robot.
+        errors: what is wrong with the true robot, completely.
+        measurements: what is measured for the calibration.
+        held_out: what the calibration is judged on and never sees.
+        calibration: settings of the calibrator.
+        paper: published figures to stand beside ours, by name.
+    """
+
+    kind: Literal["geometric_calibration"]
+    errors: tuple[ErrorSource, ...]
+    measurements: SimulatedMeasurements
+    held_out: SimulatedMeasurements
+    calibration: CalibrationSection = CalibrationSection()
+    paper: dict[str, float | int | str | list[str] | list[list[str]]] = Field(default_factory=dict)
+
+
+class HybridSection(Section):
+    """What `HybridCalibrator` may choose from; whatever does not help is left out.
+
+    Attributes:
+        features: of the unit of order 1 that are tried.
+        harmonics: of the Fourier series, tried in this order.
+        orders: numbers of factors of product units, tried in this order.
+        gravity: direction in which things fall, in the frame of the robot's first row.
+        mini_batches: whether the unknowns are trained on mini-batches: true, false, or "auto" for many rows only; or
+            their `batch_rows`, `epochs`, `learning_rate` and `seed`.
+    """
+
+    features: tuple[str, ...] = HybridCalibrator.features
+    harmonics: tuple[int, ...] = HybridCalibrator.harmonics
+    orders: tuple[tuple[int, ...], ...] = HybridCalibrator.orders
+    gravity: tuple[float, float, float] = HybridCalibrator.gravity
+    mini_batches: MiniBatches | bool | Literal["auto"] = HybridCalibrator.mini_batches
+
+    def calibrator(self, geometric: GeometricCalibrator) -> HybridCalibrator:
+        """The calibrator, on top of a geometric one.
+
+        Raises:
+            IdentificationError: a choice does not exist.
+        """
+        return HybridCalibrator(geometric, **dict(self))
+
+
+class LearningCurveSection(Section):
+    """Which numbers of training rows are tried.
+
+    Attributes:
+        rows: the numbers; all training rows come on top.
+        seed: decides which rows are drawn.
+    """
+
+    rows: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
+    seed: Seed = 0
+
+
+class HybridRecipe(AbstractRecipe):
+    """A hybrid calibration, judged beside the nominal robot and the geometric calibration.
+
+    Attributes:
+        kind: "hybrid_calibration".
+        name: of the recipe and, by default, of the model.
+        description: what it shows, for the model's card.
+        not_validated: what a reader must not take from it, for the card.
+        robot: catalogue name or robot file of the nominal robot.
+        data: where measurements come from; measured ones are judged in folds, simulated ones on held-out rows.
+        repeats: of a simulation, with all its seeds one higher each time; the model is of the first.
+        calibration: settings of the geometric calibrator.
+        hybrid: settings of the hybrid calibrator.
+        learning_curve: numbers of training rows to try; None for none.
+    """
+
+    kind: Literal["hybrid_calibration"]
+    data: Annotated[SimulatedData | MeasuredData, Field(discriminator="kind")]
+    repeats: PositiveInt = 1
+    calibration: CalibrationSection = CalibrationSection()
+    hybrid: HybridSection = HybridSection()
+    learning_curve: LearningCurveSection | None = None
+
+    def calibrator(self) -> HybridCalibrator:
+        """The calibrator for the nominal robot.
+
+        Raises:
+            IdentificationError: a choice of the section `hybrid` does not exist.
+        """
+        return self.hybrid.calibrator(self.calibration.calibrator(Robot.load(self.robot)))
+
+
+Recipe = InverseRecipe | GeometricRecipe | HybridRecipe

@@ -1,12 +1,11 @@
 """Figures as text: numbers, tables, and what the cards of all models have in common."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
+
+from pisigma.judging.training_summary import JointFigures
 
 CARD = "README.md"
-
-PARTS = (("training", "training"), ("held_out", "held-out"), ("paper", "paper"))
-"""Keys of a joint's figures and what the tables call them."""
 
 _STATISTICS = ("average", "deviation", "maximum")
 _SHOWN = {"rms": "RMS", "p95": "95 %", "max": "maximum"}
@@ -39,28 +38,23 @@ def figure_text(value: float) -> str:
     return f"{value:.4f}" if value == 0 or abs(value) >= 1e-3 else f"{value:.1e}"
 
 
-def joint_rows(joints: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
-    """Per joint and part: joint, unit, part, then average, deviation, maximum before and after.
-
-    Args:
-        joints: from `pisigma.reporting.training_report.report_joints`.
-    """
-    rows = []
+def joint_rows(joints: Sequence[JointFigures]) -> list[tuple[str, ...]]:
+    """Per joint and rows: joint, unit, rows, then average, deviation, maximum before and after."""
+    lines = []
     for joint in joints:
-        for part, label in PARTS:
-            if part in joint:
-                unit = next(iter(joint[part]["before"])).rsplit("_", 1)[1]
-                figures = [
-                    figure_text(joint[part][when][f"{name}_{unit}"])
-                    for when in ("before", "after")
-                    for name in _STATISTICS
-                ]
-                rows.append((joint["name"], unit, label, *figures))
-    return rows
+        for errors, label in (
+            (joint.training, "training"),
+            (joint.held_out, "held-out"),
+            (joint.paper, "paper"),
+        ):
+            if errors is not None:
+                figures = (*errors.before.values, *errors.after.values)
+                lines.append((joint.name, errors.before.unit, label, *map(figure_text, figures)))
+    return lines
 
 
-def joint_table(joints: Sequence[Mapping[str, Any]]) -> str:
-    """A Markdown table of the joint errors; one line per joint and part, before and after side by side."""
+def joint_table(joints: Sequence[JointFigures]) -> str:
+    """A Markdown table of the joint errors; one line per joint and rows, before and after side by side."""
     head = [
         "joint",
         "unit",

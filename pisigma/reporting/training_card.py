@@ -1,11 +1,10 @@
-"""The card of a model: what it is, how it was made, how good it is and what nobody checked."""
+"""The card of trained networks: what they are, how they were made, how good they are and what nobody checked."""
 
 import math
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
-from pisigma.recipes.recipe import Recipe
+from pisigma.judging.training_summary import TrainingRun, TrainingSummary
+from pisigma.reporting.calibration_card import CardTexts
 from pisigma.reporting.figures import (
     ENERGY_CSV,
     ENERGY_PNG,
@@ -14,21 +13,19 @@ from pisigma.reporting.figures import (
     draw_errors_over_workspace,
     write_energy_csv,
 )
-from pisigma.reporting.tables import CARD as CARD
-from pisigma.reporting.tables import joint_table, pose_table, use_text
-from pisigma.workflow.run import TrainingRun
+from pisigma.reporting.tables import CARD, joint_table, pose_table, use_text
 
 
-def write_card(
-    recipe: Recipe, command: str, run: TrainingRun, report: Mapping[str, Any], folder: Path
+def write_training_card(
+    name: str, texts: CardTexts, run: TrainingRun, summary: TrainingSummary, folder: Path
 ) -> None:
     """Write the card and its figures into a model folder.
 
     Args:
-        recipe: what was trained.
-        command: the command line that makes this model.
+        name: of the model.
+        texts: description, and what was not validated.
         run: what came out.
-        report: from `report_training`.
+        summary: all figures.
         folder: where to write.
     """
     joints, energies = run.history.joints, run.history.energies
@@ -42,33 +39,21 @@ def write_card(
     scale = shown.before.new_tensor([math.degrees(1) if unit == "deg" else 1e3 for unit in units])
     before, after = shown.before[:, index] * scale, shown.after[:, index] * scale
     draw_errors_over_workspace(joints, units, shown.T[:, :3, 3], before, after, folder / WORKSPACE_PNG)
-    (folder / CARD).write_text(_card_text(recipe, command, run, report), encoding="utf-8")
+    (folder / CARD).write_text(_card_text(name, texts, run, summary), encoding="utf-8")
 
 
-def _card_text(recipe: Recipe, command: str, run: TrainingRun, report: Mapping[str, Any]) -> str:
+def _card_text(name: str, texts: CardTexts, run: TrainingRun, summary: TrainingSummary) -> str:
     where = "held-out" if run.held_out else "training"
     parts = [
-        f"# {recipe.name}",
-        recipe.description.strip(),
-        f"Made by `{command}`.",
+        f"# {name}",
+        texts.description.strip(),
+        f"Made by `{summary.command}`.",
         "## Data",
         _data_text(run),
         "## Joint errors",
-        _joint_text(recipe, run),
-        joint_table(report["joints"]),
-    ]
-    if "cross_validation" in report:
-        models = {name: report["cross_validation"][name] for name in ("nominal", "corrected")}
-        parts += ["## Held-out pose errors", report["verdict"], pose_table(models)]
-    if "test" in report:
-        test = report["test"]
-        models = {name: test[name] for name in ("nominal", "corrected")}
-        parts += [
-            "## Pose errors of the test set",
-            f"The {test['rows']} rows that the file marks as test; nothing was trained on them.",
-            pose_table(models),
-        ]
-    parts += [
+        _joint_text(run, summary),
+        joint_table(summary.joints),
+        *_pose_error_parts(summary),
         "## Figures",
         f"Training energy of every joint over the epochs ([values]({ENERGY_CSV})): half the mean square "
         "of the error, in units of the range of the training targets.",
@@ -78,13 +63,27 @@ def _card_text(recipe: Recipe, command: str, run: TrainingRun, report: Mapping[s
         "## Domain",
         _domain_text(run),
         "## Not validated",
-        recipe.not_validated.strip(),
+        texts.not_validated.strip(),
         "## Use",
-        use_text(recipe.name),
+        use_text(name),
         "## Provenance",
         _provenance_text(run),
     ]
     return "\n\n".join(parts) + "\n"
+
+
+def _pose_error_parts(summary: TrainingSummary) -> list[str]:
+    parts = []
+    if summary.cross_validation is not None:
+        parts += ["## Held-out pose errors", summary.verdict or ""]
+        parts.append(pose_table(summary.cross_validation.by_model))
+    if summary.test is not None:
+        parts += [
+            "## Pose errors of the test set",
+            f"The {summary.test.rows} rows that the file marks as test; nothing was trained on them.",
+            pose_table(summary.test.by_model),
+        ]
+    return parts
 
 
 def _data_text(run: TrainingRun) -> str:
@@ -99,7 +98,7 @@ def _data_text(run: TrainingRun) -> str:
     )
 
 
-def _joint_text(recipe: Recipe, run: TrainingRun) -> str:
+def _joint_text(run: TrainingRun, summary: TrainingSummary) -> str:
     """What the table shows."""
     parts = [
         "Absolute error of the joint values: average, standard deviation and maximum over the rows, before "
@@ -107,7 +106,7 @@ def _joint_text(recipe: Recipe, run: TrainingRun) -> str:
     ]
     if run.held_out is None:
         parts.append("These are the rows that the network was fitted to.")
-    if recipe.paper:
+    if any(joint.paper for joint in summary.joints):
         parts.append('Lines "paper" are the published figures.')
     return " ".join(parts)
 

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,27 +14,12 @@ from torch.utils.data import DataLoader, Sampler, TensorDataset
 from pisigma.errors import TrainingError
 from pisigma.network.energy import energy, energy_gradient
 from pisigma.network.pi_sigma import PiSigma
+from pisigma.training.history import TrainingHistory
 from pisigma.training.levenberg_marquardt import LevenbergMarquardt, Patterns
 from pisigma.training.sections import FitSection, GradientDescentSection, MiniBatchSection
 from pisigma.training.trainer import SAVED, Checkpoints, train
 
 Closure = Callable[[], Any]
-
-
-@dataclass(frozen=True, eq=False)
-class TrainingHistory:
-    """What a training left behind.
-
-    Attributes:
-        joints: names of the corrected joints.
-        energies: `E = 1/2 Σ_μ (d - y)²` of every joint in every epoch (Jeong et al. 1998, eq. 3), in scaled units:
-            before the step of the epoch; after it with Levenberg-Marquardt; over its steps with mini-batches.
-        resumed_from: epoch the training went on from, 0 for a fresh one.
-    """
-
-    joints: tuple[str, ...]
-    energies: Float[Tensor, "epochs joints"]
-    resumed_from: int
 
 
 def fit_networks(

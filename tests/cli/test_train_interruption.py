@@ -10,9 +10,9 @@ from pathlib import Path
 
 from testing.closeness import assert_close
 
-from pisigma.recipes.recipe import read_recipe
-from pisigma.recipes.recipe_data import load_measurements
-from pisigma.workflow.run import RunOptions, train_recipe
+from pisigma.recipes.data import load_measurements
+from pisigma.recipes.reader import read_recipe
+from pisigma.workflow.train import TrainSettings, train_networks
 
 # Slow enough to be caught in the middle: every epoch waits, the last ones for long, which changes no number.
 SLOW = """
@@ -102,9 +102,9 @@ def test_killed_and_resumed_levenberg_marquardt_gives_the_same_weights(write_rec
     path = write_recipe(*DEFAULT)
     recipe = read_recipe(path)
     kill_after_a_checkpoint(tmp_path / "broken", path)
-    options = RunOptions(tmp_path / "broken" / ".model.training", resume=True)
-    resumed = train_recipe(recipe, load_measurements(recipe, None), options)
-    whole = train_recipe(recipe, load_measurements(recipe, None))
+    options = TrainSettings(tmp_path / "broken" / ".model.training", resume=True)
+    resumed = train_networks(recipe, load_measurements(recipe, None), options)
+    whole = train_networks(recipe, load_measurements(recipe, None))
     assert 0 < resumed.history.resumed_from < EPOCHS
     assert_close(resumed.history.energies, whole.history.energies, atol=0)
     for name, value in whole.model.network.state_dict().items():

@@ -1,34 +1,10 @@
-"""Cross-validation on a simulated robot that is handed over as if it were measured."""
+"""The verdict of a cross-validation, in a sentence."""
 
 import pytest
 import torch
-from testing.models import no_type_checker, trained_run
 
-from pisigma.errors import RecipeError
-from pisigma.judging.cross_validation import CrossValidation, cross_validate
+from pisigma.judging.cross_validation import CrossValidation
 from pisigma.judging.pose_statistics import Comparison, PoseErrors
-from pisigma.recipes.recipe import MeasuredData
-
-
-def test_the_correction_helps_on_rows_that_it_never_saw():
-    recipe, run = trained_run("kiro4")
-    measured = recipe.model_copy(update={"data": MeasuredData(kind="measured", folds=3, seed=1)})
-    seen: list[tuple[int, int]] = []
-    with no_type_checker():
-        result = cross_validate(measured, run.measurements, lambda *step: seen.append(step))
-    assert seen == [(0, 3), (1, 3), (2, 3)]
-    figures = result.in_file_units()
-    assert (figures["folds"], figures["rows_not_predicted"]) == (3, 0)
-    assert figures["corrected"]["rms_mm"] < figures["nominal"]["rms_mm"] / 3
-    assert not result.comparison.corrected.position.isnan().any()
-    assert not result.comparison.nominal.rotation.isnan().any()
-    assert result.verdict.startswith("On held-out rows the correction lowers the position error (")
-
-
-def test_a_simulated_recipe_has_held_out_rows_of_its_own():
-    recipe, run = trained_run("kiro3")
-    with pytest.raises(RecipeError, match="simulates its data"):
-        cross_validate(recipe, run.measurements)
 
 
 def verdict(position: float, rotation: float | None, largest: float | None = None) -> str:

@@ -7,20 +7,21 @@ from testing.closeness import assert_close
 
 from elimination_cases import report_correlations, report_eliminations
 from pisigma.errors import RecipeError
-from pisigma.recipes.recipe_data import simulate_held_out, simulate_training
-from pisigma.recipes.recipe_kinds import read_geometric_recipe
+from pisigma.recipes.data import simulate_held_out, simulate_training
+from pisigma.recipes.reader import read_recipe
+from pisigma.robot import Robot
 from published import read_published
 
 
 @pytest.fixture(scope="module")
 def recipe(repository):
-    return read_geometric_recipe(repository / "training" / "rb5_redundancy.yaml")
+    return read_recipe(repository / "training" / "rb5_redundancy.yaml")
 
 
 @pytest.fixture(scope="module")
 def calibrated(recipe):
     rows = simulate_training(recipe)
-    return recipe.calibrate(rows), rows
+    return recipe.calibration.calibrator(Robot.load(recipe.robot)).fit(rows), rows
 
 
 def test_every_case_predicts_the_same_and_keeps_the_sums(repository, recipe, calibrated):

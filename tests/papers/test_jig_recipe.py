@@ -14,7 +14,7 @@ from jig_recipe import (
     read_jig_recipe,
 )
 from pisigma.errors import IdentificationError, RecipeError
-from pisigma.recipes.recipe_kinds import read_any_recipe
+from pisigma.recipes.reader import read_recipe
 from pisigma.se3 import wrap_to_pi
 from pisigma.simulation.touch_candidates import JigPlacement
 
@@ -31,7 +31,7 @@ def small(recipe: JigRecipe, **changes: object) -> JigRecipe:
 
 def test_the_product_does_not_train_it(repository):
     with pytest.raises(RecipeError, match=r"'kind' cannot be 'jig_calibration'"):
-        read_any_recipe(repository / "training" / JIGS)
+        read_recipe(repository / "training" / JIGS)
 
 
 def test_the_true_robot_has_the_papers_values(recipe):

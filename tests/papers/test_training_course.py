@@ -3,9 +3,9 @@
 import pytest
 from testing.closeness import assert_close
 
-from pisigma.recipes.recipe import read_recipe
-from pisigma.recipes.recipe_data import load_measurements
-from pisigma.workflow.run import train_recipe
+from pisigma.recipes.data import load_measurements
+from pisigma.recipes.reader import read_recipe
+from pisigma.workflow.train import train_networks
 from training_course import EPOCHS_SHOWN, epochs_shown, report_course
 
 
@@ -21,8 +21,8 @@ def test_first_and_last_epoch_are_shown_and_none_twice(epochs):
 def test_energies_and_points_are_those_of_the_training(repository):
     recipe = read_recipe(repository / "training" / "kiro3_paper.yaml")
     recipe = recipe.model_copy(update={"fit": recipe.fit.model_copy(update={"epochs": 100})})
-    run = train_recipe(recipe, load_measurements(recipe, None))
-    course = report_course(recipe, run)
+    run = train_networks(recipe, load_measurements(recipe, None))
+    course = report_course(run)
     epochs = course["energies"].pop("epoch")
     assert list(course["energies"]) == ["theta_1", "theta_2"]
     assert_close(course["energies"]["theta_2"], run.history.energies[[e - 1 for e in epochs], 1], rtol=1e-5)

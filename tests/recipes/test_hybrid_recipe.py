@@ -7,15 +7,15 @@ from testing.closeness import assert_close
 from pisigma.errors import RecipeError
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.mini_batches import MiniBatches
-from pisigma.recipes.hybrid_recipe import HybridRecipe, repeated
-from pisigma.recipes.recipe import MeasuredData, SimulatedData
-from pisigma.recipes.recipe_data import (
+from pisigma.recipes.data import (
     load_measurements,
+    repeated,
     simulate_held_out,
     simulate_repeats,
     simulate_training,
 )
-from pisigma.recipes.recipe_kinds import read_any_recipe, read_hybrid_recipe
+from pisigma.recipes.reader import read_recipe
+from pisigma.recipes.recipe import HybridRecipe, MeasuredData, SimulatedData
 
 RB5 = "rb5_hybrid"
 SMALL = (("count: 5000", "count: 40"), ("repeats: 5", "repeats: 2"))
@@ -24,7 +24,7 @@ HYBRID = "repeats: 5\n"
 
 @pytest.mark.parametrize("name", ["ur5_hybrid", "ur10_hybrid", RB5])
 def test_shipped_recipes_parse_and_say_what_they_are(repository, name):
-    recipe = read_any_recipe(repository / "training" / f"{name}.yaml")
+    recipe = read_recipe(repository / "training" / f"{name}.yaml")
     assert isinstance(recipe, HybridRecipe)
     assert recipe.name == name
     assert recipe.description
@@ -35,7 +35,7 @@ def test_shipped_recipes_parse_and_say_what_they_are(repository, name):
 
 
 def test_every_error_source_is_on(repository):
-    data = read_hybrid_recipe(repository / "training" / f"{RB5}.yaml").data
+    data = read_recipe(repository / "training" / f"{RB5}.yaml").data
     assert isinstance(data, SimulatedData)
     kinds = {source.kind for source in data.errors}
     assert kinds == {"geometric", "geometric_random", "transmission", "joint_compliance", "encoder"}
@@ -66,13 +66,13 @@ def test_every_error_source_is_on(repository):
 def test_mistakes_are_refused_with_place(write_recipe, old, new, complaint):
     path = write_recipe(RB5, (old, new))
     with pytest.raises(RecipeError, match=complaint) as caught:
-        read_any_recipe(path)
+        read_recipe(path)
     assert str(caught.value).startswith(f"{path}, line ")
     assert "\n" not in str(caught.value)
 
 
 def test_repeats_are_other_robots_other_poses_and_other_noise(write_recipe):
-    recipe = read_hybrid_recipe(write_recipe(RB5, *SMALL))
+    recipe = read_recipe(write_recipe(RB5, *SMALL))
     rows, parts = simulate_repeats(recipe)
     assert rows.rows == 2 * (150 + 40)
     assert [(len(train), len(test)) for train, test in parts] == [(150, 40)] * 2
@@ -90,14 +90,14 @@ def test_repeats_are_other_robots_other_poses_and_other_noise(write_recipe):
 
 
 def test_measured_recipes_want_a_file_and_simulated_ones_none(write_recipe, tmp_path):
-    recipe = read_hybrid_recipe(write_recipe("ur5_hybrid"))
+    recipe = read_recipe(write_recipe("ur5_hybrid"))
     assert isinstance(recipe.data, MeasuredData)
     with pytest.raises(RecipeError, match="is for measured data; give the file with --data"):
         load_measurements(recipe, None)
     with pytest.raises(RecipeError, match="is for measured data and simulates nothing"):
         simulate_repeats(recipe)
     with pytest.raises(RecipeError, match="simulates its data and takes no --data"):
-        load_measurements(read_hybrid_recipe(write_recipe(RB5)), tmp_path / "rows.csv")
+        load_measurements(read_recipe(write_recipe(RB5)), tmp_path / "rows.csv")
 
 
 @pytest.mark.parametrize(
@@ -110,4 +110,4 @@ def test_a_recipe_may_choose_mini_batches(repository, tmp_path, stated, wanted):
     file.write_text(
         recipe.replace(HYBRID, f"repeats: 5\nhybrid: {{mini_batches: {stated}}}\n"), encoding="utf-8"
     )
-    assert read_hybrid_recipe(file).calibrator().mini_batches == wanted
+    assert read_recipe(file).calibrator().mini_batches == wanted

@@ -3,9 +3,8 @@
 import pytest
 
 from pisigma.errors import RecipeError, UnknownRobotError
-from pisigma.recipes.geometric_recipe import GeometricRecipe
-from pisigma.recipes.recipe import Recipe
-from pisigma.recipes.recipe_kinds import read_any_recipe, read_geometric_recipe
+from pisigma.recipes.reader import read_recipe
+from pisigma.recipes.recipe import GeometricRecipe, InverseRecipe
 
 RB5 = "rb5_redundancy"
 ERRORS = "errors:\n"
@@ -32,7 +31,7 @@ GEOMETRIC = "errors:\n  - {kind: geometric, rows: {theta_9: {a_mm: 1.0}}}\n"
 def test_mistakes_are_refused_with_place(write_recipe, old, new, complaint):
     path = write_recipe(RB5, (old, new))
     with pytest.raises(RecipeError, match=complaint) as caught:
-        read_any_recipe(path)
+        read_recipe(path)
     assert str(caught.value).startswith(f"{path}, line ")
     assert "\n" not in str(caught.value)
 
@@ -40,15 +39,15 @@ def test_mistakes_are_refused_with_place(write_recipe, old, new, complaint):
 def test_unknown_robots_and_frames(write_recipe):
     path = write_recipe(RB5, ("robot: rb5\n", "robot: rb55\n"))
     with pytest.raises(UnknownRobotError, match=r"line \d+: 'robot': 'rb55' .* did you mean 'rb5'"):
-        read_geometric_recipe(path)
+        read_recipe(path)
     path = write_recipe(RB5, ("held_out:\n", "held_out:\n  frame: other\n"))
     with pytest.raises(RecipeError, match=r"'held_out\.frame': the frame 'other' is not calibrated"):
-        read_geometric_recipe(path)
+        read_recipe(path)
 
 
 def test_a_kind_need_not_be_stated_where_it_is_inverse_calibration(write_recipe):
-    assert isinstance(read_any_recipe(write_recipe("kiro3_paper")), Recipe)
-    assert isinstance(read_any_recipe(write_recipe(RB5)), GeometricRecipe)
+    assert isinstance(read_recipe(write_recipe("kiro3_paper")), InverseRecipe)
+    assert isinstance(read_recipe(write_recipe(RB5)), GeometricRecipe)
     path = write_recipe("kiro3_paper", ("name: kiro3_paper", "kind: inverse_calibratio\nname: kiro3_paper"))
     with pytest.raises(RecipeError, match=r"line 1: 'kind' cannot be .* did you mean 'inverse_calibration'"):
-        read_any_recipe(path)
+        read_recipe(path)

@@ -3,8 +3,8 @@
 import pytest
 
 from pisigma.errors import RecipeError, RobotError, UnknownRobotError
-from pisigma.recipes.recipe import read_recipe, recipe_hash
-from pisigma.recipes.recipe_data import load_measurements, simulate_held_out, simulate_training
+from pisigma.recipes.data import load_measurements, simulate_held_out, simulate_training
+from pisigma.recipes.reader import read_recipe, recipe_hash
 from pisigma.training.sections import GradientDescentSection
 
 PAPER = "kiro3_paper"

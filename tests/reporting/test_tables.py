@@ -2,6 +2,7 @@
 
 import pytest
 
+from pisigma.judging.training_summary import JointFigures
 from pisigma.reporting.tables import figure_text, joint_table, pose_table
 
 JOINTS = [
@@ -31,7 +32,7 @@ def test_small_figures_keep_two_digits(value, text):
 
 
 def test_joint_table_has_a_line_per_joint_and_part_with_its_unit():
-    head, rule, *lines = joint_table(JOINTS).splitlines()
+    head, rule, *lines = joint_table([JointFigures.model_validate(joint) for joint in JOINTS]).splitlines()
     assert head.count("|") == rule.count("|") == 10
     assert lines == [
         "| theta_1 | deg | training | 0.4750 | 0.3179 | 1.2758 | 1.5e-04 | 0.0000 | 12.5000 |",

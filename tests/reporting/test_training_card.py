@@ -3,9 +3,10 @@
 import pytest
 from testing.models import trained_run
 
-from pisigma.reporting.card import write_card
+from pisigma.judging.training_summary import summarise_training
+from pisigma.reporting.calibration_card import CardTexts
 from pisigma.reporting.tables import CARD, joint_table
-from pisigma.reporting.training_report import report_training
+from pisigma.reporting.training_card import write_training_card
 
 SECTIONS = ("Data", "Joint errors", "Figures", "Domain", "Not validated", "Use", "Provenance")
 
@@ -14,9 +15,11 @@ SECTIONS = ("Data", "Joint errors", "Figures", "Domain", "Not validated", "Use",
 def card(request, tmp_path_factory):
     """Recipe, run, report, folder and text of a card."""
     recipe, run = trained_run(request.param)
-    report = report_training(recipe, run, None)
+    command = f"pisigma train training/{request.param}.yaml"
+    report = summarise_training(run, recipe.paper).model_copy(update={"command": command})
     folder = tmp_path_factory.mktemp("card")
-    write_card(recipe, f"pisigma train training/{request.param}.yaml", run, report, folder)
+    texts = CardTexts(recipe.description, recipe.not_validated)
+    write_training_card(recipe.name, texts, run, report, folder)
     return recipe, run, report, folder, (folder / CARD).read_text()
 
 
@@ -32,8 +35,8 @@ def test_sections_and_pictures_are_there(card):
 
 def test_the_table_is_that_of_the_report(card):
     _, run, report, _, text = card
-    assert joint_table(report["joints"]) in text
-    assert len(report["joints"]) == len(run.history.joints)
+    assert joint_table(report.joints) in text
+    assert len(report.joints) == len(run.history.joints)
     assert f"Trained on {run.model.provenance.rows} simulated rows, none left out." in text
     assert "Judged on 200 other simulated rows (held-out)." in text
 

@@ -105,14 +105,14 @@ def small_recipe_text(name: str) -> str:
 def trained_run(name: str):
     """What a short training of the shipped recipe gives: the recipe and the run."""
     from pisigma.errors import RecipeError
-    from pisigma.recipes.recipe import Recipe
-    from pisigma.recipes.recipe_data import load_measurements
-    from pisigma.workflow.run import train_recipe
+    from pisigma.recipes.data import load_measurements
+    from pisigma.recipes.recipe import InverseRecipe
+    from pisigma.workflow.train import train_networks
     from pisigma.yaml_file import parse_yaml
 
-    recipe = parse_yaml(small_recipe_text(name), Recipe, RecipeError, name)
+    recipe = parse_yaml(small_recipe_text(name), InverseRecipe, RecipeError, name)
     with no_type_checker():
-        return recipe, train_recipe(recipe, load_measurements(recipe, None))
+        return recipe, train_networks(recipe, load_measurements(recipe, None))
 
 
 @contextmanager

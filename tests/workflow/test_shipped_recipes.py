@@ -7,14 +7,13 @@ import torch
 import yaml
 from testing.closeness import assert_close
 
-from pisigma.recipes.geometric_recipe import GeometricRecipe
-from pisigma.recipes.recipe import Recipe, SimulatedData, read_recipe
-from pisigma.recipes.recipe_data import load_measurements
-from pisigma.recipes.recipe_kinds import read_any_recipe
-from pisigma.reporting.training_report import report_joints
-from pisigma.workflow.run import TrainingRun, train_recipe
+from pisigma.judging.training_summary import TrainingRun, summarise_training
+from pisigma.recipes.data import load_measurements
+from pisigma.recipes.reader import read_recipe
+from pisigma.recipes.recipe import GeometricRecipe, InverseRecipe, SimulatedData
+from pisigma.workflow.train import train_networks
 
-FOLDER = Path(__file__).parent.parent / "training"
+FOLDER = Path(__file__).parents[2] / "training"
 INVERSE = sorted(p.stem for p in FOLDER.glob("*.yaml") if "network" in yaml.safe_load(p.read_text()))
 SEEDS = range(5)
 SIGNS = {
@@ -24,13 +23,17 @@ SIGNS = {
 STATISTICS = ("average_deg", "deviation_deg", "maximum_deg")
 
 
-def read(name: str) -> Recipe:
+def read(name: str) -> InverseRecipe:
     return read_recipe(FOLDER / f"{name}.yaml")
 
 
-def train(recipe: Recipe, seed: int = 0) -> TrainingRun:
+def train(recipe: InverseRecipe, seed: int = 0) -> TrainingRun:
     recipe = recipe.model_copy(update={"fit": recipe.fit.model_copy(update={"seed": seed})})
-    return train_recipe(recipe, load_measurements(recipe, None))
+    return train_networks(recipe, load_measurements(recipe, None))
+
+
+def joints_of(recipe: InverseRecipe, run: TrainingRun) -> list[dict]:
+    return summarise_training(run, recipe.paper).to_json()["joints"]
 
 
 GEOMETRIC = sorted(
@@ -47,7 +50,7 @@ def test_the_recipes_of_geometric_calibration_are_there():
 
 @pytest.mark.parametrize("name", GEOMETRIC)
 def test_a_geometric_recipe_parses_and_says_what_it_is(name):
-    recipe = read_any_recipe(FOLDER / f"{name}.yaml")
+    recipe = read_recipe(FOLDER / f"{name}.yaml")
     assert isinstance(recipe, GeometricRecipe)
     assert recipe.name == name
     assert recipe.description
@@ -77,7 +80,7 @@ def test_the_papers_network_does_what_the_paper_says(name):
     assert (recipe.fit.method, recipe.fit.epochs) == ("gradient_descent", 3000)
     assert {group.orders for group in recipe.network} == {(3,)}
     run = train(recipe)
-    reports = report_joints(recipe, run)
+    reports = joints_of(recipe, run)
     assert [report["name"] for report in reports] == list(recipe.paper)
     for index, report in enumerate(reports):
         before, after, paper = report["training"]["before"], report["training"]["after"], report["paper"]
@@ -95,7 +98,7 @@ def test_the_papers_network_does_what_the_paper_says(name):
 def test_the_default_is_ten_times_better_than_the_paper_on_new_poses(name, seed):
     recipe = read(name)
     run = train(recipe, seed)
-    for report in report_joints(recipe, run):
+    for report in joints_of(recipe, run):
         assert report["held_out"]["after"]["average_deg"] <= report["paper"]["after"]["average_deg"] / 10
     assert len(run.held_out.before) == 2000
     assert len(run.history.energies) < recipe.fit.epochs  # it ended because it had converged
@@ -104,7 +107,7 @@ def test_the_default_is_ten_times_better_than_the_paper_on_new_poses(name, seed)
 def test_the_physical_robot_is_corrected_too():
     recipe = read("kiro3_physical")
     run = train(recipe)
-    for report in report_joints(recipe, run):
+    for report in joints_of(recipe, run):
         for key in STATISTICS:
             assert_close(report["training"]["before"][key], report["paper"]["before"][key], rtol=0.02)
         assert report["held_out"]["after"]["average_deg"] < report["held_out"]["before"]["average_deg"] / 20

@@ -13,7 +13,7 @@ from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.result import CalibrationResult
 from pisigma.judging.calibration_validation import errors_under
 from pisigma.measurement.dataset import Measurements
-from pisigma.recipes.geometric_recipe import GeometricRecipe
+from pisigma.recipes.recipe import GeometricRecipe
 from pisigma.robot.description import Robot
 from pisigma.simulation.true_robot import TrueRobot
 

@@ -17,7 +17,7 @@ from pisigma.judging.calibration_summary import summarise
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.folder.staging import check_replaceable, staged_folder
 from pisigma.model.geometric_model import model_of_calibration
-from pisigma.recipes.recipe import recipe_hash
+from pisigma.recipes.reader import recipe_hash
 from pisigma.robot.description import Robot
 
 

@@ -1,7 +1,8 @@
-"""Recipes that stand beside no paper: measured robots, and the hybrid."""
+"""Recipes that stand beside no paper: mini-batches, measured robots, and the hybrid."""
 
 from markdown_text import command_block, picture
-from pisigma.reporting.tables import markdown_table, pose_table
+from pisigma.judging.training_summary import JointFigures
+from pisigma.reporting.tables import joint_table, markdown_table, pose_table
 from published import Published
 from stored_results import Result, StoredResults
 
@@ -12,15 +13,21 @@ HYBRIDS = {
     "ur10_hybrid": "UR10, measured, hybrid",
     "ur5_hybrid": "UR5, measured, hybrid",
 }
-OTHERS = ("ur10_inverse", *HYBRIDS)
+OTHERS = ("kiro3_mini_batches", "ur10_inverse", *HYBRIDS)
 """Recipes of this part."""
 
 
 def measured_sections(published: Published, results: StoredResults) -> list[str]:
-    """The sections of the four recipes."""
+    """The sections of these recipes."""
     found = results["ur10_inverse"]
     rows, figures = found["rows"], found["cross_validation"]
+    joints = [JointFigures.model_validate(joint) for joint in results["kiro3_mini_batches"]["joints"]]
     text = [
+        "### KIRO-3 at 4000 poses, mini-batches",
+        command_block("kiro3_mini_batches"),
+        "Absolute joint errors at the training poses and at 2000 new ones:",
+        joint_table(joints),
+        published.notes["kiro3_mini_batches"],
         "### UR10, measured, inverse calibration",
         command_block("ur10_inverse"),
         f"Errors of held-out rows, {figures['folds']}-fold cross-validated; {rows['left_out']} of "

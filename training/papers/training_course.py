@@ -6,8 +6,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.recipes.recipe import Recipe, SimulatedData
-from pisigma.workflow.run import TrainingRun
+from pisigma.judging.training_summary import TrainingRun
 
 EPOCHS_SHOWN = 80
 """At most so many epochs are given, close together at the start."""
@@ -15,11 +14,10 @@ EPOCHS_SHOWN = 80
 _DIGITS = 6
 
 
-def report_course(recipe: Recipe, run: TrainingRun) -> dict[str, Any]:
+def report_course(run: TrainingRun) -> dict[str, Any]:
     """Energies over the epochs, and of simulated data every training point with its joint errors.
 
     Args:
-        recipe: what was trained.
         run: what came out.
 
     Returns:
@@ -32,7 +30,7 @@ def report_course(recipe: Recipe, run: TrainingRun) -> dict[str, Any]:
     kept = energies[epochs - 1]
     curves = {name: _rounded(kept[:, place]) for place, name in enumerate(run.history.joints)}
     course: dict[str, Any] = {"energies": {"epoch": epochs.tolist(), **curves}}
-    if isinstance(recipe.data, SimulatedData):
+    if run.held_out is not None:
         course["points"] = _points(run)
     return course
 

@@ -1,0 +1,124 @@
+"""`pisigma.train`: recipes of every kind in, typed results out that write themselves as model folders."""
+
+import json
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.models import no_type_checker, small_recipe_text, trained_run
+
+import pisigma
+from pisigma.errors import MeasurementError, RecipeError
+from pisigma.judging.pose_statistics import compare_on
+from pisigma.judging.training_summary import summarise_training
+from pisigma.recipes.reader import recipe_hash
+from pisigma.recipes.recipe import MeasuredData, SingularRows
+from pisigma.workflow.train import InverseTraining, TrainSettings, cross_validate, train_networks
+
+
+def test_a_recipe_of_inverse_calibration_in_two_lines(tmp_path):
+    path = tmp_path / "kiro3.yaml"
+    path.write_text(small_recipe_text("kiro3"))
+    with no_type_checker():
+        training = pisigma.train(path)
+        model = training.save(tmp_path / "arm")
+    assert isinstance(training, InverseTraining)
+    assert (training.validation, training.test, training.warnings) == (None, None, ())
+    assert (training.model.name, model.name) == ("kiro3", "arm")
+    assert model.provenance.recipe_sha256 == recipe_hash(path)
+    printed = json.loads(json.dumps(training.to_json(), allow_nan=False))
+    assert printed.pop("seconds") > 0
+    assert printed | {"command": "pisigma.train('kiro3')"} == model.metrics
+    T = model.forward(model.starts[:3].double())
+    assert bool(torch.isfinite(pisigma.load(tmp_path / "arm")(T).q).all())
+
+
+def test_a_recipe_of_geometric_calibration(repository, tmp_path):
+    path = repository / "training" / "rb5_redundancy.yaml"
+    with no_type_checker():
+        calibration = pisigma.train(path)
+        calibration.save(tmp_path / "rb5")
+    assert isinstance(calibration, pisigma.Calibration)
+    assert calibration.summary.pairwise_parameters == 28
+    assert calibration.summary.held_out.geometric.rms_mm < 1e-9
+    assert calibration.model.provenance.recipe == "rb5_redundancy"
+    assert calibration.to_json()["redundant_sets"][0] == ["a_6", "a_EE"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "data", "option"),
+    [(TrainSettings(resume=True), None, "--resume"), (TrainSettings(), "x.csv", "--data")],
+)
+def test_what_a_kind_of_recipe_has_no_use_for_is_refused(repository, settings, data, option):
+    with pytest.raises(RecipeError, match=f"has no use for {option}; leave it out"):
+        pisigma.train(repository / "training" / "rb5_redundancy.yaml", data, settings)
+
+
+def test_rows_that_are_left_out_are_a_warning():
+    recipe, run = trained_run("kiro4")
+    singular = SingularRows(rule="leave_out", below=0.06)
+    data = MeasuredData(kind="measured", folds=5, seed=0)
+    measured = recipe.model_copy(update={"data": data, "singular_rows": singular})
+    with no_type_checker():
+        training = pisigma.train(measured, run.measurements)
+    assert training.validation.folds == 5
+    assert training.summary.verdict == training.validation.verdict
+    left_out = training.summary.rows.left_out
+    assert 0 < left_out < 50
+    assert training.warnings == (
+        f"{left_out} rows were left out of the training: {left_out} near a singularity.",
+    )
+
+
+def test_rows_of_two_frames_are_refused():
+    recipe, run = trained_run("kiro3")
+    measured = recipe.model_copy(update={"data": MeasuredData(kind="measured")})
+    rows = replace(run.measurements, frame=("left",) * 50 + ("right",) * 50)
+    with pytest.raises(MeasurementError, match="frame 'right' stands there"):
+        train_networks(measured, rows)
+
+
+def test_the_correction_helps_on_rows_that_it_never_saw():
+    recipe, run = trained_run("kiro4")
+    measured = recipe.model_copy(update={"data": MeasuredData(kind="measured", folds=3, seed=1)})
+    steps: list[str] = []
+    with no_type_checker():
+        result = cross_validate(measured, run.measurements, steps.append)
+    assert steps == [f"cross-validation: fold {fold} of 3" for fold in (1, 2, 3)]
+    figures = result.in_file_units()
+    assert (figures["folds"], figures["rows_not_predicted"]) == (3, 0)
+    assert figures["corrected"]["rms_mm"] < figures["nominal"]["rms_mm"] / 3
+    assert not result.comparison.corrected.position.isnan().any()
+    assert not result.comparison.nominal.rotation.isnan().any()
+    assert result.verdict.startswith("On held-out rows the correction lowers the position error (")
+
+
+def test_a_simulated_recipe_has_held_out_rows_of_its_own():
+    recipe, run = trained_run("kiro3")
+    with pytest.raises(RecipeError, match="simulates its data"):
+        cross_validate(recipe, run.measurements)
+
+
+def test_rows_of_the_test_set_change_nothing_that_is_learned():
+    recipe, run = trained_run("kiro3")
+    measured = recipe.model_copy(update={"data": MeasuredData(kind="measured", folds=2, seed=0)})
+    everything = run.measurements
+    split = tuple("test" if row % 4 == 0 else "train" for row in range(everything.rows))
+    position = everything.position.clone()
+    position[::4] += 0.5
+    marked = replace(everything, split=split)
+    training, test = marked.split_sets()
+    with no_type_checker():
+        models = [
+            train_networks(measured, data).model
+            for data in (marked, replace(marked, position=position), training)
+        ]
+        run = train_networks(measured, marked)
+        summary = summarise_training(run, {}, None, compare_on(run.model, test), test.rows)
+    states = [model.network.state_dict() for model in models]
+    for name, values in states[0].items():
+        assert all(torch.equal(values, other[name]) for other in states[1:])
+    assert len({model.provenance.data_sha256 for model in models}) == 1
+    assert (summary.rows.kept_aside, summary.test.rows) == (25, 25)
+    assert summary.rows.used + summary.rows.left_out == 75
+    assert summary.test.corrected.rms_mm < summary.test.nominal.rms_mm
