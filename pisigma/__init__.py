@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from pisigma.workflow.evaluate import Limits as Limits
     from pisigma.workflow.evaluate import evaluate as evaluate
     from pisigma.workflow.report import report as report
-    from pisigma.workflow.train import TrainSettings as TrainSettings
     from pisigma.workflow.train import train as train
+    from pisigma.workflow.train_networks import TrainSettings as TrainSettings
     from pisigma.workflow.verify import VerificationSettings as VerificationSettings
     from pisigma.workflow.verify import verify as verify
 
@@ -57,7 +57,7 @@ _HOMES = {
     "Robot": "pisigma.robot.description",
     "Solution": "pisigma.inverse.solution",
     "Status": "pisigma.kinematics.status",
-    "TrainSettings": "pisigma.workflow.train",
+    "TrainSettings": "pisigma.workflow.train_networks",
     "VerificationSettings": "pisigma.workflow.verify",
     "calibrate": "pisigma.workflow.calibrate",
     "distill": "pisigma.workflow.distill",

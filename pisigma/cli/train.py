@@ -44,8 +44,9 @@ def train(
     started = time.perf_counter()
     from pisigma.model.folder.staging import check_replaceable
     from pisigma.recipes.reader import read_recipe
-    from pisigma.workflow.train import InverseTraining, TrainSettings
+    from pisigma.workflow.train import InverseTraining
     from pisigma.workflow.train import train as train_recipe
+    from pisigma.workflow.train_networks import TrainSettings
 
     name = read_recipe(recipe).name
     folder = out or _next_free(name)

@@ -12,7 +12,7 @@ from testing.closeness import assert_close
 
 from pisigma.recipes.data import load_measurements
 from pisigma.recipes.reader import read_recipe
-from pisigma.workflow.train import TrainSettings, train_networks
+from pisigma.workflow.train_networks import TrainSettings, train_networks
 
 # Slow enough to be caught in the middle: every epoch waits, the last ones for long, which changes no number.
 SLOW = """

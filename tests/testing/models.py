@@ -107,7 +107,7 @@ def trained_run(name: str):
     from pisigma.errors import RecipeError
     from pisigma.recipes.data import load_measurements
     from pisigma.recipes.recipe import InverseRecipe
-    from pisigma.workflow.train import train_networks
+    from pisigma.workflow.train_networks import train_networks
     from pisigma.yaml_file import parse_yaml
 
     recipe = parse_yaml(small_recipe_text(name), InverseRecipe, RecipeError, name)

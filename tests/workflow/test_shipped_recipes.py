@@ -11,7 +11,7 @@ from pisigma.judging.training_summary import TrainingRun, summarise_training
 from pisigma.recipes.data import load_measurements
 from pisigma.recipes.reader import read_recipe
 from pisigma.recipes.recipe import GeometricRecipe, InverseRecipe, SimulatedData
-from pisigma.workflow.train import train_networks
+from pisigma.workflow.train_networks import train_networks
 
 FOLDER = Path(__file__).parents[2] / "training"
 INVERSE = sorted(p.stem for p in FOLDER.glob("*.yaml") if "network" in yaml.safe_load(p.read_text()))

@@ -13,7 +13,8 @@ from pisigma.judging.pose_statistics import compare_on
 from pisigma.judging.training_summary import summarise_training
 from pisigma.recipes.reader import recipe_hash
 from pisigma.recipes.recipe import MeasuredData, SingularRows
-from pisigma.workflow.train import InverseTraining, TrainSettings, cross_validate, train_networks
+from pisigma.workflow.train import InverseTraining
+from pisigma.workflow.train_networks import TrainSettings, cross_validate, train_networks
 
 
 def test_a_recipe_of_inverse_calibration_in_two_lines(tmp_path):

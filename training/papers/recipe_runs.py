@@ -13,7 +13,8 @@ from pisigma.model.folder.staging import check_replaceable
 from pisigma.recipes.data import simulate_held_out
 from pisigma.recipes.reader import read_recipe
 from pisigma.recipes.recipe import GeometricRecipe
-from pisigma.workflow.train import InverseTraining, Training, TrainSettings, train
+from pisigma.workflow.train import InverseTraining, Training, train
+from pisigma.workflow.train_networks import TrainSettings
 from published import read_published
 from stored_results import RESULTS, result_text
 from training_course import report_course

@@ -1,0 +1,197 @@
+"""Train and cross-validate the networks of a recipe of inverse calibration."""
+
+import platform
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+
+import torch
+
+from pisigma.errors import MeasurementError, RecipeError
+from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
+from pisigma.judging.cross_validation import CrossValidation
+from pisigma.judging.pose_statistics import Comparison, PoseErrors, compare_on
+from pisigma.judging.training_summary import JointErrors, TrainingRun
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.splits import groups_of_equal_joints, k_folds
+from pisigma.model.calibrated_model import CalibratedModel, Provenance
+from pisigma.model.domain import Domain
+from pisigma.model.stored_starts import spread_rows
+from pisigma.recipes.data import simulate_held_out
+from pisigma.recipes.recipe import (
+    InverseRecipe,
+    MeasuredData,
+    SimulatedData,
+)
+from pisigma.robot.description import Robot
+from pisigma.training.networks import fit_networks
+from pisigma.training.pairs import TrainingPairs, build_pairs
+from pisigma.training.patterns import build_network, build_patterns
+from pisigma.training.sections import LevenbergMarquardtSection
+from pisigma.training.trainer import Checkpoints
+
+Progress = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class TrainSettings:
+    """How a training is run, apart from what it computes.
+
+    Attributes:
+        checkpoints: folder for checkpoints of networks, and of a hybrid on mini-batches; None keeps none. It is not
+            removed when the training is done.
+        resume: go on from the checkpoint there.
+        show_progress: draw the bar of networks on stderr, if that is a terminal.
+        logs: folder for Lightning's logs of networks: `metrics.csv`, and TensorBoard's events where it is installed.
+    """
+
+    checkpoints: Path | None = None
+    resume: bool = False
+    show_progress: bool = False
+    logs: Path | None = None
+
+
+def train_networks(
+    recipe: InverseRecipe,
+    measurements: Measurements,
+    settings: TrainSettings = TrainSettings(),
+    recipe_sha256: str = "",
+) -> TrainingRun:
+    """Train the networks of a recipe, without judging them.
+
+    Args:
+        recipe: the recipe.
+        measurements: its rows; those of the set "test" are not trained on.
+        settings: checkpoints, progress and logs.
+        recipe_sha256: of the recipe file, for provenance.
+
+    Raises:
+        PisigmaError: the data or the recipe do not allow it; the message says what to do.
+    """
+    measurements, _ = measurements.split_sets()
+    robot = Robot.load(recipe.robot)
+    if isinstance(recipe.data, MeasuredData):
+        _check_one_pose(measurements)
+        robot = fit_base_and_tool(robot, measurements).robot
+    bound = recipe.singular_rows.below if recipe.singular_rows.rule == "leave_out" else None
+    pairs = build_pairs(robot, measurements, bound)
+    held_out = _held_out_pairs(recipe, robot)
+    network = build_network(robot, recipe.network, pairs)
+    generator = torch.Generator().manual_seed(recipe.fit.seed)
+    share = recipe.fit.validation_share if isinstance(recipe.fit, LevenbergMarquardtSection) else 0.0
+    patterns = build_patterns(network, pairs, share, groups_of_equal_joints(measurements.q), generator)
+    history = fit_networks(
+        [net for _, net in network.members()],
+        patterns,
+        [section.joints for section in recipe.network],
+        recipe.fit,
+        checkpoints=_checkpoints(recipe, measurements, settings),
+        show_progress=settings.show_progress,
+        logs=settings.logs,
+    )
+    network.requires_grad_(False)
+    used = pairs.used
+    model = CalibratedModel(
+        name=recipe.name,
+        kind="inverse_calibration",
+        robot=robot,
+        network=network,
+        domain=Domain.around(network.scaled_inputs(pairs.T[used], pairs.q_nominal[used]), generator),
+        branches=pairs.branches,
+        starts=spread_rows(measurements.q[used]),
+        provenance=_provenance(recipe, measurements, pairs, recipe_sha256),
+    )
+    other = JointErrors.of(model, held_out) if held_out else None
+    return TrainingRun(model, history, pairs, JointErrors.of(model, pairs), other, measurements)
+
+
+def cross_validate(
+    recipe: InverseRecipe, measurements: Measurements, progress: Progress = lambda what: None
+) -> CrossValidation:
+    """Train the recipe once per fold, on the other folds, and judge it on the fold.
+
+    Args:
+        recipe: for measured data.
+        measurements: its rows to train on; every one is held out once.
+        progress: called before every fold.
+
+    Raises:
+        RecipeError: the recipe simulates its data.
+        MeasurementError: there are fewer different joint vectors than folds.
+    """
+    if not isinstance(recipe.data, MeasuredData):
+        raise RecipeError(f"recipe '{recipe.name}' simulates its data; it has held-out rows of its own.")
+    not_predicted = 0
+    nominal = torch.full((2, measurements.rows), torch.nan, dtype=torch.float64)
+    corrected = nominal.clone()
+    folds = k_folds(measurements, recipe.data.folds, recipe.data.seed)
+    for number, (training, test) in enumerate(folds, start=1):
+        progress(f"cross-validation: fold {number} of {len(folds)}")
+        model = train_networks(recipe, measurements.select(training)).model
+        comparison = compare_on(model, measurements.select(test))
+        not_predicted += comparison.not_predicted
+        for store, errors in ((nominal, comparison.nominal), (corrected, comparison.corrected)):
+            store[0, test] = errors.position
+            if errors.rotation is not None:
+                store[1, test] = errors.rotation
+    rotated = measurements.rotation is not None
+    before, after = (PoseErrors(store[0], store[1] if rotated else None) for store in (nominal, corrected))
+    return CrossValidation(len(folds), Comparison(before, after, not_predicted))
+
+
+def _checkpoints(
+    recipe: InverseRecipe, measurements: Measurements, settings: TrainSettings
+) -> Checkpoints | None:
+    if settings.checkpoints is None:
+        return None
+    fingerprint = f"{recipe.model_dump_json()}|{measurements.content_hash()}"
+    return Checkpoints(settings.checkpoints, fingerprint, settings.resume)
+
+
+def _check_one_pose(measurements: Measurements) -> None:
+    """Refuse rows of several frames or targets: the poses of a correction are those of one tool in one frame.
+
+    Raises:
+        MeasurementError: there are several; the message names the first row of another.
+    """
+    for what, names in (("frame", measurements.frame), ("target", measurements.target)):
+        other = next((row for row, name in enumerate(names) if name != names[0]), None)
+        if other is not None:
+            raise MeasurementError(
+                f"{measurements.place(other)}: {what} '{names[other]}' stands there, but "
+                f"{measurements.place(0)} has '{names[0]}'; inverse calibration wants the rows of one {what}, "
+                "so give a file for each, or use `pisigma calibrate`."
+            )
+
+
+def _held_out_pairs(recipe: InverseRecipe, robot: Robot) -> TrainingPairs | None:
+    """Fresh simulated poses, all of which must have a joint error to judge by."""
+    if not isinstance(recipe.data, SimulatedData):
+        return None
+    pairs = build_pairs(robot, simulate_held_out(recipe), None)
+    if not pairs.used.all():
+        raise RecipeError(
+            f"recipe '{recipe.name}': {int((~pairs.used).sum())} of {len(pairs.used)} poses of data.held_out "
+            "cannot be reached by the nominal robot and have no joint error; change their region."
+        )
+    return pairs
+
+
+def _provenance(
+    recipe: InverseRecipe, measurements: Measurements, pairs: TrainingPairs, sha256: str
+) -> Provenance:
+    return Provenance(
+        recipe=recipe.name,
+        recipe_sha256=sha256,
+        data_source="simulation"
+        if isinstance(recipe.data, SimulatedData)
+        else Path(measurements.source).name,
+        data_sha256=measurements.content_hash(),
+        rows=int(pairs.used.sum()),
+        rows_left_out=int((~pairs.used).sum()),
+        rule=pairs.left_out,
+        seed=recipe.fit.seed,
+        versions={name: version(name) for name in ("pisigma", "torch")}
+        | {"python": platform.python_version()},
+    )
