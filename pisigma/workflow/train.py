@@ -37,7 +37,7 @@ from pisigma.reporting.calibration_card import CardTexts
 from pisigma.reporting.training_card import write_training_card
 from pisigma.robot.description import Robot
 from pisigma.workflow.calibrate import Calibration, compose
-from pisigma.workflow.train_networks import Progress, TrainSettings, cross_validate, train_networks
+from pisigma.workflow.train_networks import DEFAULTS, Progress, TrainSettings, cross_validate, train_networks
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,7 +108,7 @@ Training = InverseTraining | Calibration
 def train(
     recipe: Recipe | str | os.PathLike[str],
     data: Measurements | str | os.PathLike[str] | None = None,
-    settings: TrainSettings = TrainSettings(),
+    settings: TrainSettings = DEFAULTS,
     progress: Progress = lambda what: None,
 ) -> Training:
     """Train the model of a recipe, and judge it on rows that it did not see.

@@ -52,10 +52,14 @@ class TrainSettings:
     logs: Path | None = None
 
 
+DEFAULTS = TrainSettings()
+"""No checkpoints, no bar, no logs."""
+
+
 def train_networks(
     recipe: InverseRecipe,
     measurements: Measurements,
-    settings: TrainSettings = TrainSettings(),
+    settings: TrainSettings = DEFAULTS,
     recipe_sha256: str = "",
 ) -> TrainingRun:
     """Train the networks of a recipe, without judging them.
