@@ -101,7 +101,10 @@ def test_calibrate_keeps_what_a_report_shows(run, tmp_path):
         assert found["correlated"]
         page = (tmp_path / "page.html").read_text()
         assert page.count("</script>") == 2
-        assert "dealt to the folds 3 times; errors of single rows are those of the first time." in page
+        assert (
+            "The cross-validation was repeated 3 times; errors of single rows are of the first repeat."
+            in page
+        )
     (folder / HELD_OUT_CSV).write_text("q1_deg\n1\n")
     refused = run("report", folder, "--out", tmp_path / "page.html")
     assert refused.exit_code == 2

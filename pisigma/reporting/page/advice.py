@@ -45,7 +45,7 @@ def advice_for(
         model: the model.
         summary: figures of its calibration; None of other models.
         rows: judged rows, or None.
-        accuracies: what is known of the accuracy.
+        accuracies: figures of the accuracy.
         limit: what limits it.
     """
     warnings: list[str] = []
@@ -70,22 +70,22 @@ def advice_for(
 def measured_stretches(
     model: CalibratedModel, q: Float64[Tensor, "rows dof"]
 ) -> list[tuple[list[Stretch], Stretch]]:
-    """Per joint the stretches of its range that were measured, and the range [rad or m].
+    """Give per joint the stretches of its range that were measured, and the range [rad or m].
 
     Joints that go all the way round have a range of one turn, and stretches that are the same a turn further.
 
     Args:
-        model: a hybrid knows its own stretches.
+        model: a hybrid keeps its stretches.
         q: measured joint values, for others.
     """
     coverage = model.hybrid.coverage if model.hybrid else JointCoverage.of(model.robot, q)
-    found = []
-    for j, (low, high) in enumerate(model.robot.limits.tolist()):
-        own, rate = coverage.joint == j, float(coverage.rate[j])
-        middle, half = coverage.middle[own].tolist(), coverage.half[own].tolist()
+    result = []
+    for j, limits in enumerate(map(tuple, model.robot.limits.tolist())):
+        of_joint, rate = coverage.joint == j, float(coverage.rate[j])
+        middle, half = coverage.middle[of_joint].tolist(), coverage.half[of_joint].tolist()
         ends = [((m - h) / rate, (m + h) / rate) for m, h in zip(middle, half, strict=True)]
-        found.append(_in_range(ends, (low, high), 2 * math.pi / rate if coverage.turning[j] else None))
-    return found
+        result.append(_in_range(ends, limits, 2 * math.pi / rate if coverage.turning[j] else None))
+    return result
 
 
 def _in_range(ends: list[Stretch], limits: Stretch, turn: float | None) -> tuple[list[Stretch], Stretch]:
@@ -102,30 +102,29 @@ def _in_range(ends: list[Stretch], limits: Stretch, turn: float | None) -> tuple
 
 
 def _joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> list[str]:
-    """Joints whose range was measured in part only."""
+    """Name joints whose range was measured in part only."""
     q = model.starts if rows is None or rows.origin == "other" else rows.measurements.q
     if not len(q):
         return []
-    parts = []
+    gaps = []
     for j, (stretches, (low, high)) in enumerate(measured_stretches(model, q)):
         name, turns = model.robot.joints[j].name, model.robot.revolute[j]
         share = sum(b - a for a, b in stretches) / (high - low) if high > low else 1.0
         if not math.isfinite(high - low) or share >= COVERED:
             continue
         factor, unit = (math.degrees(1.0), "deg") if turns else (1e3, "mm")
-        told = " and ".join(f"{a * factor:.0f} to {b * factor:.0f}" for a, b in stretches)
         if share < NOT_MOVED:
-            parts.append(f"{name} at {float(q[0, j]) * factor:.0f} {unit} only")
-        elif turns and high - low > 2 * math.pi - 1e-6:
-            parts.append(f"{name} {told} {unit} ({100 * share:.0f} % of a turn)")
-        else:
-            whole = f"{100 * share:.0f} % of {low * factor:.0f} to {high * factor:.0f}"
-            parts.append(f"{name} {told} {unit} ({whole})")
-    if not parts:
+            gaps.append(f"{name} at {float(q[0, j]) * factor:.0f} {unit} only")
+            continue
+        ranges = " and ".join(f"{a * factor:.0f} to {b * factor:.0f}" for a, b in stretches)
+        whole = f"{low * factor:.0f} to {high * factor:.0f}"
+        whole = "a turn" if turns and high - low > 2 * math.pi - 1e-6 else whole
+        gaps.append(f"{name} {ranges} {unit} ({100 * share:.0f} % of {whole})")
+    if not gaps:
         return []
-    fades = "the learned correction fades out" if model.hybrid else "nothing was measured"
+    beyond = "the learned correction fades out" if model.hybrid else "nothing was measured"
     return [
-        f"Joints were measured in part only: {'; '.join(parts)}. Beyond that {fades}: measure there if programs "
+        f"Joints were measured in part only: {'; '.join(gaps)}. Beyond that {beyond}: measure there if programs "
         "go there."
     ]
 
@@ -154,9 +153,9 @@ def _outside(rows: JudgedRows | None) -> list[str]:
     count, after = int((~rows.inside).sum()), rows.after.position.numpy() * 1e3
     apart = [after[mask & np.isfinite(after)] for mask in (~rows.inside.numpy(), rows.inside.numpy())]
     text = f"{count} of {rows.measurements.rows} rows have joint values outside those that the model was made with"
-    if all(len(part) for part in apart):
-        out, own = (figure_text(float(np.sqrt((part**2).mean()))) for part in apart)
-        text += f"; errors there are {out} mm RMS, inside {own} mm"
+    if all(len(errors) for errors in apart):
+        outside, inside = (figure_text(float(np.sqrt((errors**2).mean()))) for errors in apart)
+        text += f"; errors there are {outside} mm RMS, inside {inside} mm"
     return [f"{text}: calibrate with such rows too."]
 
 
@@ -223,7 +222,7 @@ def _orientations(model: CalibratedModel, summary: CalibrationSummary) -> list[s
 
 
 def _conditions(rows: JudgedRows | None) -> list[str]:
-    """Payload and temperature, where a file could have told them."""
+    """Say which payload and temperature the figures hold for, where a file could have stated them."""
     if rows is None or (rows.origin == "held_out" and rows.measurements.position is None):
         return []
     lines = []
@@ -231,14 +230,14 @@ def _conditions(rows: JudgedRows | None) -> list[str]:
         (rows.measurements.payload, "payload", "kg", LITTLE_KG),
         (rows.measurements.temperature, "temperature", "°C", LITTLE_C),
     ):
-        known = torch.zeros(0) if values is None else values[torch.isfinite(values)]
-        if not len(known):
+        stated = torch.zeros(0) if values is None else values[torch.isfinite(values)]
+        if not len(stated):
             lines.append(f"The file states no {name}: the figures hold for the one of the measurement.")
             continue
-        low, high = float(known.min()), float(known.max())
+        low, high = float(stated.min()), float(stated.max())
         if high - low < little:
-            told = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-            lines.append(f"The {name} was {told} {unit} throughout: nothing is known of others.")
+            span = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
+            lines.append(f"The {name} was {span} {unit} throughout: the rows show nothing of others.")
     return lines
 
 

@@ -30,14 +30,14 @@ STRONG = 0.9
 """Pairs of parameters with a larger correlation are named."""
 MOST_PAIRS = 12
 INDICES = (
-    ("O1", "volume of what the rows tell of all parameters together, larger is better (Borm and Menq 1991)"),
+    ("O1", "volume of the information on all parameters together, larger is better (Borm and Menq 1991)"),
     ("O2", "inverse of the condition number, 1 is best (Driels and Pathre 1990)"),
-    ("O3", "the direction that is seen least, larger is better (Nahvi et al. 1994)"),
+    ("O3", "the direction that is observed least, larger is better (Nahvi et al. 1994)"),
     (
         "O4",
         "noise amplification: the least direction weighed by O2, larger is better (Nahvi and Hollerbach 1996)",
     ),
-    ("O5", "harmonic mean of how well directions are seen, larger is better (Sun and Hollerbach 2008)"),
+    ("O5", "harmonic mean of how well directions are observed, larger is better (Sun and Hollerbach 2008)"),
 )
 
 
@@ -50,7 +50,7 @@ class ParameterFindings:
         table: its rows; empty for a model without identified geometry.
         estimated: number of parameters with a standard error.
         not_identified: in sentences.
-        observability: name, value and meaning of every index; empty where they are not known.
+        observability: name, value and meaning of every index; empty where the model has none.
         rank: independent combinations that the data see, or None.
         condition: condition number, or None.
         pairs: strongly correlated parameters and their correlation, strongest first.
@@ -80,7 +80,7 @@ def parameter_findings(
         missing.append(
             "This model has no identified parameters: its geometry is the nominal one."
             if model.calibrated is None
-            else "The model folder does not keep what was found of its parameters; calibrate again."
+            else "The model folder does not keep the figures of its parameters; calibrate again."
         )
     elif not tables:
         missing.append(
@@ -108,29 +108,32 @@ def read_correlations(path: Path) -> tuple[tuple[tuple[str, ...], Float64[np.nda
     """Read the tables of lengths and of angles; nothing where there is no such file, or it holds something else."""
     if not path.is_file():
         return ()
-    found: dict[str, dict[tuple[str, str], float]] = {"lengths": {}, "angles": {}}
+    kinds: dict[str, dict[tuple[str, str], float]] = {"lengths": {}, "angles": {}}
+    tables = []
     try:
         with path.open(newline="", encoding="utf-8") as file:
             for row in csv.DictReader(file):
                 value = float(row["correlation"]) if row["correlation"] else np.nan
-                found[row["of"]][row["parameter"], row["with"]] = value
-        tables = []
-        for cells in found.values():
+                kinds[row["of"]][row["parameter"], row["with"]] = value
+        for cells in kinds.values():
             names = tuple(dict.fromkeys(name for name, _ in cells))
-            tables.append(
-                (names, np.array([[cells[a, b] for b in names] for a in names]).reshape(len(names), -1))
-            )
+            values = np.array([[cells[a, b] for b in names] for a in names])
+            tables.append((names, values.reshape(len(names), -1)))
     except (KeyError, ValueError, TypeError, OSError):
         return ()
     return tuple(tables)
 
 
 def _pairs(tables: tuple[tuple[tuple[str, ...], np.ndarray], ...]) -> tuple[tuple[str, str, float], ...]:
-    found = []
-    for names, values in tables:
-        for i, name in enumerate(names):
-            found += [(name, names[k], float(values[i, k])) for k in range(i) if abs(values[i, k]) >= STRONG]
-    return tuple(sorted(found, key=lambda pair: -abs(pair[2]))[:MOST_PAIRS])
+    """List strongly correlated parameters, the strongest first."""
+    strong = [
+        (name, names[k], float(values[i, k]))
+        for names, values in tables
+        for i, name in enumerate(names)
+        for k in range(i)
+        if abs(values[i, k]) >= STRONG
+    ]
+    return tuple(sorted(strong, key=lambda pair: -abs(pair[2]))[:MOST_PAIRS])
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,7 +149,7 @@ class CorrectionCurve:
         measured: whether the joint value was measured.
         dots: corrections at measured rows.
         dot_values: joint values there.
-        sentence: what is seen.
+        sentence: how large it is, and where it fades.
     """
 
     joint: str
@@ -161,7 +164,7 @@ class CorrectionCurve:
 
 
 def correction_curves(model: CalibratedModel) -> tuple[CorrectionCurve, ...]:
-    """Curves of all joints that are corrected, the others as in the training row nearest to the middle of all.
+    """Compute curves of all corrected joints, the others as in the training row nearest to the middle of all.
 
     Returns:
         Nothing for a model without a learned correction.
@@ -169,36 +172,34 @@ def correction_curves(model: CalibratedModel) -> tuple[CorrectionCurve, ...]:
     if (model.hybrid is None and model.network is None) or not len(model.starts):
         return ()
     robot, q = model.robot, model.starts
-    seen = correction_at(model, q)
-    middle = _middle_row(q)
-    found = []
+    at_rows, middle = correction_at(model, q), _middle_row(q)
+    curves = []
     for j in range(robot.dof):
-        own = torch.linspace(*_range(robot, q, j), POINTS, dtype=torch.float64)
         at = middle.repeat(POINTS, 1)
-        at[:, j] = own
+        at[:, j] = torch.linspace(*_range(robot, q, j), POINTS, dtype=torch.float64)
         share = _share(model, at, j)
         curve = correction_at(model, at)[:, j] * share
-        if bool((curve != 0).any()) or bool((seen[:, j] != 0).any()):
-            found.append(_curve(robot, j, own, curve, share, (q[:, j], seen[:, j])))
-    return tuple(found)
+        if bool((curve != 0).any()) or bool((at_rows[:, j] != 0).any()):
+            curves.append(_curve(robot, j, at[:, j], curve, share == 1, q[:, j], at_rows[:, j]))
+    return tuple(curves)
 
 
 def correction_at(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows dof"]:
-    """The learned correction in full, at joint values [rad or m]."""
-    parts = []
+    """Compute the learned correction in full at joint values [rad or m]."""
+    hybrid = model.hybrid
     with torch.no_grad():
-        for part in torch.split(q, CHUNK):
-            if model.hybrid is not None:
-                parts.append(model.hybrid.correction(part))
-            else:
-                parts.append(model.correction(forward_kinematics(model.robot, part), part))
-    return torch.cat(parts)
+        if hybrid is not None:
+            return torch.cat([hybrid.correction(chunk) for chunk in torch.split(q, CHUNK)])
+        chunks = torch.split(q, CHUNK)
+        return torch.cat(
+            [model.correction(forward_kinematics(model.robot, chunk), chunk) for chunk in chunks]
+        )
 
 
 def _share(
     model: CalibratedModel, q: Float64[Tensor, "points dof"], joint: int
 ) -> Float64[Tensor, " points"]:
-    """How much of the correction is in force as one joint leaves its measured values."""
+    """Compute how much of the correction is in force as one joint leaves its measured values."""
     if model.hybrid is not None:
         coverage = model.hybrid.coverage
         return share_beyond(coverage.beyond(q)[:, joint], coverage.fade)
@@ -212,7 +213,7 @@ def _middle_row(q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, " dof"]:
 
 
 def _range(robot: Robot, q: Float64[Tensor, "rows dof"], joint: int) -> tuple[float, float]:
-    """The joint's measured values and a fifth more on either side, within its limits."""
+    """Give the joint's measured values and a fifth more on either side, within its limits."""
     low, high = float(q[:, joint].min()), float(q[:, joint].max())
     more = max((high - low) / 5, math.radians(20) if robot.revolute[joint] else 0.02)
     lower, upper = robot.limits[joint]
@@ -220,20 +221,28 @@ def _range(robot: Robot, q: Float64[Tensor, "rows dof"], joint: int) -> tuple[fl
 
 
 def _curve(
-    robot: Robot, j: int, own: Tensor, curve: Tensor, share: Tensor, dots: tuple[Tensor, Tensor]
+    robot: Robot, joint: int, q: Tensor, curve: Tensor, measured: Tensor, q_rows: Tensor, at_rows: Tensor
 ) -> CorrectionCurve:
-    name, turns = robot.joints[j].name, robot.revolute[j]
+    """Convert a curve over joint values, and corrections at measured rows, to units for people."""
+    turns = robot.revolute[joint]
     factor, small = (math.degrees(1.0), math.degrees(1e3)) if turns else (1e3, 1e6)
     unit, small_unit = ("deg", "mdeg") if turns else ("mm", "µm")
-    value, at = dots[1].numpy() * small, dots[0].numpy() * factor
-    inside = share.numpy() == 1
-    size = float(np.sqrt((value**2).mean()))
+    values, dots, inside = q.numpy() * factor, at_rows.numpy() * small, measured.numpy()
+    rms = float(np.sqrt((dots**2).mean()))
     sentence = (
-        f"RMS {size:.3g} {small_unit}, at most {np.abs(value).max():.3g}, at the rows that the model keeps"
+        f"RMS {rms:.3g} {small_unit}, at most {np.abs(dots).max():.3g}, at the rows that the model keeps"
     )
-    low, high = own.numpy()[inside].min(initial=math.inf), own.numpy()[inside].max(initial=-math.inf)
+    low, high = values[inside].min(initial=math.inf), values[inside].max(initial=-math.inf)
     if not inside.all() and high > low:
-        sentence += f"; measured from {low * factor:.0f} to {high * factor:.0f} {unit}, beyond it fades"
+        sentence += f"; measured from {low:.0f} to {high:.0f} {unit}, beyond it fades"
     return CorrectionCurve(
-        name, unit, small_unit, own.numpy() * factor, curve.numpy() * small, inside, value, at, f"{sentence}."
+        joint=robot.joints[joint].name,
+        unit=unit,
+        small_unit=small_unit,
+        values=values,
+        correction=curve.numpy() * small,
+        measured=inside,
+        dots=dots,
+        dot_values=q_rows.numpy() * factor,
+        sentence=f"{sentence}.",
     )

@@ -1,4 +1,4 @@
-"""What a report knows of every row: where it is, and how far off before and after the calibration."""
+"""What a report holds of every row: where it is, and how far off before and after the calibration."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -22,7 +22,7 @@ from pisigma.se3 import invert, transform_from_xyzrpy
 MOST_PREDICTED = 4_000
 """The accuracy is predicted at so many rows at most, evenly over them: each costs a millisecond."""
 ROUNDING = 1e-9
-"""[rad] A joint value that is beyond the measured ones by less is not."""
+"""A joint value that is beyond the measured ones by less counts as measured [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,16 +30,16 @@ class JudgedRows:
     """Rows and their errors, in SI units.
 
     Attributes:
-        origin: "held_out": errors under calibrations that never saw the row; "training": of the rows that the model
+        origin: "held_out": errors under calibrations without the row; "training": of the rows that the model
             was made of; "other": of other rows.
-        measurements: the rows; of a model's own held-out rows joint values and names only.
-        place: position of the tool in the robot's own base [m].
+        measurements: the rows; of a model's held-out rows joint values and names only.
+        place: position of the tool in the robot's base [m].
         models: by name, "nominal" first and the model last, errors of every row.
         residual: measured minus predicted position in the row's frame under the model [m]; NaN where there is none.
         residual_origin: the same for the residuals as `origin` for the lengths.
-        predicted: standard deviation of the predicted position [m]; NaN where it is not known or not computed.
+        predicted: standard deviation of the predicted position [m]; NaN where there is none.
         inside: whether every joint value was measured when the model was made.
-        remarks: what has to be said of these rows.
+        remarks: what a reader should know of these rows, a sentence each.
     """
 
     origin: str
@@ -63,13 +63,6 @@ class JudgedRows:
         return list(self.models.values())[-1]
 
 
-def name_of(model: CalibratedModel) -> str:
-    """What a model is called beside "nominal" in tables."""
-    if model.hybrid is not None:
-        return "hybrid"
-    return "geometric" if model.calibrated is not None else "corrected"
-
-
 def rows_of_file(
     model: CalibratedModel, measurements: Measurements, held_out: HeldOutRows | None
 ) -> JudgedRows:
@@ -83,57 +76,52 @@ def rows_of_file(
     Raises:
         MeasurementError: no row can be judged.
     """
-    rows, remarks = _other_rows(measurements)
+    rows, remarks = _test_rows(measurements)
     digest = rows.content_hash()
     if held_out is not None and digest == held_out.data_sha256:
-        residual = held_out.residual
-        kept = bool(torch.isfinite(residual).any())
-        known = residual if kept else _model_errors(model, rows)[1]
-        origins = ("held_out", "held_out" if kept else "training")
-        return _judged(model, rows, held_out.models, known, origins, [*remarks, *_dealt(model)])
+        residual, origin = held_out.residual, "held_out"
+        if not bool(torch.isfinite(residual).any()):
+            residual, origin = _errors(poses_of_rows(model, rows), rows)[1], "training"
+        return _judged(
+            model, rows, held_out.models, residual, ("held_out", origin), [*remarks, *_repeats(model)]
+        )
     origin = "training" if digest == model.provenance.data_sha256 else "other"
-    remarks += _seen_before(model, rows) if origin == "other" else []
-    errors, residual = _model_errors(model, rows)
+    remarks += _measured_again(model, rows) if origin == "other" else []
+    errors, residual = _errors(poses_of_rows(model, rows), rows)
     if not (torch.isfinite(errors.position).any() or errors.rotation is not None):
         raise MeasurementError(
             f"{rows.source}: no row holds a position, an orientation or a socket that was touched twice, so the model "
             "cannot be judged on this file; give poses or positions, or leave the file out."
         )
-    models = {"nominal": _nominal_errors(model, rows, remarks)}
+    T_nominal, remark = _nominal_poses(model, rows)
+    models = {"nominal": _errors(T_nominal, rows)[0]}
     if model.hybrid is not None:
-        models["geometric"] = _model_errors(replace(model, hybrid=None), rows)[0]
-    models[name_of(model)] = errors
+        models["geometric"] = _errors(poses_of_rows(replace(model, hybrid=None), rows), rows)[0]
+    identified = "corrected" if model.calibrated is None else "geometric"
+    models["hybrid" if model.hybrid is not None else identified] = errors
+    remarks.append(remark)
     if rows.socket is not None:
         remarks.append(
-            "Rows in sockets are judged from where the model puts the ball of the socket on average: an error that all "
-            "rows of a socket share is not seen."
+            "Rows in sockets are judged from where the model puts the ball of the socket on average, so an error that "
+            "all rows of a socket share does not show."
         )
-    there = torch.isfinite(errors.position)
-    if not bool(there.all()) and bool(there.any()):
-        remarks.append(f"{int((~there).sum())} of {rows.rows} rows have no position error that can be known.")
+    missing = int((~torch.isfinite(errors.position)).sum())
+    if 0 < missing < rows.rows:
+        remarks.append(f"{missing} of {rows.rows} rows have no position error that can be known.")
     return _judged(model, rows, models, residual, (origin, origin), remarks)
 
 
 def rows_of_folder(model: CalibratedModel, held_out: HeldOutRows) -> JudgedRows:
-    """The held-out rows that a model folder keeps."""
+    """Give the held-out rows that a model folder keeps."""
     rows = Measurements(
         q=held_out.q, frame=held_out.frame, target=held_out.target, source=model.provenance.data_source
     )
-    return _judged(model, rows, held_out.models, held_out.residual, ("held_out", "held_out"), _dealt(model))
-
-
-def _dealt(model: CalibratedModel) -> list[str]:
-    """A sentence where the errors that are kept of every row are those of one repeat among several."""
-    times = model.metrics.get("cross_validation", {}).get("repeats", 1)
-    if times == 1:
-        return []
-    return [
-        f"The rows were dealt to the folds {times} times; errors of single rows are those of the first time."
-    ]
+    origins = ("held_out", "held_out")
+    return _judged(model, rows, held_out.models, held_out.residual, origins, _repeats(model))
 
 
 def place_of(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows 3"]:
-    """Position of the tool in the robot's own base [m]."""
+    """Compute the position of the tool in the robot's base [m]."""
     T = model.forward(q)
     T = torch.where(torch.isfinite(T), T, forward_kinematics(model.robot, q))
     base = transform_from_xyzrpy(torch.from_numpy(model.robot.base.copy()))
@@ -141,20 +129,19 @@ def place_of(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[
 
 
 def predicted_at(model: CalibratedModel, rows: Measurements) -> Float64[Tensor, " rows"]:
-    """Standard deviation of predicted positions [m]; NaN where it is not known, and past `MOST_PREDICTED` rows."""
-    found = torch.full((rows.rows,), torch.nan, dtype=torch.float64)
+    """Compute standard deviations of predicted positions [m]; NaN without one, and past `MOST_PREDICTED` rows."""
+    predicted = torch.full((rows.rows,), torch.nan, dtype=torch.float64)
     chosen = torch.linspace(0, rows.rows - 1, min(rows.rows, MOST_PREDICTED)).round().long()
     if model.uncertainty is not None and len(chosen):
-        known = rows.select(chosen)
         try:
-            found[chosen] = deviation_of_rows(model, known).norm(dim=-1)
+            predicted[chosen] = deviation_of_rows(model, rows.select(chosen)).norm(dim=-1)
         except MeasurementError:  # a frame or target that was left out of the model
-            return found
-    return found
+            return predicted
+    return predicted
 
 
 def inside(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Bool[Tensor, " rows"]:
-    """Whether every joint value was measured; everywhere where the model does not keep that."""
+    """Say whether every joint value was measured; everywhere where the model does not keep that."""
     if model.hybrid is None:
         return torch.ones(len(q), dtype=torch.bool)
     return model.hybrid.coverage.beyond(q).amax(-1) <= ROUNDING
@@ -181,17 +168,27 @@ def _judged(
     )
 
 
-def _other_rows(measurements: Measurements) -> tuple[Measurements, list[str]]:
-    """The rows marked as test, or all where none is."""
+def _test_rows(measurements: Measurements) -> tuple[Measurements, list[str]]:
+    """Select the rows marked as test, or all where none is."""
     test = torch.tensor([name == "test" for name in measurements.split or ()], dtype=torch.bool)
-    if not test.any():
+    if not test.any() or bool(test.all()):
         return measurements, []
     remark = f"The {int((~test).sum())} rows that the file marks as 'train' are left out."
-    return measurements.select(test), [remark] if not bool(test.all()) else []
+    return measurements.select(test), [remark]
 
 
-def _seen_before(model: CalibratedModel, rows: Measurements) -> list[str]:
-    """A remark where joint values are among those that the model keeps of its training rows."""
+def _repeats(model: CalibratedModel) -> list[str]:
+    """Say where the errors that are kept of every row are those of one repeat among several."""
+    repeats = model.metrics.get("cross_validation", {}).get("repeats", 1)
+    if repeats == 1:
+        return []
+    return [
+        f"The cross-validation was repeated {repeats} times; errors of single rows are of the first repeat."
+    ]
+
+
+def _measured_again(model: CalibratedModel, rows: Measurements) -> list[str]:
+    """Say where joint values are among those that the model keeps of its training rows."""
     kept = {tuple(row) for row in model.starts.tolist()}
     count = sum(tuple(row) in kept for row in rows.q.tolist())
     if not count:
@@ -202,55 +199,44 @@ def _seen_before(model: CalibratedModel, rows: Measurements) -> list[str]:
     ]
 
 
-def _model_errors(model: CalibratedModel, rows: Measurements) -> tuple[PoseErrors, Float64[Tensor, "rows 3"]]:
-    """Errors of rows, and the signed ones of their positions; of balls in sockets from where these are on average."""
-    T = poses_of_rows(model, rows)
-    none = torch.full((rows.rows,), torch.nan, dtype=torch.float64)
-    residual = none[:, None].repeat(1, 3) if rows.position is None else rows.position - T[:, :3, 3]
-    if rows.socket is not None:
-        residual = torch.where(rows.measured("socket")[:, None], _from_socket(rows, T[:, :3, 3]), residual)
-    return PoseErrors(residual.norm(dim=-1), _turned(rows, T)), residual
-
-
-def _turned(rows: Measurements, T: Float64[Tensor, "rows 4 4"]) -> Float64[Tensor, " rows"] | None:
-    """Angles of the orientation errors of rows [rad]; None where none was measured."""
-    if rows.rotation is None:
-        return None
-    alone = Measurements(q=rows.q, position=T[:, :3, 3].nan_to_num(), rotation=rows.rotation)
-    return PoseErrors.between(alone, T).rotation
-
-
-def _from_socket(rows: Measurements, ball: Float64[Tensor, "rows 3"]) -> Float64[Tensor, "rows 3"]:
-    """Mean place of every row's socket minus where the row puts the ball; NaN in sockets of a single row."""
-    names = list(zip(rows.frame, rows.socket or (), strict=True))
-    order = {name: number for number, name in enumerate(dict.fromkeys(names))}
-    number = torch.tensor([order[name] for name in names])
-    counts = torch.bincount(number, minlength=len(order)).double()
-    sums = torch.zeros(len(order), 3, dtype=torch.float64).index_add_(0, number, ball)
-    apart = (sums / counts[:, None])[number] - ball
-    return torch.where((counts[number] > 1)[:, None], apart, torch.nan)
-
-
-def _nominal_errors(model: CalibratedModel, rows: Measurements, remarks: list[str]) -> PoseErrors:
-    """Errors of the robot as drawn, with the base and tool that `nominal_model` gives it."""
+def _nominal_poses(model: CalibratedModel, rows: Measurements) -> tuple[Float64[Tensor, "rows 4 4"], str]:
+    """Predict poses of the robot as drawn with the base and tool that suit it, and say which these are."""
     try:
         nominal = nominal_model(model, rows.rotation is not None)
     except ModelError:
-        remarks.append(
+        return nominal_poses_of_rows(model, rows), (
             "Nominal is the robot as drawn with the model's base and tool, as the model keeps too few joint values to "
             "fit its own; it looks worse than it is."
         )
-        return _errors_at(nominal_poses_of_rows(model, rows), rows)
-    remarks.append(
-        "Nominal is the robot as drawn with the base and tool that the model was given."
-        if model.calibrated is None
-        else "Nominal is the robot as drawn, base and tool fitted to the model's own poses where it was measured."
-    )
-    return _model_errors(nominal, rows)[0]
+    if model.calibrated is None:
+        remark = "Nominal is the robot as drawn with the base and tool that the model was given."
+    else:
+        remark = "Nominal is the robot as drawn, base and tool fitted to the model's own poses where it was measured."
+    return poses_of_rows(nominal, rows), remark
 
 
-def _errors_at(T: Float64[Tensor, "rows 4 4"], rows: Measurements) -> PoseErrors:
-    if rows.position is not None:
-        return PoseErrors.between(rows, T)
-    apart = _from_socket(rows, T[:, :3, 3]) if rows.socket else torch.full_like(T[:, :3, 3], torch.nan)
-    return PoseErrors(apart.norm(dim=-1), _turned(rows, T))
+def _errors(
+    T: Float64[Tensor, "rows 4 4"], rows: Measurements
+) -> tuple[PoseErrors, Float64[Tensor, "rows 3"]]:
+    """Compute errors of rows, and the signed ones of positions; of balls in sockets from where these are on average."""
+    position = torch.full_like(T[:, :3, 3], torch.nan) if rows.position is None else rows.position
+    residual = position - T[:, :3, 3]
+    if rows.socket is not None:
+        of_sockets = rows.measured("socket")[:, None]
+        residual = torch.where(of_sockets, _from_socket(rows, T[:, :3, 3]), residual)
+    rotation = None
+    if rows.rotation is not None:
+        turned = Measurements(q=rows.q, position=T[:, :3, 3].nan_to_num(), rotation=rows.rotation)
+        rotation = PoseErrors.between(turned, T).rotation
+    return PoseErrors(residual.norm(dim=-1), rotation), residual
+
+
+def _from_socket(rows: Measurements, ball: Float64[Tensor, "rows 3"]) -> Float64[Tensor, "rows 3"]:
+    """Compute the mean position of every row's socket minus the row's ball; NaN in sockets of a single row."""
+    names = list(zip(rows.frame, rows.socket or (), strict=True))
+    index = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    number = torch.tensor([index[name] for name in names])
+    counts = torch.bincount(number, minlength=len(index)).double()
+    sums = torch.zeros(len(index), 3, dtype=torch.float64).index_add_(0, number, ball)
+    apart = (sums / counts[:, None])[number] - ball
+    return torch.where((counts[number] > 1)[:, None], apart, torch.nan)

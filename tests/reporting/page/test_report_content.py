@@ -135,7 +135,7 @@ def test_sockets_are_judged_from_where_they_are_on_average(hybrid, tmp_path):
     assert bool(torch.isnan(content.rows.residual[8]).all())
     said = " ".join(content.rows.remarks)
     assert "1 of 9 rows have no position error" in said
-    assert "that all rows of a socket share is not seen" in said
+    assert "that all rows of a socket share does not show" in said
 
 
 def test_rows_that_cannot_be_judged_are_refused(hybrid, tmp_path):
