@@ -8,16 +8,18 @@ import typer
 if TYPE_CHECKING:
     from pisigma.workflow.verify import Verification
 
+FitFrame = Annotated[
+    bool, typer.Option("--fit-frame", help="The sensor was moved since: fit its frame to these rows.")
+]
+Data = Annotated[
+    Path, typer.Argument(help="New measurements (CSV) at the joint values that the robot was commanded to.")
+]
+
 
 def verify(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
-    data: Annotated[
-        Path,
-        typer.Argument(help="New measurements (CSV) at the joint values that the robot was commanded to."),
-    ],
-    fit_frame: Annotated[
-        bool, typer.Option("--fit-frame", help="The sensor was moved since: fit its frame to these rows.")
-    ] = False,
+    data: Data,
+    fit_frame: FitFrame = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Say whether new measurements are explained better by the corrected model than by the nominal robot.
@@ -28,23 +30,22 @@ def verify(
     """
     from pisigma.cli.output import print_json, progress_of
     from pisigma.errors import AcceptanceError
-    from pisigma.workflow.verify import VerificationSettings
-    from pisigma.workflow.verify import verify as run
+    from pisigma.workflow import verify as workflow
 
     with progress_of(f"verifying {model}"):
-        verification = run(model, data, VerificationSettings(fit_frame))
-    if as_json:
-        print_json(verification.to_json())
-    else:
-        _print(verification)
+        verification = workflow.verify(model, data, workflow.VerificationSettings(fit_frame))
+    print_json(verification.to_json()) if as_json else _print(verification)
     if not verification.accepted:
         raise AcceptanceError(verification.sentence)
 
 
 def _print(verification: "Verification") -> None:
-    from pisigma.cli.evaluate import print_comparison
-    from pisigma.cli.output import print_lines
+    from pisigma.cli.output import print_lines, print_table, screen_width
+    from pisigma.reporting.comparison_tables import comparison_tables
 
     print_lines([verification.sentence])
-    print_comparison(verification.comparison, verification.data)
+    for title, table in comparison_tables(
+        verification.comparison, Path(verification.data).name, screen_width()
+    ):
+        print_table(title, *table)
     print_lines([*(fault.sentence for fault in verification.setup_faults), *verification.warnings])

@@ -44,12 +44,12 @@ class Difference:
 
     def to_json(self, unit: str) -> dict[str, object]:
         """Return the figures as plain values, the unit in their names."""
-        found: dict[str, object] = {}
+        values: dict[str, object] = {}
         for name, value in self.statistics.items():
             interval = self.intervals[name]
-            found[f"{name}_{unit}"] = value
-            found[f"{name}_{unit}_interval"] = None if interval is None else list(interval)
-        return found | {"better_share": self.better_share, "wilcoxon": asdict(self.test)}
+            values[f"{name}_{unit}"] = value
+            values[f"{name}_{unit}_interval"] = None if interval is None else list(interval)
+        return values | {"better_share": self.better_share, "wilcoxon": asdict(self.test)}
 
 
 @dataclass(frozen=True)
@@ -201,11 +201,10 @@ def compare_models(
     domains = [inside_domain(model, measurements) for model in models.values()]
     group = groups_to_keep_whole(measurements)
     positions = _quantity("position", [errors.position for errors in compared], domains, group, bootstrap)
+    orientations: Sequence[QuantityErrors | None] = [None] * len(models)
     turns = [errors.rotation for errors in compared if errors.rotation is not None]
-    oriented = bool(turns) and bool(torch.isfinite(turns[0]).any())
-    orientations = (
-        _quantity("orientation", turns, domains, group, bootstrap) if oriented else [None] * len(models)
-    )
+    if turns and bool(torch.isfinite(turns[0]).any()):
+        orientations = _quantity("orientation", turns, domains, group, bootstrap)
     figures = [
         ModelFigures(
             name=name,
@@ -217,13 +216,8 @@ def compare_models(
         )
         for name, position, orientation, inside in zip(models, positions, orientations, domains, strict=True)
     ]
-    return ModelComparison(
-        models=tuple(figures),
-        rows=int(common.sum()),
-        rows_without_position=int((~measured).sum()),
-        configurations=len(set(group[common].tolist())),
-        bootstrap=bootstrap,
-    )
+    unmeasured, configurations = int((~measured).sum()), len(set(group[common].tolist()))
+    return ModelComparison(tuple(figures), int(common.sum()), unmeasured, configurations, bootstrap)
 
 
 def inside_domain(model: CalibratedModel, measurements: Measurements) -> Bool[Tensor, " rows"] | None:
@@ -261,15 +255,15 @@ def _quantity(
     differences = _differences(sizes, index, intervals)
     figures = []
     for number, (errors, inside) in enumerate(zip(stacked[:, there], domains, strict=True)):
-        parts = (None, None) if inside is None else (inside[there], ~inside[there])
+        within = None if inside is None else inside[there]
         figures.append(
             QuantityErrors(
                 unit=unit,
                 statistics=error_statistics(errors.norm(dim=-1)),
                 intervals=_by_name(intervals.value[:, number]),
                 axes={axis: axis_statistics(along) for axis, along in zip("xyz", errors.T, strict=True)},
-                inside=_some(errors, parts[0]),
-                outside=_some(errors, parts[1]),
+                inside=_some(errors, within),
+                outside=_some(errors, None if within is None else ~within),
                 difference=differences[number] if number else None,
             )
         )

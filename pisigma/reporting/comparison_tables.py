@@ -1,94 +1,98 @@
 """A comparison of models as tables for people."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 from pisigma.judging.model_comparison import Difference, Interval, ModelComparison, QuantityErrors
-from pisigma.reporting.tables import figure_text
+from pisigma.reporting.tables import Table, figure_text
 
 _SHOWN = (("rms", "RMS"), ("mean", "mean"), ("p95", "95 %"), ("max", "maximum"))
 _NONE = "-"
 
 
-@dataclass(frozen=True)
-class ModelTable:
-    """A table with one column per model.
+_Lines = list[tuple[str, Sequence[str]]]
+"""Per line of a table what it is, and a cell per model."""
 
-    Attributes:
-        title: what it shows.
-        models: heads of the columns.
-        lines: per line what it is, and a cell per model.
+
+def comparison_tables(comparison: ModelComparison, data: str, width: int) -> list[tuple[str, Table]]:
+    """Make titled tables of the errors of every model, and of their differences to the first.
+
+    They have one column per model. Where the models do not fit the width side by side, there are several tables.
+
+    Args:
+        comparison: of one model or more.
+        data: name of the rows.
+        width: of the screen, in characters.
     """
-
-    title: str
-    models: tuple[str, ...]
-    lines: tuple[tuple[str, tuple[str, ...]], ...]
-
-    def fitting(self, width: int) -> list[tuple[list[str], list[tuple[str, ...]]]]:
-        """Give heads and rows, as several tables one below the other where the models do not fit a width."""
-        label = max(len(line) for line, _ in self.lines)
-        cells = [
-            max(map(len, column)) for column in zip(self.models, *(c for _, c in self.lines), strict=True)
-        ]
-        blocks: list[list[int]] = [[]]
-        for number, size in enumerate(cells):
-            if blocks[-1] and label + sum(cells[k] + 2 for k in blocks[-1]) + size + 4 > width:
-                blocks.append([])
-            blocks[-1].append(number)
-        return [
-            (
-                ["", *(self.models[k] for k in block)],
-                [(line, *(texts[k] for k in block)) for line, texts in self.lines],
-            )
-            for block in blocks
-        ]
+    names = [model.name for model in comparison.models]
+    rows = f"{comparison.rows} rows ({comparison.configurations} configurations) of {data}"
+    tables = [(f"Errors of {rows}", names, _error_lines(comparison))]
+    if len(names) > 1:
+        title = f"Differences to {names[0]} on the same rows, below 0 is better"
+        tables.append((title, names[1:], _difference_lines(comparison)))
+    return [(title, table) for title, heads, lines in tables for table in _fitting(heads, lines, width)]
 
 
-def error_table(comparison: ModelComparison) -> ModelTable:
-    """Make a table of the errors of every model, with confidence intervals where there are some."""
+def _fitting(heads: Sequence[str], lines: _Lines, width: int) -> list[Table]:
+    """Divide the models among tables that fit the width, a single model at least."""
+    label = max(len(line) for line, _ in lines)
+    widths = [max(len(head), *(len(cells[k]) for _, cells in lines)) for k, head in enumerate(heads)]
+    blocks: list[list[int]] = [[]]
+    for k, size in enumerate(widths):
+        if blocks[-1] and label + sum(widths[other] + 2 for other in blocks[-1]) + size + 4 > width:
+            blocks.append([])
+        blocks[-1].append(k)
+    return [
+        Table(
+            ("", *(heads[k] for k in block)),
+            tuple((line, *(cells[k] for k in block)) for line, cells in lines),
+        )
+        for block in blocks
+    ]
+
+
+def _error_lines(comparison: ModelComparison) -> _Lines:
+    """Write errors with confidence intervals, along the axes, and inside and outside of the domain."""
     models = comparison.models
-    lines: list[tuple[str, tuple[str, ...]]] = []
-    confidence = _confidence(comparison)
+    lines: _Lines = []
     for quantity, first in models[0].quantities.items():
         errors = [model.quantities[quantity] for model in models]
         for key, shown in _SHOWN:
-            values = tuple(figure_text(one.statistics[key]) for one in errors)
+            values = [figure_text(one.statistics[key]) for one in errors]
             lines.append((f"{quantity}, {shown} [{first.unit}]", values))
             if first.intervals.get(key) is not None:
-                lines.append((confidence, tuple(_interval(one.intervals[key]) for one in errors)))
+                lines.append((_confidence(comparison), [_interval(one.intervals[key]) for one in errors]))
         word = "along" if quantity == "position" else "about"
         for axis in "xyz":
-            values = tuple(figure_text(one.axes[axis]["rms"]) for one in errors)
+            values = [figure_text(one.axes[axis]["rms"]) for one in errors]
             lines.append((f"{quantity}, RMS {word} {axis} [{first.unit}]", values))
     if any(model.rows_outside for model in models):
         for quantity, first in models[0].quantities.items():
             for where in ("inside", "outside"):
-                cells = (
+                cells = [
                     _domain(getattr(model.quantities[quantity], where), getattr(model, f"rows_{where}"))
                     for model in models
-                )
-                lines.append((f"{quantity}, RMS {where} its domain [{first.unit}]", tuple(cells)))
-    title = f"Errors of {comparison.rows} rows ({comparison.configurations} configurations)"
-    return ModelTable(title, tuple(model.name for model in models), tuple(lines))
+                ]
+                lines.append((f"{quantity}, RMS {where} its domain [{first.unit}]", cells))
+    return lines
 
 
-def difference_table(comparison: ModelComparison) -> ModelTable:
-    """Make a table of the differences of every later model to the first, with intervals and Wilcoxon's p."""
+def _difference_lines(comparison: ModelComparison) -> _Lines:
+    """Write the differences of every later model to the first, with intervals and Wilcoxon's p."""
     first, *others = comparison.models
-    lines: list[tuple[str, tuple[str, ...]]] = []
-    confidence = _confidence(comparison)
+    lines: _Lines = []
     for quantity, errors in first.quantities.items():
         differences = [_difference(model.quantities[quantity]) for model in others]
         for key, shown in (("mean", "mean"), ("rms", "RMS")):
-            values = tuple(figure_text(one.statistics[key]) for one in differences)
+            values = [figure_text(one.statistics[key]) for one in differences]
             lines.append((f"{quantity}, {shown} [{errors.unit}]", values))
             if differences[0].intervals[key] is not None:
-                lines.append((confidence, tuple(_interval(one.intervals[key]) for one in differences)))
-        shares = tuple(f"{100 * one.better_share:.0f} %" for one in differences)
+                lines.append(
+                    (_confidence(comparison), [_interval(one.intervals[key]) for one in differences])
+                )
+        shares = [f"{100 * one.better_share:.0f} %" for one in differences]
         lines.append((f"{quantity}, better in", shares))
-        lines.append((f"{quantity}, Wilcoxon's p", tuple(_p(one.test.p) for one in differences)))
-    title = f"Differences to {first.name}, below 0 is better, on the same rows"
-    return ModelTable(title, tuple(model.name for model in others), tuple(lines))
+        lines.append((f"{quantity}, Wilcoxon's p", [_p(one.test.p) for one in differences]))
+    return lines
 
 
 def _difference(errors: QuantityErrors) -> Difference:

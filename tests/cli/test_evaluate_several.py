@@ -93,7 +93,7 @@ def test_the_tables_name_every_model(run, folder):
     heads = [line.split() for line in lines if set(line.split()) & {"nominal", "hybrid", "geometric_only"}]
     shown = [head for head in heads if set(head) <= {"nominal", "hybrid", "geometric_only"}]
     assert [name for head in shown[:-1] for name in head] == ["nominal", "hybrid", "geometric_only"]
-    assert "Differences to nominal, below 0 is better, on the same rows of rows.csv" in lines
+    assert "Differences to nominal on the same rows, below 0 is better" in lines
     outside = " ".join(line for line in lines if "position, RMS outside its domain [mm]" in line)
     assert outside.count(" rows)") == 1
     assert outside.split().count("-") == 2
