@@ -121,21 +121,21 @@ def test_what_is_printed_for_people(run, data, tmp_path):
 
 
 def test_fewer_training_rows(run, refuses, data, tmp_path):
-    command = ("calibrate", "rb5", data, "--out", tmp_path / "arm", "--folds", 3)
+    command = ("calibrate", "rb5", data, "--out")
     few, many = (
         json.loads(
-            run(*command[:4], tmp_path / str(count), *command[5:], "--train-rows", count, "--json").stdout
+            run(*command, tmp_path / str(rows), "--hold-out", 0.3, "--train-rows", rows, "--json").stdout
         )
-        for count in (50, 130)
+        for rows in (50, 130)
     )
     assert (few["rows"], many["rows"]) == (50, 130)
-    assert few["cross_validation"]["rows"] == many["cross_validation"]["rows"] == 200
-    errors = [found["cross_validation"]["hybrid"]["rms_mm"] for found in (few, many)]
+    assert few["cross_validation"]["rows"] == many["cross_validation"]["rows"] == 60
+    errors = [printed["cross_validation"]["hybrid"]["rms_mm"] for printed in (few, many)]
     assert errors[1] < errors[0] < 1.05 * few["cross_validation"]["geometric"]["rms_mm"]
     assert "--train-rows 50" in (tmp_path / "50" / "README.md").read_text()
     assert "on 50 rows of" in (tmp_path / "50" / "README.md").read_text()
     for count, wanted in (("150", "there are 133 to draw"), ("0", "ask for 1 to 13")):
-        assert wanted in refuses(*command, "--train-rows", count)
+        assert wanted in refuses(*command, tmp_path / "arm", "--folds", 3, "--train-rows", count)
     assert not (tmp_path / "arm").exists()
 
 
