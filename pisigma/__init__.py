@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pisigma.inverse.solution import Solution as Solution
     from pisigma.kernels.array_kinematics import forward_kinematics as forward_kinematics
     from pisigma.kernels.array_kinematics import joint_jacobian as joint_jacobian
+    from pisigma.joint_correction.registry import register_feature as register_feature
     from pisigma.kinematics.status import Status as Status
     from pisigma.measurement.dataset import Measurements as Measurements
     from pisigma.network.pi_sigma import PiSigma as PiSigma
@@ -65,6 +66,7 @@ _HOMES = {
     "forward_kinematics": "pisigma.kernels.array_kinematics",
     "joint_jacobian": "pisigma.kernels.array_kinematics",
     "load": "pisigma.inverse.corrected_ik",
+    "register_feature": "pisigma.joint_correction.registry",
     "register_sensor": "pisigma.sensors.registry",
     "report": "pisigma.workflow.report",
     "train": "pisigma.workflow.train",
@@ -97,6 +99,7 @@ __all__ = [
     "forward_kinematics",
     "joint_jacobian",
     "load",
+    "register_feature",
     "register_sensor",
     "report",
     "train",

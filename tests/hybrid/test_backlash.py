@@ -9,9 +9,13 @@ import torch
 from testing.closeness import assert_close
 from testing.models import no_type_checker
 
+from pisigma.export.onnx_model import export_onnx
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.result import HybridResult
+from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.robot import Robot
 from pisigma.simulation.errors.backlash import Backlash
 from pisigma.simulation.errors.geometric import RandomGeometricDeviation
@@ -124,3 +128,36 @@ def test_where_no_side_is_stated_a_joint_is_in_the_middle_of_its_play(missing):
     q = measured(ARC_MINUTE, 200, 9, 0.0).q
     with no_type_checker():
         assert_close(learned.correction(q, torch.full_like(q, missing)), learned.correction(q), atol=0)
+
+
+@functools.cache
+def model() -> CalibratedModel:
+    with no_type_checker():
+        return model_of_hybrid("play", ROBOT, fitted(ARC_MINUTE, True), measured(ARC_MINUTE, 60, 0, NOISE))
+
+
+def test_inverse_kinematics_knows_the_side():
+    true, q = true_robot(ARC_MINUTE), 0.7 + 0.3 * measured(ARC_MINUTE, 200, 9, 0.0).q[:20]
+    approach = torch.from_numpy(np.random.default_rng(3).choice([-1.0, 1.0], (20, 6)))
+    with no_type_checker():
+        T = true.forward(q, approach)
+        ik = CorrectedIK(model())
+        solution = ik(T, near=q, approach=approach)
+        missed = (true.forward(solution.q, approach) - T)[:, :3, 3].norm(dim=1)
+        without = (true.forward(ik(T, near=q).q, approach) - T)[:, :3, 3].norm(dim=1)
+        by_reference = ik.reference(T, near=q, approach=approach)
+    assert ik.compiled is not None
+    assert_close(solution.q, by_reference.q, atol=1e-9)
+    assert float(missed.square().mean().sqrt()) < 0.5 * float(without.square().mean().sqrt())
+
+
+def test_the_onnx_graph_has_an_input_for_the_side():
+    pytest.importorskip("onnx")
+    runtime = pytest.importorskip("onnxruntime")
+    q = measured(ARC_MINUTE, 200, 9, 0.0).q[:4]
+    approach = torch.tensor([1.0, -1.0, 0.0, 1.0, -1.0, 1.0], dtype=torch.float64).repeat(4, 1)
+    session = runtime.InferenceSession(export_onnx(model()), providers=["CPUExecutionProvider"])
+    (full,) = session.run(["full_correction"], {"q": q.numpy(), "approach": approach.numpy()})
+    arm = model().hybrid
+    assert arm is not None
+    assert_close(torch.from_numpy(full), arm.correction(q, approach), atol=1e-15)
