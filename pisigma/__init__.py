@@ -15,9 +15,9 @@ if TYPE_CHECKING:
     from pisigma.inverse.corrected_ik import CorrectedIK as CorrectedIK
     from pisigma.inverse.corrected_ik import load as load
     from pisigma.inverse.solution import Solution as Solution
+    from pisigma.joint_correction.registry import register_feature as register_feature
     from pisigma.kernels.array_kinematics import forward_kinematics as forward_kinematics
     from pisigma.kernels.array_kinematics import joint_jacobian as joint_jacobian
-    from pisigma.joint_correction.registry import register_feature as register_feature
     from pisigma.kinematics.status import Status as Status
     from pisigma.measurement.dataset import Measurements as Measurements
     from pisigma.network.pi_sigma import PiSigma as PiSigma
