@@ -4,7 +4,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError, nearest_choice
@@ -12,11 +12,14 @@ from pisigma.kinematics.parameter_jacobian import ToolMotion
 from pisigma.measurement.dataset import Measurements
 from pisigma.sensors.sensor import (
     AbstractSensor,
+    Derivative,
     InitialUnknowns,
+    Poses,
     SensorRows,
     UnknownDerivative,
     UnknownGroup,
     Unknowns,
+    Values,
     along,
     names_of,
     numbers_of,
@@ -66,18 +69,14 @@ class AnchorSensor(AbstractSensor):
         present = data.measured("distance") & (number >= 0)
         return cls(number, torch.where(present, data.distance, 0.0), present, rows.sigma(present))
 
-    def residual(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "components poses"]:
+    def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return shown minus predicted distances [m]."""
         zero = unknowns["anchor"][3, self.anchor[rows]]
         predicted = self._from_anchor(motion, unknowns, rows).norm(dim=0) + zero
         residual: Tensor = self.measured[rows] - predicted
         return residual[None]
 
-    def derivative(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "parameters components poses"]:
+    def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
         """Return the tool's shift away from the anchor."""
         return along(unit_vectors(self._from_anchor(motion, unknowns, rows)), motion.derivative)
 
@@ -100,9 +99,7 @@ class AnchorSensor(AbstractSensor):
         return UnknownGroup("anchor", ANCHOR_COLUMNS, owners, frames) if owners else None
 
     @classmethod
-    def initial_guess(
-        cls, measurements: Measurements, T: Float64[Tensor, "rows 4 4"], reach: float
-    ) -> InitialUnknowns | None:
+    def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
         """Guess zeros, and by multilateration the positions that the measurements do not state.
 
         Raises:
@@ -132,7 +129,7 @@ class AnchorSensor(AbstractSensor):
         cls,
         measurements: Measurements,
         owner: str,
-        T: Float64[Tensor, "rows 4 4"],
+        T: Poses,
         calibrated: Collection[str],
     ) -> Float64[Tensor, " columns"]:
         """Return the anchor's position that the measurements state, and no zero.

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
@@ -11,9 +11,12 @@ from pisigma.kinematics.parameter_jacobian import ToolMotion
 from pisigma.measurement.dataset import Measurements
 from pisigma.sensors.sensor import (
     AbstractSensor,
+    Derivative,
     InitialUnknowns,
+    Poses,
     SensorRows,
     Unknowns,
+    Values,
     along,
     names_of,
     unit_vectors,
@@ -53,27 +56,21 @@ class PairSensor(AbstractSensor):
         present = data.measured("distance") & paired & first
         return cls(torch.where(present, data.distance, 0.0), present, rows.sigma(present))
 
-    def residual(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "components poses"]:
+    def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return measured minus predicted distances [m]."""
         residual: Tensor = self.measured[rows] - _apart(motion.position).norm(dim=0)
         return residual[None]
 
-    def derivative(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "parameters components poses"]:
+    def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
         """Return the shift of the first tool against the second along their line."""
         return along(unit_vectors(_apart(motion.position)), _apart(motion.derivative[:, :3]))
 
-    def partner_derivative(self, motion: ToolMotion) -> Float[Tensor, "parameters components poses"]:
+    def partner_derivative(self, motion: ToolMotion) -> Derivative:
         """Return minus the shift of the next row's tool along the line."""
         return -along(unit_vectors(_apart(motion.position)), _following(motion.derivative[:, :3]))
 
     @classmethod
-    def initial_guess(
-        cls, measurements: Measurements, T: Float64[Tensor, "rows 4 4"], reach: float
-    ) -> InitialUnknowns | None:
+    def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
         """Guess nothing.
 
         Raises:

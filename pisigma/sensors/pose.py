@@ -8,7 +8,7 @@ from torch import Tensor
 
 from pisigma.kinematics.parameter_jacobian import ToolMotion
 from pisigma.se3 import invert, rotation_vector
-from pisigma.sensors.sensor import AbstractSensor, SensorRows, Unknowns
+from pisigma.sensors.sensor import AbstractSensor, Derivative, SensorRows, Unknowns, Values
 
 NEARLY_OPPOSITE = -0.99
 """Cosine of the turn below which its axis comes from the symmetric part."""
@@ -42,15 +42,11 @@ class PositionSensor(AbstractSensor):
         position = (T[:, :3, :3] @ data.position[..., None])[..., 0] + T[:, :3, 3]
         return cls(torch.where(present, position.t(), 0.0).contiguous(), present, rows.sigma(present))
 
-    def residual(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "components poses"]:
+    def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return measured minus predicted positions [m]."""
         return self.measured[:, rows] - motion.position
 
-    def derivative(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "parameters components poses"]:
+    def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
         """Return the tool's shift."""
         return motion.derivative[:, :3]
 
@@ -85,15 +81,11 @@ class RotationSensor(AbstractSensor):
         rotation = torch.where(present[:, None, None], rotation, eye).permute(1, 2, 0).contiguous()
         return cls(rotation, present, rows.sigma(present, "rad"))
 
-    def residual(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "components poses"]:
+    def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return the rotation vectors of measured · predicted^T [rad]."""
         return rotation_difference(self.measured[..., rows], motion.rotation)
 
-    def derivative(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "parameters components poses"]:
+    def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
         """Return the tool's turn.
 
         The residual r falls by `J_r(r)^-1 turn` rather than by the turn; as `J_r^-T r = r`, the cost's

@@ -20,6 +20,13 @@ SHORTEST = 1e-12
 Unknowns = Mapping[str, Float64[Tensor, "columns owners"]]
 """By group, what sensors have to find out about themselves; points are as seen from the anchor of their base."""
 
+Poses = Float64[Tensor, "rows 4 4"]
+"""Tool poses, each in the frame of its row."""
+Values = Float[Tensor, "components poses"]
+"""What a sensor measures, or by how much it misses what is predicted [m or rad]."""
+Derivative = Float[Tensor, "parameters components poses"]
+"""Derivative of predicted values by parameters that move the tool [m/m, m/rad, rad/m or rad/rad]."""
+
 
 @dataclass(frozen=True)
 class UnknownGroup:
@@ -162,18 +169,14 @@ class AbstractSensor(ABC):
         """
 
     @abstractmethod
-    def residual(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "components poses"]:
+    def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return measured minus predicted values; rows without a value may hold anything."""
 
     @abstractmethod
-    def derivative(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "parameters components poses"]:
+    def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
         """Return the derivative of the predicted values by every parameter that moves the tool."""
 
-    def partner_derivative(self, motion: ToolMotion) -> Float[Tensor, "parameters components poses"]:
+    def partner_derivative(self, motion: ToolMotion) -> Derivative:
         """Return what of the derivative comes from the next row's tool, where values are paired; else 0."""
         return motion.derivative.new_zeros(1, self.components, 1).expand(
             motion.derivative.shape[0], -1, motion.derivative.shape[2]
@@ -191,9 +194,7 @@ class AbstractSensor(ABC):
         return None
 
     @classmethod
-    def initial_guess(
-        cls, measurements: Measurements, T: Float64[Tensor, "rows 4 4"], reach: float
-    ) -> InitialUnknowns | None:
+    def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
         """Guess the unknowns from the robot as drawn, and refuse values that no robot near it can have measured.
 
         Args:
@@ -211,7 +212,7 @@ class AbstractSensor(ABC):
         cls,
         measurements: Measurements,
         owner: str,
-        T: Float64[Tensor, "rows 4 4"],
+        T: Poses,
         calibrated: Collection[str],
     ) -> Float64[Tensor, " columns"]:
         """Return the unknowns of an owner that was not calibrated, for judging its rows.

@@ -4,7 +4,7 @@ from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError, nearest_choice
@@ -12,11 +12,14 @@ from pisigma.kinematics.parameter_jacobian import ToolMotion
 from pisigma.measurement.dataset import Measurements
 from pisigma.sensors.sensor import (
     AbstractSensor,
+    Derivative,
     InitialUnknowns,
+    Poses,
     SensorRows,
     UnknownDerivative,
     UnknownGroup,
     Unknowns,
+    Values,
     names_of,
     numbers_of,
     owners_of,
@@ -57,15 +60,11 @@ class SocketSensor(AbstractSensor):
             return None
         return cls(rows.numbers(names, names_of(names)), present, rows.sigma(present))
 
-    def residual(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "components poses"]:
+    def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return the socket's position minus the tool's [m]."""
         return unknowns["socket"][:, self.socket[rows]] - motion.position
 
-    def derivative(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "parameters components poses"]:
+    def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
         """Return the tool's shift."""
         return motion.derivative[:, :3]
 
@@ -84,9 +83,7 @@ class SocketSensor(AbstractSensor):
         return UnknownGroup("socket", SOCKET_COLUMNS, owners, frames) if owners else None
 
     @classmethod
-    def initial_guess(
-        cls, measurements: Measurements, T: Float64[Tensor, "rows 4 4"], reach: float
-    ) -> InitialUnknowns | None:
+    def initial_guess(cls, measurements: Measurements, T: Poses, reach: float) -> InitialUnknowns | None:
         """Guess every socket at the mean of its rows.
 
         Raises:
@@ -112,7 +109,7 @@ class SocketSensor(AbstractSensor):
         cls,
         measurements: Measurements,
         owner: str,
-        T: Float64[Tensor, "rows 4 4"],
+        T: Poses,
         calibrated: Collection[str],
     ) -> Float64[Tensor, " columns"]:
         """Return where the rows of a socket meet on average."""
@@ -186,16 +183,12 @@ class SocketDistanceSensor(AbstractSensor):
         tensors = (first, second, measured, first >= 0, torch.full_like(measured, sigma))
         return cls(*(tensor.to(device) for tensor in tensors))
 
-    def residual(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "components poses"]:
+    def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return given minus present distances [m]."""
         residual: Tensor = self.measured[rows] - self._apart(unknowns, rows).norm(dim=0)
         return residual[None]
 
-    def derivative(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "parameters components poses"]:
+    def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
         """Return 0: the tool has no part in it."""
         return torch.zeros_like(motion.derivative[:, :1])
 

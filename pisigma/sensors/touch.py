@@ -3,11 +3,11 @@
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.kinematics.parameter_jacobian import ToolMotion
-from pisigma.sensors.sensor import AbstractSensor, SensorRows, Unknowns, along
+from pisigma.sensors.sensor import AbstractSensor, Derivative, SensorRows, Unknowns, Values, along
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +41,10 @@ class TouchSensor(AbstractSensor):
         measured = torch.where(present, data.touch - lines[:, 3], 0.0)
         return cls(lines[:, :3].t().contiguous(), measured, present, rows.sigma(present))
 
-    def residual(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "components poses"]:
+    def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return measured minus predicted coordinates [m]."""
         return (self.measured[rows] - (self.axis[:, rows] * motion.position).sum(0))[None]
 
-    def derivative(
-        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> Float[Tensor, "parameters components poses"]:
+    def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
         """Return the tool's shift along the axis."""
         return along(self.axis[:, rows], motion.derivative)
