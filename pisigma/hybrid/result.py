@@ -125,6 +125,6 @@ def unexplained_length(result: CalibrationResult) -> float:
     for noise in result.noise:
         if noise.unit == "m":
             found.append(noise.sigma)
-        elif noise.quantity == "m" and noise.unit == "given":
+        elif noise.quantity == "m" and noise.unit == "stated":
             found.append(noise.rms / math.sqrt(noise.components))
     return max(found, default=0.0)

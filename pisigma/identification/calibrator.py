@@ -34,7 +34,7 @@ from pisigma.robot.row import FRAME_COLUMNS
 from pisigma.sensors.socket import PairOfSockets
 
 ROUGH_ROWS = 4_096
-"""Rows that the first steps and the start are worked out from."""
+"""Rows that the initial guess and the first steps are worked out from."""
 SEEN_AT_ALL = 1e-3
 """A length whose column is shorter than this share of the longest does not hold the scale."""
 ROUGH_STEPS = 3
@@ -49,20 +49,20 @@ class GeometricCalibrator:
 
     Attributes:
         robot: the nominal robot.
-        free: "identifiable": all that the data can tell; "joint_offsets": theta of turning and d of sliding
+        free: "identifiable": all that the data can determine; "joint_offsets": theta of turning and d of sliding
             joints; or names of parameters, such as "a_2". Base and tool come on top, see below.
         base: "free", or "fixed" to the robot's own (then only parameters that `free` names are estimated).
         tool: the same for the tool; "position" frees x, y and z only.
         elimination: how redundant parameters are left out: "exact" (rank and pivoted QR), "pairwise" (the
             paper's Pearson correlation), or "none". The predicted poses do not depend on it.
-        prior: standard deviations of the parameters' errors, or None. With it, what the data cannot see
+        prior: standard deviations of the parameters' errors, or None. With it, what the data cannot determine
             stays at its nominal value.
         prior_sizes: "estimated": by the data, one factor on the prior for each of joint offsets, lengths, lengths
             drawn as 0, and angles between axes; "widened": one for lengths and one for angles, and only where
             the errors are larger than the prior says; "stated": as it is.
         frames: per frame of touches, about where the robot's base is in it: x, y, z [m], roll, pitch, yaw
-            [rad], such as the planned placement of a jig. Needed only where the touches do not tell it.
-        socket_distances: known distances between two sockets [m], which give the scale:
+            [rad], such as the planned placement of a jig. Needed only where the touches do not determine it.
+        socket_distances: distances between two sockets [m], which determine the scale:
             `{("plate/0", "plate/1"): 0.05}`.
         socket_sigma: standard deviation of these distances [m].
         loss: `HampelLoss()` gives rows that are far off less weight or none; `SquaredLoss()` does not.
@@ -182,17 +182,17 @@ class GeometricCalibrator:
         Raises:
             IdentificationError: `free` names a parameter that does not exist.
         """
-        found = {i for i, p in enumerate(space.parameters) if p.group == "base" and self.base == "free"}
+        chosen = {i for i, p in enumerate(space.parameters) if p.group == "base" and self.base == "free"}
         tools = list(space.of("tool")) if self.tool != "fixed" else []
-        found |= {i for place, i in enumerate(tools) if self.tool == "free" or place % 6 < 3}
+        chosen |= {i for k, i in enumerate(tools) if self.tool == "free" or k % 6 < 3}
         if self.free == "identifiable":
-            found |= set(range(space.arm_size))
+            chosen |= set(range(space.arm_size))
         elif self.free == "joint_offsets":
             for row in self.robot.joint_rows:
-                found.add(5 * row + (1 if self.robot.rows[row].type == "prismatic" else 0))
+                chosen.add(5 * row + (1 if self.robot.rows[row].type == "prismatic" else 0))
         else:
-            found |= {place for name in self.free for place in space.indices(name)}
-        return sorted(found)
+            chosen |= {index for name in self.free for index in space.indices(name)}
+        return sorted(chosen)
 
     def _at_start(self, setup: CalibrationSetup, candidates: list[int]) -> tuple[list[int], Information]:
         """What the data say of the candidates at the start, after the sensors' own unknowns.
@@ -233,7 +233,7 @@ class GeometricCalibrator:
     def _solved(
         self, problem: CalibrationProblem, start: Float64[Tensor, " parameters"], candidates: list[int]
     ) -> tuple[Solution[Tensor], CalibrationProblem, list[int]]:
-        """Solve roughly without the prior, add what the data tell there, then solve with the prior.
+        """Solve roughly without the prior, add what the data determine there, then solve with the prior.
 
         The rough steps show the noise that the prior is weighed against; a few thousand rows are enough for
         them.

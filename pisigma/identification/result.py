@@ -55,7 +55,7 @@ class SensorNoise:
         sensor: "position", "rotation", "touch", "socket", "distance", "pair", "socket distance", or the name of a
             registered sensor.
         sigma: standard deviation of one value [m or rad]; where the rows state their own, the factor on it.
-        unit: "m" or "rad", or "given" for a factor.
+        unit: "m" or "rad", or "stated" for a factor on what the rows state.
         values: number of measured values.
         used: how many of them the parameters used up.
         rms: root mean square of the residuals' lengths, all rows [m or rad].

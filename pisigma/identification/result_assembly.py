@@ -86,7 +86,7 @@ def assemble_result(
     solution: Solution[Tensor],
     findings: Findings,
 ) -> CalibrationResult:
-    """Make the result; see `CalibrationResult` for its parts."""
+    """Make the result; see `CalibrationResult` for its fields."""
     here = problem.refined(solution.linearisation)
     geometry = identified_geometry(setup, here.point)
     covariance = _covariance(here, problem, geometry)
@@ -215,8 +215,8 @@ def _without_rows(
         J = torch.from_numpy(at_start.jacobian[:, columns])
         if len(own) and _determines_all(J.t() @ J) and not _determines_all(normal[own[:, None], own]):
             lost[own] = True
-    found: list[int] = active[lost].tolist()
-    return found
+    indices: list[int] = active[lost].tolist()
+    return indices
 
 
 def _determines_all(information: Float64[Tensor, "own own"]) -> bool:
@@ -229,8 +229,8 @@ def _prior_precision(problem: CalibrationProblem, here: Linearisation[Tensor]) -
     """1 / variance of all parameters by the prior, 0 where they are not free."""
     full = torch.zeros_like(problem.precision)
     full[problem.active] = view_of(here).scaled(problem.precision[problem.active], problem.prior_group)
-    found: np.ndarray = full.cpu().numpy()
-    return found
+    precision: np.ndarray = full.cpu().numpy()
+    return precision
 
 
 def _remark(name: str, free: bool, extended: bool, redundancy: Redundancy) -> tuple[str, str]:
@@ -290,13 +290,13 @@ def _outliers(
 
 
 def _noise(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[SensorNoise, ...]:
-    found = []
+    noise = []
     view = view_of(here)
     used = values_used(view, covariance_of(here.normal))
     for k, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
         sigma = view.noise[k]
-        unit = sensor.unit if sensor.sigma is None else "given"
-        found.append(
+        unit = sensor.unit if sensor.sigma is None else "stated"
+        noise.append(
             SensorNoise(
                 sensor=sensor.name,
                 sigma=sigma,
@@ -308,4 +308,4 @@ def _noise(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[Se
                 components=sensor.components,
             )
         )
-    return tuple(found)
+    return tuple(noise)

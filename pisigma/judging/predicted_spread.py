@@ -95,7 +95,7 @@ def _noise(result: HybridResult, measurements: Measurements) -> Float64[Tensor, 
     first = next(noise for noise in result.geometric.noise if noise.sensor == "position")
     sigma = first.sigma if result.learned is None else result.learned.noise["position"]
     none = torch.zeros(measurements.rows, dtype=torch.float64)
-    if first.unit != "given":
+    if first.unit != "stated":
         return none + sigma
     stated = measurements.sigma_position
     return none if stated is None else sigma * torch.nan_to_num(stated)

@@ -170,7 +170,7 @@ def anchor_from_distances(
     p, d = points - centre, distance - middle
     A = torch.cat([-2 * p, 2 * d[:, None], torch.ones_like(d)[:, None]], -1)
     solution = torch.linalg.pinv(A, rtol=1e-4) @ (d.square() - p.square().sum(-1))
-    # where the zero is not told by the linear system, a sensor that shows 0 at no distance is the other start
+    # where the linear system does not determine the zero, a sensor that shows 0 at no distance is the other start
     without_zero = torch.linalg.pinv(A[:, [0, 1, 2, 4]], rtol=1e-6) @ (distance.square() - p.square().sum(-1))
     starts = solution[:4], torch.cat([without_zero[:3], -middle[None]])
     best, _ = min((_polished(p, d, start) for start in starts), key=lambda end: end[1])

@@ -28,7 +28,7 @@ IdentifiedUnknowns = Mapping[str, Mapping[str, Float64[np.ndarray, " columns"]]]
 
 
 def register_sensor(sensor: type[AbstractSensor]) -> type[AbstractSensor]:
-    """Make a kind of sensor known to measurement files, calibration and judging; also a class decorator.
+    """Register a kind of sensor with measurement files, calibration and judging; also a class decorator.
 
     Args:
         sensor: a final subclass of `AbstractSensor`. Its `readings` say which columns it adds to measurement files;
@@ -102,7 +102,7 @@ def measured_errors(
         that no row has are left out.
 
     Raises:
-        IdentificationError: the rows of an owner that was not calibrated do not tell its unknowns.
+        IdentificationError: the rows of an owner that was not calibrated do not determine its unknowns.
     """
     rows = pairs_first(measurements, torch.arange(measurements.rows, device=T.device))
     data = replace(measurements, sigma_position=None, sigma_rotation=None).select(rows)

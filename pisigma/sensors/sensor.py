@@ -138,10 +138,10 @@ class AbstractSensor(ABC):
         unit: of its values.
         components: values a row.
         turning: whether it needs the tool's rotation.
-        certain: whether its values are given rather than measured: their standard deviation stands, and none of them
+        certain: whether its values are stated rather than measured: their standard deviation stands, and none of them
             counts as wrong.
         paired: whether a value belongs to a row and the next one together.
-        holds_frame: whether its values tell where the frame is that it measures in.
+        holds_frame: whether its values determine where the frame is that it measures in.
         readings: the columns that it adds to measurement files; None for a sensor whose values are fields of
             `Measurements`.
         present: whether a row has a value.

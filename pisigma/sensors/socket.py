@@ -1,4 +1,4 @@
-"""Sockets: fixed points that the ball at the tool sits in, and given distances between them."""
+"""Sockets: fixed points that the ball at the tool sits in, and stated distances between them."""
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -120,7 +120,7 @@ class SocketSensor(AbstractSensor):
 
 @dataclass(frozen=True, eq=False)
 class SocketDistanceSensor(AbstractSensor):
-    """Given distances between two sockets, each attached to a row of one of them.
+    """Stated distances between two sockets, each attached to a row of one of them.
 
     Attributes:
         first: index of one socket, -1 where a row has no such distance.
@@ -184,7 +184,7 @@ class SocketDistanceSensor(AbstractSensor):
         return cls(*(tensor.to(device) for tensor in tensors))
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
-        """Return given minus present distances [m]."""
+        """Return stated minus present distances [m]."""
         residual: Tensor = self.measured[rows] - self._apart(unknowns, rows).norm(dim=0)
         return residual[None]
 

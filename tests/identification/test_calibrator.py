@@ -258,7 +258,7 @@ def test_given_standard_deviations_weight_the_rows() -> None:
     good = GeometricCalibrator(arm.nominal).fit(weighted)
     plain = GeometricCalibrator(arm.nominal).fit(unweighted)
     assert mean_error(good.robot, arm.true) < 0.3 * mean_error(plain.robot, arm.true)
-    assert good.noise[0].unit == "given"
+    assert good.noise[0].unit == "stated"
     assert_close(good.noise[0].sigma, 1.0, atol=0.2)
 
 

@@ -11,14 +11,14 @@ from pisigma.identification.problem.noise import view_of
 from pisigma.identification.problem.problem import CalibrationProblem
 
 ROUNDING = 1e-12
-"""Information of less than this share of the largest cannot be told from none."""
+"""Information of less than this share of the largest cannot be distinguished from none."""
 SHOWN = 0.25
 """Parameters with at least this share of a direction are named."""
 
 
 @dataclass(frozen=True)
 class Observability:
-    """How well poses tell the chosen parameters: from the singular values s_1 ≥ ... ≥ s_L of their Jacobian.
+    """How well poses determine the chosen parameters: from the singular values s_1 ≥ ... ≥ s_L of their Jacobian.
 
     The scaling: parameters in mm and mrad, positions in mm, rotations in mrad; the Jacobian is not divided
     by noise.
@@ -64,9 +64,9 @@ def observability_of(gram: Float64[Tensor, "chosen chosen"], poses: int) -> Obse
 
 
 def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[str, ...]:
-    """Find directions of the free arm parameters that the data tell less well than the prior does.
+    """Find directions of the free arm parameters that the data determine less well than the prior does.
 
-    Base and tool are marginalised: what they can mimic does not count as seen. The directions are
+    Base and tool are marginalised: what they can mimic does not count as determined. The directions are
     eigenvectors of the data's information in units of the prior's standard deviations (1 mm and 1 mrad
     where there is none).
 
@@ -86,11 +86,11 @@ def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor
     if not bool(arm.any()):
         return ()
     cross = data[arm][:, ~arm]
-    seen = (
+    schur = (
         data[arm][:, arm]
         - cross @ torch.linalg.pinv(data[~arm][:, ~arm], rtol=1e-12, hermitian=True) @ cross.mT
     )
-    values, vectors = torch.linalg.eigh((seen + seen.mT) / 2)
+    values, vectors = torch.linalg.eigh((schur + schur.mT) / 2)
     names = [problem.space.names[i] for i in problem.active[arm].tolist()]
     end = "it stays near its nominal value" if held else "without a prior it may be anything"
     sentences = []
@@ -100,13 +100,13 @@ def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor
             break
         width = value**-0.5 if value > max(1e-12, rounding) else float("inf")
         sentences.append(
-            f"{_in_words(vector, names)}: the data tell it only to {width:.2g} times its tolerance; {end}"
+            f"{_in_words(vector, names)}: the data determine it only to {width:.2g} times its tolerance; {end}"
         )
     return tuple(sentences)
 
 
 def _in_words(vector: Tensor, names: list[str]) -> str:
-    """The large parts of a direction, in units of the tolerances."""
+    """The large components of a direction, in units of the tolerances."""
     order = vector.abs().argsort(descending=True).tolist()
     sign = 1.0 if float(vector[order[0]]) > 0 else -1.0
     text = ""

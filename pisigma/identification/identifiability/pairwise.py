@@ -105,14 +105,14 @@ def find_pairwise_redundancy(
 
 def _correlations(centred: np.ndarray, acting: np.ndarray) -> np.ndarray:
     deviations = np.linalg.norm(centred, axis=0)
-    known = acting & (deviations > 0)
-    unit = np.where(known, centred / np.where(known, deviations, 1.0), np.nan)
+    varies = acting & (deviations > 0)
+    unit = np.where(varies, centred / np.where(varies, deviations, 1.0), np.nan)
     return unit.T @ unit
 
 
 def _sets(correlations: np.ndarray, tolerance: float) -> list[tuple[list[int], list[int]]]:
     """Sets of two or more parameters that act alike: their indices, and their signs against the first."""
-    found, taken = [], set()
+    sets, taken = [], set()
     for first in range(len(correlations)):
         if first in taken:
             continue
@@ -120,5 +120,5 @@ def _sets(correlations: np.ndarray, tolerance: float) -> list[tuple[list[int], l
         members = [k for k in alike if k not in taken]
         taken |= set(members)
         if len(members) > 1:
-            found.append((members, [int(np.sign(correlations[first, k])) for k in members]))
-    return found
+            sets.append((members, [int(np.sign(correlations[first, k])) for k in members]))
+    return sets

@@ -15,7 +15,7 @@ NO_EFFECT = 1e-9
 PREFERENCE = ("base", "tool", "theta", "a", "d", "alpha", "beta")
 """Which parameters are kept first; each class counts ten times as much as the next."""
 CLEARLY_SEEN = 1.0
-"""A parameter is added when the data alone tell it to this many mm or mrad."""
+"""A parameter is added when the data alone determine it to this many mm or mrad."""
 EXPLAINED = 0.5
 """All that can be seen at all are added when they explain this share of what is left of the residuals."""
 SIGNIFICANT = 20.0
@@ -26,7 +26,7 @@ VISIBLE = 1e-7
 
 @dataclass(frozen=True)
 class Dependency:
-    """A combination of parameters of which the data tell only the sum.
+    """A combination of parameters of which the data determine only the sum.
 
     Attributes:
         names: the parameter that is kept, then those that act like it.
@@ -47,7 +47,7 @@ class Redundancy:
 
     Attributes:
         names: the parameters that were looked at.
-        rank: how many independent combinations of them the data see.
+        rank: how many independent combinations of them the data determine.
         tolerance: of the rank, as a share of the largest singular value.
         singular_values: of the column-scaled Jacobian.
         kept: the parameters that were chosen, `rank` of them.
@@ -67,8 +67,8 @@ class Redundancy:
 
     def group(self, name: str) -> str | None:
         """The sentence of a dependency that a parameter is part of, the shortest if several."""
-        found = [dependency for dependency in self.dependencies if name in dependency.names]
-        return min(found, key=lambda dependency: len(dependency.names)).sentence if found else None
+        having = [dependency for dependency in self.dependencies if name in dependency.names]
+        return min(having, key=lambda dependency: len(dependency.names)).sentence if having else None
 
 
 def find_redundancy(
@@ -138,7 +138,7 @@ def _dependencies(
     J = information.jacobian
     scaled, *_ = np.linalg.lstsq(J[:, kept] / lengths[kept], J[:, removed] / lengths[removed], rcond=None)
     usual = np.array([parameter.usual_error for parameter in information.parameters])
-    found = []
+    dependencies = []
     for row, index in zip(scaled, kept, strict=True):
         partners = [k for k in range(len(removed)) if abs(row[k]) > 1e-6]
         if not partners:
@@ -149,8 +149,8 @@ def _dependencies(
             coefficients.append(float(change * usual[index] / usual[removed[k]]))
         members = [information.parameters[index], *(information.parameters[removed[k]] for k in partners)]
         names = tuple(member.name for member in members)
-        found.append(Dependency(names, tuple(coefficients), sentence_of(members, coefficients)))
-    return tuple(found)
+        dependencies.append(Dependency(names, tuple(coefficients), sentence_of(members, coefficients)))
+    return tuple(dependencies)
 
 
 def sentence_of(members: list[Parameter], coefficients: list[float]) -> str:
@@ -168,10 +168,10 @@ def sentence_of(members: list[Parameter], coefficients: list[float]) -> str:
 
 
 def rank_extension(information: Information, kept: list[int]) -> list[int]:
-    """Find columns that the data tell besides those kept.
+    """Find columns that the data determine besides those kept.
 
     Nominal axes are parallel or meet exactly; real ones do not, so that dependencies of the nominal robot
-    are not quite dependencies of the real one. Columns are added one by one while the data tell the next to
+    are not quite dependencies of the real one. Columns are added one by one while the data determine the next to
     a usual error; or all that are visible, if the residuals show that they are needed (as with exact data).
 
     Args:
@@ -199,14 +199,14 @@ def _pivots(rest: np.ndarray, rounding: np.ndarray, kept: list[int]) -> list[tup
     rest = rest.copy()
     taken = np.zeros(rest.shape[1], dtype=bool)
     taken[kept] = True
-    found: list[tuple[int, float]] = []
+    pivots: list[tuple[int, float]] = []
     while True:
         lengths = np.linalg.norm(rest, axis=0)
         lengths[taken | (lengths <= rounding)] = 0.0
         best = int(lengths.argmax()) if len(lengths) else 0
         if not len(lengths) or lengths[best] == 0.0:
-            return found
-        found.append((best, float(lengths[best])))
+            return pivots
+        pivots.append((best, float(lengths[best])))
         taken[best] = True
         direction = rest[:, best] / lengths[best]
         rest -= np.outer(direction, direction @ rest)

@@ -156,5 +156,5 @@ def _status(solution: Solution[BaseToolState]) -> str:
         return solution.status.value
     return (
         f"{solution.status.value}; the data see only {rank} of the {free} unknowns of base and tool, "
-        "the others stay where they started (poses with more different wrist orientations would tell)"
+        "the others stay where they started (poses with more different wrist orientations would determine them)"
     )

@@ -21,7 +21,7 @@ def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[Bas
     """Starts to be polished and compared; one is enough except with positions of few or special poses.
 
     Args:
-        robot: gives the tool, which decides what the data leave open, and the parts that are not free.
+        robot: gives the tool, which decides what the data leave open, and what is not free.
         problem: flange poses and measurements.
     """
     like = problem.position
@@ -153,7 +153,7 @@ def _tool_start(
     turned: bool,
     R_tool: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """The tool with the base given: the mean of what each row says."""
+    """The tool for a fixed base: the mean of what each row says."""
     seen = (position - p_base) @ R_base
     point = (R_flange.mT @ (seen - p_flange)[..., None])[..., 0].mean(0)
     if turned:
@@ -162,7 +162,7 @@ def _tool_start(
 
 
 def _mean_turn(R_base: Tensor, R_flange: Tensor, rotation: Tensor) -> Tensor:
-    """The tool's rotation with the base's given."""
+    """The tool's rotation for a fixed rotation of the base."""
     return nearest_rotation((R_flange.mT @ R_base.mT @ rotation).sum(0))
 
 
@@ -174,7 +174,7 @@ def _procrustes(points: Tensor, position: Tensor) -> Tensor:
 def _translations(
     R_base: Tensor, R_flange: Tensor, p_flange: Tensor, position: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Positions of base and tool with the base's rotation given; they are linear then."""
+    """Positions of base and tool for a fixed rotation of the base; they are linear then."""
     rows = position.shape[0]
     A = torch.cat([torch.eye(3).to(position).expand(rows, 3, 3), R_base @ R_flange], -1).flatten(0, 1)
     b = (position - p_flange @ R_base.mT).flatten()

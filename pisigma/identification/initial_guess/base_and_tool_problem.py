@@ -38,7 +38,7 @@ class BaseToolState:
 class _View:
     """Normal matrix, descent and cost, and the standard deviation, of positions and of rotations."""
 
-    parts: tuple[tuple[Tensor, Tensor, float], ...]
+    blocks: tuple[tuple[Tensor, Tensor, float], ...]
     noise: tuple[float, float]
 
 
@@ -119,32 +119,32 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         blocks = [(self._shifts(point, R_base_flange), self.position_residual(point), self.sigma_position)]
         if self.turned:
             blocks.append((self._turns(R_base_flange), self.rotation_residual(point), self.sigma_rotation))
-        parts = []
+        sums = []
         for J, residual, sigma in blocks:
             A, r = J[..., self.active].flatten(0, 1), residual.flatten()
             if sigma is not None:
                 weight = (1 / sigma).repeat_interleave(3)
                 A, r = A * weight[:, None], r * weight
-            parts.append((A.mT @ A, A.mT @ r, float(r @ r)))
-        return self._combined(point, _View(tuple(parts), noise))
+            sums.append((A.mT @ A, A.mT @ r, float(r @ r)))
+        return self._combined(point, _View(tuple(sums), noise))
 
     def renewed(
         self, linearisation: Linearisation[BaseToolState]
     ) -> tuple[Linearisation[BaseToolState], bool]:
-        """Weight positions and rotations by 1 / their own scatter, where no sigma is given."""
+        """Weight positions and rotations by 1 / their own scatter, where no sigma is stated."""
         view = _view_of(linearisation)
         values = (3 * len(self.position), 3 * self._rotations)
-        given = (self.sigma_position is not None, self.sigma_rotation is not None)
-        found = [1.0, 1.0]
-        for k, part in enumerate(view.parts):
-            if not given[k]:
-                found[k] = max((part[2] / values[k]) ** 0.5, SMALLEST_NOISE)
-        settled = all(abs(new / old - 1) < 1e-2 for new, old in zip(found, view.noise, strict=True))
-        return self._combined(linearisation.point, _View(view.parts, (found[0], found[1]))), settled
+        stated = (self.sigma_position is not None, self.sigma_rotation is not None)
+        noise = [1.0, 1.0]
+        for k, part in enumerate(view.blocks):
+            if not stated[k]:
+                noise[k] = max((part[2] / values[k]) ** 0.5, SMALLEST_NOISE)
+        settled = all(abs(new / old - 1) < 1e-2 for new, old in zip(noise, view.noise, strict=True))
+        return self._combined(linearisation.point, _View(view.blocks, (noise[0], noise[1]))), settled
 
     def _combined(self, point: BaseToolState, view: "_View") -> Linearisation[BaseToolState]:
-        noise = view.noise[: len(view.parts)]
-        pairs = list(zip(view.parts, noise, strict=True))
+        noise = view.noise[: len(view.blocks)]
+        pairs = list(zip(view.blocks, noise, strict=True))
         normal = torch.stack([part[0] / s**2 for part, s in pairs]).sum(0)
         descent = torch.stack([part[1] / s**2 for part, s in pairs]).sum(0)
         cost = sum(part[2] / s**2 for part, s in pairs)
@@ -257,7 +257,7 @@ def _rotations(measurements: Measurements, keep: Tensor) -> tuple[Tensor, Tensor
 
 
 def _given(sigma: Tensor | None, keep: Tensor, used: Tensor) -> Tensor | None:
-    """Standard deviations of the rows to keep; None where not all used ones are given."""
+    """Standard deviations of the rows to keep; None where not all used ones are stated."""
     if sigma is None or not bool(torch.isfinite(sigma[keep][used]).all()):
         return None
     return torch.where(used, sigma[keep], 1.0)

@@ -48,7 +48,7 @@ class AbstractLoss(ABC):
             distance: distances of the rows that were seen, in the sensor's unit.
             components: values a row.
             used: how many values the estimated parameters use up.
-            scale: about what it is, to tell the good rows.
+            scale: about what it is, to distinguish the good rows.
         """
 
 
@@ -79,7 +79,7 @@ class SquaredLoss(AbstractLoss):
 class HampelLoss(AbstractLoss):
     """Least squares up to the 99 % quantile of normal noise, then less and less, at three times that nothing.
 
-    Hampel's three parts (Hampel et al. 1986, section 2.6) with corners at 1, 1.5 and 3 times the quantile:
+    Hampel's three-part function (Hampel et al. 1986, section 2.6) with corners at 1, 1.5 and 3 times the quantile:
     good rows keep the weight one, so normal noise is treated as by least squares; rows far off do not count
     at all. The scale is the median of the distances, so it needs no threshold in metres and stands up to
     nearly half of the rows being wrong.

@@ -29,7 +29,7 @@ class PriorGroup(IntEnum):
     JOINT_OFFSET = 0
     """theta: where the zeros of the joints were set."""
     LENGTH = 1
-    """d and a that are drawn: how long parts are."""
+    """d and a that are drawn: how long links are."""
     NO_LENGTH = 2
     """d and a drawn as 0, or shorter than their tolerance: how nearly axes meet or are in line."""
     BETWEEN_AXES = 3
@@ -140,8 +140,8 @@ def loss_scale(
 
 def renumbered(keys: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
     """Numbers from 0 on, equal where the keys are equal."""
-    found: Tensor = torch.unique(keys, return_inverse=True)[1]
-    return found
+    numbers: Tensor = torch.unique(keys, return_inverse=True)[1]
+    return numbers
 
 
 def group_variance_ratio(

@@ -26,7 +26,7 @@ USUAL_LENGTH = 1e-3
 USUAL_ANGLE = 1e-3
 """[rad]"""
 SMALLEST_PRIOR = 1e-12
-"""[m or rad] A parameter that is known better is fixed: leave it out of `free`."""
+"""[m or rad] A parameter with less uncertainty is fixed: leave it out of `free`."""
 
 PriorSizes = Literal["stated", "widened", "estimated"]
 """Whether the prior's sizes stand, may only grow, or are estimated."""

@@ -53,7 +53,7 @@ class MotionMemory:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationProblem(AbstractLeastSquares[Tensor]):
-    """Rows, sensors, the parameters that are free and what is known of them.
+    """Rows, sensors, the parameters that are free and what the prior says of them.
 
     Attributes:
         space: the parameters; a point is a vector of all of them.
@@ -63,7 +63,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         sensors: what was measured in the rows.
         loss: how rows far from their prediction count.
         nominal: values of all parameters that the prior is about.
-        precision: 1 / variance of their errors, 0 where nothing is known.
+        precision: 1 / variance of their errors by the prior, 0 where it says nothing.
         active: indices of the free parameters.
         pose: number of every row's pose (joint values, frame, target), None where no pose is repeated.
         configuration: number of every row's joint values and frame, None where none is seen of several targets.
@@ -115,7 +115,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return replace(self, active=torch.tensor(sorted(active), dtype=torch.int64, device=self.q.device))
 
     def without_prior(self) -> "CalibrationProblem":
-        """The same with nothing known beforehand."""
+        """The same without a prior."""
         return replace(self, precision=torch.zeros_like(self.precision))
 
     def select(self, rows: Int64[Tensor, " chosen"]) -> "CalibrationProblem":
@@ -147,15 +147,17 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def linearise(self, point: Tensor, like: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
         """Sum up the normal equations; rows are weighted by the noise of `like`."""
-        known = None if like is None else view_of(like)
+        before = None if like is None else view_of(like)
         sums = [self._empty(k) for k in range(len(self.sensors))]
         unknowns = self.space.sensor_unknowns(point)
         for rows in self.chunks():
             motion = self.motion(point, rows, self.active)
             for k, total in enumerate(sums):
-                self._add(k, total, float("inf") if known is None else known.noise[k], motion, unknowns, rows)
+                self._add(
+                    k, total, float("inf") if before is None else before.noise[k], motion, unknowns, rows
+                )
         ones = (1.0,) * len(sums)
-        view = SensorView(tuple(sums), ones, ones) if known is None else replace(known, sums=tuple(sums))
+        view = SensorView(tuple(sums), ones, ones) if before is None else replace(before, sums=tuple(sums))
         return self.combined(point, view)
 
     def renewed(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], bool]:

@@ -56,7 +56,7 @@ class PoseChunk:
         T: T_base_tool [m] of the rows that are poses.
         line: their lines.
         bad: the other rows and what is wrong with them.
-        share: of the file that has been read, 0 to 1; NaN where its length cannot be told.
+        share: of the file that has been read, 0 to 1; NaN where the file has no length.
     """
 
     T: Float64[Tensor, "rows 4 4"]

@@ -37,7 +37,7 @@ def read_fields(
     `q1_deg` or `q1_rad` and so on (prismatic: `q3_mm` or `q3_m`) must be there, and at least one kind of
     length (each also in `_m`), of which a row holds one: `x_mm,y_mm,z_mm`; `socket`, the name of the fixed
     point that the ball sits in; `touch_axis` (x, y or z) and `touch_mm` with `frame`, the jig; `distance_mm`
-    with `anchor`, the name of a fixed point whose place `anchor_x_mm,anchor_y_mm,anchor_z_mm` may be known,
+    with `anchor`, the name of a fixed point whose position `anchor_x_mm,anchor_y_mm,anchor_z_mm` may be stated,
     or with `pair`, the name of the two rows it lies between, which stands in both.
 
     `roll_deg,pitch_deg,yaw_deg` (RotZ(roll) · RotY(pitch) · RotX(yaw)) or `qx,qy,qz,qw`, `target`, `frame`,

@@ -14,7 +14,7 @@ from pisigma.errors import MeasurementError
 
 @dataclass(frozen=True, eq=False)
 class Table:
-    """The fields of a CSV file, before anything is known of their meaning.
+    """The fields of a CSV file, before their meaning is looked at.
 
     Attributes:
         source: the file, as complaints call it.
