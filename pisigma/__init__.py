@@ -73,38 +73,7 @@ _HOMES = {
     "verify": "pisigma.workflow.verify",
 }
 
-__all__ = [
-    "Calibration",
-    "CalibrationResult",
-    "CalibrationSettings",
-    "CorrectedIK",
-    "Distillation",
-    "DistillationSettings",
-    "EvaluationSettings",
-    "GeometricCalibrator",
-    "HybridCalibrator",
-    "HybridResult",
-    "Limits",
-    "Measurements",
-    "PiSigma",
-    "PisigmaError",
-    "Robot",
-    "Solution",
-    "Status",
-    "TrainSettings",
-    "VerificationSettings",
-    "calibrate",
-    "distill",
-    "evaluate",
-    "forward_kinematics",
-    "joint_jacobian",
-    "load",
-    "register_feature",
-    "register_sensor",
-    "report",
-    "train",
-    "verify",
-]
+__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:

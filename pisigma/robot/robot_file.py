@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
+from jaxtyping import Float64
 from pydantic import Field, model_validator
 
 from pisigma.errors import RobotError, UnknownRobotError, nearest_choice
@@ -15,19 +16,29 @@ from pisigma.yaml_file import Section, parse_yaml, read_yaml
 Limits = Annotated[tuple[float, float], Field(description="lower and upper")]
 
 
-class RowSection(Section):
-    """One joint or fixed row. Angles in degrees, lengths in millimetres."""
+class ParameterSection(Section):
+    """The parameters of a row. Angles in degrees, lengths in millimetres."""
+
+    theta_deg: float = 0.0
+    d_mm: float = 0.0
+    a_mm: float = 0.0
+    alpha_deg: float = 0.0
+    beta_deg: float = 0.0
+
+    def to_si(self) -> Float64[np.ndarray, " 5"]:
+        """The parameters as `DH_COLUMNS` [rad or m]."""
+        theta, alpha, beta = np.deg2rad([self.theta_deg, self.alpha_deg, self.beta_deg])
+        return np.array([theta, self.d_mm / 1e3, self.a_mm / 1e3, alpha, beta])
+
+
+class RowSection(ParameterSection):
+    """One joint or fixed row."""
 
     name: str = Field(min_length=1)
     type: JointType
     direction: Literal[1, -1] = 1
     limits_deg: Limits | None = None
     limits_mm: Limits | None = None
-    theta_deg: float = 0.0
-    d_mm: float = 0.0
-    a_mm: float = 0.0
-    alpha_deg: float = 0.0
-    beta_deg: float = 0.0
 
     @model_validator(mode="after")
     def _limits_fit_type(self) -> "RowSection":
@@ -94,22 +105,12 @@ class RobotDocument(Section):
 
     def drawing(self) -> Drawing:
         """The robot in SI units."""
-        dh = [
-            [
-                np.deg2rad(row.theta_deg),
-                row.d_mm / 1e3,
-                row.a_mm / 1e3,
-                np.deg2rad(row.alpha_deg),
-                np.deg2rad(row.beta_deg),
-            ]
-            for row in self.rows
-        ]
         return Drawing(
             name=self.name,
             maker=self.maker,
             source=self.source,
             rows=tuple(row.to_row() for row in self.rows),
-            dh=np.array(dh, dtype=np.float64),
+            dh=np.array([row.to_si() for row in self.rows]),
             base=self.base.to_si(),
             tool=self.tool.to_si(),
         )

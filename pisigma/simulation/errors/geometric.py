@@ -8,24 +8,8 @@ from jaxtyping import Float64
 from pydantic import Field
 
 from pisigma.robot.description import Robot
-from pisigma.robot.robot_file import FrameSection
+from pisigma.robot.robot_file import FrameSection, ParameterSection
 from pisigma.simulation.errors.source import AbstractGeometrySource, GeometryChange, row_index
-from pisigma.yaml_file import Section
-
-
-class RowDeviation(Section):
-    """What is added to the parameters of one row. Angles in degrees, lengths in millimetres."""
-
-    theta_deg: float = 0.0
-    d_mm: float = 0.0
-    a_mm: float = 0.0
-    alpha_deg: float = 0.0
-    beta_deg: float = 0.0
-
-    def to_si(self) -> Float64[np.ndarray, " 5"]:
-        """Give theta [rad], d [m], a [m], alpha [rad], beta [rad]."""
-        theta, alpha, beta = np.deg2rad([self.theta_deg, self.alpha_deg, self.beta_deg])
-        return np.array([theta, self.d_mm / 1e3, self.a_mm / 1e3, alpha, beta])
 
 
 class GeometricDeviation(AbstractGeometrySource):
@@ -47,7 +31,7 @@ class GeometricDeviation(AbstractGeometrySource):
     """
 
     kind: Literal["geometric"]
-    rows: dict[str, RowDeviation] = Field(default_factory=dict)
+    rows: dict[str, ParameterSection] = Field(default_factory=dict)
     base: FrameSection = FrameSection()
     tool: FrameSection = FrameSection()
 
