@@ -57,7 +57,7 @@ def joint_values(robot: Robot, count: int = 5) -> torch.Tensor:
     return torch.cat([torch.zeros(1, robot.dof, dtype=torch.float64), drawn])
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=120, deadline=None)
 @given(chains)
 @example([DrawnJoint("prismatic", (0.1, 0.2, 0.3), (0, 0, 0), (1, 0, 0))])
 @example([DrawnJoint("revolute", (0.1, 0.2, 0.3), (0.1, math.pi / 2, 0.2), (0.6, 0, 0.8))] * 7)
@@ -73,7 +73,7 @@ def test_any_chain_keeps_its_forward_kinematics(chain):
     ]
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(chains)
 def test_no_length_is_far_beyond_those_of_the_chain(chain):
     """A common normal of nearly parallel axes would be hundreds of metres away."""
