@@ -109,7 +109,10 @@ def _domain(statistics: Mapping[str, float], rows: int | None) -> str:
 
 
 def _interval(interval: Interval | None) -> str:
-    return _NONE if interval is None else f"[{interval[0]:.3g}, {interval[1]:.3g}]"
+    if interval is None:
+        return _NONE
+    ends = (f"{end:.3g}" if abs(end) < 1e3 else f"{end:.0f}" for end in interval)
+    return f"[{', '.join(ends)}]"
 
 
 def _p(value: float) -> str:

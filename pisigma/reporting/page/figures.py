@@ -32,7 +32,7 @@ MANY_DOTS = 200
 PIXELS = 130
 """Of dots, per inch."""
 BEFORE, AFTER, OTHER = "#b35806", "#1f5fa8", "#4d4d4d"
-"""Colours that are told apart by people who see no red or no green, too."""
+"""Colours that people who see no red or no green can distinguish, too."""
 _STYLE: dict[Any, Any] = {
     "text.parse_math": False,
     "svg.hashsalt": "pisigma",
@@ -135,33 +135,30 @@ def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
     return written
 
 
-def draw_dependence(found: Dependence) -> Drawing:
-    """Errors over one quantity: every row a dot, and the RMS error of its parts."""
+def draw_dependence(dependence: Dependence) -> Drawing:
+    """Draw errors over one quantity: every row a dot, and the RMS errors of its bins."""
     with drawing_style():
         figure, axes = _panel()
-        if "before" in found.errors:
-            _lengths(axes, found)
+        if "before" in dependence.errors:
+            _lengths(axes, dependence)
         else:
-            _signed(axes, found)
-        unit = f" [{found.unit}]" if found.unit else ""
-        axes.set_xlabel(f"{found.title}{unit}")
-    return Drawing(f"residual_{found.key}", found.title, found.sentence, figure)
+            _signed(axes, dependence)
+        unit = f" [{dependence.unit}]" if dependence.unit else ""
+        axes.set_xlabel(f"{dependence.title}{unit}")
+    return Drawing(f"residual_{dependence.key}", dependence.title, dependence.sentence, figure)
 
 
 def draw_correction(curve: CorrectionCurve) -> Drawing:
-    """What a joint is corrected by over its own value, measured values shaded."""
+    """Draw what a joint is corrected by over its own value, measured values shaded."""
     with drawing_style():
         figure, axes = _panel()
         for low, high in _stretches(curve.values, curve.measured):
             axes.axvspan(low, high, color="0.92", linewidth=0)
         dots = axes.plot(curve.dot_values, curve.dots, ".", color=OTHER, alpha=0.5, markersize=3)
         dots[0].set_rasterized(len(curve.dots) > MANY_DOTS)
-        axes.plot(
-            curve.values, np.where(curve.measured, curve.correction, np.nan), "-", color=AFTER, linewidth=1.3
-        )
-        axes.plot(
-            curve.values, np.where(curve.measured, np.nan, curve.correction), "--", color=AFTER, linewidth=1.3
-        )
+        for where, line in ((curve.measured, "-"), (~curve.measured, "--")):
+            shown = np.where(where, curve.correction, np.nan)
+            axes.plot(curve.values, shown, line, color=AFTER, linewidth=1.3)
         axes.axhline(0.0, color="black", linewidth=0.6)
         axes.set(xlabel=f"{curve.joint} [{curve.unit}]", ylabel=f"correction [{curve.small_unit}]")
     return Drawing(f"correction_{curve.joint}", curve.joint, curve.sentence, figure)
@@ -170,38 +167,32 @@ def draw_correction(curve: CorrectionCurve) -> Drawing:
 def draw_correlations(
     tables: Sequence[tuple[tuple[str, ...], Float64[np.ndarray, "_names _names"]]],
 ) -> tuple[Drawing, ...]:
-    """Correlations of lengths and of angles; pairs that act alike bear their sign."""
-    found = []
-    for (names, values), title in zip(tables, ("lengths", "angles"), strict=False):
-        if not names:
-            continue
-        with drawing_style():
-            side = float(np.clip(0.25 * len(names) + 1.3, 3.4, 9.0))
-            figure = Figure(figsize=(side + 0.9, side), layout="constrained")
-            axes = figure.add_subplot()
-            axes.grid(False)
-            axes.set_facecolor("0.85")
-            shown = axes.imshow(values, cmap="RdBu", vmin=-1, vmax=1, interpolation="nearest")
-            labels = list(names)
-            axes.set_xticks(range(len(names)), labels, rotation=90, fontsize=8)
-            axes.set_yticks(range(len(names)), labels, fontsize=8)
-            for (i, k), value in np.ndenumerate(np.nan_to_num(values)):
-                if i != k and abs(value) >= 0.5:
-                    mark = "+" if value > 0 else "−"
-                    text = mark if abs(value) > 1 - 1e-6 else f"{10 * abs(value):.0f}"
-                    axes.text(
-                        k,
-                        i,
-                        text,
-                        ha="center",
-                        va="center",
-                        fontsize=6.5,
-                        color="white" if abs(value) > 0.7 else "black",
-                    )
-            figure.colorbar(shown, ax=axes, shrink=0.8).set_label("Pearson correlation")
-        alt = f"Correlations of the columns of {len(names)} {title}; the strongest pairs stand in the text."
-        found.append(Drawing(f"correlation_{title}", title, alt, figure))
-    return tuple(found)
+    """Draw correlations of lengths and of angles; pairs that act alike bear their sign."""
+    named = [(title, *table) for title, table in zip(("lengths", "angles"), tables, strict=False)]
+    return tuple(_correlations(title, names, values) for title, names, values in named if names)
+
+
+def _correlations(
+    title: str, names: tuple[str, ...], values: Float64[np.ndarray, "_names _names"]
+) -> Drawing:
+    with drawing_style():
+        side = float(np.clip(0.25 * len(names) + 1.3, 3.4, 9.0))
+        figure = Figure(figsize=(side + 0.9, side), layout="constrained")
+        axes = figure.add_subplot()
+        axes.grid(False)
+        axes.set_facecolor("0.85")
+        shown = axes.imshow(values, cmap="RdBu", vmin=-1, vmax=1, interpolation="nearest")
+        axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
+        axes.set_yticks(range(len(names)), names, fontsize=8)
+        for (i, k), value in np.ndenumerate(np.nan_to_num(values)):
+            if i != k and abs(value) >= 0.5:
+                sign = "+" if value > 0 else "−"
+                text = sign if abs(value) > 1 - 1e-6 else f"{10 * abs(value):.0f}"
+                color = "white" if abs(value) > 0.7 else "black"
+                axes.text(k, i, text, ha="center", va="center", fontsize=6.5, color=color)
+        figure.colorbar(shown, ax=axes, shrink=0.8).set_label("Pearson correlation")
+    alt = f"Correlations of the columns of {len(names)} {title}; the strongest pairs stand in the text."
+    return Drawing(f"correlation_{title}", title, alt, figure)
 
 
 def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
@@ -222,17 +213,17 @@ def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
     return Drawing("learning_curve", "learning curve", alt, figure)
 
 
-def draw_map(found: ErrorMap) -> Drawing:
-    """The map from above and from the side, for paper and for pages without scripts."""
-    layers = found.layers[:3]
+def draw_map(error_map: ErrorMap) -> Drawing:
+    """Draw the map from above and from the side, for paper and for pages without scripts."""
+    layers = error_map.layers[:3]
     with drawing_style():
         figure = Figure(figsize=(3.9 * len(layers), 5.8), layout="constrained")
         grid = figure.subplots(2, len(layers), squeeze=False)
         for column, layer in enumerate(layers):
-            known = np.isfinite(layer.values)
-            order = np.argsort(layer.values[known], kind="stable")
+            finite = np.isfinite(layer.values)
+            order = np.argsort(layer.values[finite], kind="stable")
             order = np.concatenate([order[:-MOST_MAP_DOTS:4], order[-MOST_MAP_DOTS:]])[-2 * MOST_MAP_DOTS :]
-            values, place = layer.values[known][order], found.place[known][order]
+            values, place = layer.values[finite][order], error_map.place[finite][order]
             top = max(float(values.max(initial=0.0)), 1e-12)
             for axes, (a, b) in zip(grid[:, column], ((0, 1), (0, 2)), strict=True):
                 dots = axes.scatter(
@@ -242,9 +233,8 @@ def draw_map(found: ErrorMap) -> Drawing:
                 axes.set_aspect("equal", "datalim")
                 axes.set(xlabel=f"{'xyz'[a]} [mm]", ylabel=f"{'xyz'[b]} [mm]")
             grid[0, column].set_title(f"{layer.label}, largest {top:.3g} {layer.unit}")
-            figure.colorbar(
-                dots, ax=list(grid[:, column]), orientation="horizontal", format="%.2g"
-            ).set_label(layer.unit)
+            bar = figure.colorbar(dots, ax=list(grid[:, column]), orientation="horizontal", format="%.2g")
+            bar.set_label(layer.unit)
     return Drawing("error_map", "map", "Errors over the workspace from above and from the side.", figure)
 
 
@@ -257,46 +247,39 @@ def _panel() -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _lengths(axes: Axes, found: Dependence) -> None:
-    """Lengths on a logarithmic axis: dots after, and root mean squares before and after."""
-    after = found.errors["after"]
+def _lengths(axes: Axes, dependence: Dependence) -> None:
+    """Draw lengths on a logarithmic axis: dots after, and root mean squares before and after."""
+    after = dependence.errors["after"]
     floor = max(float(np.quantile(after, 0.01)) / 2, 1e-9) if len(after) else 1e-9
-    _dots(axes, found.values, np.maximum(after, floor), AFTER)
+    _dots(axes, dependence.values, np.maximum(after, floor), AFTER)
     for name, color, line in (("before", BEFORE, "--"), ("after", AFTER, "-")):
-        lengths = found.errors[name]
-        known = np.isfinite(lengths)
-        if known.sum() < 3:
+        lengths = dependence.errors[name]
+        finite = np.isfinite(lengths)
+        if finite.sum() < 3:
             continue
-        parts = binned(found.values[known], lengths[known])
-        axes.stairs(
-            parts.rms,
-            parts.edges,
-            baseline=None,
-            color=color,
-            linestyle=line,
-            linewidth=2,
-            label=f"RMS {name}",
-        )
-    axes.set(yscale="log", ylabel=f"error [{found.error_unit}]")
+        bins = binned(dependence.values[finite], lengths[finite])
+        style = {"color": color, "linestyle": line, "linewidth": 2, "label": f"RMS {name}"}
+        axes.stairs(bins.rms, bins.edges, baseline=None, **style)  # type: ignore[arg-type]
+    axes.set(yscale="log", ylabel=f"error [{dependence.error_unit}]")
     _plain_log(axes)
-    if axes.get_legend_handles_labels()[0]:  # too few rows for parts have no lines
+    if axes.get_legend_handles_labels()[0]:  # too few rows for bins have no lines
         axes.legend(ncols=2, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
 
 
-def _signed(axes: Axes, found: Dependence) -> None:
-    """Signed errors, with the mean of parts of the rows."""
+def _signed(axes: Axes, dependence: Dependence) -> None:
+    """Draw signed errors, with the mean of stretches of the rows."""
     styles = {"x": (AFTER, "-", "o"), "y": (BEFORE, "--", "s"), "z": (OTHER, ":", "^")}
+    number = dependence.values
     for name, (color, line, mark) in styles.items():
-        values = found.errors[name]
-        _dots(axes, found.values, values, color)
-        parts = np.array_split(np.arange(len(values)), min(20, max(len(values) // 8, 1)))
-        middle = [found.values[part].mean() for part in parts]
-        mean = [values[part].mean() for part in parts]
-        axes.plot(
-            middle, mean, line, marker=mark, markersize=3.5, color=color, label=f"mean {name}", linewidth=1.8
-        )
-    largest = max(float(np.quantile(np.abs(found.errors[name]), 0.995)) for name in styles)
-    axes.set(ylabel=f"error [{found.error_unit}]", ylim=(-1.15 * largest - 1e-12, 1.15 * largest + 1e-12))
+        errors = dependence.errors[name]
+        _dots(axes, number, errors, color)
+        stretches = np.array_split(np.arange(len(errors)), min(20, max(len(errors) // 8, 1)))
+        middle, mean = ([values[rows].mean() for rows in stretches] for values in (number, errors))
+        style = {"marker": mark, "markersize": 3.5, "color": color, "label": f"mean {name}", "linewidth": 1.8}
+        axes.plot(middle, mean, line, **style)  # type: ignore[arg-type]
+    largest = max(float(np.quantile(np.abs(dependence.errors[name]), 0.995)) for name in styles)
+    limit = 1.15 * largest + 1e-12
+    axes.set(ylabel=f"error [{dependence.error_unit}]", ylim=(-limit, limit))
     axes.axhline(0.0, color="black", linewidth=0.6)
     axes.legend(ncols=3, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
 

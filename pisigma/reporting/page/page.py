@@ -23,6 +23,7 @@ from pisigma.reporting.page.figures import (
     draw_map,
 )
 from pisigma.reporting.tables import figure_text
+from pisigma.robot.description import Robot
 
 _ESCAPED = {ord(mark): f"\\u{ord(mark):04x}" for mark in "<>&\u2028\u2029"}
 _PACKAGE = "pisigma.reporting.page"
@@ -58,9 +59,9 @@ def draw_figures(content: ReportContent) -> ReportFigures:
     points = content.learning_curve
     return ReportFigures(
         map=draw_map(content.map),
-        dependences=tuple(draw_dependence(found) for found in content.dependences),
+        dependences=tuple(map(draw_dependence, content.dependences)),
         correlations=draw_correlations(content.parameters.correlations),
-        corrections=tuple(draw_correction(curve) for curve in content.curves),
+        corrections=tuple(map(draw_correction, content.curves)),
         learning_curve=(draw_learning_curve(points),) if len(points) > 1 else (),
     )
 
@@ -73,57 +74,47 @@ def render_page(content: ReportContent, figures: ReportFigures) -> str:
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {"image": _image, "png": _png, "figure": figure_text, "signed": _signed}
+    environment.filters |= {
+        "image": _image,
+        "png": lambda content: _address("png", content),
+        "figure": figure_text,
+        "signed": "{:+.4f}".format,
+    }
     template = environment.from_string(_resource("template.html.j2"))
     return template.render(
         c=content,
         figures=figures,
         tables=[_table(accuracy) for accuracy in content.accuracies],
         joint_table=[_joint_line(joint) for joint in content.joints],
-        map_data=script_json(
-            map_data(
-                content.map,
-                [joint.name for joint in content.model.robot.joints],
-                content.model.robot.revolute,
-            )
-        ),
+        map_data=script_json(map_data(content.map, content.model.robot)),
         style=Markup(_resource("style.css")),  # ours
         script=Markup(_resource("viewer.js")),
     )
 
 
 def script_json(value: Any) -> Markup:
-    """JSON that can stand inside a script element: nothing in it ends the element or a line."""
+    """Write JSON that can stand inside a script element: nothing in it ends the element or a line."""
     return Markup(json.dumps(value, allow_nan=False, ensure_ascii=True).translate(_ESCAPED))
 
 
-def map_data(found: ErrorMap, joints: Sequence[str], revolute: Sequence[bool]) -> dict[str, Any]:
-    """What the viewer reads; arrays as base64 of little-endian float32."""
-    frames, frame = _numbered(found.frame)
-    targets, target = _numbered(found.target)
+def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
+    """Pack what the viewer reads; arrays as base64 of little-endian float32."""
+    frames, frame = _numbered(error_map.frame)
+    targets, target = _numbered(error_map.target)
     return {
-        "place": _packed(found.place),
-        "layers": [
-            {
-                "key": layer.key,
-                "label": layer.label,
-                "unit": layer.unit,
-                "says": layer.says,
-                "values": _packed(layer.values),
-            }
-            for layer in found.layers
-        ],
-        "row": _packed(found.row),
-        "q": _packed(found.q),
+        "place": _packed(error_map.place),
+        "layers": [vars(layer) | {"values": _packed(layer.values)} for layer in error_map.layers],
+        "row": _packed(error_map.row),
+        "q": _packed(error_map.q),
         "joints": [
-            {"name": name, "unit": "°" if turns else "mm"}
-            for name, turns in zip(joints, revolute, strict=True)
+            {"name": joint.name, "unit": "°" if turns else "mm"}
+            for joint, turns in zip(robot.joints, robot.revolute, strict=True)
         ],
         "frames": frames,
         "frame": _packed(frame),
         "targets": targets,
         "target": _packed(target),
-        "inside": _packed(found.inside),
+        "inside": _packed(error_map.inside),
     }
 
 
@@ -141,16 +132,12 @@ def _numbered(names: Sequence[str]) -> tuple[list[str], list[int]]:
 
 
 def _image(drawing: Drawing) -> str:
-    """A figure as the address of an image that holds it."""
-    return f"data:image/svg+xml;base64,{base64.b64encode(drawing.svg().encode()).decode()}"
+    """Give the address of an image that holds a figure."""
+    return _address("svg+xml", drawing.svg().encode())
 
 
-def _png(content: bytes) -> str:
-    return f"data:image/png;base64,{base64.b64encode(content).decode()}"
-
-
-def _signed(value: float) -> str:
-    return f"{value:+.4f}"
+def _address(kind: str, content: bytes) -> str:
+    return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
 @dataclass(frozen=True)
