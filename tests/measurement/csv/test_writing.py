@@ -82,7 +82,7 @@ def assert_same(actual: Measurements, expected: Measurements) -> None:
         assert_close(a[~a.isnan()], e[~e.isnan()], atol=1e-12, rtol=1e-12)
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data(), st.integers(1, 5), st.lists(st.booleans(), min_size=1, max_size=7))
 def test_reads_back_what_was_written(tmp_path: Path, data: st.DataObject, rows: int, revolute: list[bool]):
     given_fields = data.draw(written_fields(rows, len(revolute)))
