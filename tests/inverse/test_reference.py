@@ -13,6 +13,8 @@ from pisigma.errors import PoseError
 from pisigma.hybrid.arms import HybridArm
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.inverse.reference import ReferenceIK
+from pisigma.joint_correction.backlash import Backlash
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kinematics.status import Status
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
@@ -121,3 +123,60 @@ def test_poses_in_millimetres_and_near_misses_are_unreachable(kind):
         assert bool((solution.status == Status.UNREACHABLE).all())
         assert bool(solution.q.isnan().all())
         assert bool((solution.branch == ik.order[0]).all())
+
+
+def arm_with_backlash(size: float = 2e-3):
+    """A UR5 whose joints stop short by different amounts on the side that they come from [rad]."""
+    model = calibrated_arm("ur5")
+    own = model.hybrid.correction
+    correction = JointCorrection(model.robot, [*own.features, Backlash(model.robot)], own.orders)
+    state = {
+        **own.state_dict(),
+        f"linear.{len(own.features)}": size * torch.arange(1.0, 7.0).double()[:, None] / 6,
+    }
+    correction.load_state_dict(state)
+    return replace(model, hybrid=replace(model.hybrid, correction=correction.requires_grad_(False)))
+
+
+def test_both_routes_know_from_which_side_joints_come():
+    model = arm_with_backlash()
+    ik, reference = CorrectedIK(model), ReferenceIK(model)
+    assert ik.compiled is not None
+    q = joints_of(model.robot, 12, seed=2, share=0.8)
+    sides = torch.tensor([[1.0, 1, 1, -1, -1, 0], [-1.0, 1, 0, 0, 1, 1]]).repeat(6, 1).double()
+    T = model.hybrid.forward(q, sides)
+    for near in (None, q + 0.01):
+        tensors, expected = ik(T, near=near, approach=sides), reference(T, near=near, approach=sides)
+        fine = (tensors.status == Status.REACHED) & (expected.status == Status.REACHED)
+        assert float(fine.double().mean()) > 0.8
+        assert_close(tensors.q[fine], expected.q[fine], atol=1e-9)
+        arrays = ik(T.numpy(), near=None if near is None else near.numpy(), approach=sides.numpy())
+        assert_close(arrays.q[fine], tensors.q[fine], atol=1e-12)
+    assert_close(tensors.q[fine], q[fine], atol=1e-9)
+    one = ik(T[0].numpy(), near=q[0].numpy(), approach=[1, 1, 1, -1, -1, 0])
+    assert_close(one.q, tensors.q[0], atol=1e-12)
+    assert_close(ik.forward(q.numpy(), approach=sides.numpy()), T, atol=1e-12)
+    plain = ik(T, near=q)
+    assert float((plain.q - q)[fine].abs().amax()) > 1e-3
+    assert_close(ik(T, near=q, approach=torch.zeros(6)).q, plain.q, atol=1e-12)
+    every = ik.all_branches(T, approach=sides)
+    picked = torch.take_along_dim(every.q, tensors.branch[:, None, None], 1)[:, 0]
+    assert_close((picked - tensors.q)[fine].sin(), 0.0, atol=1e-9)
+    with pytest.raises(PoseError, match="approach"):
+        ik(T, approach=sides[:5])
+
+
+def test_along_a_path_joints_come_from_where_they_move():
+    model = arm_with_backlash()
+    ik = CorrectedIK(model)
+    q = torch.tensor([0.3, -1.2, 1.1, 0.4, 1.0, 0.2]).double() + torch.zeros(9, 6).double()
+    way = (
+        torch.tensor([0.0, 1, 2, 3, 4, 3, 2, 1, 0]).double()[:, None]
+        * 0.02
+        * torch.tensor([1.0, -1, 1, 1, 0, 1])
+    )
+    sides = torch.sign(torch.diff(way, dim=0, prepend=way[:1] - (way[1:2] - way[:1])))
+    T = model.hybrid.forward(q + way, sides)
+    path = ik.path(T.numpy(), near=(q[0] - 0.5 * way[1]).numpy())
+    moving = [0, 1, 2, 3, 5]
+    assert_close(path.solution.q[:, moving], (q + way)[:, moving], atol=1e-5)
