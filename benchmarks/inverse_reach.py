@@ -75,14 +75,14 @@ def report(name: str, model: CalibratedModel, rows: int) -> None:
     for label, near in (("no near", None), (f"near within {NEAR} rad", beside)):
         found = ReferenceIK(model)(T, near=near)
         line = figures(found.status.numpy(), found.position_residual.numpy(), found.rotation_residual.numpy())
-        print(f"{name:9s} {label:20s} torch    {len(T):6d} poses, {line}", flush=True)
+        print(f"{name:9s} {label:20s} reference {len(T):6d} poses, {line}", flush=True)
         try:
             kernels = CompiledIK.of(model)
         except ModelError:
             continue
         done = kernels.solve_batch(T.numpy(), near=None if near is None else near.numpy())
         line = figures(done.status, done.position_residual, done.rotation_residual)
-        print(f"{name:9s} {label:20s} compiled {len(T):6d} poses, {line}", flush=True)
+        print(f"{name:9s} {label:20s} kernels   {len(T):6d} poses, {line}", flush=True)
 
 
 def figures(status: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> str:

@@ -4,13 +4,19 @@ Both compute in float64 on one thread, on the same joint values, alternately, an
 counts. The peer's chain is built in float64 from the robot's own rows (a chain converted with
 ``.to(torch.float64)`` is off by 2e-8 m), and the two are compared before anything is timed.
 
+Then the same of NumPy arrays, which go through compiled kernels, against Robotics Toolbox's ``ets.eval`` (C++)
+where ``roboticstoolbox`` can be imported.
+
 Run with ``python benchmarks/kinematics_speed.py [--poses 10000] [--rounds 30]``.
 """
 
 import argparse
 import time
 from collections.abc import Callable
+from importlib.util import find_spec
+from typing import Any
 
+import numpy as np
 import torch
 from pytorch_kinematics import SerialChain
 from pytorch_kinematics.chain import Chain
@@ -18,6 +24,7 @@ from pytorch_kinematics.frame import Frame, Joint, Link
 from pytorch_kinematics.transforms import Transform3d
 from torch import Tensor
 
+import pisigma
 from pisigma.kinematics.components import (
     IDENTITY,
     as_transform,
@@ -102,6 +109,42 @@ def compare(name: str, poses: int, rounds: int) -> None:
         print(f"{name:12s} {what:19s} {rates}   {difference:.0e}")
 
 
+def toolbox_chain(robot: Robot) -> Any:
+    """The same robot as Robotics Toolbox's elementary transforms, between base and tool."""
+    from roboticstoolbox import ET, ETS
+
+    chain = ETS()
+    for row, (theta, d, a, alpha, beta) in zip(robot.rows, robot.dh.tolist(), strict=True):
+        chain = chain * ET.Rz(theta)
+        if row.type == "revolute":
+            chain = chain * ET.Rz(flip=row.direction < 0)
+        elif row.type == "prismatic":
+            chain = chain * ET.tz(flip=row.direction < 0)
+        chain = chain * ET.tz(d) * ET.tx(a) * ET.Rx(alpha) * ET.Ry(beta)
+    return chain.compile()
+
+
+def compare_arrays(name: str, poses: int, rounds: int) -> None:
+    """Print a line for arrays of many poses and one for a single pose."""
+    robot = Robot.load(name).with_geometry(base=np.zeros(6), tool=np.zeros(6))
+    many = np.random.default_rng(0).uniform(-1, 1, (poses, robot.dof))
+    chain = toolbox_chain(robot) if find_spec("roboticstoolbox") else None
+    if chain is not None and abs(chain.eval(many) - pisigma.forward_kinematics(robot, many)).max() > 1e-12:
+        raise SystemExit(f"{name}: Robotics Toolbox disagrees, so its times mean nothing.")
+    for q, times in ((many, rounds), (many[0], 100 * rounds)):
+        own, peer = time_alternately(
+            lambda q=q: pisigma.forward_kinematics(robot, q),  # type: ignore[misc]
+            lambda q=q: None if chain is None else chain.eval(q),  # type: ignore[misc]
+            times,
+        )
+        beside = (
+            ""
+            if chain is None
+            else f"; Robotics Toolbox {peer * 1e6:,.1f} us, {peer / own:.1f} times as long"
+        )
+        print(f"{name:12s} array of {np.size(q) // robot.dof} poses: {own * 1e6:,.1f} us{beside}")
+
+
 def main() -> None:
     """Print the table for every robot of the catalogue, or those named."""
     parser = argparse.ArgumentParser(
@@ -120,6 +163,8 @@ def main() -> None:
     with torch.no_grad():
         for name in arguments.robots:
             compare(name, arguments.poses, arguments.rounds)
+    for name in arguments.robots:
+        compare_arrays(name, arguments.poses, arguments.rounds)
 
 
 if __name__ == "__main__":
