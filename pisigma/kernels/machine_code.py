@@ -23,7 +23,23 @@ from pisigma.kernels.build import ARGUMENTS, ENTRY, intermediate_code
 from pisigma.kernels.features import FORMS
 from pisigma.kernels.ready import read_ready, ready_features, source_hash
 
-_ALLOWED = frozenset("acos atan2 ceil cos fabs floor hypot log memcpy memset pow sin sqrt".split())
+_ALLOWED = frozenset(
+    (
+        "acos",
+        "atan2",
+        "ceil",
+        "cos",
+        "fabs",
+        "floor",
+        "hypot",
+        "log",
+        "memcpy",
+        "memset",
+        "pow",
+        "sin",
+        "sqrt",
+    )
+)
 """Functions of the C library that every process has."""
 _OPTIONS = "speed 3, vectors, internal linkage"
 """What `optimised_object` does, as far as the code depends on it; part of the key of kept code."""
