@@ -127,31 +127,24 @@ def print_calibration(
         seconds: time it took [s].
         verbose: print all parameters, not only those that were estimated.
     """
-    from pisigma.reporting.calibration_tables import (
-        curve_table,
-        learned_lines,
-        parameter_table,
-        trial_table,
-        undetermined_lines,
-        warning_lines,
-    )
+    from pisigma.reporting import calibration_tables as tables
 
     _print_accuracy(summary)
     if summary.hybrid is not None:
-        print_lines(learned_lines(summary.hybrid))
-    print_lines(f"Warning: {line}" for line in warning_lines(summary))
+        print_lines(tables.learned_lines(summary.hybrid))
+    print_lines(f"Warning: {line}" for line in tables.warning_lines(summary))
     if summary.learning_curve is not None:
         print_table(
-            "errors of held-out rows by number of training rows", *curve_table(summary.learning_curve)
+            "errors of held-out rows by number of training rows", *tables.curve_table(summary.learning_curve)
         )
     if summary.hybrid is not None:
-        print_table("what was tried beyond the geometry", *trial_table(summary.hybrid))
+        print_table("what was tried beyond the geometry", *tables.trial_table(summary.hybrid))
     estimated = [row for row in summary.parameters if verbose or row.standard_error is not None]
     rest = len(summary.parameters) - len(estimated)
     title = f"estimated parameters ({rest} others are nominal: --verbose)" if rest else "parameters"
-    print_table(title, *parameter_table(estimated))
+    print_table(title, *tables.parameter_table(estimated))
     typer.echo("What these data cannot determine:")
-    print_lines((f"- {line}" for line in undetermined_lines(summary)), indent="  ")
+    print_lines((f"- {line}" for line in tables.undetermined_lines(summary)), indent="  ")
     count = len(summary.outliers)
     worst = f"; the worst is {summary.outliers[0].place}" if count else ""
     print_lines([f"Rank {summary.rank}, {summary.iterations} iterations, {count} outliers{worst}."])
@@ -160,7 +153,8 @@ def print_calibration(
 
 def _print_accuracy(summary: "CalibrationSummary") -> None:
     """Print the errors of rows that were not calibrated with."""
-    from pisigma.reporting.calibration_tables import coverage_line, error_table, folds_text, held_out_lines
+    from pisigma.reporting.calibration_tables import coverage_line, folds_text, held_out_lines
+    from pisigma.reporting.tables import pose_rows
 
     for figures, title in (
         (summary.held_out, "pose errors of {rows} other simulated rows"),
@@ -168,7 +162,7 @@ def _print_accuracy(summary: "CalibrationSummary") -> None:
         (summary.test, "pose errors of the {rows} rows of the set 'test', which were kept apart"),
     ):
         if figures is not None:
-            print_table(title.format(rows=figures.rows, how=folds_text(figures)), *error_table(figures))
+            print_table(title.format(rows=figures.rows, how=folds_text(figures)), *pose_rows(figures.models))
             print_lines([*held_out_lines(figures), *filter(None, [coverage_line(figures)])])
 
 

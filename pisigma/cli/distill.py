@@ -123,11 +123,12 @@ def _region(model: Path, box: Box | None, joints: Path | None) -> "Region | None
 
 def _print(distillation: "Distillation", out: Path) -> None:
     """Print for people how well the model follows the full solution."""
-    from pisigma.reporting.distilled_card import correction_table, size_table, tool_error_table
+    from pisigma.reporting.distilled_card import correction_table, size_table
+    from pisigma.reporting.tables import pose_rows
 
     summary = distillation.summary
     title = f"tool under the full model, {summary.poses.held_out} held-out poses"
-    print_table(title, *tool_error_table(summary))
+    print_table(title, *pose_rows(summary.held_out.models))
     print_lines(f"Warning: {sentence}" for sentence in summary.warnings)
     print_table("absolute joint corrections, and errors of the distilled ones", *correction_table(summary))
     print_table("sizes tried", *size_table(summary))

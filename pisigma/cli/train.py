@@ -85,11 +85,11 @@ def _print_training(summary: "TrainingSummary") -> None:
     print_table("absolute joint errors", ("joint", "unit", "rows", *columns), joint_rows(summary.joints))
     if summary.cross_validation is not None:
         title = f"pose errors of held-out rows, {summary.cross_validation.folds}-fold cross-validation"
-        print_table(title, *pose_rows(summary.cross_validation.by_model))
+        print_table(title, *pose_rows(summary.cross_validation.models))
         print_lines([summary.verdict or ""])
     if summary.test is not None:
         title = f"pose errors of the {summary.test.rows} rows of the set 'test', which were kept aside"
-        print_table(title, *pose_rows(summary.test.by_model))
+        print_table(title, *pose_rows(summary.test.models))
     rows = summary.rows
     reason = f" ({rows.rule})" if rows.left_out else ""
     print_lines([f"{rows.used} rows used, {rows.left_out} left out{reason}."])

@@ -7,20 +7,15 @@ finite value is None.
 
 import math
 from dataclasses import asdict
-from typing import Any
 
-from pydantic import JsonValue, ValidationError
+from pydantic import JsonValue
 
-from pisigma.errors import ModelError
 from pisigma.hybrid.result import HybridResult, LearnedPart
 from pisigma.identification.result import CalibrationResult, SensorNoise
+from pisigma.judging.summary import AbstractSummary
 from pisigma.judging.trained_calibrations import Result, geometric_result
 from pisigma.judging.validation_figures import LearningPoint, ValidationFigures
-from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.yaml_file import Section
-
-KINDS = ("geometric_calibration", "hybrid_calibration")
-"""Kinds of models whose metrics are a `CalibrationSummary`."""
 
 _UNITS = {"m": ("mm", 1e3), "rad": ("deg", math.degrees(1.0))}
 
@@ -184,11 +179,10 @@ class HeldOutFile(Section):
     data_sha256: str
 
 
-class CalibrationSummary(Section):
+class CalibrationSummary(AbstractSummary):
     """All figures of a calibration.
 
     Attributes:
-        command: what made the model: a command line or a call.
         rows: number of rows that were calibrated with.
         fit_seconds: time that the calibration took without its validation [s].
         status: why the search ended.
@@ -215,7 +209,8 @@ class CalibrationSummary(Section):
         paper: of a recipe: published figures, by name.
     """
 
-    command: str = ""
+    kinds = ("geometric_calibration", "hybrid_calibration")
+
     rows: int | None = None
     fit_seconds: float | None = None
     status: str
@@ -241,40 +236,10 @@ class CalibrationSummary(Section):
     pairwise_parameters: int | None = None
     paper: dict[str, JsonValue] | None = None
 
-    def to_json(self) -> dict[str, Any]:
-        """Everything that is set as JSON values, by name."""
-        return self.model_dump(mode="json", exclude_unset=True)
-
-    def having(self, **figures: object) -> "CalibrationSummary":
-        """The same with more figures; those that are None are left out."""
-        return self.model_copy(update={name: value for name, value in figures.items() if value is not None})
-
     @property
     def judged(self) -> ValidationFigures | None:
         """Held-out errors: of the cross-validation, else of simulated rows, else of the test set."""
         return self.cross_validation or self.held_out or self.test
-
-
-def read_summary(model: CalibratedModel) -> CalibrationSummary | None:
-    """Read the figures that a model keeps of its calibration.
-
-    Returns:
-        None for a model that is no calibration, or keeps no figures.
-
-    Raises:
-        ModelError: the figures are not in the form of this version.
-    """
-    if model.kind not in KINDS or not model.metrics:
-        return None
-    try:
-        return CalibrationSummary.model_validate(model.metrics)
-    except ValidationError as problem:
-        first = problem.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise ModelError(
-            f"model '{model.name}': the metrics are not those of a calibration ({key}: {first['msg']}); "
-            "calibrate again, or run `pisigma upgrade` on the folder of an earlier version."
-        ) from None
 
 
 def summarise(result: Result) -> CalibrationSummary:

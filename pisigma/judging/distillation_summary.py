@@ -4,17 +4,9 @@ A card, tables on the screen and JSON render it, and a model folder keeps it as 
 millimetres and degrees.
 """
 
-from typing import Any
-
-from pydantic import ValidationError
-
-from pisigma.errors import ModelError
+from pisigma.judging.summary import AbstractSummary
 from pisigma.judging.validation_figures import ErrorFigures
-from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.yaml_file import Section
-
-KIND = "distilled"
-"""Kind of models whose metrics are a `DistillationSummary`."""
 
 
 class ParentFigures(Section):
@@ -124,11 +116,10 @@ class JointErrorFigures(Section):
     error: AbsoluteFigures
 
 
-class DistillationSummary(Section):
+class DistillationSummary(AbstractSummary):
     """All figures of a distilled model.
 
     Attributes:
-        command: what made the model: a command line or a call.
         parent: the model that was distilled.
         region: where poses were drawn.
         poses: how many there were.
@@ -139,7 +130,8 @@ class DistillationSummary(Section):
         limitations: what the full solution has and the distilled model lacks, a sentence each.
     """
 
-    command: str = ""
+    kinds = ("distilled",)
+
     parent: ParentFigures
     region: RegionFigures
     poses: PoseFigures
@@ -148,29 +140,3 @@ class DistillationSummary(Section):
     joints: tuple[JointErrorFigures, ...]
     warnings: tuple[str, ...] = ()
     limitations: tuple[str, ...] = ()
-
-    def to_json(self) -> dict[str, Any]:
-        """Everything that is set as JSON values, by name."""
-        return self.model_dump(mode="json", exclude_unset=True)
-
-
-def read_distillation(model: CalibratedModel) -> DistillationSummary | None:
-    """Read the figures that a distilled model keeps.
-
-    Returns:
-        None for a model that is not distilled, or keeps no figures.
-
-    Raises:
-        ModelError: the figures are not in the form of this version.
-    """
-    if model.kind != KIND or not model.metrics:
-        return None
-    try:
-        return DistillationSummary.model_validate(model.metrics)
-    except ValidationError as problem:
-        first = problem.errors()[0]
-        key = ".".join(map(str, first["loc"]))
-        raise ModelError(
-            f"model '{model.name}': the metrics are not those of a distilled model ({key}: {first['msg']}); distil "
-            "again, or run `pisigma upgrade` on the folder of an earlier version."
-        ) from None

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import ModelError
-from pisigma.judging.calibration_summary import HeldOutFile, read_summary
+from pisigma.judging.calibration_summary import CalibrationSummary, HeldOutFile
 from pisigma.judging.calibration_validation import CalibrationValidation
 from pisigma.judging.pose_statistics import PoseErrors
 from pisigma.measurement.dataset import Measurements
@@ -101,7 +101,7 @@ def read_held_out(folder: Path, model: CalibratedModel) -> HeldOutRows | None:
     Raises:
         ModelError: the file is missing, or is not the one that was written with the model.
     """
-    summary = read_summary(model)
+    summary = CalibrationSummary.read(model)
     if summary is None or summary.held_out_rows is None:
         return None
     hashes = summary.held_out_rows

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pisigma.judging.cross_validation import CrossValidation
 from pisigma.judging.pose_statistics import Comparison, JointStatistics
+from pisigma.judging.summary import AbstractSummary
 from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -137,16 +138,15 @@ class ComparisonFigures(Section):
         )
 
     @property
-    def by_model(self) -> dict[str, dict[str, float]]:
+    def models(self) -> dict[str, ErrorFigures]:
         """The errors of both by name."""
-        return {"nominal": self.nominal.by_name, "corrected": self.corrected.by_name}
+        return {"nominal": self.nominal, "corrected": self.corrected}
 
 
-class TrainingSummary(Section):
+class TrainingSummary(AbstractSummary):
     """All figures of a training of networks.
 
     Attributes:
-        command: what made the model: a command line or a call.
         rows: how many there were.
         joints: errors of every corrected joint.
         cross_validation: pose errors of rows that were held out in turn, for measured data.
@@ -154,16 +154,13 @@ class TrainingSummary(Section):
         test: pose errors of the rows that the file marks as test.
     """
 
-    command: str = ""
+    kinds = ("inverse_calibration",)
+
     rows: RowFigures
     joints: tuple[JointFigures, ...]
     cross_validation: ComparisonFigures | None = None
     verdict: str | None = None
     test: ComparisonFigures | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """Everything that is set as JSON values, by name."""
-        return self.model_dump(mode="json", exclude_unset=True)
 
 
 def summarise_training(

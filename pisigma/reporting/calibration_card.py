@@ -11,41 +11,15 @@ from pisigma.judging.calibration_validation import CalibrationValidation
 from pisigma.judging.trained_calibrations import Result, geometric_result
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.calibration_figures import (
-    CORRECTIONS_PNG,
-    CORRELATION_PNG,
-    CURVE_PNG,
-    HELD_OUT_PNG,
-    RESIDUALS_PNG,
-    SPREAD_PNG,
-    draw_corrections,
-    draw_correlations,
-    draw_held_out,
-    draw_learning_curve,
-    draw_residuals,
-    draw_spread,
-)
+from pisigma.reporting import calibration_figures as figures
+from pisigma.reporting import calibration_tables as tables
 from pisigma.reporting.calibration_files import (
     CORRELATION_CSV,
     PARAMETERS_CSV,
     write_correlations,
     write_parameters,
 )
-from pisigma.reporting.calibration_tables import (
-    coverage_line,
-    cross_validation_text,
-    curve_table,
-    error_table,
-    held_out_lines,
-    learned_lines,
-    noise_text,
-    parameter_table,
-    simulations_text,
-    trial_table,
-    undetermined_lines,
-    warning_lines,
-)
-from pisigma.reporting.tables import CARD, markdown_table, use_text
+from pisigma.reporting.tables import CARD, markdown_table, pose_table, use_text
 
 
 @dataclass(frozen=True)
@@ -78,24 +52,24 @@ def write_calibration_card(
     """
     write_parameters(summary.parameters, folder / PARAMETERS_CSV)
     geometric = geometric_result(result)
-    tables = (geometric.pairwise.lengths, geometric.pairwise.angles)
-    write_correlations(tables, folder / CORRELATION_CSV)
-    draw_correlations(tables, folder / CORRELATION_PNG)
-    draw_residuals(
+    correlations = (geometric.pairwise.lengths, geometric.pairwise.angles)
+    write_correlations(correlations, folder / CORRELATION_CSV)
+    figures.draw_correlations(correlations, folder / figures.CORRELATION_PNG)
+    figures.draw_residuals(
         geometric.residuals,
-        folder / RESIDUALS_PNG,
+        folder / figures.RESIDUALS_PNG,
         ", geometric" if isinstance(result, HybridResult) else "",
     )
     if validation is not None:
         lengths = {name: errors.position.numpy() for name, errors in validation.all_errors.items()}
-        draw_held_out(lengths, folder / HELD_OUT_PNG)
+        figures.draw_held_out(lengths, folder / figures.HELD_OUT_PNG)
         spread = validation.all_spread
         if spread is not None and spread.values:
-            draw_spread(spread, folder / SPREAD_PNG)
+            figures.draw_spread(spread, folder / figures.SPREAD_PNG)
     if isinstance(result, HybridResult) and result.learned is not None:
-        draw_corrections(result.learned.correction, rows, folder / CORRECTIONS_PNG)
+        figures.draw_corrections(result.learned.correction, rows, folder / figures.CORRECTIONS_PNG)
     if summary.learning_curve is not None:
-        draw_learning_curve(summary.learning_curve, folder / CURVE_PNG)
+        figures.draw_learning_curve(summary.learning_curve, folder / figures.CURVE_PNG)
     drawn = {entry.name for entry in folder.glob("*.png")}
     (folder / CARD).write_text(_text(model, geometric, summary, texts, drawn), encoding="utf-8")
 
@@ -105,7 +79,7 @@ def _text(
     result: CalibrationResult,
     summary: CalibrationSummary,
     texts: CardTexts,
-    figures: Collection[str],
+    drawn: Collection[str],
 ) -> str:
     source = model.provenance.data_source
     source = f"`{source}`" if "." in source else f"a {source}"
@@ -117,9 +91,9 @@ def _text(
     ]
     if "position" in result.residuals:
         under = " under the geometric calibration" if summary.hybrid is not None else ""
-        if HELD_OUT_PNG in figures:
-            sections.append(f"![errors of rows that the calibration did not see]({HELD_OUT_PNG})")
-        sections.append(f"![residuals of the calibration rows{under}]({RESIDUALS_PNG})")
+        if figures.HELD_OUT_PNG in drawn:
+            sections.append(f"![errors of rows that the calibration did not see]({figures.HELD_OUT_PNG})")
+        sections.append(f"![residuals of the calibration rows{under}]({figures.RESIDUALS_PNG})")
     sections += [
         *_hybrid_sections(summary),
         *_parameter_sections(summary),
@@ -140,21 +114,21 @@ def _accuracy_sections(summary: CalibrationSummary) -> list[str]:
     """Headings, sentences and tables of errors on rows that were not calibrated with."""
     nominal = "nominal is the robot as drawn, with base and tool fitted to those other rows"
     sections: list[str] = []
-    if (figures := summary.cross_validation) is not None:
+    if (judged := summary.cross_validation) is not None:
         how = (
-            cross_validation_text(figures)
-            if (figures.folds or 1) > 1
-            else f"Judged on {figures.rows} rows by a calibration on the others"
+            tables.cross_validation_text(judged)
+            if (judged.folds or 1) > 1
+            else f"Judged on {judged.rows} rows by a calibration on the others"
         )
-        table = markdown_table(*error_table(figures))
-        sections += ["## Held-out pose errors", f"{how}; {nominal}.", table, *held_out_lines(figures)]
-    if (figures := summary.test) is not None:
-        how = f"The {figures.rows} rows that the file marks as test, with which nothing was calibrated"
-        table = markdown_table(*error_table(figures))
+        table = pose_table(judged.models)
+        sections += ["## Held-out pose errors", f"{how}; {nominal}.", table, *tables.held_out_lines(judged)]
+    if (judged := summary.test) is not None:
+        how = f"The {judged.rows} rows that the file marks as test, with which nothing was calibrated"
+        table = pose_table(judged.models)
         sections += ["## Pose errors of the test set", f"{how}; {nominal}.", table]
-    if (figures := summary.held_out) is not None:
-        table = markdown_table(*error_table(figures))
-        sections += ["## Held-out pose errors", simulations_text(figures), table]
+    if (judged := summary.held_out) is not None:
+        table = pose_table(judged.models)
+        sections += ["## Held-out pose errors", tables.simulations_text(judged), table]
     return sections
 
 
@@ -164,21 +138,21 @@ def _hybrid_sections(summary: CalibrationSummary) -> list[str]:
         return []
     sections = [
         "## What was learned",
-        " ".join(learned_lines(hybrid)),
+        " ".join(tables.learned_lines(hybrid)),
         "What was tried, in order. The left-out error is the RMS of training rows that were left out of the fit, in "
         "units of the geometric calibration's:",
-        markdown_table(*trial_table(hybrid)),
+        markdown_table(*tables.trial_table(hybrid)),
     ]
     if hybrid.learned is not None:
-        sections.append(f"![correction of every joint over its own value]({CORRECTIONS_PNG})")
-    if summary.judged is not None and (line := coverage_line(summary.judged)):
-        figure = f"![errors of held-out rows over what was predicted of them]({SPREAD_PNG})"
+        sections.append(f"![correction of every joint over its own value]({figures.CORRECTIONS_PNG})")
+    if summary.judged is not None and (line := tables.coverage_line(summary.judged)):
+        figure = f"![errors of held-out rows over what was predicted of them]({figures.SPREAD_PNG})"
         sections += ["## How sure it is", line, figure]
     if summary.learning_curve is not None:
-        figure = f"![error on held-out rows over the number of training rows]({CURVE_PNG})"
+        figure = f"![error on held-out rows over the number of training rows]({figures.CURVE_PNG})"
         sections += [
             "## How many rows it takes",
-            markdown_table(*curve_table(summary.learning_curve)),
+            markdown_table(*tables.curve_table(summary.learning_curve)),
             figure,
         ]
     return sections
@@ -198,12 +172,14 @@ def _parameter_sections(summary: CalibrationSummary) -> list[str]:
         "`Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`. A standard error is what the measurement noise "
         "makes of the estimate; a parameter without one was left at its nominal value. "
         f"In full digits and with full remarks: [{PARAMETERS_CSV}]({PARAMETERS_CSV}).",
-        markdown_table(*parameter_table(summary.parameters)),
+        markdown_table(*tables.parameter_table(summary.parameters)),
         "## What these data cannot determine",
-        "\n".join(f"- {line}" for line in [*undetermined_lines(summary), *warning_lines(summary)]),
+        "\n".join(
+            f"- {line}" for line in [*tables.undetermined_lines(summary), *tables.warning_lines(summary)]
+        ),
         "How alike the columns of the identification Jacobian are, lengths and angles apart "
         "(Pearson correlation; only pairs show here, the sentences above count larger sets too):",
-        f"![correlations of the identification Jacobian's columns]({CORRELATION_PNG})",
+        f"![correlations of the identification Jacobian's columns]({figures.CORRELATION_PNG})",
     ]
 
 
@@ -215,7 +191,7 @@ def _quality_text(result: CalibrationResult, summary: CalibrationSummary) -> str
             f"- The search {summary.status}, after {summary.iterations} iterations.",
             f"- Of {len(result.redundancy.names)} parameters the data determine {summary.rank} independent "
             f"combinations (rank), and {len(result.free)} were estimated.",
-            *(f"- {noise_text(noise)}" for noise in summary.noise),
+            *(f"- {tables.noise_text(noise)}" for noise in summary.noise),
             f"- {count or 'No'} row{'s' if count != 1 else ''} counted for less than half as outliers.",
             f"- Condition number {result.condition_number:.4g}; observability indices O1 {o.O1:.4g}, O2 {o.O2:.4g}, "
             f"O3 {o.O3:.4g}, O4 {o.O4:.4g}, O5 {o.O5:.4g} (columns per mm and mrad, rows in mm and mrad).",

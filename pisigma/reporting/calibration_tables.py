@@ -9,7 +9,7 @@ from pisigma.judging.calibration_summary import (
     ParameterFigures,
 )
 from pisigma.judging.validation_figures import AbstractValidationFigures, LearningPoint, ValidationFigures
-from pisigma.reporting.tables import Table, figure_text, pose_rows
+from pisigma.reporting.tables import Table, figure_text
 
 PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")
 TRIAL_COLUMNS = ("tried", "unknowns", "log evidence", "left-out error", "seconds", "kept")
@@ -76,11 +76,6 @@ def coverage_line(figures: AbstractValidationFigures) -> str:
         f"{100 * figures.coverage:.1f} % of the held-out coordinates are within the 95 % intervals that the hybrid "
         f"predicts (RMS of a predicted position error: {figure_text(figures.predicted_rms_mm)} mm)."
     )
-
-
-def error_table(figures: AbstractValidationFigures) -> Table:
-    """One column per calibration, one row per figure of the held-out errors."""
-    return pose_rows({name: errors.by_name for name, errors in figures.models.items()})
 
 
 def curve_table(points: Sequence[LearningPoint]) -> Table:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from pisigma.judging.distillation_summary import DistillationSummary
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.tables import CARD, Table, figure_text, markdown_table, pose_rows, use_text
+from pisigma.reporting.tables import CARD, Table, figure_text, markdown_table, pose_table, use_text
 
 _SIZES = ("orders", "harmonics", "unknowns per joint", "tool, RMS [mm]", "kept")
 _STATISTICS = (("mean", "mean"), ("rms", "RMS"), ("max", "max"))
@@ -46,11 +46,6 @@ def correction_table(summary: DistillationSummary) -> Table:
     return Table(("joint", "unit", *head), tuple(rows))
 
 
-def tool_error_table(summary: DistillationSummary) -> Table:
-    """One column per model, one row per figure of the tool's errors."""
-    return pose_rows({name: errors.by_name for name, errors in summary.held_out.models.items()})
-
-
 def _text(model: CalibratedModel, summary: DistillationSummary) -> str:
     parent = summary.parent
     sections = [
@@ -64,7 +59,7 @@ def _text(model: CalibratedModel, summary: DistillationSummary) -> str:
         "## Error against the full solution",
         f"On {summary.poses.held_out} poses of the region that were neither fitted to nor chosen by: where the "
         "tool comes to lie under the full calibrated model, from where it was wanted. Nominal is without correction.",
-        markdown_table(*tool_error_table(summary)),
+        pose_table(summary.held_out.models),
         *(f"**Warning.** {sentence}" for sentence in summary.warnings),
         "Absolute values per joint: what the full solution adds (correction), and what the network is off it (error).",
         markdown_table(*correction_table(summary)),

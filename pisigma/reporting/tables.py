@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from pisigma.judging.training_summary import JointFigures
+from pisigma.judging.validation_figures import ErrorFigures
 
 CARD = "README.md"
 
@@ -64,20 +65,18 @@ def joint_table(joints: Sequence[JointFigures]) -> str:
     return markdown_table(head, joint_rows(joints))
 
 
-def pose_rows(models: Mapping[str, Mapping[str, float]]) -> Table:
+def pose_rows(models: Mapping[str, ErrorFigures]) -> Table:
     """Pose errors: one column per model, one row per figure.
 
     Args:
-        models: by name, the figures of `pisigma.judging.pose_statistics.PoseErrors.in_file_units`.
+        models: by name, their errors.
     """
-    names = next(iter(models.values()))
-    rows = [
-        (*_with_unit(name), *(figure_text(figures[name]) for figures in models.values())) for name in names
-    ]
+    figures = [errors.by_name for errors in models.values()]
+    rows = [(*_with_unit(name), *(figure_text(errors[name]) for errors in figures)) for name in figures[0]]
     return Table(("error", "unit", *models), tuple(rows))
 
 
-def pose_table(models: Mapping[str, Mapping[str, float]]) -> str:
+def pose_table(models: Mapping[str, ErrorFigures]) -> str:
     """A Markdown table of pose errors, one column per model. See `pose_rows`."""
     return markdown_table(*pose_rows(models))
 

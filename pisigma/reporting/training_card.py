@@ -76,12 +76,12 @@ def _pose_error_parts(summary: TrainingSummary) -> list[str]:
     parts = []
     if summary.cross_validation is not None:
         parts += ["## Held-out pose errors", summary.verdict or ""]
-        parts.append(pose_table(summary.cross_validation.by_model))
+        parts.append(pose_table(summary.cross_validation.models))
     if summary.test is not None:
         parts += [
             "## Pose errors of the test set",
             f"The {summary.test.rows} rows that the file marks as test; nothing was trained on them.",
-            pose_table(summary.test.by_model),
+            pose_table(summary.test.models),
         ]
     return parts
 

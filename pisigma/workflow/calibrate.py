@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 from pisigma.errors import IdentificationError, MeasurementError, nearest_choice
 from pisigma.hybrid.calibrator import HybridCalibrator
@@ -29,11 +29,10 @@ from pisigma.measurement.splits import (
     with_fewer,
 )
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.model_folder import save_model
-from pisigma.model.folder.staging import staged_folder
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.reporting.calibration_card import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
+from pisigma.workflow.result import AbstractModelResult
 
 FOLDS = 5
 """Of a cross-validation that is not by placement."""
@@ -143,7 +142,7 @@ class CalibrationSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Calibration:
+class Calibration(AbstractModelResult):
     """A calibrated robot, how well it was judged, and all figures of it.
 
     Attributes:
@@ -175,37 +174,12 @@ class Calibration:
         """What to check or to measure next, a sentence each."""
         return self.summary.warnings
 
-    def to_json(self) -> dict[str, Any]:
-        """Give all figures as JSON values, in mm and deg."""
-        return {"seconds": round(self.seconds, 3), **self.summary.to_json()}
-
-    def save(
-        self, folder: str | os.PathLike[str], name: str | None = None, command: str | None = None
-    ) -> CalibratedModel:
-        """Write the model folder with card and figures, whole or not at all; a model that is there is replaced.
-
-        Args:
-            folder: to write.
-            name: of the model; None for the name of the folder.
-            command: what made the model, for the card; None for the call of `calibrate`.
-
-        Returns:
-            The model as written.
-
-        Raises:
-            OutputError: the folder holds something that is no model, or cannot be written.
-        """
-        summary = self.summary.having(command=command)
-        name = name or Path(folder).resolve().name
-        model = replace(self.model, name=name, metrics=summary.to_json())
-        with staged_folder(folder) as scratch:
-            save_model(model, scratch)
-            judged = self.validation or self.test
-            write_calibration_card(model, self.result, self.rows, judged, summary, self.texts, scratch)
-            if self.held_out is not None:
-                text = self.held_out.to_csv(model.robot)
-                (scratch / HELD_OUT_CSV).write_text(text, encoding="utf-8", newline="\n")
-        return model
+    def _describe(self, model: CalibratedModel, summary: CalibrationSummary, folder: Path) -> None:
+        judged = self.validation or self.test
+        write_calibration_card(model, self.result, self.rows, judged, summary, self.texts, folder)
+        if self.held_out is not None:
+            text = self.held_out.to_csv(model.robot)
+            (folder / HELD_OUT_CSV).write_text(text, encoding="utf-8", newline="\n")
 
 
 def calibrate(

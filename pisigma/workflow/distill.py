@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Float64
@@ -25,7 +24,6 @@ from pisigma.inverse.reference import NUMERIC
 from pisigma.joint_correction.conditions import learned_conditions
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.judging.distillation_summary import (
-    KIND,
     AbsoluteFigures,
     DistillationSummary,
     DistilledErrors,
@@ -42,13 +40,13 @@ from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.domain import Domain
 from pisigma.model.folder.folder_files import DESCRIPTION
-from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.model.folder.staging import staged_folder
+from pisigma.model.folder.model_folder import load_model
 from pisigma.model.stored_starts import spread_rows
 from pisigma.reporting.distilled_card import write_distilled_card
 from pisigma.robot.description import Robot
 from pisigma.se3 import pose_error
 from pisigma.workflow.distilled_network import Size, Trial, choose_network, sizes_for
+from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.solved_poses import SINGULAR_BELOW, Region, SolvedPoses, draw_solved_poses
 
 POSES = 5_000
@@ -86,7 +84,7 @@ class DistillationSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class Distillation:
+class Distillation(AbstractModelResult):
     """A distilled model and how well it follows the full solution.
 
     Attributes:
@@ -114,33 +112,8 @@ class Distillation:
         """Why the model should perhaps not be used, a sentence each."""
         return self.summary.warnings
 
-    def to_json(self) -> dict[str, Any]:
-        """Give all figures as JSON values, in mm and deg."""
-        return {"seconds": round(self.seconds, 3), **self.summary.to_json()}
-
-    def save(
-        self, folder: str | os.PathLike[str], name: str | None = None, command: str = "pisigma.distill(...)"
-    ) -> CalibratedModel:
-        """Write the model folder with its card, whole or not at all; a model that is there is replaced.
-
-        Args:
-            folder: to write.
-            name: of the model; None for the name of the folder.
-            command: what made the model, for the card.
-
-        Returns:
-            The model as written.
-
-        Raises:
-            OutputError: the folder holds something that is no model, or cannot be written.
-        """
-        summary = self.summary.model_copy(update={"command": command})
-        name = name or Path(folder).resolve().name
-        model = replace(self.model, name=name, metrics=summary.to_json())
-        with staged_folder(folder) as scratch:
-            save_model(model, scratch)
-            write_distilled_card(model, summary, scratch)
-        return model
+    def _describe(self, model: CalibratedModel, summary: DistillationSummary, folder: Path) -> None:
+        write_distilled_card(model, summary, folder)
 
 
 def distill(
@@ -186,7 +159,7 @@ def distill(
         scaled = network.scaled_inputs(every.T[fitted], every.q_nominal[fitted])
     distilled = CalibratedModel(
         name=f"{parent.name}_distilled",
-        kind=KIND,
+        kind="distilled",
         robot=parent.robot,
         network=network,
         domain=Domain.around(scaled[:DOMAIN_SAMPLES], generator),
@@ -266,7 +239,7 @@ def _summary(
         full=_tool_errors(parent, poses.T, poses.q_nominal + poses.correction),
     )
     return DistillationSummary(
-        command="",
+        command=f"pisigma.distill({parent.name!r})",
         parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=model.provenance.data_sha256),
         region=_region(region, poses, parent.robot),
         poses=PoseFigures(

@@ -4,7 +4,6 @@ import os
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from pisigma.errors import RecipeError
 from pisigma.judging.calibration_summary import CalibrationSummary, summarise
@@ -22,8 +21,6 @@ from pisigma.judging.validation_figures import ErrorFigures, ValidationFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import TrainTest, k_folds
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.model_folder import save_model
-from pisigma.model.folder.staging import staged_folder
 from pisigma.recipes.data import load_measurements, simulate_held_out, simulate_repeats, simulate_training
 from pisigma.recipes.reader import read_recipe, recipe_hash
 from pisigma.recipes.recipe import (
@@ -37,14 +34,16 @@ from pisigma.reporting.calibration_card import CardTexts
 from pisigma.reporting.training_card import write_training_card
 from pisigma.robot.description import Robot
 from pisigma.workflow.calibrate import Calibration, compose
+from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.train_networks import DEFAULTS, Progress, TrainSettings, cross_validate, train_networks
 
 
 @dataclass(frozen=True, eq=False)
-class InverseTraining:
+class InverseTraining(AbstractModelResult):
     """Networks on nominal joint values, trained and judged.
 
     Attributes:
+        model: what `pisigma.load` would read, with all figures as its metrics.
         recipe: what was trained.
         run: what training gave: history, pairs, joint errors.
         validation: errors of rows under trainings without them, for measured data; None for simulated ones.
@@ -53,6 +52,7 @@ class InverseTraining:
         seconds: time it took [s].
     """
 
+    model: CalibratedModel
     recipe: InverseRecipe
     run: TrainingRun
     validation: CrossValidation | None
@@ -61,45 +61,14 @@ class InverseTraining:
     seconds: float = 0.0
 
     @property
-    def model(self) -> CalibratedModel:
-        """What `pisigma.load` would read, with all figures as its metrics."""
-        return replace(self.run.model, metrics=self.summary.to_json())
-
-    @property
     def warnings(self) -> tuple[str, ...]:
         """What to heed, a sentence each."""
         rows = self.summary.rows
         return (f"{rows.left_out} rows were left out of the training: {rows.rule}.",) if rows.rule else ()
 
-    def to_json(self) -> dict[str, Any]:
-        """Give all figures as JSON values, in mm and deg."""
-        return {"seconds": round(self.seconds, 3), **self.summary.to_json()}
-
-    def save(
-        self, folder: str | os.PathLike[str], name: str | None = None, command: str | None = None
-    ) -> CalibratedModel:
-        """Write the model folder with card and figures, whole or not at all; a model that is there is replaced.
-
-        Args:
-            folder: to write.
-            name: of the model; None for the name of the folder.
-            command: what made the model, for the card; None for the call of `train`.
-
-        Returns:
-            The model as written.
-
-        Raises:
-            OutputError: the folder holds something that is no model, or cannot be written.
-        """
-        command = command or f"pisigma.train({self.recipe.name!r})"
-        summary = self.summary.model_copy(update={"command": command})
-        name = name or Path(folder).resolve().name
-        model = replace(self.model, name=name, metrics=summary.to_json())
-        with staged_folder(folder) as scratch:
-            save_model(model, scratch)
-            texts = CardTexts(self.recipe.description, self.recipe.not_validated)
-            write_training_card(name, texts, self.run, summary, scratch)
-        return model
+    def _describe(self, model: CalibratedModel, summary: TrainingSummary, folder: Path) -> None:
+        texts = CardTexts(self.recipe.description, self.recipe.not_validated)
+        write_training_card(model.name, texts, self.run, summary, folder)
 
 
 Training = InverseTraining | Calibration
@@ -259,4 +228,6 @@ def _train_inverse(
         test = compare_on(run.model, test_rows)
     count = 0 if test_rows is None else test_rows.rows
     summary = summarise_training(run, recipe.paper, validation, test, count)
-    return InverseTraining(recipe, run, validation, test, summary)
+    summary = summary.having(command=f"pisigma.train({recipe.name!r})")
+    model = replace(run.model, metrics=summary.to_json())
+    return InverseTraining(model, recipe, run, validation, test, summary)

@@ -3,6 +3,7 @@
 import pytest
 
 from pisigma.judging.training_summary import JointFigures
+from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.reporting.tables import figure_text, joint_table, pose_table
 
 JOINTS = [
@@ -42,7 +43,7 @@ def test_joint_table_has_a_line_per_joint_and_part_with_its_unit():
 
 def test_pose_table_has_a_column_per_model():
     table = pose_table(
-        {"nominal": {"rms_mm": 2.0, "p95_deg": 3.0}, "corrected": {"rms_mm": 0.5, "p95_deg": 0.1}}
+        {"nominal": ErrorFigures(rms_mm=2.0, p95_deg=3.0), "corrected": ErrorFigures(rms_mm=0.5, p95_deg=0.1)}
     )
     assert table.splitlines() == [
         "| error | unit | nominal | corrected |",

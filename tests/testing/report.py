@@ -15,7 +15,6 @@ from pisigma.judging.calibration_summary import (
     CalibrationSummary,
     ObservabilityFigures,
     RedundancyFigures,
-    read_summary,
     summarise,
 )
 from pisigma.judging.calibration_validation import CalibrationValidation, judge
@@ -73,7 +72,7 @@ def folder_with_held_out(arm: HybridArmUnderTest, model: CalibratedModel, folder
             errors.position.mul_(1.1)
         held_out = HeldOutRows.of(found, arm.measurements)
         text = held_out.to_csv(model.robot)
-        summary = read_summary(model).having(held_out_rows=held_out.hashes(text))
+        summary = CalibrationSummary.read(model).having(held_out_rows=held_out.hashes(text))
         model = replace(model, metrics=summary.to_json())
         folder.mkdir()
         save_model(model, folder)

@@ -9,7 +9,7 @@ from testing.simulated_arm import simulate
 import pisigma
 from pisigma.cli.calibrate import _socket_distances
 from pisigma.errors import IdentificationError, MeasurementError
-from pisigma.judging.calibration_summary import read_summary
+from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.model.folder.model_folder import load_model
 from pisigma.workflow.calibrate import CalibrationSettings
 
@@ -45,13 +45,13 @@ def test_it_writes_a_folder_that_says_the_same(calibration, tmp_path):
     written = calibration.save(tmp_path / "arm")
     model = load_model(tmp_path / "arm")
     assert (model.name, model.metrics) == ("arm", written.metrics)
-    assert read_summary(model) == calibration.summary
+    assert CalibrationSummary.read(model) == calibration.summary
     call = (
         "pisigma.calibrate('kiro4', 'rows.csv', CalibrationSettings(model='geometric', folds=2, repeats=1))"
     )
     assert f"Made by `{call}`, on 40 rows" in (tmp_path / "arm" / "README.md").read_text()
     calibration.save(tmp_path / "arm", command="pisigma calibrate kiro4 rows.csv")
-    assert read_summary(load_model(tmp_path / "arm")).command == "pisigma calibrate kiro4 rows.csv"
+    assert CalibrationSummary.read(load_model(tmp_path / "arm")).command == "pisigma calibrate kiro4 rows.csv"
 
 
 def test_a_file_gives_the_same(calibration, measurements, tmp_path):
@@ -66,8 +66,8 @@ def test_a_file_gives_the_same(calibration, measurements, tmp_path):
 def test_metrics_of_an_earlier_version_are_refused(calibration):
     metrics = calibration.model.metrics | {"unseen": []}
     with pytest.raises(pisigma.PisigmaError, match=r"\(unseen: .*run `pisigma upgrade`"):
-        read_summary(replace(calibration.model, metrics=metrics))
-    assert read_summary(replace(calibration.model, metrics={})) is None
+        CalibrationSummary.read(replace(calibration.model, metrics=metrics))
+    assert CalibrationSummary.read(replace(calibration.model, metrics={})) is None
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,7 @@ from pisigma.errors import IdentificationError, ModelError
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
-from pisigma.judging.distillation_summary import read_distillation
+from pisigma.judging.distillation_summary import DistillationSummary
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel
@@ -196,7 +196,7 @@ def test_figures_and_card_are_those_of_the_held_out_poses(tmp_path):
         rtol=1e-9,
     )
     written = found.save(tmp_path / "small", command="pisigma distill it")
-    assert read_distillation(written).parent == summary.parent
+    assert DistillationSummary.read(written).parent == summary.parent
     card = (tmp_path / "small" / "README.md").read_text()
     assert "Made by `pisigma distill it`." in card
     assert f"{summary.held_out.distilled.rms_mm:.4f} mm RMS" in card

@@ -2,6 +2,7 @@
 
 from markdown_text import command_block, picture
 from pisigma.judging.training_summary import JointFigures
+from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.reporting.tables import joint_table, markdown_table, pose_table
 from published import Published
 from stored_results import Result, StoredResults
@@ -32,7 +33,7 @@ def measured_sections(published: Published, results: StoredResults) -> list[str]
         command_block("ur10_inverse"),
         f"Errors of held-out rows, {figures['folds']}-fold cross-validated; {rows['left_out']} of "
         f"{rows['used'] + rows['left_out']} rows are left out of the training.",
-        pose_table({name: figures[name] for name in ("nominal", "corrected")}),
+        pose_table({name: ErrorFigures.model_validate(figures[name]) for name in ("nominal", "corrected")}),
         published.notes["ur10_inverse"],
         picture(
             LEARNING_CURVES, "position error of held-out rows by the number of training rows, three robots"

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pisigma.judging.calibration_summary import CalibrationSummary, read_summary
+from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.judging.held_out_rows import read_held_out
 from pisigma.judging.validation_figures import LearningPoint
 from pisigma.measurement.dataset import Measurements
@@ -134,7 +134,7 @@ def report_content(
         MeasurementError: the rows cannot be judged.
         ModelError: files of the folder are missing or were changed.
     """
-    summary, held_out = read_summary(model), read_held_out(folder, model)
+    summary, held_out = CalibrationSummary.read(model), read_held_out(folder, model)
     rows = None
     if measurements is not None:
         rows = rows_of_file(model, measurements, held_out)

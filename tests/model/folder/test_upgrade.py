@@ -11,7 +11,7 @@ from testing.models import hand_made_model
 from testing.report import hybrid_under_test
 
 from pisigma.errors import ModelError
-from pisigma.judging.calibration_summary import read_summary
+from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.folder.upgrade import Upgrade, upgrade_folder
@@ -59,7 +59,7 @@ def test_a_hybrid_calibration_comes_back_with_all_figures(tmp_path):
     assert upgrade_folder(tmp_path / "arm") == Upgrade("arm", 2, 3)
     upgraded = load_model(tmp_path / "arm")
     assert upgraded.metrics == model.metrics
-    assert read_summary(upgraded) == read_summary(model)
+    assert CalibrationSummary.read(upgraded) == CalibrationSummary.read(model)
     assert upgraded.uncertainty.prior_scale == model.uncertainty.prior_scale
     for name in ("model.safetensors", "README.md"):
         assert (tmp_path / "arm" / name).read_bytes() == files[name]

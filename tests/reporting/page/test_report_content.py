@@ -13,7 +13,7 @@ from testing.models import hand_made_model, joints_around
 from testing.report import folder_with_held_out, geometric_under_test, hybrid_under_test, measured
 
 from pisigma.errors import MeasurementError
-from pisigma.judging.calibration_summary import read_summary
+from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.row_poses import poses_of_rows
@@ -62,7 +62,7 @@ def test_rows_of_the_calibration_are_known_by_their_hash(hybrid, tmp_path):
     assert not own.held_out
     assert "very rows that the model was made of" in own.how
     assert content.accuracies[0].held_out  # the model's own held-out figures lead
-    assert content.accuracies[0].models == read_summary(model).cross_validation.models
+    assert content.accuracies[0].models == CalibrationSummary.read(model).cross_validation.models
 
 
 def test_training_rows_alone_are_no_held_out_figures(hybrid, tmp_path):
@@ -162,7 +162,7 @@ def test_a_geometric_model_says_what_it_lacks(tmp_path):
     assert any("no uncertainty" in line for line in content.missing)
     assert content.limit.share is None
     assert "cannot tell which" in content.verdict.sentence
-    assert content.parameters.table == parameter_table(read_summary(model).parameters).rows
+    assert content.parameters.table == parameter_table(CalibrationSummary.read(model).parameters).rows
 
 
 @pytest.mark.parametrize("name", ["kiro3", "ur10"])
@@ -207,10 +207,10 @@ def test_the_noise_that_a_hybrid_found_is_the_limit(hybrid, tmp_path):
     model = hybrid[1]
     sigma = model.metrics["hybrid"]["learned"]["noise"][0]["sigma_mm"]
     accuracy = report_content(model, tmp_path).accuracies[0]
-    limit = limit_of(model, read_summary(model), accuracy, None)
+    limit = limit_of(model, CalibrationSummary.read(model), accuracy, None)
     assert_close(limit.noise, math.sqrt(3) * sigma, rtol=1e-12)
     larger = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=2 * limit.noise)})
-    limit = limit_of(model, read_summary(model), larger, None)
+    limit = limit_of(model, CalibrationSummary.read(model), larger, None)
     assert_close(limit.share, 0.25, rtol=1e-12)
     assert "25 % of the squared error; the rest, 75 %, comes of the model" in limit.sentence
 
@@ -220,7 +220,7 @@ def test_scatter_above_the_error_is_no_share_of_it(hybrid, tmp_path):
     model = hybrid[1]
     accuracy = report_content(model, tmp_path).accuracies[0]
     smaller = replace(accuracy, models={"hybrid": ErrorFigures(rms_mm=1e-3)})
-    limit = limit_of(model, read_summary(model), smaller, None)
+    limit = limit_of(model, CalibrationSummary.read(model), smaller, None)
     assert limit.noise > 1e-3
     assert limit.share is None
     assert "no less than the error itself (0.0010 mm RMS)" in limit.sentence

@@ -1,0 +1,58 @@
+"""What the results that hold a model have in common: they are JSON, and write themselves as model folders."""
+
+import os
+from abc import ABC, abstractmethod
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from pisigma.judging.summary import AbstractSummary
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import save_model
+from pisigma.model.folder.staging import staged_folder
+
+
+class AbstractModelResult(ABC):
+    """A model with all figures of it.
+
+    Attributes:
+        model: what `pisigma.load` would read, with all figures as its metrics.
+        summary: the figures.
+        seconds: time it took [s].
+    """
+
+    model: CalibratedModel
+    summary: AbstractSummary
+    seconds: float
+
+    def to_json(self) -> dict[str, Any]:
+        """Give all figures as JSON values, in mm and deg."""
+        return {"seconds": round(self.seconds, 3), **self.summary.to_json()}
+
+    def save(
+        self, folder: str | os.PathLike[str], name: str | None = None, command: str | None = None
+    ) -> CalibratedModel:
+        """Write the model folder with card and figures, whole or not at all; a model that is there is replaced.
+
+        Args:
+            folder: to write.
+            name: of the model; None for the name of the folder.
+            command: what made the model, for the card; None for the call.
+
+        Returns:
+            The model as written.
+
+        Raises:
+            OutputError: the folder holds something that is no model, or cannot be written.
+        """
+        summary = self.summary.having(command=command)
+        name = name or Path(folder).resolve().name
+        model = replace(self.model, name=name, metrics=summary.to_json())
+        with staged_folder(folder) as scratch:
+            save_model(model, scratch)
+            self._describe(model, summary, scratch)
+        return model
+
+    @abstractmethod
+    def _describe(self, model: CalibratedModel, summary: Any, folder: Path) -> None:
+        """Write card, figures and tables beside the model."""
