@@ -209,12 +209,12 @@ def _count(node: yaml.Node, known: dict[int, int]) -> int:
 
 def _complaint(problem: ValidationError, node: yaml.Node, document: type[BaseModel], source: str) -> str:
     """Say in one sentence what the first finding is and where it stands."""
-    found = problem.errors()
-    first = next((item for item in found if item["type"] == "extra_forbidden"), found[0])
+    errors = problem.errors()
+    first = next((item for item in errors if item["type"] == "extra_forbidden"), errors[0])
     path: _Path = first["loc"]
     line, keys = _locate(node, path)
     key = ".".join(str(part) for part in keys) or "the file"
-    more = f" ({len(found) - 1} more findings)" if len(found) > 1 else ""
+    more = f" ({len(errors) - 1} more findings)" if len(errors) > 1 else ""
     context = first.get("ctx", {})
     if first["type"] == "extra_forbidden":
         section = ".".join(str(part) for part in keys[:-1]) or "the file"
@@ -235,14 +235,14 @@ def _complaint(problem: ValidationError, node: yaml.Node, document: type[BaseMod
     if first["type"] == "literal_error" and (texts := allowed_texts(document, path)):
         return _wrong_choice(source, line, keys, str(first["input"]), texts) + more
     message = first["msg"].removeprefix("Value error, ").rstrip(".")
-    given = first["input"]
-    came = f", but got {given!r}" if isinstance(given, str | int | float) else ""
+    value = first["input"]
+    came = f", but got {value!r}" if isinstance(value, str | int | float) else ""
     return f"{source}, line {line}: '{key}': {message[:1].lower()}{message[1:]}{came}.{more}"
 
 
-def _wrong_choice(source: str, line: int, keys: list[str | int], given: str, choices: list[str]) -> str:
+def _wrong_choice(source: str, line: int, keys: list[str | int], stated: str, choices: list[str]) -> str:
     key = ".".join(str(part) for part in keys)
-    return f"{source}, line {line}: '{key}' cannot be '{given}'; {nearest_choice(given, choices)}"
+    return f"{source}, line {line}: '{key}' cannot be '{stated}'; {nearest_choice(stated, choices)}"
 
 
 def _locate(node: yaml.Node, path: _Path) -> tuple[int, list[str | int]]:
@@ -254,10 +254,10 @@ def _locate(node: yaml.Node, path: _Path) -> tuple[int, list[str | int]]:
     keys: list[str | int] = []
     for part in path:
         if isinstance(node, yaml.MappingNode):
-            found = next(((k, v) for k, v in node.value if k.value == part), None)
-            if found is None:
+            entry = next(((k, v) for k, v in node.value if k.value == part), None)
+            if entry is None:
                 continue
-            line, node = found[0].start_mark.line + 1, found[1]
+            line, node = entry[0].start_mark.line + 1, entry[1]
         elif isinstance(node, yaml.SequenceNode) and isinstance(part, int) and part < len(node.value):
             node = node.value[part]
             line = node.start_mark.line + 1
@@ -277,11 +277,11 @@ def valid_keys(document: type[BaseModel], path: _Path) -> set[str]:
 
 def allowed_texts(document: type[BaseModel], path: _Path) -> list[str]:
     """Texts that are allowed where a validation path leads, sorted; none where any text is."""
-    found: set[str] = set()
+    texts: set[str] = set()
     for schema in _follow(document, path):
         values = [schema["const"]] if "const" in schema else schema.get("enum", [])
-        found |= {value for value in values if isinstance(value, str)}
-    return sorted(found)
+        texts |= {value for value in values if isinstance(value, str)}
+    return sorted(texts)
 
 
 def _follow(document: type[BaseModel], path: _Path) -> list[_Schema]:

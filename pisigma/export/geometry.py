@@ -52,9 +52,9 @@ def condition_remarks(model: CalibratedModel) -> tuple[str, ...]:
     """A sentence on the payload and temperature that joint values are for, where the model learned what these do."""
     learned = None if model.hybrid is None else learned_conditions(model.hybrid.correction)
     usual = {} if learned is None else dict(zip(learned.names, learned.mean, strict=True))
-    given = [f"{name} {value:g}" for name, value in model.conditions.items()]
-    given += [f"{name} {mean:.4g} (usual)" for name, mean in usual.items()]
-    return (f"Made for {' and '.join(given)}.",) if given else ()
+    stated = [f"{name} {value:g}" for name, value in model.conditions.items()]
+    stated += [f"{name} {mean:.4g} (usual)" for name, mean in usual.items()]
+    return (f"Made for {' and '.join(stated)}.",) if stated else ()
 
 
 def offset_remarks(model: CalibratedModel) -> tuple[str, ...]:

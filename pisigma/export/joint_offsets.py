@@ -30,8 +30,8 @@ from pisigma.se3 import (
 )
 
 ITERATIONS = 50
-UNSEEN = 1e-6
-"""A joint's column whose part outside those of base and tool is a smaller share of it tells nothing."""
+UNOBSERVABLE = 1e-6
+"""A joint's column whose part outside those of base and tool is a smaller share of it determines nothing."""
 NO_EFFECT = 1e-4
 """Directions of the unknowns whose effect is smaller than this share of the largest are not moved along: base and
 tool would run away for next to nothing."""
@@ -89,12 +89,12 @@ def solve_offsets(problem: OffsetProblem) -> tuple[Robot, tuple[bool, ...]]:
     """Minimise the sum of squares by damped Gauss-Newton steps (Levenberg-Marquardt) from the robot as it is.
 
     Returns:
-        The robot, and for every joint whether its offset could be told from base and tool; else it is left 0.
+        The robot, and for every joint whether its offset can be determined beside base and tool; else it is left 0.
     """
     robot = problem.robot
     missing, J = problem.residual(robot)
-    seen = _seen(J, robot.dof)
-    free = torch.tensor([*seen, *[True] * 12])
+    observable = _observable(J, robot.dof)
+    free = torch.tensor([*observable, *[True] * 12])
     damping = 1e-3
     for _ in range(ITERATIONS):
         step = torch.zeros(len(free), dtype=torch.float64)
@@ -110,7 +110,7 @@ def solve_offsets(problem: OffsetProblem) -> tuple[Robot, tuple[bool, ...]]:
             break
         else:
             damping *= 10
-    return robot, seen
+    return robot, observable
 
 
 def _step(
@@ -124,17 +124,17 @@ def _step(
     return step
 
 
-def _seen(J: Float64[Tensor, "values unknowns"], dof: int) -> tuple[bool, ...]:
+def _observable(J: Float64[Tensor, "values unknowns"], dof: int) -> tuple[bool, ...]:
     """For every joint whether its column is no combination of those of base, tool and the joints before."""
-    known, found = J[:, dof:] / J[:, dof:].norm(dim=0).clamp(min=1e-12), []
+    others, observable = J[:, dof:] / J[:, dof:].norm(dim=0).clamp(min=1e-12), []
     for column in J[:, :dof].unbind(1):
         column = column / column.norm()
-        U, s, _ = torch.linalg.svd(known, full_matrices=False)
-        basis = U[:, s > UNSEEN * s[0]]
-        found.append(bool((column - basis @ (basis.mT @ column)).norm() > UNSEEN))
-        if found[-1]:
-            known = torch.cat([known, column[:, None]], 1)
-    return tuple(found)
+        U, s, _ = torch.linalg.svd(others, full_matrices=False)
+        basis = U[:, s > UNOBSERVABLE * s[0]]
+        observable.append(bool((column - basis @ (basis.mT @ column)).norm() > UNOBSERVABLE))
+        if observable[-1]:
+            others = torch.cat([others, column[:, None]], 1)
+    return tuple(observable)
 
 
 def _small(step: Float64[Tensor, " 6"]) -> Float64[Tensor, "4 4"]:
@@ -207,12 +207,14 @@ def fit_joint_offsets(model: CalibratedModel, seed: int = 0) -> JointOffsets:
         ModelError: the model stores no joint values, or predicts none of their poses.
     """
     generator = torch.Generator().manual_seed(seed)
-    fitted, seen = solve_offsets(OffsetProblem(model.robot, *_poses(model, generator)))
+    fitted, observable = solve_offsets(OffsetProblem(model.robot, *_poses(model, generator)))
     q, T = _poses(model, generator)
     return JointOffsets(
         robot=fitted,
         values=_offsets(model.robot, fitted),
-        unobservable=tuple(j.name for j, known in zip(model.robot.joints, seen, strict=True) if not known),
+        unobservable=tuple(
+            j.name for j, free in zip(model.robot.joints, observable, strict=True) if not free
+        ),
         lost=_departure(forward_kinematics(fitted, q), T),
         nominal=_departure(forward_kinematics(model.robot, q), T),
     )
@@ -231,23 +233,23 @@ def _poses(
     share = torch.rand((POSES, 1), generator=generator, dtype=torch.float64)
     q = starts[pair[0]] + share * (starts[pair[1]] - starts[pair[0]])
     T = model.forward(q)
-    known = torch.isfinite(T).flatten(1).all(-1)
+    usable = torch.isfinite(T).flatten(1).all(-1)
     if model.network is not None and model.domain is not None:
         with torch.no_grad():
-            known &= model.domain.contains(model.network.scaled_inputs(T, q))
-    if not known.any():
+            usable &= model.domain.contains(model.network.scaled_inputs(T, q))
+    if not usable.any():
         raise ModelError(
             f"model {model.name} predicts no pose between the joint values that it stores; train it again."
         )
-    return q[known], T[known]
+    return q[usable], T[usable]
 
 
 def _offsets(nominal: Robot, fitted: Robot) -> Float64[np.ndarray, " dof"]:
-    found = [
+    offsets = [
         joint.direction * (fitted.dh[row] - nominal.dh[row])[0 if joint.type == "revolute" else 1]
         for joint, row in zip(nominal.joints, nominal.joint_rows, strict=True)
     ]
-    return np.array(found)
+    return np.array(offsets)
 
 
 def _departure(T: Float64[Tensor, "poses 4 4"], T_model: Float64[Tensor, "poses 4 4"]) -> Departure:

@@ -67,11 +67,11 @@ def _add_inputs(graph: OnnxGraph, group: JointGroup, q: str, T: str | None) -> t
     parts: list[str] = []
     order: list[int] = []
     for function, operator in (("sin", "Sin"), ("cos", "Cos"), ("", "")):
-        own = [i for i, (kind, factors) in enumerate(terms) if factors and kind == function]
-        if own:
-            angle = graph.node("MatMul", q, np.array([terms[i][1] for i in own]).T)
+        rows = [i for i, (kind, factors) in enumerate(terms) if factors and kind == function]
+        if rows:
+            angle = graph.node("MatMul", q, np.array([terms[i][1] for i in rows]).T)
             parts.append(graph.node(operator, angle) if operator else angle)
-            order += own
+            order += rows
     coordinates = [i for i, (_, factors) in enumerate(terms) if not factors]
     if coordinates:
         assert T is not None
@@ -86,8 +86,8 @@ def _add_coordinates(graph: OnnxGraph, reference: np.ndarray, T: str) -> Sequenc
     cells = graph.reshape(T, [16])
     place = [graph.column(cells, 4 * axis + 3) for axis in range(3)]
     rotation = graph.columns(cells, [0, 1, 2, 4, 5, 6, 8, 9, 10])
-    seen = graph.node("MatMul", rotation, np.kron(reference, np.eye(3)))  # reference.T @ R, cell by cell
-    return [*place, *add_roll_pitch_yaw(graph, seen)]
+    turned = graph.node("MatMul", rotation, np.kron(reference, np.eye(3)))  # reference.T @ R, cell by cell
+    return [*place, *add_roll_pitch_yaw(graph, turned)]
 
 
 def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) -> str:
@@ -255,18 +255,20 @@ def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, s
 
 def _domain(model: CalibratedModel) -> dict[str, Any]:
     """Where it holds: the range of training rows, and of a hybrid the stretches of every joint that were measured."""
-    found: dict[str, Any] = {}
+    domain: dict[str, Any] = {}
     if len(model.starts):
         low, high = model.starts.aminmax(dim=0)
-        found |= {"q_lower": low.tolist(), "q_upper": high.tolist()}
+        domain |= {"q_lower": low.tolist(), "q_upper": high.tolist()}
     if model.network is None and model.hybrid is not None:
-        own = model.hybrid.coverage
+        coverage = model.hybrid.coverage
         stretches: list[list[list[float]]] = [[] for _ in range(model.robot.dof)]
-        for j, middle, half in zip(own.joint.tolist(), own.middle.tolist(), own.half.tolist(), strict=True):
-            rate = float(own.rate[j])
+        for j, middle, half in zip(
+            coverage.joint.tolist(), coverage.middle.tolist(), coverage.half.tolist(), strict=True
+        ):
+            rate = float(coverage.rate[j])
             stretches[j].append([(middle - half) / rate, (middle + half) / rate])
-        found |= {"measured": stretches, "fade_rad": own.fade}
-    return found
+        domain |= {"measured": stretches, "fade_rad": coverage.fade}
+    return domain
 
 
 def _graph_name(model: CalibratedModel) -> str:

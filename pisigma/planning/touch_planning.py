@@ -110,7 +110,7 @@ def build_planning_problem(
     tool = space.arm_size + 6
     columns = [*arm, tool, tool + 1, tool + 2]
     usual = torch.from_numpy(space.usual_errors)[columns]
-    own = torch.tensor([USUAL_LENGTH] * 3 + [USUAL_ANGLE] * 3, dtype=torch.float64)
+    usual_base = torch.tensor([USUAL_LENGTH] * 3 + [USUAL_ANGLE] * 3, dtype=torch.float64)
     size = len(columns) + 6 * len(Ts_jig_base)
     rows = torch.zeros(candidates.count, size, dtype=torch.float64)
     free_of_base = robot.with_geometry(base=np.zeros(6))
@@ -120,7 +120,7 @@ def build_planning_problem(
         along = T_jig_base[candidates.axis[chosen], :3]
         start = len(columns) + 6 * number
         rows[chosen, : len(columns)] = torch.einsum("ni,nip->np", along, J[:, :3, columns]) * usual
-        rows[chosen, start : start + 6] = _base_rows(along, T[:, :3, 3]) * own
+        rows[chosen, start : start + 6] = _base_rows(along, T[:, :3, 3]) * usual_base
     _, J = identification_jacobian(free_of_base, workspace)
     J = J[:, :3, columns] * usual * 1e3
     weight = torch.zeros(size, size, dtype=torch.float64)

@@ -104,10 +104,10 @@ def _copy_joint(element: Any, copied: Any, source: str) -> None:
 
     name = element.get("name")
     place = f"{source}, line {element.sourceline}: joint '{name}'"
-    given = element.get("type")
-    if given not in JOINT_TYPES:
-        raise RobotError(f"{place}: the type cannot be '{given}'; {nearest_choice(given or '', JOINT_TYPES)}")
-    copied.set("type", given)
+    kind = element.get("type")
+    if kind not in JOINT_TYPES:
+        raise RobotError(f"{place}: the type cannot be '{kind}'; {nearest_choice(kind or '', JOINT_TYPES)}")
+    copied.set("type", kind)
     for child in element.iterchildren(*(f"{{*}}{tag}" for tag in _KEPT)):
         tag = etree.QName(child).localname
         if copied.find(tag) is not None:
@@ -268,19 +268,19 @@ def _root(urdf: Any, path: str) -> str:
 
 def _only_tip(urdf: Any, base: str, path: str) -> str:
     """The one link below the base that has no child."""
-    found, open_links, seen = [], [base], {base}
+    ends, open_links, passed = [], [base], {base}
     while open_links:
         link = open_links.pop()
-        children = [child for _, child in urdf.child_map.get(link, ()) if child not in seen]
-        seen.update(children)
+        children = [child for _, child in urdf.child_map.get(link, ()) if child not in passed]
+        passed.update(children)
         open_links += children
         if link not in urdf.child_map:
-            found.append(link)
-    if len(found) == 1:
-        return str(found[0])
-    names = ", ".join(sorted(found)) or "none"
+            ends.append(link)
+    if len(ends) == 1:
+        return str(ends[0])
+    names = ", ".join(sorted(ends)) or "none"
     raise RobotError(
-        f"{path}: below '{base}' the chain has {len(found)} ends ({names}); say with tip which link is meant."
+        f"{path}: below '{base}' the chain has {len(ends)} ends ({names}); say with tip which link is meant."
     )
 
 

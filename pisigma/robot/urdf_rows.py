@@ -133,8 +133,8 @@ def _point_of_axis(joints: tuple[ChainJoint, ...], axes: list[Vector], index: in
         following = joints[index + 1].origin
         sine = np.linalg.norm(np.cross(axes[index], following[:3, :3] @ axes[index + 1]))
         if sine < NEARLY_PARALLEL:
-            found: Vector = (T @ following)[:3, 3]
-            return found
+            joined: Vector = (T @ following)[:3, 3]
+            return joined
     return np.zeros(3)
 
 

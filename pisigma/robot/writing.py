@@ -212,13 +212,13 @@ def _check_same(drawn: Drawing, nominal: Robot, path: str) -> None:
 
 def _new_origins(chain: Chain, rows: ChainRows, calibrated: Robot, urdf: Any) -> dict[str, Frame]:
     """Origins of the joints that move, in the links before them; that of the first stays."""
-    found: dict[str, Frame] = {}
+    origins: dict[str, Frame] = {}
     for i, joint in enumerate(chain.joints[1:], 1):
         whole = rows.frames[i - 1] @ row_frame(*calibrated.dh[i - 1].tolist()) @ inverse(rows.frames[i])
         # Fixed joints between the two stay; what is before the joint's own origin is their product.
         before = joint.origin @ inverse(origin_of(urdf.joint_map[joint.name]))
-        found[joint.name] = inverse(before) @ whole
-    return found
+        origins[joint.name] = inverse(before) @ whole
+    return origins
 
 
 def _set_origin(element: Any, origin: Frame) -> None:

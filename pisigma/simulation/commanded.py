@@ -1,7 +1,5 @@
 """Which joint values are commanded: drawn as such, or those that take the true robot to wanted poses."""
 
-from typing import TypeVar
-
 import torch
 from jaxtyping import Bool, Float64
 from pydantic import Field, model_validator
@@ -54,13 +52,21 @@ class BranchSection(Section):
             RecipeError: no such branch or joint, or the robot has no closed form whose branch could be named.
             UnreachablePoseError: the nominal robot does not reach a pose on this branch.
         """
-        solver = closed_form_solver(robot)
-        if self.name is not None:
-            return self._named(solver, robot, T)
         near = self._near(robot).to(T.device)
-        if solver is None:
+        solver = closed_form_solver(robot)
+        if solver is None and self.name is None:
             return near.expand(len(T), robot.dof)
-        return _nearest(solver.solve(T), robot, near)
+        solutions = self._solutions(solver, robot, T)
+        reached = solutions.status != Status.UNREACHABLE
+        if not reached.any(-1).all():
+            unreachable = ~reached.any(-1)
+            where = f"branch '{self.name}'" if self.name else "any branch"
+            raise UnreachablePoseError(
+                f"wanted pose {int(unreachable.nonzero()[0])} (counted from 0; {int(unreachable.sum())} of "
+                f"{len(unreachable)} poses) cannot be reached by the nominal robot on {where}; "
+                "change the region of the poses or the branch."
+            )
+        return _nearest(solutions, robot, near, reached)
 
     def find(
         self, robot: Robot, T: Float64[Tensor, "poses 4 4"]
@@ -78,19 +84,14 @@ class BranchSection(Section):
         Raises:
             RecipeError: no such branch or joint, or the robot has no closed form whose branch could be named.
         """
-        solver = closed_form_solver(robot)
-        if self.name is not None:
-            solutions = self._solutions(solver, robot, T)
-            assert solver is not None
-            index = solver.branches.index(self.name)
-            return solutions.q[:, index].nan_to_num(), solutions.status[:, index] == Status.REACHED
         near = self._near(robot).to(T.device)
-        if solver is None:
-            found = solve_numeric(robot, T, near)
-            return found.q, found.status == Status.REACHED
-        solutions = solver.solve(T)
+        solver = closed_form_solver(robot)
+        if solver is None and self.name is None:
+            solved = solve_numeric(robot, T, near)
+            return solved.q, solved.status == Status.REACHED
+        solutions = self._solutions(solver, robot, T)
         reached = solutions.status == Status.REACHED
-        return _nearest_of(solutions, robot, near, reached).nan_to_num(), reached.any(-1)
+        return _nearest(solutions, robot, near, reached).nan_to_num(), reached.any(-1)
 
     def _near(self, robot: Robot) -> Float64[Tensor, " dof"]:
         """The joint values to be near to [rad or m]."""
@@ -101,39 +102,25 @@ class BranchSection(Section):
     def _solutions(
         self, solver: AbstractClosedForm | None, robot: Robot, T: Float64[Tensor, "poses 4 4"]
     ) -> InverseSolutions:
-        """All solutions, when the branch that is named is one of them."""
+        """All solutions, or those on the branch that is named alone."""
         if solver is None:
             raise RecipeError(
                 f"branch: robot '{robot.name}' has no closed form and so no branch '{self.name}'; "
                 "state near_deg instead."
             )
+        if self.name is None:
+            return solver.solve(T)
         if self.name not in solver.branches:
             raise RecipeError(
                 f"branch: robot '{robot.name}' has no branch '{self.name}'; "
-                f"{nearest_choice(str(self.name), solver.branches)}"
+                f"{nearest_choice(self.name, solver.branches)}"
             )
-        return solver.solve(T)
-
-    def _named(
-        self, solver: AbstractClosedForm | None, robot: Robot, T: Float64[Tensor, "poses 4 4"]
-    ) -> Float64[Tensor, "poses dof"]:
-        solutions = self._solutions(solver, robot, T)
-        assert solver is not None
-        index = solver.branches.index(str(self.name))
-        _refuse_unreachable(solutions.status[:, index] == Status.UNREACHABLE, f"branch '{self.name}'")
-        return solutions.q[:, index]
+        index = solver.branches.index(self.name)
+        solutions = solver.solve(T)
+        return InverseSolutions(solutions.q[:, index, None], solutions.status[:, index, None], (self.name,))
 
 
 def _nearest(
-    solutions: InverseSolutions, robot: Robot, near: Float64[Tensor, " dof"]
-) -> Float64[Tensor, "poses dof"]:
-    """Of each pose's solutions the nearest, by the sum of squared differences, angles wrapped."""
-    unreachable = solutions.status == Status.UNREACHABLE
-    _refuse_unreachable(unreachable.all(-1), "any branch")
-    return _nearest_of(solutions, robot, near, ~unreachable)
-
-
-def _nearest_of(
     solutions: InverseSolutions,
     robot: Robot,
     near: Float64[Tensor, " dof"],
@@ -145,18 +132,6 @@ def _nearest_of(
     difference = torch.where(revolute, wrap_to_pi(difference), difference)
     distance = torch.where(allowed, (difference * difference).sum(-1), torch.inf)
     return torch.take_along_dim(solutions.q, distance.argmin(-1)[:, None, None], 1)[:, 0]
-
-
-def _refuse_unreachable(unreachable: Tensor, where: str) -> None:
-    if unreachable.any():
-        raise UnreachablePoseError(
-            f"wanted pose {int(unreachable.nonzero()[0])} (counted from 0; {int(unreachable.sum())} of "
-            f"{len(unreachable)} poses) cannot be reached by the nominal robot on {where}; "
-            "change the region of the poses or the branch."
-        )
-
-
-Own = TypeVar("Own", bound="AbstractCommanded")
 
 
 class AbstractCommanded(Section):
@@ -171,7 +146,7 @@ class AbstractCommanded(Section):
     branch: BranchSection | None = None
 
     @model_validator(mode="after")
-    def _branch_for_poses(self: Own) -> Own:
+    def _branch_for_poses(self) -> "AbstractCommanded":
         if isinstance(self.poses, JointsRandom) != (self.branch is None):
             raise ValueError(
                 "wanted poses need a branch, but none is stated"

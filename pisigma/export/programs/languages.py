@@ -68,7 +68,7 @@ def program_text(targets: Targets, path: Path, cartesian: bool, config: str | No
         UnreachablePoseError: a pose has no target; the message names line and status.
     """
     check_program(path, targets.robot, cartesian, config)
-    targets.check_all_given()
+    targets.check_complete()
     language = language_of(path)
     if cartesian and not language.keeps_branch and len(set(targets.branch)) > 1:
         other = next(row for row, name in enumerate(targets.branch) if name != targets.branch[0])

@@ -15,7 +15,7 @@ from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert, transform_from_xyzrpy
 
-GIVEN = (Status.REACHED, Status.OUTSIDE_DOMAIN)
+WITH_TARGET = (Status.REACHED, Status.OUTSIDE_DOMAIN)
 """A pose of any other status gets no target."""
 
 _LISTED = 10
@@ -75,7 +75,7 @@ class Targets:
     @property
     def failure(self) -> str | None:
         """Which poses have no target, and why; None where all have one."""
-        failed = [(n, s) for n, s in zip(self.line, self.status, strict=True) if s not in GIVEN]
+        failed = [(n, s) for n, s in zip(self.line, self.status, strict=True) if s not in WITH_TARGET]
         if not failed:
             return None
         line, status = failed[0]
@@ -95,7 +95,7 @@ class Targets:
             Status.OUTSIDE_DOMAIN.sentence
         )
 
-    def check_all_given(self) -> None:
+    def check_complete(self) -> None:
         """Refuse targets of which one is missing: a program without it would be another program.
 
         Raises:
@@ -117,9 +117,9 @@ def targets_of(solution: Solution, source: str, line: tuple[int, ...], accuracy:
     assert solution.owner is not None, "a solution as it is handed out knows its model"
     model = solution.owner.model
     status = tuple(Status(value) for value in solution.status.tolist())
-    given = torch.tensor([s in GIVEN for s in status])
-    deviation = torch.as_tensor(solution.accuracy) if accuracy else torch.full(given.shape, torch.nan)
-    q = solution.q.detach().to("cpu", torch.float64).where(given[:, None], torch.nan)
+    has_target = torch.tensor([s in WITH_TARGET for s in status])
+    deviation = torch.as_tensor(solution.accuracy) if accuracy else torch.full(has_target.shape, torch.nan)
+    q = solution.q.detach().to("cpu", torch.float64).where(has_target[:, None], torch.nan)
     return Targets(
         model=model.name,
         robot=model.robot,
@@ -128,7 +128,7 @@ def targets_of(solution: Solution, source: str, line: tuple[int, ...], accuracy:
         status=status,
         branch=tuple(solution.branches[index] for index in solution.branch.tolist()),
         q=q,
-        T=forward_kinematics(model.robot, q).where(given[:, None, None], torch.nan),
-        deviation=deviation.double().where(given, torch.nan),
+        T=forward_kinematics(model.robot, q).where(has_target[:, None, None], torch.nan),
+        deviation=deviation.double().where(has_target, torch.nan),
         remarks=(*condition_remarks(model), *frame_remarks(model)),
     )

@@ -153,10 +153,10 @@ def joint_values(
     ):
         for name, value in mapping.items():
             index = joint_index(robot, name, place)
-            found = robot.joints[index].type
-            if found != kind:
+            actual = robot.joints[index].type
+            if actual != kind:
                 raise RecipeError(
-                    f"{place}: joint '{name}' is {found}, so state it in {other}, not in {field}."
+                    f"{place}: joint '{name}' is {actual}, so state it in {other}, not in {field}."
                 )
             values[index] = value
     return values
