@@ -10,6 +10,7 @@ from testing.models import no_type_checker
 
 import pisigma
 from pisigma.judging.pose_statistics import JointStatistics
+from pisigma.judging.training_summary import TrainingSummary
 from pisigma.model.folder.model_folder import load_model
 from pisigma.recipes.data import simulate_held_out, simulate_training
 from pisigma.recipes.reader import read_recipe, recipe_hash
@@ -48,7 +49,7 @@ def test_a_card_says_everything(folder):
     provenance = load_model(folder).provenance
     for value in (provenance.recipe_sha256, provenance.data_sha256, *provenance.versions.values()):
         assert value in text
-    assert joint_table(load_model(folder).metrics["joints"]) in text
+    assert joint_table(TrainingSummary.model_validate(load_model(folder).metrics).joints) in text
 
 
 @each

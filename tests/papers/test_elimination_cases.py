@@ -4,12 +4,12 @@ import json
 
 import pytest
 from testing.closeness import assert_close
+from testing.models import shipped_training
 
 from elimination_cases import report_correlations, report_eliminations
 from pisigma.errors import RecipeError
-from pisigma.recipes.data import simulate_held_out, simulate_training
+from pisigma.recipes.data import simulate_held_out
 from pisigma.recipes.reader import read_recipe
-from pisigma.robot import Robot
 from published import read_published
 
 
@@ -19,9 +19,9 @@ def recipe(repository):
 
 
 @pytest.fixture(scope="module")
-def calibrated(recipe):
-    rows = simulate_training(recipe)
-    return recipe.calibration.calibrator(Robot.load(recipe.robot)).fit(rows), rows
+def calibrated():
+    calibration = shipped_training("rb5_redundancy")
+    return calibration.result, calibration.rows
 
 
 def test_every_case_predicts_the_same_and_keeps_the_sums(repository, recipe, calibrated):

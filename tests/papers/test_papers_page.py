@@ -202,8 +202,8 @@ def test_the_simulated_touches_are_a_measurement_file(repository, tmp_path, caps
 
 
 def test_the_folder_runs_as_a_script(repository, tmp_path):
-    command = [sys.executable, str(repository / "training" / "papers"), "run", "nothing"]
+    command = [sys.executable, str(repository / "training" / "papers"), "--folder", str(tmp_path)]
     environment = os.environ | {"PYTHONPATH": str(repository)}
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 2
-    assert "nothing.yaml" in done.stderr
+    assert "published.yaml" in done.stderr

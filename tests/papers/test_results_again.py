@@ -4,9 +4,8 @@ import json
 
 import pytest
 from testing.closeness import assert_close
-from testing.models import no_type_checker
+from testing.models import no_type_checker, shipped_training
 
-import pisigma
 from recipe_runs import extra_figures
 from stored_results import read_results
 
@@ -27,7 +26,7 @@ def again(repository):
     def run(name: str) -> tuple[dict, dict]:
         folder = repository / "training"
         with no_type_checker():
-            training = pisigma.train(folder / f"{name}.yaml")
+            training = shipped_training(name)
             result = {**training.to_json(), **extra_figures(folder, name, training)}
         stored = dict(read_results(folder)[name])
         assert stored.pop("model") == f"runs/{name}"

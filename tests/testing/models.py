@@ -102,6 +102,19 @@ def small_recipe_text(name: str) -> str:
 
 
 @functools.cache
+def shipped_training(name: str, seed: int | None = None):
+    """What `pisigma.train` gives for a shipped recipe, whole, with its own seed or another."""
+    import pisigma
+    from pisigma.recipes.reader import read_recipe
+
+    recipe = read_recipe(Path(__file__).parents[2] / "training" / f"{name}.yaml")
+    if seed is not None:
+        recipe = recipe.model_copy(update={"fit": recipe.fit.model_copy(update={"seed": seed})})
+    with no_type_checker():
+        return pisigma.train(recipe)
+
+
+@functools.cache
 def trained_run(name: str):
     """What a short training of the shipped recipe gives: the recipe and the run."""
     from pisigma.errors import RecipeError

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from testing.models import no_type_checker, small_recipe_text, trained_run
+from testing.models import no_type_checker, shipped_training, small_recipe_text, trained_run
 
 import pisigma
 from pisigma.errors import MeasurementError, RecipeError
@@ -34,16 +34,15 @@ def test_a_recipe_of_inverse_calibration_in_two_lines(tmp_path):
     assert bool(torch.isfinite(pisigma.load(tmp_path / "arm")(T).q).all())
 
 
-def test_a_recipe_of_geometric_calibration(repository, tmp_path):
-    path = repository / "training" / "rb5_redundancy.yaml"
-    with no_type_checker():
-        calibration = pisigma.train(path)
-        calibration.save(tmp_path / "rb5")
+def test_a_recipe_of_geometric_calibration(tmp_path):
+    calibration = shipped_training("rb5_redundancy")
     assert isinstance(calibration, pisigma.Calibration)
     assert calibration.summary.pairwise_parameters == 28
     assert calibration.summary.held_out.geometric.rms_mm < 1e-9
     assert calibration.model.provenance.recipe == "rb5_redundancy"
     assert calibration.to_json()["redundant_sets"][0] == ["a_6", "a_EE"]
+    with no_type_checker():
+        assert calibration.save(tmp_path / "rb5").name == "rb5"
 
 
 @pytest.mark.parametrize(

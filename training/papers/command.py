@@ -12,7 +12,6 @@ from pisigma.errors import PisigmaError
 from pisigma.export.output_file import write_whole
 from pisigma.robot.description import Robot
 from published import read_published
-from recipe_runs import run_recipe
 from stored_results import read_results
 
 FOLDER = Path(__file__).resolve().parent.parent
@@ -31,6 +30,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     chosen = _parser().parse_args(arguments)
     try:
         if chosen.command == "run":
+            from recipe_runs import run_recipe  # imports lightning, which takes seconds
+
             run_recipe(chosen.folder, chosen.name, chosen.data, chosen.out)
         elif chosen.command == "touches":
             write_touches(chosen.folder, chosen.out)
