@@ -27,7 +27,7 @@ def _torch_solutions(model, T, near=None, branch=None):
         return ReferenceIK(model)(T, near=near, branch=branch)
 
 
-def _both(name, arms, rows=60, near=False, **kind):
+def _both(name, arms, rows=40, near=False, **kind):
     """Joint values, poses, the compiled solution and that of torch."""
     model = arms.calibrated(name, **kind)
     q = arms.draw_joints(model.robot, rows, seed=7, share=kind.get("covered", 1.0) * 1.05)
@@ -74,10 +74,10 @@ def test_what_is_called_reached_is_reached(name, covered, arms):
     assert (np.abs(found.q - q.numpy()).max(-1) < 1e-6).mean() > 0.99 or model.robot.dof > 6
 
 
-@pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur5", "rb5"])
+@pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur5"])  # one for every closed form
 def test_every_branch_is_that_of_torch(name, arms):
     model, kernels = arms.calibrated(name), arms.compiled(name)
-    T = model.forward(arms.draw_joints(model.robot, 20, seed=9))
+    T = model.forward(arms.draw_joints(model.robot, 8, seed=9))
     for branch in kernels.branches:
         found, expected = (
             kernels.solve_batch(T.numpy(), branch=branch),
