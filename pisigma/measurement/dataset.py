@@ -21,10 +21,10 @@ from pisigma.measurement.fields import (
     LeftOut,
     MeasuredFields,
     OnBadRow,
-    check_fields,
     joined_fields,
 )
 from pisigma.measurement.readings import READINGS
+from pisigma.measurement.rules import check_fields
 from pisigma.robot import Robot
 from pisigma.se3 import transform
 

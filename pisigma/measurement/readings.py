@@ -14,6 +14,17 @@ Readings = Mapping[str, Float64[np.ndarray, " rows"] | Sequence[str]]
 """The cells of a sensor by column, in SI units; NaN and "" where a cell is empty."""
 
 Unit = Literal["deg", "rad", "mm", "m", "kg", "c", ""]
+_PER_SI = {"deg": 180 / np.pi, "mm": 1e3}
+
+
+def to_si(values: Float64[np.ndarray, "*shape"], unit: Unit) -> Float64[np.ndarray, "*shape"]:
+    """Convert values to SI units (temperature stays in deg C)."""
+    return values / _PER_SI.get(unit, 1.0)
+
+
+def from_si(values: Float64[np.ndarray, "*shape"], unit: Unit) -> Float64[np.ndarray, "*shape"]:
+    """Convert values to a unit of measurement files; inverse of `to_si`."""
+    return values * _PER_SI.get(unit, 1.0)
 
 
 @dataclass(frozen=True)

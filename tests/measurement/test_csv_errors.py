@@ -124,7 +124,7 @@ ROWS = {
     "an approach that is none": (
         None,
         f"q1_deg,{POSITION},approach1\n1,1,2,3,0\n",
-        (2, "column 'approach1'", "+1", "leave the cell empty"),
+        (2, "column 'approach1'", "+1", "leave it empty"),
     ),
     "a sigma of nothing": (
         None,

@@ -272,7 +272,7 @@ def test_faulty_readings_are_named(tmp_path: Path, content: str, message: str) -
 def test_readings_in_memory_are_checked_too() -> None:
     data = measured(4)[1].select(torch.arange(4))
     steep = dict(data.readings) | {"tilt_y": torch.full((4,), 2.0, dtype=torch.float64)}
-    with pytest.raises(MeasurementError, match=r"row 0: 'tilt' 2 rad is beyond"):
+    with pytest.raises(MeasurementError, match=r"row 0: 'tilt': 2 rad is beyond"):
         replace(data, readings=steep)
     with pytest.raises(MeasurementError, match=r"no sensor has readings called 'tilt'; did you mean 'tilt_"):
         replace(data, readings={"tilt": torch.zeros(4, dtype=torch.float64)})

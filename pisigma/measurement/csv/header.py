@@ -5,9 +5,6 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-import numpy as np
-from jaxtyping import Float64
-
 from pisigma.errors import MeasurementError, nearest_choice
 from pisigma.measurement.csv.table import Table
 from pisigma.measurement.readings import READINGS, Unit, reading_numbers, reading_texts
@@ -21,8 +18,6 @@ TEXTS = ("target", "frame", "set", "socket", "touch_axis", "anchor", "pair")
 
 REVOLUTE_UNITS: tuple[Unit, ...] = ("deg", "rad")
 PRISMATIC_UNITS: tuple[Unit, ...] = ("mm", "m")
-
-_PER_SI = {"deg": 180 / np.pi, "mm": 1e3}
 
 _JOINT = re.compile(r"q([1-9][0-9]{0,2})_(deg|rad|mm|m)")
 _APPROACH = re.compile(r"approach([1-9][0-9]{0,2})")
@@ -116,16 +111,6 @@ def column_choices(name: str) -> str:
 def quoted(columns: Iterable[Column]) -> str:
     """Names of columns as complaints list them."""
     return ", ".join(f"'{column.name}'" for column in columns)
-
-
-def to_si(values: Float64[np.ndarray, "*shape"], unit: str) -> Float64[np.ndarray, "*shape"]:
-    """Values of a column in SI units (temperature stays in deg C)."""
-    return values / _PER_SI.get(unit, 1.0)
-
-
-def from_si(values: Float64[np.ndarray, "*shape"], unit: str) -> Float64[np.ndarray, "*shape"]:
-    """Values in the unit of a column; inverse of `to_si`."""
-    return values * _PER_SI.get(unit, 1.0)
 
 
 @dataclass(frozen=True)

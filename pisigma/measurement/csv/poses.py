@@ -20,11 +20,11 @@ from pisigma.measurement.csv.header import (
     check_separators,
     find_column,
     quoted,
-    to_si,
 )
 from pisigma.measurement.csv.rows import QUATERNION_TOLERANCE
 from pisigma.measurement.csv.table import split_line
 from pisigma.measurement.fields import LeftOut
+from pisigma.measurement.readings import to_si
 from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy, transform
 
 CHUNK_ROWS = 20_000

@@ -2,6 +2,7 @@
 
 import math
 import os
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,13 +19,14 @@ from pisigma.measurement.csv.header import (
     Column,
     Layout,
     find_column,
+    quoted,
     read_header,
-    to_si,
 )
-from pisigma.measurement.csv.rows import CheckedRows, check_rows
+from pisigma.measurement.csv.rows import CheckedRows, check_cells, check_equal_rows
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.fields import TEXTS, LeftOut, MeasuredFields, OnBadRow
-from pisigma.measurement.readings import reading_numbers, reading_texts
+from pisigma.measurement.readings import READINGS, reading_numbers, reading_texts, to_si
+from pisigma.measurement.rules import Labels, group_faults, row_faults
 from pisigma.robot import Robot
 from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy
 
@@ -61,10 +63,20 @@ def read_fields(
         )
     table = read_table(path)
     layout = read_header(table, robot)
-    rows = check_rows(table, layout, robot)
-    if rows.faults and (on_bad_row == "error" or len(rows.faults) == len(table.lines)):
-        raise MeasurementError(_complaint(table, rows.faults))
-    return _fields(table, layout, rows)
+    rows = check_cells(table, layout, robot)
+    data, labels, faults = _fields(table, layout, rows), _labels(layout), rows.faults
+    for bad, describe in row_faults(data, labels):
+        faults.add(bad, describe)
+    check_equal_rows(rows, layout, table)
+    lines = [f"line {line}" for line in table.lines]
+    for bad, describe in group_faults(data, labels, faults.sound(data.rows), lines.__getitem__):
+        faults.add(bad, describe)
+    if faults.reasons and (on_bad_row == "error" or len(faults.reasons) == data.rows):
+        raise MeasurementError(_complaint(table, faults.reasons))
+    sound = data.select(torch.from_numpy(np.flatnonzero(faults.sound(data.rows))))
+    numbers = {name: values for name, values in sound.numbers.items() if not bool(values.isnan().all())}
+    left_out = tuple(LeftOut(table.lines[row], faults.reasons[row]) for row in sorted(faults.reasons))
+    return replace(sound, numbers=numbers, left_out=left_out)
 
 
 def _complaint(table: Table, faults: dict[int, str]) -> str:
@@ -75,51 +87,46 @@ def _complaint(table: Table, faults: dict[int, str]) -> str:
     return f"{table.source}, line {table.lines[row]}, {faults[row]}{others}."
 
 
+def _labels(layout: Layout) -> Labels:
+    """Columns as complaints call them, and their units."""
+    names = {quantity: f"column '{layout.column(quantity).name}'" for quantity in layout.index}
+    groups: dict[str, tuple[str, ...]] = {"position": POSITION, "anchor_place": ANCHOR_PLACE}
+    groups |= {sensor: (*readings.numbers, *readings.texts) for sensor, readings in READINGS.items()}
+    for name, group in groups.items():
+        if set(group) <= set(layout.index):
+            names[name] = f"columns {quoted(layout.column(quantity) for quantity in group)}"
+    names["split"] = "column 'set'"
+    units = {quantity: layout.column(quantity).unit for quantity in layout.index}
+    return Labels("column '{}'", names, units)
+
+
 def _fields(table: Table, layout: Layout, rows: CheckedRows) -> MeasuredFields:
-    """The sound rows in SI units."""
-    values, cells, faults = rows.values, rows.cells, rows.faults
-    kept = [row for row in range(len(table.lines)) if row not in faults]
+    """All rows in SI units, those at fault too."""
 
-    def numbers(*quantities: str) -> Tensor | None:
-        if not quantities or any(quantity not in layout.index for quantity in quantities):
-            return None
-        columns = [to_si(values[kept, layout.index[name]], layout.column(name).unit) for name in quantities]
-        stacked = np.stack(columns, axis=1)
-        return None if np.isnan(stacked).all() else torch.from_numpy(stacked)
+    def numbers(*quantities: str) -> Tensor:
+        columns = [to_si(rows.values[:, layout.index[name]], layout.column(name).unit) for name in quantities]
+        return torch.from_numpy(np.stack(columns, axis=1))
 
-    def single(quantity: str) -> Tensor | None:
-        column = numbers(quantity)
-        return None if column is None else column[:, 0]
-
-    orientation = numbers(*layout.orientation)
-    to_rotation = rotation_from_quaternion if layout.orientation == QUATERNION else rotation_from_rpy
-    approach = torch.full((len(kept), layout.dof), torch.nan, dtype=torch.float64)
-    for quantity in layout.approaches:
-        approach[:, layout.column(quantity).approach - 1] = torch.from_numpy(
-            values[kept, layout.index[quantity]]
-        )
-    fields = {
-        "q": numbers(*layout.joints),
-        "position": numbers(*POSITION),
-        "rotation": None if orientation is None else to_rotation(orientation),
-        "anchor_place": numbers(*ANCHOR_PLACE),
-        "approach": None if bool(approach.isnan().all()) else approach,
-    }
+    fields = {"q": numbers(*layout.joints)}
+    for name, group in (("position", POSITION), ("anchor_place", ANCHOR_PLACE)):
+        if set(group) <= set(layout.index):
+            fields[name] = numbers(*group)
+    if layout.orientation:
+        to_rotation = rotation_from_quaternion if layout.orientation == QUATERNION else rotation_from_rpy
+        fields["rotation"] = to_rotation(numbers(*layout.orientation))
+    if layout.approaches:
+        fields["approach"] = torch.full_like(fields["q"], torch.nan)
+        for quantity in layout.approaches:
+            fields["approach"][:, layout.column(quantity).approach - 1] = numbers(quantity)[:, 0]
     singles = ("sigma_position", "sigma_rotation", "payload", "temperature", "touch", "distance")
-    fields |= {name: single(name) for name in (*singles, *reading_numbers())}
+    fields |= {name: numbers(name)[:, 0] for name in (*singles, *reading_numbers()) if name in layout.index}
     quantities = {name: "set" if name == "split" else name for name in (*TEXTS, *reading_texts())}
     texts = {
-        name: tuple(cells[layout.index[quantity]][row].strip() for row in kept)
+        name: rows.texts(layout.index[quantity])
         for name, quantity in quantities.items()
         if quantity in layout.index
     }
-    return MeasuredFields(
-        numbers={name: column for name, column in fields.items() if column is not None},
-        texts=texts,
-        line=tuple(table.lines[row] for row in kept),
-        source=table.source,
-        left_out=tuple(LeftOut(table.lines[row], faults[row]) for row in sorted(faults)),
-    )
+    return MeasuredFields(fields, texts, table.lines, table.source)
 
 
 def read_joints(path: str | os.PathLike[str], robot: Robot) -> Float64[Tensor, "rows dof"]:

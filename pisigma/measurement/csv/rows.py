@@ -1,4 +1,4 @@
-"""Which rows of a measurement file can be used: every cell checked, every fault with its column."""
+"""The cells of a measurement file: every one checked, every fault with its column."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,17 +6,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from pisigma.measurement.csv.header import ANCHOR_PLACE, QUATERNION, Column, Layout, from_si, quoted, to_si
+from pisigma.measurement.csv.header import QUATERNION, Column, Layout, quoted
 from pisigma.measurement.csv.table import Faults, Table
-from pisigma.measurement.lengths import LengthCells, group_faults, row_faults
-from pisigma.measurement.readings import READINGS, SensorReadings
+from pisigma.measurement.readings import READINGS, from_si, to_si
 from pisigma.robot import Robot, Row
 
 LIMIT_TOLERANCE = 1e-9
 """How far [rad or m] a joint value may lie outside its limits, for rounding."""
 
-LARGEST, SMALLEST_SIGMA = 1e9, 1e-9
-"""In the file's units: nothing that is measured is larger, and nothing is measured more exactly."""
+LARGEST = 1e9
+"""In the file's units: nothing that is measured is larger."""
 QUATERNION_TOLERANCE = 1e-3
 """How far the norm of a quaternion may be from 1."""
 
@@ -37,16 +36,20 @@ class CheckedRows:
     Attributes:
         values: numbers in the file's units; NaN where a cell is empty or holds a text.
         cells: the same as text.
-        faults: what is wrong with the rows that cannot be used, by row.
+        faults: what is wrong with the rows that cannot be used.
     """
 
     values: Float64[np.ndarray, "rows columns"]
     cells: list[Sequence[str]]
-    faults: dict[int, str]
+    faults: Faults
+
+    def texts(self, column: int) -> tuple[str, ...]:
+        """The texts of a column."""
+        return tuple(cell.strip() for cell in self.cells[column])
 
 
-def check_rows(table: Table, layout: Layout, robot: Robot | None) -> CheckedRows:
-    """Turn all cells into values and find the rows that cannot be used.
+def check_cells(table: Table, layout: Layout, robot: Robot | None) -> CheckedRows:
+    """Turn all cells into values and find those that cannot be used.
 
     Args:
         table: the file.
@@ -56,21 +59,16 @@ def check_rows(table: Table, layout: Layout, robot: Robot | None) -> CheckedRows
     faults = Faults(table.broken)
     cells = _cells(table, faults)
     values = np.stack([_numbers(cells[i], column, faults) for i, column in enumerate(layout.columns)], axis=1)
-    _check_texts(cells, layout, faults)
     _check_joints(values, layout, robot, faults)
     with np.errstate(over="ignore"):
         _check_measured(values, cells, layout, faults)
-    _check_optional(values, layout, faults)
     for readings in READINGS.values():
-        _check_readings(readings, values, cells, layout, faults)
-    lengths = _length_cells(values, cells, layout)
-    for rows, describe in row_faults(lengths):
-        faults.add(rows, describe)
-    _check_equal_rows(values, cells, layout, table, faults)
-    lines = [f"line {line}" for line in table.lines]
-    for rows, describe in group_faults(lengths, faults.sound(len(values)), lines.__getitem__):
-        faults.add(rows, describe)
-    return CheckedRows(values, cells, faults.reasons)
+        if set(readings.numbers) <= set(layout.index):
+            columns = [layout.column(name) for name in readings.numbers]
+            _check_whole(
+                np.isnan(values[:, [layout.index[name] for name in readings.numbers]]), columns, faults
+            )
+    return CheckedRows(values, cells, faults)
 
 
 def _cells(table: Table, faults: Faults) -> list[Sequence[str]]:
@@ -135,18 +133,6 @@ def _number(cell: str) -> float:
         return np.inf if "_" in cell else float(cell) if cell else np.nan
     except ValueError:
         return np.inf
-
-
-def _check_texts(cells: list[Sequence[str]], layout: Layout, faults: Faults) -> None:
-    """The column set holds train and test only."""
-    if "set" in layout.index:
-        texts = [cell.strip() for cell in cells[layout.index["set"]]]
-        faults.add(
-            np.array([text not in ("train", "test") for text in texts]),
-            lambda row: (
-                f"column 'set': '{texts[row]}' stands where train or test was wanted; write one of them"
-            ),
-        )
 
 
 def _check_joints(values: _Values, layout: Layout, robot: Robot | None, faults: Faults) -> None:
@@ -220,68 +206,12 @@ def _check_whole(missing: Bool[np.ndarray, "rows group"], columns: list[Column],
     )
 
 
-def _check_optional(values: _Values, layout: Layout, faults: Faults) -> None:
-    """Standard deviations are measurably above 0, payloads not below."""
-    for quantity in ("sigma_position", "sigma_rotation", "payload"):
-        if quantity in layout.index:
-            _check_sign(values[:, layout.index[quantity]], layout.column(quantity), faults)
-    for quantity in layout.approaches:
-        _check_approach(values[:, layout.index[quantity]], layout.column(quantity), faults)
-
-
-def _check_approach(values: Float64[np.ndarray, " rows"], column: Column, faults: Faults) -> None:
-    """The direction from which a joint came is +1 or -1 where it is stated."""
-    faults.add(
-        ~np.isnan(values) & (np.abs(values) != 1),
-        lambda row: (
-            f"column '{column.name}': {values[row]:.6g} stands where +1 (the joint value grew) or -1 (it fell) was "
-            "wanted; correct it or leave the cell empty"
-        ),
-    )
-
-
-def _check_sign(values: Float64[np.ndarray, " rows"], column: Column, faults: Faults) -> None:
-    """The values of one column are above 0, or not below for a payload."""
-    zero_too = column.quantity == "payload"
-    wanted = "0 or more" if zero_too else f"{SMALLEST_SIGMA:g} or more"
-    faults.add(
-        values < (0 if zero_too else SMALLEST_SIGMA),
-        lambda row: (
-            f"column '{column.name}': {values[row]:.6g} stands where {wanted} was wanted; correct it or "
-            "leave the cell empty"
-        ),
-    )
-
-
-def _check_readings(
-    readings: SensorReadings, values: _Values, cells: list[Sequence[str]], layout: Layout, faults: Faults
-) -> None:
-    """The readings of a registered sensor are there whole or not at all, and can be."""
-    if not {column.name for column in readings.columns} <= set(layout.index):
-        return
-    columns = [layout.column(name) for name in readings.numbers]
-    numbers = values[:, [layout.index[name] for name in readings.numbers]]
-    _check_whole(np.isnan(numbers), columns, faults)
-    texts = {name: _names(cells, layout, name) for name in readings.texts}
-    si = {column.quantity: to_si(numbers[:, k], column.unit) for k, column in enumerate(columns)}
-    for rows, describe in readings.row_faults({**si, **texts}):
-        faults.add(rows, lambda row, describe=describe: f"columns {quoted(columns)}: {describe(row)}")  # type: ignore[misc]
-
-
-def _check_equal_rows(
-    values: _Values,
-    cells: list[Sequence[str]],
-    layout: Layout,
-    table: Table,
-    faults: Faults,
-) -> None:
-    """No two rows are equal in all columns; the later one is at fault."""
-    texts = [
-        [cell.strip() for cell in cells[i]] for i, column in enumerate(layout.columns) if not column.is_number
-    ]
-    first = first_of_equal_rows(values, texts)
-    faults.add(
-        faults.sound(len(values)) & (first != np.arange(len(values))),
+def check_equal_rows(rows: CheckedRows, layout: Layout, table: Table) -> None:
+    """Find rows that equal another one in all columns; the later one is at fault."""
+    texts = [rows.texts(i) for i, column in enumerate(layout.columns) if not column.is_number]
+    first = first_of_equal_rows(rows.values, texts)
+    rows.faults.add(
+        rows.faults.sound(len(rows.values)) & (first != np.arange(len(rows.values))),
         lambda row: (
             f"all columns: the row equals line {table.lines[first[row]]}; remove one of them "
             "(a repeated measurement has other readings)"
@@ -297,49 +227,3 @@ def first_of_equal_rows(values: _Values, texts: Sequence[Sequence[str]]) -> Int6
     )
     first: dict[tuple[object, ...], int] = {}
     return np.array([first.setdefault(key, row) for row, key in enumerate(keys)], dtype=np.int64)
-
-
-def _length_cells(
-    values: Float64[np.ndarray, "rows columns"], cells: list[Sequence[str]], layout: Layout
-) -> LengthCells:
-    """The cells of a file as the rules for lengths want them, in the file's units."""
-    rows = len(values)
-
-    def numbers(quantity: str) -> Float64[np.ndarray, " rows"]:
-        return values[:, layout.index[quantity]] if quantity in layout.index else np.full(rows, np.nan)
-
-    def names(quantity: str) -> tuple[str, ...]:
-        return _names(cells, layout, quantity) if quantity in layout.index else ("",) * rows
-
-    others = {}
-    for sensor, readings in READINGS.items():
-        if readings.is_length:
-            others[sensor] = ~np.isnan(np.stack([numbers(name) for name in readings.numbers])).any(0)
-    labels = {quantity: f"column '{layout.column(quantity).name}'" for quantity in layout.index}
-    for name, group in (("position", layout.position), ("anchor_place", ANCHOR_PLACE)):
-        if set(group) <= set(layout.index):
-            labels[name] = f"columns {quoted(layout.column(quantity) for quantity in group)}"
-    labels |= {sensor: f"columns of '{sensor}'" for sensor in others}
-    labels["sigma"] = labels.get("sigma_position", "sigma_mm")
-    position = np.zeros(rows, dtype=bool)
-    if layout.position:
-        position = ~np.isnan(np.stack([numbers(name) for name in layout.position], axis=1)).any(1)
-    return LengthCells(
-        labels=labels,
-        frame=names("frame"),
-        socket=names("socket"),
-        touch_axis=names("touch_axis"),
-        anchor=names("anchor"),
-        pair=names("pair"),
-        position=position,
-        touch=numbers("touch"),
-        distance=numbers("distance"),
-        anchor_place=np.stack([numbers(name) for name in ANCHOR_PLACE], axis=1),
-        sigma=numbers("sigma_position"),
-        others=others,
-    )
-
-
-def _names(cells: list[Sequence[str]], layout: Layout, quantity: str) -> tuple[str, ...]:
-    """The texts of a quantity that the file has."""
-    return tuple(cell.strip() for cell in cells[layout.index[quantity]])

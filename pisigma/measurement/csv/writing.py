@@ -13,10 +13,10 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, OutputError
-from pisigma.measurement.csv.header import ANCHOR_PLACE, POSITION, QUATERNION, from_si
+from pisigma.measurement.csv.header import ANCHOR_PLACE, POSITION, QUATERNION
 from pisigma.measurement.csv.rows import first_of_equal_rows
 from pisigma.measurement.fields import KINDS, TEXTS, MeasuredFields
-from pisigma.measurement.readings import READINGS, Unit, reading_texts
+from pisigma.measurement.readings import READINGS, Unit, from_si, reading_texts
 
 
 def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: Sequence[bool]) -> None:
