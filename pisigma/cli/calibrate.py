@@ -107,8 +107,8 @@ def calibrate(
         **stated,
     )
     nominal = Robot.load(robot, base, tip)
-    with progress_of("calibrate") as tell:
-        calibration = workflow.calibrate(nominal, data, settings, tell)
+    with progress_of("calibrate") as progress:
+        calibration = workflow.calibrate(nominal, data, settings, progress)
     calibration.save(out, command=command_line(context))
     if as_json:
         print_json({"model": str(out), **calibration.to_json()})

@@ -6,14 +6,14 @@ import typer
 
 PayloadKg = Annotated[
     float | None,
-    typer.Option(help="What the robot carries, if the model learned what that does. [default: the usual]"),
+    typer.Option(help="Payload of the robot [kg], if the model learned what that does. [default: the usual]"),
 ]
 TemperatureC = Annotated[
-    float | None, typer.Option(help="Temperature of the robot, likewise. [default: the usual]")
+    float | None, typer.Option(help="Temperature of the robot [deg C], likewise. [default: the usual]")
 ]
 
 
 def given_conditions(payload_kg: float | None, temperature_c: float | None) -> dict[str, float]:
-    """Those that were given, by the names of columns of measurements."""
+    """The stated conditions, by the names of columns of measurements."""
     stated = {"payload_kg": payload_kg, "temperature_c": temperature_c}
     return {name: value for name, value in stated.items() if value is not None}

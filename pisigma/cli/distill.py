@@ -39,7 +39,7 @@ Orders = Annotated[
 Harmonics = Annotated[
     int | None,
     typer.Option(
-        help="With --orders: cycles a turn up to which a joint's own value is an input. [default: 1]"
+        help="With --orders: cycles a turn up to which the value of a joint is an input. [default: 1]"
     ),
 ]
 Seed = Annotated[int, typer.Option(help="Seed of poses and starts.")]
@@ -73,8 +73,8 @@ def distill(
         raise RecipeError(f"--seed {seed}: a whole number from 0 to 2^63 - 1 was wanted.")
     size, where = _size(orders, harmonics), _region(model, region, joints)
     settings = DistillationSettings(region=where, poses=poses, size=size, seed=seed)
-    with progress_of("distillation") as tell:
-        distillation = run(model, settings, tell)
+    with progress_of("distillation") as progress:
+        distillation = run(model, settings, progress)
     distillation.save(out, command=command_line(context, ("out", "joints")))
     if as_json:
         print_json({"model": str(out), **distillation.to_json()})

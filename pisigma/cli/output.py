@@ -121,7 +121,7 @@ def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
     """
 
     @functools.wraps(command)
-    def told(*args: Any, **kwargs: Any) -> None:
+    def guarded(*args: Any, **kwargs: Any) -> None:
         try:
             command(*args, **kwargs)
         except AcceptanceError as problem:
@@ -136,7 +136,7 @@ def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
             typer.echo("pisigma: interrupted; nothing was left half written.", err=True)
             raise typer.Exit(_INTERRUPTED) from None
 
-    return told
+    return guarded
 
 
 def fail(sentence: str, status: int = 2) -> None:

@@ -44,7 +44,7 @@ class CalibrationValidation:
         distances: by model, predicted minus known distances of sockets that were held out [m].
         frames_fitted: how many frames were held out whole; where the base stands in them was fitted to the
             held-out rows themselves, under either arm.
-        sockets_held_out: how many sockets were held out whole; their errors are from where their own rows put the
+        sockets_held_out: how many sockets were held out whole; their errors are from where their rows put the
             ball on average.
         not_judged: how many held-out rows have a target or an anchor that the rows calibrated with lack.
         again: the same for other folds, whose errors count in the figures too.
@@ -81,7 +81,7 @@ class CalibrationValidation:
         """The figures in mm and deg of all repeats.
 
         Args:
-            simulations: training and test rows of each of several simulations; their RMS errors are given one by one.
+            simulations: training and test rows of each of several simulations; their RMS errors are listed one by one.
         """
         last = list(self.models.values())[-1]
         figures: dict[str, object] = {"folds": self.folds} if self.folds else {}

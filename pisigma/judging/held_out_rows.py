@@ -28,7 +28,7 @@ _DEGREES = float(np.rad2deg(1.0))
 
 @dataclass(frozen=True, eq=False)
 class HeldOutRows:
-    """Errors of rows under calibrations that never saw them, in the order of the measurements.
+    """Errors of rows under calibrations without them, in the order of the measurements.
 
     Attributes:
         q: commanded joint values [rad or m].

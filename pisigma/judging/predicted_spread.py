@@ -67,8 +67,8 @@ class PredictedSpread:
 def predicted_spread(result: HybridResult, measurements: Measurements) -> PredictedSpread:
     """Errors of measured positions under a hybrid calibration, and what it predicts of them.
 
-    The noise of the measurement is what the calibration found, or, where its rows stated theirs, what these rows
-    state times the factor that was found; rows that then state none are exact.
+    The noise of the measurement is what the residuals of the calibration show, or, where its rows stated theirs, what
+    these rows state times the factor that the residuals show; rows that then state none are exact.
 
     Raises:
         IdentificationError: a row has a target that was not calibrated.

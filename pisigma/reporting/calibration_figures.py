@@ -28,7 +28,7 @@ SPREAD_PNG = "predicted_spread.png"
 _UNITS = {"position": ("mm", 1e3), "rotation": ("deg", float(np.rad2deg(1.0)))}
 _REDUNDANT = 1 - 1e-6
 STYLES = {"nominal": (":", "s"), "geometric": ("--", "o"), "hybrid": ("-", "^")}
-"""Line and mark of every model, so that they are told apart without colour."""
+"""Line and mark of every model, so that they differ without colour too."""
 POINTS = 2_000
 """Points of a curve: 18 to a period of the 110th harmonic."""
 MOST_DOTS = 2_000
@@ -81,10 +81,10 @@ def draw_held_out(held_out: Mapping[str, Float64[np.ndarray, " held"]], path: Pa
     figure = Figure(figsize=(7.6, 3.8), layout="constrained")
     axes = figure.subplots()
     for (name, lengths), style in zip(held_out.items(), ("--", "-", "-.", ":"), strict=False):
-        known = np.maximum(np.sort(lengths[np.isfinite(lengths)]) * 1e3, 1e-15)
-        share = np.arange(1, len(known) + 1) / len(known) * 100
-        rms, largest = np.sqrt((known**2).mean()), known.max(initial=0.0)
-        axes.plot(known, share, style, label=f"{name}: RMS {rms:.3g} mm, largest {largest:.3g} mm")
+        errors = np.maximum(np.sort(lengths[np.isfinite(lengths)]) * 1e3, 1e-15)
+        share = np.arange(1, len(errors) + 1) / len(errors) * 100
+        rms, largest = np.sqrt((errors**2).mean()), errors.max(initial=0.0)
+        axes.plot(errors, share, style, label=f"{name}: RMS {rms:.3g} mm, largest {largest:.3g} mm")
     axes.set(xlabel="position error [mm]", ylabel="share of rows below [%]", xscale="log", ylim=(0, 100))
     axes.set_title("rows that the calibration did not see", loc="left", fontsize=10)
     low, high = axes.get_xlim()
@@ -144,17 +144,19 @@ def draw_corrections(correction: JointCorrection, measurements: Measurements, pa
     figure = Figure(figsize=(10.0, 2.3 * rows + 0.5), layout="constrained")
     panels = figure.subplots(rows, 2, squeeze=False).flatten()
     with torch.no_grad():
-        seen = correction.of_rows(measurements).numpy()
+        corrections = correction.of_rows(measurements).numpy()
     for j, (axes, joint) in enumerate(zip(panels, joints, strict=False)):
         unit, factor, small, scale = (
             ("deg", float(np.rad2deg(1.0)), "mdeg", float(np.rad2deg(1e3)))
             if joint.type == "revolute"
             else ("mm", 1e3, "µm", 1e6)
         )
-        own, line = _over_own_value(correction, q, j)
+        values, line = _over_own_value(correction, q, j)
         step = max(len(q) // MOST_DOTS, 1)
-        axes.plot(q[::step, j].numpy() * factor, seen[::step, j] * scale, ".", color="0.55", markersize=2.5)
-        axes.plot(own * factor, line * scale, "-", color="black", linewidth=0.8)
+        axes.plot(
+            q[::step, j].numpy() * factor, corrections[::step, j] * scale, ".", color="0.55", markersize=2.5
+        )
+        axes.plot(values * factor, line * scale, "-", color="black", linewidth=0.8)
         axes.axhline(0.0, color="black", linewidth=0.5, linestyle=":")
         axes.set_title(joint.name, loc="left", fontsize=10)
         axes.set_xlabel(f"joint value [{unit}]", fontsize=9)
@@ -173,11 +175,11 @@ def _over_own_value(
     correction: JointCorrection, q: Float64[Tensor, "rows dof"], joint: int
 ) -> tuple[Float64[np.ndarray, " points"], Float64[np.ndarray, " points"]]:
     """Values of one joint over its measured range, the others at their medians, and its corrections there."""
-    own = torch.linspace(float(q[:, joint].min()), float(q[:, joint].max()), POINTS, dtype=torch.float64)
+    values = torch.linspace(float(q[:, joint].min()), float(q[:, joint].max()), POINTS, dtype=torch.float64)
     at = q.median(0).values.repeat(POINTS, 1)
-    at[:, joint] = own
+    at[:, joint] = values
     with torch.no_grad():
-        return own.numpy(), correction(at)[:, joint].numpy()
+        return values.numpy(), correction(at)[:, joint].numpy()
 
 
 def draw_learning_curve(points: Sequence[LearningPoint], path: Path) -> None:
@@ -220,8 +222,8 @@ def draw_spread(spread: PredictedSpread, path: Path) -> None:
         spread: with at least one judged value.
         path: the PNG to write.
     """
-    known = torch.isfinite(spread.error) & torch.isfinite(spread.sigma)
-    sigma, error = spread.sigma[known].numpy() * 1e3, np.abs(spread.error[known].numpy()) * 1e3
+    judged = torch.isfinite(spread.error) & torch.isfinite(spread.sigma)
+    sigma, error = spread.sigma[judged].numpy() * 1e3, np.abs(spread.error[judged].numpy()) * 1e3
     order = sigma.argsort(kind="stable")
     sigma, error = sigma[order], error[order]
     figure = Figure(figsize=(6.8, 5.2), layout="constrained")

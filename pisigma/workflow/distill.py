@@ -45,7 +45,7 @@ from pisigma.model.stored_starts import spread_rows
 from pisigma.reporting.distilled_card import write_distilled_card
 from pisigma.robot.description import Robot
 from pisigma.se3 import pose_error
-from pisigma.workflow.distilled_network import Size, Trial, choose_network, sizes_for
+from pisigma.workflow.distilled_network import Size, choose_network, sizes_for
 from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.solved_poses import SINGULAR_BELOW, Region, SolvedPoses, draw_solved_poses
 
@@ -91,7 +91,6 @@ class Distillation(AbstractModelResult):
         model: the distilled model, with all figures as its metrics.
         parent: the model it was distilled from.
         region: where.
-        trials: sizes that were fitted, in order.
         held_out: poses that were neither fitted to nor chosen by.
         predicted: what the network adds to their nominal joint values [rad or m].
         summary: all figures.
@@ -101,7 +100,6 @@ class Distillation(AbstractModelResult):
     model: CalibratedModel
     parent: CalibratedModel
     region: Region
-    trials: tuple[Trial, ...]
     held_out: SolvedPoses
     predicted: Float64[Tensor, "poses dof"]
     summary: DistillationSummary
@@ -150,7 +148,7 @@ def distill(
     total = settings.poses + choosing + judging
     every = draw_solved_poses(CorrectedIK(parent), region, total, generator, progress)
     fitted, chosen_by = slice(settings.poses), slice(settings.poses, settings.poses + choosing)
-    network, trials = choose_network(
+    network, sizes_tried = choose_network(
         parent, every, (fitted, chosen_by), sizes, (settings.seed, settings.epochs), progress
     )
     held_out = _rows(every, slice(settings.poses + choosing, None))
@@ -169,10 +167,10 @@ def distill(
         tools=parent.tools,
         provenance=_provenance(parent, sha256, settings),
     )
-    summary = _summary(distilled, parent, region, trials, settings.poses, held_out, predicted)
+    summary = _summary(distilled, parent, region, sizes_tried, settings.poses, held_out, predicted)
     distilled = replace(distilled, metrics=summary.to_json())
     seconds = time.perf_counter() - started
-    return Distillation(distilled, parent, region, trials, held_out, predicted, summary, seconds)
+    return Distillation(distilled, parent, region, held_out, predicted, summary, seconds)
 
 
 def _check_parent(parent: CalibratedModel) -> None:
@@ -224,7 +222,7 @@ def _summary(
     model: CalibratedModel,
     parent: CalibratedModel,
     region: Region,
-    trials: tuple[Trial, ...],
+    sizes: tuple[SizeFigures, ...],
     fitted: int,
     poses: SolvedPoses,
     predicted: Float64[Tensor, "poses dof"],
@@ -250,20 +248,11 @@ def _summary(
             drawn=poses.drawn,
             refused=poses.refused,
         ),
-        sizes=tuple(
-            SizeFigures(
-                orders=trial.size.orders,
-                harmonics=trial.size.harmonics,
-                unknowns=trial.unknowns,
-                rms_mm=trial.error * 1e3,
-                kept=trial.kept,
-            )
-            for trial in trials
-        ),
+        sizes=sizes,
         held_out=held_out,
         joints=_joint_errors(parent.robot, poses.correction, predicted),
         warnings=_warnings(held_out, len(region.q), parent.robot.dof),
-        limitations=_limitations(parent, held_out.distilled, trials),
+        limitations=_limitations(parent, held_out.distilled, sizes),
     )
 
 
@@ -286,7 +275,9 @@ def _warnings(held_out: DistilledErrors, rows: int, joints: int) -> tuple[str, .
     return tuple(sentences)
 
 
-def _limitations(parent: CalibratedModel, errors: ErrorFigures, trials: tuple[Trial, ...]) -> tuple[str, ...]:
+def _limitations(
+    parent: CalibratedModel, errors: ErrorFigures, sizes: tuple[SizeFigures, ...]
+) -> tuple[str, ...]:
     """What the full solution has and the distilled one lacks."""
     sentences = [
         f"Exactness: on held-out poses of the region the tool is {errors.rms_mm:.4f} mm RMS (95 % within "
@@ -295,12 +286,12 @@ def _limitations(parent: CalibratedModel, errors: ErrorFigures, trials: tuple[Tr
     ]
     features = () if parent.hybrid is None else parent.hybrid.correction.features
     harmonics = max((one.harmonics for one in features if isinstance(one, FourierSeries)), default=1)
-    inputs = next(trial.size.harmonics for trial in trials if trial.kept)
+    inputs = next(size.harmonics for size in sizes if size.kept)
     if harmonics > inputs:
         sentences.append(
             f"Fast ripple: the parent corrects every joint by a series of up to {harmonics} cycles a turn, this "
             f"network sees {'sine and cosine' if inputs == 1 else f'up to {inputs} cycles'} of the joint's nominal "
-            f"value and follows what is slower{_without_overtones(trials)}."
+            f"value and follows what is slower{_without_overtones(sizes)}."
         )
     conditions = None if parent.hybrid is None else learned_conditions(parent.hybrid.correction)
     if conditions is not None:
@@ -315,12 +306,13 @@ def _limitations(parent: CalibratedModel, errors: ErrorFigures, trials: tuple[Tr
     )
 
 
-def _without_overtones(trials: tuple[Trial, ...]) -> str:
+def _without_overtones(sizes: tuple[SizeFigures, ...]) -> str:
     """What sines and cosines of the joints alone would give, where that was tried and something else taken."""
-    smooth = [trial.error for trial in trials if trial.size.harmonics == 1]
-    if not smooth or any(trial.kept and trial.size.harmonics == 1 for trial in trials):
+    smooth = [size for size in sizes if size.harmonics == 1]
+    if not smooth or any(size.kept for size in smooth):
         return ""
-    return f" (with sines and cosines of the joints alone it would be {min(smooth) * 1e3:.4f} mm RMS)"
+    error = min(size.rms_mm for size in smooth)
+    return f" (with sines and cosines of the joints alone it would be {error:.4f} mm RMS)"
 
 
 def _region(region: Region, poses: SolvedPoses, robot: Robot) -> RegionFigures:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pisigma.errors import IdentificationError
 from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.judging.distillation_summary import SizeFigures
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.pi_sigma import PiSigma
@@ -61,23 +62,6 @@ RIPPLED = (Size((1, 2)), Size((1, 2, 3)), Size((1, 2, 3), 8), Size((1, 2, 3), 24
 """Sizes where gears and encoders run out of true as well."""
 
 
-@dataclass(frozen=True)
-class Trial:
-    """A size that was fitted.
-
-    Attributes:
-        size: of the network.
-        unknowns: number of weights and biases per joint.
-        error: RMS of the tool's error against the full solution, over the poses for choosing [m].
-        kept: whether it was chosen.
-    """
-
-    size: Size
-    unknowns: int
-    error: float
-    kept: bool
-
-
 def sizes_for(model: CalibratedModel, poses: int) -> tuple[Size, ...]:
     """Give the sizes to try for a model with so many poses to fit, small ones first.
 
@@ -106,7 +90,7 @@ def choose_network(
     sizes: tuple[Size, ...],
     search: tuple[int, int],
     progress: Callable[[str], None],
-) -> tuple[CorrectionNetwork, tuple[Trial, ...]]:
+) -> tuple[CorrectionNetwork, tuple[SizeFigures, ...]]:
     """Give the smallest network that is about as good as the best, and all that were tried.
 
     Args:
@@ -137,10 +121,17 @@ def choose_network(
             break
     best = min(error for *_, error in fits)
     kept = next(k for k, (*_, error) in enumerate(fits) if error <= max(AS_GOOD * best, ENOUGH))
-    trials = tuple(
-        Trial(size, size.unknowns(parent.robot), error, k == kept) for k, (_, size, error) in enumerate(fits)
+    sizes_tried = tuple(
+        SizeFigures(
+            orders=size.orders,
+            harmonics=size.harmonics,
+            unknowns=size.unknowns(parent.robot),
+            rms_mm=error * 1e3,
+            kept=k == kept,
+        )
+        for k, (_, size, error) in enumerate(fits)
     )
-    return fits[kept][0], trials
+    return fits[kept][0], sizes_tried
 
 
 def _pairs(poses: SolvedPoses, rows: slice) -> TrainingPairs:
@@ -192,7 +183,7 @@ def _fit_size(
 
 
 def _sections(robot: Robot, size: Size, q: Float64[Tensor, "poses dof"]) -> list[NetworkSection]:
-    """One group of all joints, or one of each joint where it sees its own overtones."""
+    """One group of all joints, or one of each joint where its overtones are inputs."""
     names = [joint.name for joint in robot.joints]
     moves = ((q.amax(0) - q.amin(0)) > _STILL).tolist()
     shared: list[str] = []
@@ -208,8 +199,8 @@ def _sections(robot: Robot, size: Size, q: Float64[Tensor, "poses dof"]) -> list
     sections = []
     for name, turns, moving in zip(names, robot.revolute, moves, strict=True):
         multiples = range(2, size.harmonics + 1) if turns and moving else ()
-        own = [f"{function}({k}*{name})" for k in multiples for function in ("sin", "cos")]
-        sections.append(NetworkSection(joints=(name,), inputs=(*shared, *own), orders=size.orders))
+        overtones = [f"{function}({k}*{name})" for k in multiples for function in ("sin", "cos")]
+        sections.append(NetworkSection(joints=(name,), inputs=(*shared, *overtones), orders=size.orders))
     return sections
 
 

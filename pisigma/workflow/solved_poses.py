@@ -74,7 +74,7 @@ def draw_solved_poses(
     region: Region,
     count: int,
     generator: torch.Generator,
-    tell: Callable[[str], None] = lambda what: None,
+    progress: Callable[[str], None] = lambda what: None,
 ) -> SolvedPoses:
     """Draw poses until as many as wanted could be solved.
 
@@ -83,7 +83,7 @@ def draw_solved_poses(
         region: where.
         count: how many are wanted.
         generator: draws them.
-        tell: is called with the state of the work.
+        progress: called with what is being done.
 
     Raises:
         IdentificationError: the robot takes too few of the poses of the region; the message says why not.
@@ -99,7 +99,7 @@ def draw_solved_poses(
         refused = {name: refused.get(name, 0) + number for name, number in reasons.items()}
         if TRIES * have < drawn:
             raise IdentificationError(_complaint(ik, region, have, drawn, refused))
-        tell(f"{min(have, count)} of {count} poses solved")
+        progress(f"{min(have, count)} of {count} poses solved")
     T, q_nominal, correction, branch, status = (torch.cat(part)[:count] for part in zip(*kept, strict=True))
     return SolvedPoses(T, q_nominal, correction, branch, status, drawn, refused)
 
@@ -139,35 +139,36 @@ def _solve(
     q = draw_between(robot, region.q, count, generator)
     T = forward_kinematics(robot, q)
     if region.box is None:
-        found = ik(T, near=q)
+        solution = ik(T, near=q)
     else:
         low, high = T.new_tensor(region.box[::2]), T.new_tensor(region.box[1::2])
         T[:, :3, 3] = low + (high - low) * torch.rand(count, 3, generator=generator, dtype=T.dtype)
-        found = ik(T)
-    nominal = found.q_nominal
-    lost = (found.status == Status.UNREACHABLE) | ~torch.isfinite(nominal).all(-1)
+        solution = ik(T)
+    nominal = solution.q_nominal
+    lost = (solution.status == Status.UNREACHABLE) | ~torch.isfinite(nominal).all(-1)
     safe = torch.where(lost[:, None], q, nominal)
     limits = torch.from_numpy(robot.limits)
     outside = (safe < limits[:, 0] - LIMIT_TOLERANCE) | (safe > limits[:, 1] + LIMIT_TOLERANCE)
     away = (safe - q).abs().amax(-1) > _MOVED if region.box is None else torch.zeros_like(lost)
     reasons = {
         "unreachable": lost,
-        "outside the joint limits": outside.any(-1) | (found.status == Status.OUTSIDE_JOINT_LIMITS),
-        "singular": (singularity_measure(robot, safe) < SINGULAR_BELOW) | (found.status == Status.SINGULAR),
+        "outside the joint limits": outside.any(-1) | (solution.status == Status.OUTSIDE_JOINT_LIMITS),
+        "singular": (singularity_measure(robot, safe) < SINGULAR_BELOW)
+        | (solution.status == Status.SINGULAR),
         "on another branch": away,
     }
     counts, good = {}, torch.ones_like(lost)
     for name, bad in reasons.items():
         counts[name] = int((good & bad).sum())
         good = good & ~bad
-    parts = (T, nominal, found.q - nominal, found.branch, found.status)
+    parts = (T, nominal, solution.q - nominal, solution.branch, solution.status)
     return tuple(part[good] for part in parts), counts
 
 
 def _complaint(ik: CorrectedIK, region: Region, have: int, drawn: int, refused: dict[str, int]) -> str:
     """Say that the region is not one for the robot."""
     reasons = ", ".join(f"{number} {name}" for name, number in refused.items() if number)
-    where = "around the joint values given"
+    where = "around the stated joint values"
     if region.box is not None:
         low, high = (", ".join(f"{value * 1e3:g}" for value in region.box[i::2]) for i in (0, 1))
         where = f"between ({low}) and ({high}) mm"

@@ -148,10 +148,11 @@ def test_a_given_seed_gives_the_same_model():
 
 def test_the_smallest_size_that_is_good_is_kept():
     found = distilled("hybrid", "kiro3", None, 800)
-    assert [trial.size for trial in found.trials][:2] == [Size((1, 2)), Size((1, 2, 3))]
-    (kept,) = (trial for trial in found.trials if trial.kept)
-    assert kept.error <= max(1.1 * min(trial.error for trial in found.trials), 5e-6)
-    assert kept.size.harmonics == found.trials[-1].size.harmonics > 1
+    sizes = found.summary.sizes
+    assert [size.orders for size in sizes][:2] == [(1, 2), (1, 2, 3)]
+    (kept,) = (size for size in sizes if size.kept)
+    assert kept.rms_mm <= max(1.1 * min(size.rms_mm for size in sizes), 5e-3)
+    assert kept.harmonics == sizes[-1].harmonics > 1
 
 
 def test_sizes_fit_the_number_of_poses_and_the_parent():
