@@ -62,7 +62,10 @@ def evaluate(
     limits = workflow.Limits(max_mean_mm, max_p95_mm, max_mm, max_mean_deg)
     settings = workflow.EvaluationSettings(limits, fit_frame, Bootstrap(resamples, seed))
     evaluation = workflow.evaluate(paths[:-1], paths[-1], settings)
-    print_json(evaluation.to_json()) if as_json else _print(evaluation)
+    if as_json:
+        print_json(evaluation.to_json())
+    else:
+        _print(evaluation)
     if not evaluation.accepted:
         raise AcceptanceError(f"not accepted: {'; '.join(evaluation.missed)}.")
 

@@ -34,7 +34,10 @@ def verify(
 
     with progress_of(f"verifying {model}"):
         verification = workflow.verify(model, data, workflow.VerificationSettings(fit_frame))
-    print_json(verification.to_json()) if as_json else _print(verification)
+    if as_json:
+        print_json(verification.to_json())
+    else:
+        _print(verification)
     if not verification.accepted:
         raise AcceptanceError(verification.sentence)
 

@@ -221,28 +221,25 @@ class _Trial:
         model: without what costs time; maps are tried on it before the whole model judges them.
         some: rows of one frame.
         measured: their poses.
-        free_frame: whether the frame is fitted anew for every map.
     """
 
     model: CalibratedModel
     some: Measurements
     measured: MeasuredPoses
-    free_frame: bool
 
-    def errors(self, maps: JointMaps) -> Float64[Tensor, " maps"]:
-        """Compute the mean squared errors [m²] with every map."""
+    def errors(self, maps: JointMaps) -> Float64[Tensor, "2 maps"]:
+        """Compute the mean squared errors [m²] with every map: in the frame as it is, and in one fitted to the map."""
         chunks = torch.split(torch.arange(len(maps.order)), max(1, _MOST_POSES // self.some.rows))
-        return torch.cat([self._errors(maps.select(chunk)) for chunk in chunks])
+        return torch.cat([self._errors(maps.select(chunk)) for chunk in chunks], 1)
 
-    def _errors(self, maps: JointMaps) -> Float64[Tensor, " maps"]:
+    def _errors(self, maps: JointMaps) -> Float64[Tensor, "2 maps"]:
         q, count = maps.of(self.some.q), len(maps.order)
         repeated = Measurements(
             q=q.flatten(0, 1), frame=self.some.frame * count, target=self.some.target * count
         )
         T = poses_of_rows(self.model, repeated).reshape(*q.shape[:2], 4, 4)
-        if self.free_frame:
-            T = best_base(T, self.measured)[:, None] @ T
-        return self.measured.squares(T).mean(-1)
+        fitted = best_base(T, self.measured)[:, None] @ T
+        return torch.stack([self.measured.squares(poses).mean(-1) for poses in (T, fitted)])
 
 
 def likely_maps(model: CalibratedModel, measurements: Measurements, measured: MeasuredPoses) -> JointMaps:
@@ -256,23 +253,25 @@ def likely_maps(model: CalibratedModel, measurements: Measurements, measured: Me
         measurements: rows with positions.
         measured: their poses.
     """
-    rows = _screened_rows(measurements)
-    robot = model.robot
+    rows, robot = _screened_rows(measurements), model.robot
+    trial = _Trial(
+        replace(model, hybrid=None, network=None), measurements.select(rows), measured.select(rows)
+    )
     kinds = (
         other_units(robot),
         reversed_signs(robot.dof),
         other_orders(robot.dof),
         quarter_turned_zeros(robot),
     )
+    tried = [(maps, trial.errors(maps)) for maps in kinds]
+    unchanged = trial.errors(JointMaps.unchanged(1, robot.dof))[:, 0].tolist()
     likely: list[JointMaps] = []
-    for free_frame in (False, True):
-        geometry = replace(model, hybrid=None, network=None)
-        trial = _Trial(geometry, measurements.select(rows), measured.select(rows), free_frame)
-        tried = [(maps, trial.errors(maps)) for maps in (*kinds, _best_zeros(trial))]
-        least = min(float(errors.min()) for _, errors in tried if len(errors))
-        limit = PROMISING**2 * float(trial.errors(JointMaps.unchanged(1, robot.dof)))
-        limit = min(limit, max(NEAR_BEST**2 * least, NOTICED**2))
-        for maps, errors in tried:
+    for frame in (0, 1):
+        zeros = _best_zeros(trial, frame)
+        candidates = [(maps, errors[frame]) for maps, errors in (*tried, (zeros, trial.errors(zeros)))]
+        least = min(float(errors.min()) for _, errors in candidates if len(errors))
+        limit = min(PROMISING**2 * unchanged[frame], max(NEAR_BEST**2 * least, NOTICED**2))
+        for maps, errors in candidates:
             best = errors.argsort()[:KEPT]
             likely.append(maps.select(best[errors[best] <= limit]))
     return _distinct(likely)
@@ -286,8 +285,13 @@ def _screened_rows(measurements: Measurements) -> Int64[Tensor, " chosen"]:
     return rows[torch.linspace(0, len(rows) - 1, count).round().long()]
 
 
-def _best_zeros(trial: _Trial) -> JointMaps:
-    """Find per joint the zero that explains most, moved by any amount; by a quarter turn where it is almost one."""
+def _best_zeros(trial: _Trial, frame: int) -> JointMaps:
+    """Find per joint the zero that explains most, moved by any amount; by a quarter turn where it is almost one.
+
+    Args:
+        trial: what to explain.
+        frame: 0 for the frame as it is, 1 for one that is fitted to every map.
+    """
     robot, dof = trial.model.robot, trial.model.robot.dof
     width = torch.tensor(
         [torch.pi if turns else robot.reach for turns in robot.revolute], dtype=torch.float64
@@ -297,7 +301,7 @@ def _best_zeros(trial: _Trial) -> JointMaps:
     grid = torch.linspace(-1, 1, 2 * STEPS + 1, dtype=torch.float64)
     for _ in range(FINER):
         tried = by[:, None] + width[:, None] * grid
-        errors = trial.errors(moved_zeros(joints, tried.flatten(), dof)).reshape(tried.shape)
+        errors = trial.errors(moved_zeros(joints, tried.flatten(), dof))[frame].reshape(tried.shape)
         by = tried.gather(1, errors.argmin(1, keepdim=True))[:, 0]
         width = width * 2 / STEPS
     near = (by / QUARTER).round() * QUARTER

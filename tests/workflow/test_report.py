@@ -1,0 +1,42 @@
+"""A report in Python: what the command writes, in one call."""
+
+import json
+
+import pytest
+from testing.report import geometric_under_test, measured
+
+import pisigma
+from pisigma.errors import MeasurementError, OutputError
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.folder.model_folder import save_model
+
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A model folder and rows to judge it on."""
+    path = tmp_path_factory.mktemp("report")
+    arm, model = geometric_under_test()
+    (path / "plain").mkdir()
+    save_model(model, path / "plain")
+    measured(arm, 30, seed=9).write_csv(path / "rows.csv", model.robot)
+    return path
+
+
+def test_a_report_says_and_saves(folder, tmp_path):
+    said = []
+    report = pisigma.report(folder / "plain", folder / "rows.csv", said.append)
+    assert said == ["judging rows", "drawing"]
+    assert report.verdict in json.dumps(report.to_json(), ensure_ascii=False)
+    written = report.save(tmp_path / "page.html", tmp_path / "figures")
+    assert len(written) == 2 * len(report.figures.all)
+    assert report.verdict.split(";")[0] in (tmp_path / "page.html").read_text()
+    with pytest.raises(OutputError, match=r"\.html"):
+        report.save(tmp_path / "page.pdf")
+
+
+def test_rows_that_cannot_be_judged_are_refused(folder):
+    q = geometric_under_test()[1].starts[:5]
+    with pytest.raises(MeasurementError, match="cannot be judged on this file"):
+        pisigma.report(folder / "plain", Measurements(q=q))
