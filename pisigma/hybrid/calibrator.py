@@ -10,7 +10,7 @@ from pisigma.hybrid.coverage import JointCoverage, fade_angle
 from pisigma.hybrid.design import Rows
 from pisigma.hybrid.evidence import effective_share
 from pisigma.hybrid.mini_batches import MANY_ROWS, MiniBatches, batch_checkpoints, refine_in_batches
-from pisigma.hybrid.refinement import Refined, refine, with_frames_of, with_held_factors
+from pisigma.hybrid.refinement import Refined, refine, with_all_factors, with_frames_of
 from pisigma.hybrid.result import HybridResult, LearnedPart
 from pisigma.hybrid.search import LARGEST_EFFECTIVE_SHARE, Additive, Search, best_products
 from pisigma.hybrid.sensor_values import sensor_values
@@ -32,7 +32,7 @@ SEARCHED_ROWS = 4_000
 """Features and product units are chosen on so many rows at most; everything is fitted to all in the end."""
 
 
-@dataclass(frozen=True, init=False)
+@dataclass(frozen=True)
 class HybridCalibrator:
     """Fits `T(q) = base · Π A_i(q_i + Δ_i(q); dh_i + ε_i) · tool` to measurements, Δ a Pi-Sigma network.
 
@@ -41,7 +41,7 @@ class HybridCalibrator:
     the geometric calibration.
 
     Attributes:
-        geometric: the geometric calibrator, whose robot, sensors, priors and loss are used.
+        robot: the nominal robot; or its geometric calibrator, where that needs other settings than its defaults.
         features: of the unit of order 1 that are tried, by the names of `joint_correction.registry.FEATURES`.
         harmonics: of the Fourier series, tried in this order.
         orders: numbers of factors of product units, tried in this order; none for an additive correction.
@@ -50,50 +50,14 @@ class HybridCalibrator:
             normal equations of all rows: True or False; how; or "auto", which does so from `MANY_ROWS` rows on.
     """
 
-    geometric: GeometricCalibrator
+    robot: Robot | GeometricCalibrator
     features: tuple[str, ...] = ("gravity", "conditions", "backlash", "series")
     harmonics: tuple[int, ...] = (8, 24, 56, 110)
     orders: tuple[tuple[int, ...], ...] = ((2,), (2, 2), (2, 2, 2, 2))
     gravity: tuple[float, float, float] = (0.0, 0.0, -1.0)
     mini_batches: MiniBatches | bool | Literal["auto"] = "auto"
 
-    def __init__(
-        self,
-        geometric: Robot | GeometricCalibrator,
-        features: tuple[str, ...] = features,
-        harmonics: tuple[int, ...] = harmonics,
-        orders: tuple[tuple[int, ...], ...] = orders,
-        gravity: tuple[float, float, float] = gravity,
-        mini_batches: MiniBatches | bool | Literal["auto"] = mini_batches,
-    ) -> None:
-        """Choose what may be tried.
-
-        Args:
-            geometric: the nominal robot; or a geometric calibrator, where that needs other settings than its
-                defaults.
-            features: see above, as all others.
-            harmonics: of the Fourier series.
-            orders: of the product units.
-            gravity: direction.
-            mini_batches: whether, and how.
-
-        Raises:
-            IdentificationError: a choice does not exist.
-        """
-        if isinstance(geometric, Robot):
-            geometric = GeometricCalibrator(geometric)
-        for name, value in (
-            ("geometric", geometric),
-            ("features", features),
-            ("harmonics", harmonics),
-            ("orders", orders),
-            ("gravity", gravity),
-            ("mini_batches", mini_batches),
-        ):
-            object.__setattr__(self, name, value)
-        self._check()
-
-    def _check(self) -> None:
+    def __post_init__(self) -> None:
         """Refuse choices that do not exist."""
         for name in self.features:
             if name not in FEATURES:
@@ -109,6 +73,11 @@ class HybridCalibrator:
             raise IdentificationError(
                 f"orders={self.orders}: a product unit has two factors or more; give tuples such as (2,)."
             )
+
+    @property
+    def geometric(self) -> GeometricCalibrator:
+        """The geometric calibrator, whose sensors, priors and loss are used."""
+        return GeometricCalibrator(self.robot) if isinstance(self.robot, Robot) else self.robot
 
     def fit(
         self,
@@ -167,7 +136,7 @@ class HybridCalibrator:
             f"A joint correction was kept ({' + '.join(names)}): left-out rows are predicted with {share:.2f} "
             f"times the error of the geometric calibration. {trained}".rstrip()
         )
-        whole = with_held_factors(refined)
+        whole = with_all_factors(refined)
         uncertainty = position_uncertainty(
             whole.rows, whole.design, whole.posterior, whole.sums, learned.geometry
         )
@@ -252,8 +221,8 @@ def _geometric_alone(solved: SolvedCalibration, search: Search, verdict: str) ->
     """The geometric calibration, with the uncertainty of its positions."""
     geometry = identified_geometry(solved.setup, solved.solution.linearisation.point)
     first = search.geometry
-    known = position_uncertainty(search.rows, first.design, first.posterior, first.sums, geometry)
-    return HybridResult(solved.result(), None, known, tuple(search.trials), verdict)
+    uncertainty = position_uncertainty(search.rows, first.design, first.posterior, first.sums, geometry)
+    return HybridResult(solved.result(), None, uncertainty, tuple(search.trials), verdict)
 
 
 def searched_rows(problem: CalibrationProblem) -> CalibrationProblem:

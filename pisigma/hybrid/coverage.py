@@ -53,11 +53,11 @@ class JointCoverage:
         """Stretches around measured joint values."""
         rate = torch.from_numpy(turning_rate(robot))
         turning = tuple(bool(turns) for turns in robot.revolute)
-        found: list[tuple[int, float, float]] = []
+        stretches: list[tuple[int, float, float]] = []
         for j, values in enumerate((q.cpu() * rate).t()):
-            found += [(j, low, high) for low, high in _stretches(values.numpy(), turning[j])]
-        joint = torch.tensor([j for j, _, _ in found], dtype=torch.int64)
-        ends = torch.tensor([[low, high] for _, low, high in found], dtype=torch.float64)
+            stretches += [(j, low, high) for low, high in _stretches(values.numpy(), turning[j])]
+        joint = torch.tensor([j for j, _, _ in stretches], dtype=torch.int64)
+        ends = torch.tensor([[low, high] for _, low, high in stretches], dtype=torch.float64)
         return JointCoverage(joint, ends.mean(1), (ends[:, 1] - ends[:, 0]) / 2, rate, turning, fade)
 
     def beyond(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
@@ -65,11 +65,11 @@ class JointCoverage:
         angle = q * self.rate.to(q)
         columns = []
         for j, turns in enumerate(self.turning):
-            own = self.joint == j
-            off = angle[..., j, None] - self.middle[own].to(q)
+            here = self.joint == j
+            off = angle[..., j, None] - self.middle[here].to(q)
             if turns:
                 off = off - 2 * math.pi * torch.round(off / (2 * math.pi))
-            columns.append((off.abs() - self.half[own].to(q)).clamp(min=0).amin(-1))
+            columns.append((off.abs() - self.half[here].to(q)).clamp(min=0).amin(-1))
         return torch.stack(columns, -1)
 
     def share(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch"]:

@@ -44,7 +44,7 @@ class Design:
         start = self.active + sum(int(chosen.used.sum()) for chosen in self.features[:number])
         return slice(start, start + int(self.features[number].used.sum()))
 
-    def columns(self, values: SensorValues, rows: slice) -> Float64[Tensor, "seen components unknowns"]:
+    def columns(self, values: SensorValues, rows: slice) -> Float64[Tensor, "values components unknowns"]:
         """Derivative of a sensor's values by all unknowns, not weighted."""
         state = self.problem.state
         blocks = [values.geometry[rows]]
@@ -74,40 +74,40 @@ class Design:
 
     def prior_like(self, other: "Design", prior: GaussianPrior) -> GaussianPrior:
         """The prior with sizes to start from that another design's fit came to; new bands as its last one."""
-        own = self.prior(prior.sizes[: prior.classes].tolist())
-        sizes = own.sizes.clone()
+        prior_here = self.prior(prior.sizes[: prior.classes].tolist())
+        sizes = prior_here.sizes.clone()
         starts = dict(zip((c.name for c in other.features), other.group_starts(prior.classes), strict=True))
         for chosen, start in zip(self.features, self.group_starts(prior.classes), strict=True):
             if chosen.name in starts:
-                known = next(c for c in other.features if c.name == chosen.name)
-                count = len(known.group_names)
+                like = next(c for c in other.features if c.name == chosen.name)
+                count = len(like.group_names)
                 for number in range(len(chosen.group_names)):
                     sizes[start + number] = prior.sizes[starts[chosen.name] + min(number, count - 1)]
-        return replace(own, sizes=sizes)
+        return replace(prior_here, sizes=sizes)
 
     def group_starts(self, classes: int) -> list[int]:
         """Number of the first prior size of every choice of features."""
         counts = [len(chosen.group_names) for chosen in self.features]
         return [classes + sum(counts[:k]) for k in range(len(counts))]
 
-    def places(self, features: Sequence[AbstractFeature]) -> Int64[Tensor, " chosen"]:
+    def indices(self, features: Sequence[AbstractFeature]) -> Int64[Tensor, " chosen"]:
         """Where the unknowns stand that a design with some of the features has.
 
         A smaller feature than the one of its name here, such as a series of fewer harmonics, counts as a part of it.
         """
-        chosen = [torch.arange(self.active)]
+        indices = [torch.arange(self.active)]
         for wanted in features:
-            number = next(k for k, own in enumerate(self.features) if own.name == wanted.name)
-            own, start = self.features[number], self.stretch(number).start
-            place = torch.cumsum(own.used.flatten(), 0).view(own.used.shape) - 1 + start
-            columns = wanted.places_in(own)
-            chosen.append(place.gather(1, columns)[own.used.gather(1, columns)])
-        return torch.cat(chosen)
+            number = next(k for k, chosen in enumerate(self.features) if chosen.name == wanted.name)
+            larger, start = self.features[number], self.stretch(number).start
+            index = torch.cumsum(larger.used.flatten(), 0).view(larger.used.shape) - 1 + start
+            columns = wanted.columns_in(larger)
+            indices.append(index.gather(1, columns)[larger.used.gather(1, columns)])
+        return torch.cat(indices)
 
 
 def weighted_columns(
     design: Design, values: Sequence[SensorValues], here: Float64[Tensor, " unknowns"] | None = None
-) -> tuple[list[Float64[Tensor, "seen components unknowns"]], list[Float64[Tensor, "seen components"]]]:
+) -> tuple[list[Float64[Tensor, "values components unknowns"]], list[Float64[Tensor, "values components"]]]:
     """Columns and targets of all rows of every sensor at once, weighted; for data that fit into memory."""
     columns, targets = [], []
     for sensor in values:
@@ -151,7 +151,7 @@ def sum_up(
         descent=descent,
         square=tuple(square),
         count=tuple(float(sensor.residual.numel()) for sensor in values),
-        known=tuple(sensor.given for sensor in values),
+        stated=tuple(sensor.stated for sensor in values),
         exact=tuple(sensor.certain for sensor in values),
     )
 
@@ -200,7 +200,9 @@ class Rows:
         mask[order[:most]] = True
         return self.of(mask.to(self.configuration.device))
 
-    def left(self, design: Design, posterior: Posterior, noise: Sequence[float]) -> Float64[Tensor, " found"]:
+    def left(
+        self, design: Design, posterior: Posterior, noise: Sequence[float]
+    ) -> Float64[Tensor, " configurations"]:
         """Sum of squared residuals over variances of every configuration, under a posterior."""
         total = posterior.x.new_zeros(self.configurations)
         change = self.start(design) - posterior.x
@@ -219,7 +221,7 @@ def weigh(
     change: Float64[Tensor, " unknowns"],
     used: Sequence[float],
     loss: AbstractLoss,
-) -> tuple[Float64[Tensor, " seen"], ...]:
+) -> tuple[Float64[Tensor, " values"], ...]:
     """Weights of all rows of every sensor by their distance from a prediction.
 
     Args:
@@ -229,7 +231,7 @@ def weigh(
         used: values that the unknowns use up, per sensor.
         loss: how far-off rows count; its scale is automatic.
     """
-    found = []
+    weights = []
     for sensor, taken in zip(values, used, strict=True):
         residual = torch.cat(
             [
@@ -239,8 +241,8 @@ def weigh(
         )
         distance = residual.norm(dim=1) * sensor.root
         if sensor.certain or isinstance(loss, SquaredLoss):
-            found.append(torch.ones_like(distance))
+            weights.append(torch.ones_like(distance))
             continue
         scale = max(loss.scale(distance, sensor.components, taken), 1e-10)
-        found.append(loss.weight(distance / scale, sensor.components))
-    return tuple(found)
+        weights.append(loss.weight(distance / scale, sensor.components))
+    return tuple(weights)

@@ -25,15 +25,15 @@ class Sums:
         descent: `Σ X^T y`.
         square: `Σ y^T y`.
         count: number of values that count as independent.
-        known: per sensor whether its rows give their noise, which then is at least as given.
-        exact: per sensor whether it is exactly as given.
+        stated: per sensor whether its rows state their noise, which then is at least as large.
+        exact: per sensor whether it is exactly as stated.
     """
 
     normal: Float64[Tensor, "sensors unknowns unknowns"]
     descent: Float64[Tensor, "sensors unknowns"]
     square: tuple[float, ...]
     count: tuple[float, ...]
-    known: tuple[bool, ...]
+    stated: tuple[bool, ...]
     exact: tuple[bool, ...]
 
     def select(self, columns: Int64[Tensor, " chosen"]) -> "Sums":
@@ -57,7 +57,7 @@ class GaussianPrior:
     """Independent normal unknowns: precision `base / sizes[group]²`.
 
     Attributes:
-        base: 1 / variance at size 1; 0 where nothing is known.
+        base: 1 / variance at size 1; 0 where there is no prior knowledge.
         group: number of every unknown's size.
         sizes: standard deviations.
         classes: the first so many groups are classes of geometric parameters, whose sizes are factors on what
@@ -85,9 +85,9 @@ class GaussianPrior:
     def updated(
         self, x: Float64[Tensor, " unknowns"], variance: Float64[Tensor, " unknowns"]
     ) -> "GaussianPrior":
-        """Sizes by MacKay's rule (1992, Neural Computation 4(3), eq. 4.7), `size² = Σ x² base / Σ told`."""
-        told = (1 - self.precision * variance) * (self.base > 0)
-        count = torch.zeros_like(self.sizes).index_add(0, self.group, told)
+        """Sizes by MacKay's rule (1992, Neural Computation 4(3), eq. 4.7), `size² = Σ x² base / Σ determined`."""
+        determined = (1 - self.precision * variance) * (self.base > 0)
+        count = torch.zeros_like(self.sizes).index_add(0, self.group, determined)
         square = torch.zeros_like(self.sizes).index_add(0, self.group, x.square() * self.base)
         is_class = torch.arange(len(self.sizes), device=x.device) < self.classes
         least = torch.where(is_class, LEAST_EFFECTIVE, 1e-9)
@@ -107,7 +107,7 @@ class Posterior:
         covariance: of the unknowns; empty where it was not asked for.
         log_evidence: of the data under the prior, up to a constant of the data.
         prior: with its sizes as estimated.
-        noise: standard deviation per sensor [m or rad], or a factor on the given ones.
+        noise: standard deviation per sensor [m or rad], or a factor on the stated ones.
         iterations: updates made.
     """
 
@@ -118,12 +118,16 @@ class Posterior:
     noise: tuple[float, ...]
     iterations: int
 
+    @property
+    def determined(self) -> Float64[Tensor, " unknowns"]:
+        """Share of every unknown that the data determine, from 0 to 1; the prior holds the rest."""
+        return 1 - self.prior.precision * self.covariance.diagonal()
 
-def effective_share(sums: Sums, found: Posterior) -> float:
+
+def effective_share(sums: Sums, posterior: Posterior) -> float:
     """Share of the values that the unknowns use up; near 1 nothing is left that tells noise from error."""
-    held = found.prior.precision * found.covariance.diagonal()
     values = sum(count for count, exact in zip(sums.count, sums.exact, strict=True) if not exact)
-    return float((1 - held).sum()) / max(values, 1.0)
+    return float(posterior.determined.sum()) / max(values, 1.0)
 
 
 def solve_posterior(sums: Sums, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
@@ -140,8 +144,7 @@ def solve_posterior(sums: Sums, prior: GaussianPrior, noise: tuple[float, ...]) 
     x = scale * torch.cholesky_solve((scale * descent)[:, None], factor)[:, 0]
     covariance = torch.cholesky_inverse(factor) * scale * scale[:, None]
     log_det = 2 * float(factor.diagonal().log().sum()) - 2 * float(scale.log().sum())
-    known = precision > 0
-    log_prior = float(precision[known].log().sum())
+    log_prior = float(precision[precision > 0].log().sum())
     fit = sum(misfit / sigma**2 for misfit, sigma in zip(misfits(sums, x), noise, strict=True))
     spread = sum(2 * count * math.log(sigma) for count, sigma in zip(sums.count, noise, strict=True))
     evidence = -0.5 * (fit + float((x.square() * precision).sum()) + spread + log_det - log_prior)
@@ -204,26 +207,26 @@ def maximise_evidence(
     Returns:
         The posterior of the last update.
     """
-    found = solve_posterior(sums, prior, noise)
+    posterior = solve_posterior(sums, prior, noise)
     for made in range(1, iterations + 1):
-        prior = found.prior.updated(found.x, found.covariance.diagonal())
-        noise = renewed_noise(sums, found)
+        prior = posterior.prior.updated(posterior.x, posterior.covariance.diagonal())
+        noise = renewed_noise(sums, posterior)
         following = replace(solve_posterior(sums, prior, noise), iterations=made)
-        gain = following.log_evidence - found.log_evidence
-        found = following
+        gain = following.log_evidence - posterior.log_evidence
+        posterior = following
         if abs(gain) < tolerance:
             break
-    return found
+    return posterior
 
 
-def renewed_noise(sums: Sums, found: Posterior) -> tuple[float, ...]:
+def renewed_noise(sums: Sums, posterior: Posterior) -> tuple[float, ...]:
     """Noise of every sensor from its misfit and the values that the unknowns use up (Förstner 1979)."""
-    used = (sums.normal * found.covariance).sum((1, 2)).tolist()
+    used = (sums.normal * posterior.covariance).sum((1, 2)).tolist()
     noise = []
-    for k, misfit in enumerate(misfits(sums, found.x)):
-        left = max(sums.count[k] - used[k] / found.noise[k] ** 2, 1.0)
+    for k, misfit in enumerate(misfits(sums, posterior.x)):
+        left = max(sums.count[k] - used[k] / posterior.noise[k] ** 2, 1.0)
         sigma = math.sqrt(misfit / left)
         if sums.exact[k]:
             sigma = 1.0
-        noise.append(max(sigma, 1.0 if sums.known[k] else SMALLEST_NOISE))
+        noise.append(max(sigma, 1.0 if sums.stated[k] else SMALLEST_NOISE))
     return tuple(noise)

@@ -1,6 +1,6 @@
 """Predicting every configuration from all others, in closed form."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,7 +14,7 @@ CHUNK = 2_048
 """Values that are worked on together."""
 FOLDS = 4
 FOLD_UPDATES = 4
-"""Updates of noise and prior sizes for every part left out."""
+"""Updates of noise and prior sizes for every fold left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,24 +35,22 @@ class LeftOut:
 
 
 def left_out(rows: Rows, design: Design, posterior: Posterior) -> LeftOut:
-    """Leave out one configuration after the other, prior sizes, noise and held factors as they are.
+    """Leave out one configuration after the other, prior sizes, noise and fixed factors as they are.
 
     With X, r and I of one configuration's values (whitened; r after the fit to all), the error when it is left out
     is `(I - X C X^T)^-1 r`, and its covariance `(I - X C X^T)^-1` (Cook and Weisberg 1982, section 2.2).
     """
-    errors, spreads, places, kinds = [], [], [], []
-    for place, kind, X, r in _configurations(rows, design, posterior):
+    blocks = []
+    for configuration, kind, X, r in _configurations(rows, design, posterior):
         hat = X @ posterior.covariance @ X.mT
         inverse = torch.linalg.inv((1 + 1e-12) * torch.eye(hat.shape[-1]).to(hat) - hat)
-        errors.append((inverse @ r[..., None])[..., 0].flatten())
-        spreads.append(inverse.diagonal(dim1=-2, dim2=-1).clamp(min=1.0).sqrt().flatten())
-        places.append(place.flatten())
-        kinds.append(kind.flatten())
-    return LeftOut(torch.cat(errors), torch.cat(spreads), torch.cat(places), torch.cat(kinds))
+        error = (inverse @ r[..., None])[..., 0]
+        blocks.append((error, inverse.diagonal(dim1=-2, dim2=-1).clamp(min=1.0).sqrt(), configuration, kind))
+    return _joined(blocks)
 
 
 def folds_left_out(rows: Rows, design: Design, posterior: Posterior, sums: Sums) -> LeftOut:
-    """Leave out one of `FOLDS` parts of the configurations after the other, noise and prior sizes estimated anew.
+    """Leave out one of `FOLDS` folds of the configurations after the other, noise and prior sizes estimated anew.
 
     Where there are few rows the noise and the many prior sizes themselves are uncertain, which leaving out single
     configurations does not show.
@@ -64,28 +62,23 @@ def folds_left_out(rows: Rows, design: Design, posterior: Posterior, sums: Sums)
         sums: normal equations of all rows.
     """
     order = torch.randperm(rows.configurations, generator=torch.Generator().manual_seed(0))
-    found = []
+    blocks = []
     for k in range(FOLDS):
         mask = torch.zeros(rows.configurations, dtype=torch.bool)
         mask[order[k::FOLDS]] = True
         test = rows.of(mask.to(rows.configuration.device))
         rest = sums.minus(sum_up(design, test.values, test.start(design)))
-        own = maximise_evidence(rest, posterior.prior, posterior.noise, FOLD_UPDATES)
-        found.append(_predicted(test, design, own))
-    parts = zip(*((f.error, f.spread, f.configuration, f.sensor) for f in found), strict=True)
-    return LeftOut(*(torch.cat(part) for part in parts))
+        without = maximise_evidence(rest, posterior.prior, posterior.noise, FOLD_UPDATES)
+        for configuration, kind, X, r in _configurations(test, design, without):
+            variance = ((X @ without.covariance) * X).sum(-1)
+            blocks.append((r, (1 + variance.clamp(min=0)).sqrt(), configuration, kind))
+    return _joined(blocks)
 
 
-def _predicted(test: Rows, design: Design, posterior: Posterior) -> LeftOut:
-    """Errors of rows that a posterior never saw."""
-    errors, spreads, places, kinds = [], [], [], []
-    for place, kind, X, r in _configurations(test, design, posterior):
-        variance = ((X @ posterior.covariance) * X).sum(-1)
-        errors.append(r.flatten())
-        spreads.append((1 + variance.clamp(min=0)).sqrt().flatten())
-        places.append(place.flatten())
-        kinds.append(kind.flatten())
-    return LeftOut(torch.cat(errors), torch.cat(spreads), torch.cat(places), torch.cat(kinds))
+def _joined(blocks: Sequence[tuple[Tensor, Tensor, Tensor, Tensor]]) -> LeftOut:
+    return LeftOut(
+        *(torch.cat([values.flatten() for values in column]) for column in zip(*blocks, strict=True))
+    )
 
 
 def _configurations(
@@ -93,19 +86,19 @@ def _configurations(
 ) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
     """Configurations with equally many values together: configuration, sensor, columns and residuals."""
     change = rows.start(design) - posterior.x
-    kinds, places, offsets = [], [], []
+    kinds, configurations, offsets = [], [], []
     for number, sensor in enumerate(rows.values):
         if not sensor.certain:
             index = torch.arange(len(sensor.row), device=sensor.row.device)
-            places.append(rows.configuration[sensor.row])
+            configurations.append(rows.configuration[sensor.row])
             kinds.append(torch.full_like(index, number))
             offsets.append(index)
-    place, kind, offset = torch.cat(places), torch.cat(kinds), torch.cat(offsets)
-    order = torch.argsort(place * len(rows.values) + kind, stable=True)
-    place, kind, offset = place[order], kind[order], offset[order]
+    configuration, kind, offset = torch.cat(configurations), torch.cat(kinds), torch.cat(offsets)
+    order = torch.argsort(configuration * len(rows.values) + kind, stable=True)
+    configuration, kind, offset = configuration[order], kind[order], offset[order]
     sizes = torch.tensor([sensor.components for sensor in rows.values], device=kind.device)[kind]
     # Configurations whose rows are of the same kinds have columns of one shape.
-    owner, counts = torch.unique_consecutive(place, return_counts=True)
+    owner, counts = torch.unique_consecutive(configuration, return_counts=True)
     firsts = torch.cumsum(counts, 0) - counts
     shape = torch.zeros_like(owner).index_add(
         0, torch.repeat_interleave(torch.arange(len(owner)), counts), kind + 1

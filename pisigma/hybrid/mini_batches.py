@@ -14,10 +14,10 @@ from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
 from torch.func import functional_call
 
+from pisigma.hybrid.alternating_products import AlternatingProducts, normalised
 from pisigma.hybrid.design import Design
 from pisigma.hybrid.evidence import Posterior
-from pisigma.hybrid.held_products import HeldProducts, normalised
-from pisigma.hybrid.refinement import Refined, refine, refined_at, with_held_factors
+from pisigma.hybrid.refinement import Refined, refine, refined_at, with_all_factors
 from pisigma.hybrid.search import Additive
 from pisigma.hybrid.sensor_values import SensorValues, sensor_values
 from pisigma.hybrid.uncertainty import covariance_root
@@ -140,12 +140,12 @@ class WhitenedUnknowns:
     """`x = start + root · z`, where some rows say that z is about 0 with covariance 1.
 
     The unknowns x are the free parameters counted from nominal, the weights of the features, and of the product
-    units first the weights of the free factors and then the changes of the held ones.
+    units first the weights of the free factors and then the changes of the fixed ones.
 
     Attributes:
         design: of the few rows.
         posterior: of their unknowns, whose prior sizes and noise stand.
-        held: choices of free factors, that of `design` first; none without product units.
+        products: product units by choice of free factors, that of `design` first; none without product units.
         start: x where z is 0.
         root: root of the covariance of x.
         precision: 1 / variance of x in the prior, whose mean is 0.
@@ -154,7 +154,7 @@ class WhitenedUnknowns:
 
     design: Design
     posterior: Posterior
-    held: tuple[HeldProducts, ...]
+    products: tuple[AlternatingProducts, ...]
     start: Float64[Tensor, " unknowns"]
     root: Float64[Tensor, "unknowns unknowns"]
     precision: Float64[Tensor, " unknowns"]
@@ -163,14 +163,16 @@ class WhitenedUnknowns:
     @staticmethod
     def around(few: Refined) -> "WhitenedUnknowns":
         """Around the solution of a part of the rows."""
-        whole = with_held_factors(few)
+        whole = with_all_factors(few)
         covariance = whole.posterior.covariance
         change = torch.eye(few.design.active).to(covariance)
         extra = len(covariance) - few.design.unknowns
         return WhitenedUnknowns(
             design=few.design,
             posterior=few.posterior,
-            held=tuple(chosen for chosen in whole.design.features if isinstance(chosen, HeldProducts)),
+            products=tuple(
+                chosen for chosen in whole.design.features if isinstance(chosen, AlternatingProducts)
+            ),
             start=torch.cat([few.posterior.x, few.posterior.x.new_zeros(extra)]),
             root=covariance_root(covariance, change),
             precision=whole.posterior.prior.precision,
@@ -187,7 +189,7 @@ class WhitenedUnknowns:
         for number, chosen in enumerate(self._additive):
             none = torch.zeros(chosen.used.shape).to(x)
             weights[f"linear.{number}"] = none.masked_scatter(chosen.used, x[self.design.stretch(number)])
-        if self.held:
+        if self.products:
             factors = self.factors(x)
             weights |= {"bias": factors[..., 0], "weight": factors[..., 1:]}
         delta: Tensor = functional_call(self.correction, weights, (state,))
@@ -195,7 +197,7 @@ class WhitenedUnknowns:
 
     def factors(self, x: Float64[Tensor, " unknowns"]) -> Float64[Tensor, "dof factors inputs"]:
         """Weights of all factors of the product units, the bias first."""
-        first, *others = self.held
+        first, *others = self.products
         dof, _, inputs = first.factors.shape
         place = self.design.stretch(len(self._additive)).start
         total = first.factors.clone()
@@ -207,27 +209,27 @@ class WhitenedUnknowns:
         return total
 
     def solution(self, x: Float64[Tensor, " unknowns"]) -> tuple[Design, Posterior]:
-        """Design and posterior with these unknowns as the most probable values, held factors of length 1."""
+        """Design and posterior with these unknowns as the most probable values, fixed factors of length 1."""
         x = x.detach()
-        if not self.held:
+        if not self.products:
             return self.design, replace(self.posterior, x=x)
-        first, factors = self.held[0], self.factors(x)
+        first, factors = self.products[0], self.factors(x)
         length, unit = factors.norm(dim=-1), normalised(factors)
         free, start = [], 0
         for order, place in zip(first.orders, first.free, strict=True):
             others = [s for s in range(start, start + order) if s != place]
             free.append(factors[:, place] * length[:, others].prod(1)[:, None])
             start += order
-        held = HeldProducts(self.design.problem.space.robot, first.orders, unit, first.turn)
+        units = AlternatingProducts(self.design.problem.space.robot, first.orders, unit, first.turn)
         weights = x[: self.design.stretch(len(self._additive)).start]
         x = torch.cat([weights, torch.stack(free, 1).flatten()])
-        design = replace(self.design, features=(*self._additive, held))
+        design = replace(self.design, features=(*self._additive, units))
         return design, replace(self.posterior, x=x)
 
     @property
     def _additive(self) -> tuple[AbstractFeature, ...]:
         """Features of the unit of order 1."""
-        return self.design.features[:-1] if self.held else self.design.features
+        return self.design.features[:-1] if self.products else self.design.features
 
 
 class BatchRows:
@@ -306,7 +308,7 @@ class HybridBatchCost:
             count += float(counts[sensor.row].sum()) * sensor.components
         return self._share * cost, square / count
 
-    def _root(self, few: CalibrationProblem, number: int, sensor: SensorValues) -> Float64[Tensor, " seen"]:
+    def _root(self, few: CalibrationProblem, number: int, sensor: SensorValues) -> Float64[Tensor, " values"]:
         """Root of every row's weight over its variance."""
         root = sensor.root / self._unknowns.posterior.noise[number]
         distance = sensor.residual.norm(dim=1) * root

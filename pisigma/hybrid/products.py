@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.hybrid.alternating_products import AlternatingProducts, InputPairs, normalised
 from pisigma.hybrid.design import Design, weighted_columns
 from pisigma.hybrid.evidence import GaussianPrior, Posterior, Sums, maximise_evidence
-from pisigma.hybrid.held_products import HeldProducts, InputPairs, normalised
 from pisigma.hybrid.sensor_values import SensorValues
 from pisigma.joint_correction.feature import AbstractFeature
 
@@ -34,16 +34,16 @@ class FittedProducts:
     posterior: Posterior
 
     @property
-    def held(self) -> HeldProducts:
+    def units(self) -> AlternatingProducts:
         """The units with their factors."""
-        held = self.design.features[-1]
-        assert isinstance(held, HeldProducts)
-        return held
+        units = self.design.features[-1]
+        assert isinstance(units, AlternatingProducts)
+        return units
 
     @property
     def factors(self) -> Float64[Tensor, "dof factors inputs"]:
         """All factors, the free ones as solved."""
-        return self.held.solved(self.posterior.x[self.design.stretch(len(self.design.features) - 1)])
+        return self.units.solved(self.posterior.x[self.design.stretch(len(self.design.features) - 1)])
 
 
 class ProductFit:
@@ -97,18 +97,18 @@ class ProductFit:
         prior: GaussianPrior | None = None
         quick = self.design.unknowns <= QUICK
         for turn in range(ROUNDS - 1):
-            held = HeldProducts(robot, orders, factors, turn)
-            weights, prior, _ = self._reduced(held, prior, 3)
+            units = AlternatingProducts(robot, orders, factors, turn)
+            weights, prior, _ = self._reduced(units, prior, 3)
             if quick and turn in RENEWALS:
-                whole = self._whole(held, prior, 5)
+                whole = self._whole(units, prior, 5)
                 self._reduce(replace(whole.posterior, prior=self._without_last(whole.posterior.prior)))
                 weights = whole.posterior.x[self.design.unknowns :]
-            factors = normalised(held.solved(weights))
-        held = HeldProducts(robot, orders, factors, ROUNDS - 1)
+            factors = normalised(units.solved(weights))
+        units = AlternatingProducts(robot, orders, factors, ROUNDS - 1)
         if final_iterations:
-            return self._whole(held, prior, final_iterations)
-        weights, prior, cross = self._reduced(held, prior, 3)
-        return FittedProducts(self._with(held), self._completed(weights, prior, cross))
+            return self._whole(units, prior, final_iterations)
+        weights, prior, cross = self._reduced(units, prior, 3)
+        return FittedProducts(self._with(units), self._completed(weights, prior, cross))
 
     def _reduce(self, base: Posterior) -> None:
         """Take geometry and unit of order 1 out, noise and prior sizes as in a posterior."""
@@ -125,9 +125,9 @@ class ProductFit:
         scaled.diagonal().add_(1e-13)
         self._root = torch.linalg.cholesky(scaled)
         descent = weight @ self.sums.descent
-        self._seen = self._solve_root((self._scale * descent)[:, None])[:, 0]
+        self._reduced_descent = self._solve_root((self._scale * descent)[:, None])[:, 0]
         square = sum(total / sigma**2 for total, sigma in zip(self.sums.square, base.noise, strict=True))
-        self._square = max(square - float(self._seen.square().sum()), 0.0)
+        self._square = max(square - float(self._reduced_descent.square().sum()), 0.0)
 
     def _reduced(
         self, features: AbstractFeature, prior: GaussianPrior | None, iterations: int
@@ -143,7 +143,7 @@ class ProductFit:
             cross.addmm_(self._X[k].t(), P, alpha=1 / sigma)
         cross = self._solve_root(self._scale[:, None] * cross)
         normal -= cross.t() @ cross
-        descent -= cross.t() @ self._seen
+        descent -= cross.t() @ self._reduced_descent
         sums = Sums(
             normal[None], descent[None], (self._square,), (max(self._count, 1.0),), (False,), (False,)
         )
@@ -152,12 +152,12 @@ class ProductFit:
             last = replace(whole, base=whole.base[-size:], group=whole.group[-size:])
             first = int(last.group.min())
             prior = GaussianPrior(last.base, last.group - first, last.sizes[first:], 0)
-        found = maximise_evidence(sums, prior, (1.0,), iterations)
-        return found.x, found.prior, cross
+        posterior = maximise_evidence(sums, prior, (1.0,), iterations)
+        return posterior.x, posterior.prior, cross
 
     def _completed(self, weights: Tensor, prior: GaussianPrior, cross: Tensor) -> Posterior:
         """All unknowns with the last weights; the covariance is left out."""
-        rest = self._seen - cross @ weights
+        rest = self._reduced_descent - cross @ weights
         base = self._scale * torch.linalg.solve_triangular(self._root.t(), rest[:, None], upper=True)[:, 0]
         x = torch.cat([base, weights])
         joined = self._joined(prior)
@@ -170,8 +170,8 @@ class ProductFit:
         design = self._with(features)
         if prior is None:
             _, prior, _ = self._reduced(features, None, 3)
-        found = maximise_evidence(self._extended(features), self._joined(prior), self._noise, iterations)
-        return FittedProducts(design, found)
+        posterior = maximise_evidence(self._extended(features), self._joined(prior), self._noise, iterations)
+        return FittedProducts(design, posterior)
 
     def _joined(self, last: GaussianPrior) -> GaussianPrior:
         """The prior of everything."""

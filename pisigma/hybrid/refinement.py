@@ -7,9 +7,9 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.hybrid.alternating_products import AlternatingProducts
 from pisigma.hybrid.design import Design, Rows, sum_up, weigh
 from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence, renewed_noise, solve_posterior
-from pisigma.hybrid.held_products import HeldProducts
 from pisigma.hybrid.products import ProductFit
 from pisigma.hybrid.search import Additive
 from pisigma.hybrid.sensor_values import sensor_values
@@ -27,9 +27,9 @@ MOST_ROUNDS = 5
 SETTLED = 0.02
 """[standard deviations] Rounds end when no unknown moves by more, on average."""
 PRODUCT_CONFIGURATIONS = 3_000
-"""Factors of product units are found on so many configurations at most."""
+"""Factors of product units are solved for on so many configurations at most."""
 ARM = 0.1
-"""Points of the tool at this share of the reach from its origin are met as well, so that turns are told."""
+"""Points of the tool at this share of the reach from its origin are met as well, so that rotations count."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +56,8 @@ class Refined:
 
     @property
     def effective(self) -> float:
-        """Number of unknowns that the data tell."""
-        held = self.posterior.prior.precision * self.posterior.covariance.diagonal()
-        return float((1 - held).sum())
+        """Number of unknowns that the data determine."""
+        return float(self.posterior.determined.sum())
 
 
 def refine(
@@ -101,7 +100,7 @@ def refine(
 def refined_at(
     solved: SolvedCalibration, design: Design, posterior: Posterior, loss: AbstractLoss, rounds: int
 ) -> Refined:
-    """All rows linearised and weighted at the most probable values of a posterior, and the posterior seen there.
+    """All rows linearised and weighted at the most probable values of a posterior, and the posterior there.
 
     Args:
         solved: the geometric calibration.
@@ -123,8 +122,8 @@ def refined_at(
 def network(design: Design, posterior: Posterior) -> JointCorrection:
     """The network with the weights of a posterior."""
     robot = design.problem.space.robot
-    held = design.features[-1] if design.features else None
-    products = held if isinstance(held, HeldProducts) else None
+    last = design.features[-1] if design.features else None
+    products = last if isinstance(last, AlternatingProducts) else None
     features = design.features[:-1] if products else design.features
     made = JointCorrection(robot, features, products.orders if products else ())
     with torch.no_grad():
@@ -163,10 +162,10 @@ def _rows(
 
 
 def _used(rows: Rows, design: Design, posterior: Posterior) -> list[float]:
-    """Values of every sensor that the unknowns use up: those told, shared out by the sensors' values."""
-    told = float((1 - posterior.prior.precision * posterior.covariance.diagonal()).sum())
+    """Values of every sensor that the unknowns use up: those that are determined, shared out by the sensors' values."""
+    determined = float(posterior.determined.sum())
     counts = [0.0 if sensor.certain else float(sensor.residual.numel()) for sensor in rows.values]
-    return [told * count / max(sum(counts), 1.0) for count in counts]
+    return [determined * count / max(sum(counts), 1.0) for count in counts]
 
 
 def _with_products(
@@ -176,31 +175,31 @@ def _with_products(
     few = rows.sample(PRODUCT_CONFIGURATIONS)
     sums = sum_up(design, few.values, few.start(design))
     additive = maximise_evidence(sums, additive.prior, additive.noise)
-    found = ProductFit(design, few.values, few.start(design), additive, sums).fit(orders)
-    sums = sum_up(found.design, rows.values, rows.start(found.design))
-    return found.design, maximise_evidence(sums, found.posterior.prior, found.posterior.noise), sums
+    fitted = ProductFit(design, few.values, few.start(design), additive, sums).fit(orders)
+    sums = sum_up(fitted.design, rows.values, rows.start(fitted.design))
+    return fitted.design, maximise_evidence(sums, fitted.posterior.prior, fitted.posterior.noise), sums
 
 
-def with_held_factors(refined: Refined) -> Refined:
-    """The same with the factors of product units that were held free too, for what is uncertain in them.
+def with_all_factors(refined: Refined) -> Refined:
+    """The same with all factors of product units free, for what is uncertain in those that were fixed.
 
     Their columns are the derivatives at the solution, their changes normal about 0 with the size of a weight among
     all of a factor of length 1.
     """
-    held = refined.design.features[-1] if refined.design.features else None
-    if not isinstance(held, HeldProducts):
+    units = refined.design.features[-1] if refined.design.features else None
+    if not isinstance(units, AlternatingProducts):
         return refined
     weights = refined.posterior.x[refined.design.stretch(len(refined.design.features) - 1)]
-    factors = held.solved(weights)
+    factors = units.solved(weights)
     others = [
-        HeldProducts(refined.design.problem.space.robot, held.orders, factors, held.turn + k)
-        for k in range(1, max(held.orders))
+        AlternatingProducts(refined.design.problem.space.robot, units.orders, factors, units.turn + k)
+        for k in range(1, max(units.orders))
     ]
     design = replace(refined.design, features=(*refined.design.features, *others))
     extra = design.unknowns - refined.design.unknowns
-    known = refined.rows.weights
-    known = refined.posterior.x[refined.design.active :] if known is None else known
-    rows = replace(refined.rows, weights=torch.cat([known, known.new_zeros(extra)]))
+    in_force = refined.rows.weights
+    start = refined.posterior.x[refined.design.active :] if in_force is None else in_force
+    rows = replace(refined.rows, weights=torch.cat([start, start.new_zeros(extra)]))
     sums = sum_up(design, rows.values, rows.start(design))
     prior = refined.posterior.prior
     size = len(prior.sizes)
@@ -218,10 +217,10 @@ def with_held_factors(refined: Refined) -> Refined:
 def with_frames_of(
     solved: SolvedCalibration, refined: Refined, geometry: IdentifiedGeometry
 ) -> IdentifiedGeometry:
-    """A geometry whose frames that nothing holds are moved onto those of the geometric calibration.
+    """A geometry whose frames that nothing determines are moved onto those of the geometric calibration.
 
-    Sockets, and distances from anchors at unknown places, are met as well after any motion of the whole frame.
-    Geometric and hybrid arm, each in its own place, must not be blended; so every such frame gets the motion that
+    Sockets, and distances from anchors at unknown points, are met as well after any motion of the whole frame.
+    Geometric and hybrid arm, each somewhere else, must not be blended; so every such frame gets the motion that
     takes the hybrid's poses nearest to the geometric ones.
 
     Args:
@@ -239,8 +238,8 @@ def with_frames_of(
     points = _points(geometry, moved), _points(first, rows)
     motions = {}
     for frame in frames:
-        own = torch.tensor([name == frame for name in rows.frame])
-        motions[frame] = nearest_motion(points[0][own].flatten(0, 1), points[1][own].flatten(0, 1))
+        here = torch.tensor([name == frame for name in rows.frame])
+        motions[frame] = nearest_motion(points[0][here].flatten(0, 1), points[1][here].flatten(0, 1))
     return _moved(solved, geometry, motions)
 
 
@@ -273,11 +272,11 @@ def _moved(
     for frame, T in motions.items():
         base = transform_from_xyzrpy(torch.from_numpy(np.asarray(bases[frame])))
         bases[frame] = xyzrpy_from_transform(T @ base).numpy()
-        for own in setup.problem.space.unknowns:
-            for owner, number in zip(own.owners, setup.unknown_frames[own.name].tolist(), strict=True):
-                if own.has_point and frames[number] == frame:
-                    values = unknowns[own.name][owner]
+        for group in setup.problem.space.unknowns:
+            for owner, number in zip(group.owners, setup.unknown_frames[group.name].tolist(), strict=True):
+                if group.has_point and frames[number] == frame:
+                    values = unknowns[group.name][owner]
                     point = (T[:3, :3] @ torch.from_numpy(np.asarray(values[:3])) + T[:3, 3]).numpy()
-                    unknowns[own.name][owner] = np.concatenate([point, values[3:]])
+                    unknowns[group.name][owner] = np.concatenate([point, values[3:]])
     robot = geometry.robot.with_geometry(base=next(iter(bases.values())))
     return replace(geometry, robot=robot, bases=bases, unknowns=unknowns)

@@ -27,9 +27,9 @@ class LearnedPart:
         geometry: differs from that of the geometric calibration, which has to make up for the correction.
         correction: Δ.
         coverage: joint values that were measured; beyond them the geometric calibration holds.
-        noise: per sensor, its standard deviation [m or rad], or a factor where the rows give it.
+        noise: per sensor, its standard deviation [m or rad], or a factor where the rows state it.
         unknowns: number of parameters and weights.
-        effective: how many of them the data tell (the rest the prior holds).
+        effective: how many of them the data determine (the rest the prior holds).
         rounds: linearisations made.
     """
 
@@ -75,7 +75,7 @@ class HybridResult:
         """Where the targets were, each in the frame of its row.
 
         Raises:
-            IdentificationError: a row has a frame or a target that is not known.
+            IdentificationError: a row has a frame or a target that was not calibrated.
             PoseError: the joint values do not fit the robot.
         """
         geometric = self.geometric
@@ -92,9 +92,8 @@ class HybridResult:
         """Measured - predicted of any measurements; see `CalibrationResult.errors_of`."""
         if self.learned is None:
             return self.geometric.errors_of(measurements)
-        known = self.learned.geometry
         T = self.predicted_poses(measurements)
-        return measured_errors(T, measurements, known.unknowns)
+        return measured_errors(T, measurements, self.learned.geometry.unknowns)
 
     def deviation(self, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
         """Standard deviation of the predicted positions along the axes of the row's frame [m], without noise.
@@ -119,12 +118,12 @@ class HybridResult:
 def unexplained_length(result: CalibrationResult) -> float:
     """What a geometric calibration does not explain of one coordinate of the measured lengths [m]; 0 without any.
 
-    The noise that was found; where the rows give their own, the RMS of the residuals.
+    The estimated noise; where the rows state their own, the RMS of the residuals.
     """
-    found = []
+    lengths = []
     for noise in result.noise:
         if noise.unit == "m":
-            found.append(noise.sigma)
+            lengths.append(noise.sigma)
         elif noise.quantity == "m" and noise.unit == "stated":
-            found.append(noise.rms / math.sqrt(noise.components))
-    return max(found, default=0.0)
+            lengths.append(noise.rms / math.sqrt(noise.components))
+    return max(lengths, default=0.0)

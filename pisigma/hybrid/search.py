@@ -17,7 +17,7 @@ LEVEL = 1.03
 CLEARLY = 5.0
 """The log evidence has to rise by so much (a Bayes factor of 150: very strong, Kass and Raftery 1995)."""
 LARGEST_EFFECTIVE_SHARE = 0.75
-"""Unknowns may use up so much of the values, or the noise cannot be told from them."""
+"""Unknowns may use up so much of the values, or the noise cannot be separated from them."""
 ROUGHLY = 0.1
 """While features are chosen, a log evidence that rises by less has settled."""
 FAILURES = 3
@@ -25,7 +25,7 @@ FAILURES = 3
 
 Progress = Callable[[str], None]
 FOLDS = 4
-"""Parts of the training rows on which product units are judged."""
+"""Folds of the training rows on which product units are judged."""
 MOST_CONFIGURATIONS = 600
 """They are judged on so many configurations at most."""
 LEAST_CONFIGURATIONS = 40
@@ -111,24 +111,24 @@ class Search:
 
     def additive(self, features: Sequence[AbstractFeature], near: Additive | None = None) -> Additive:
         """Fit geometry and a unit of order 1, from the noise of another fit."""
-        places = self._largest.places(features)
+        indices = self._largest.indices(features)
         design = Design(self.rows.problem, tuple(features))
-        sums = self._sums.select(places)
+        sums = self._sums.select(indices)
         noise, prior = self.noise, design.prior(self.prior_scale)
         if near is not None:
             noise, prior = near.posterior.noise, design.prior_like(near.design, near.posterior.prior)
         posterior = maximise_evidence(sums, prior, noise, tolerance=ROUGHLY)
-        found = Additive(design, sums, posterior)
-        self.fitted.append(found)
-        return found
+        fitted = Additive(design, sums, posterior)
+        self.fitted.append(fitted)
+        return fitted
 
     def left_out_rms(self, design: Design, posterior: Posterior) -> float:
         """RMS of left-out values over the noise of the geometric calibration."""
-        found = left_out(self.rows, design, posterior)
+        errors = left_out(self.rows, design, posterior)
         scale = posterior.x.new_tensor(
             [mine / first for mine, first in zip(posterior.noise, self.noise, strict=True)]
         )
-        return float((found.error * scale[found.sensor]).square().mean().sqrt())
+        return float((errors.error * scale[errors.sensor]).square().mean().sqrt())
 
     def note(
         self, name: str, design: Design, posterior: Posterior, rms: float, began: float, kept: bool
@@ -181,21 +181,21 @@ class Search:
         """The better of a new unit of order 1 and the best so far, by evidence and by left-out rows."""
         self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()
-        found = self.additive(features, best)
-        own = self.left_out_rms(found.design, found.posterior)
-        gain = found.posterior.log_evidence - best.posterior.log_evidence
+        tried = self.additive(features, best)
+        left_out_rms = self.left_out_rms(tried.design, tried.posterior)
+        gain = tried.posterior.log_evidence - best.posterior.log_evidence
         better = (
             gain > CLEARLY
-            and own < rms * LEVEL
-            and effective_share(found.sums, found.posterior) < LARGEST_EFFECTIVE_SHARE
+            and left_out_rms < rms * LEVEL
+            and effective_share(tried.sums, tried.posterior) < LARGEST_EFFECTIVE_SHARE
         )
-        self.note(found.name, found.design, found.posterior, own, began, better)
-        return (found, own, True) if better else (best, rms, False)
+        self.note(tried.name, tried.design, tried.posterior, left_out_rms, began, better)
+        return (tried, left_out_rms, True) if better else (best, rms, False)
 
 
 @dataclass(frozen=True, eq=False)
 class _Fold:
-    """Rows that are held out, and the additive model fitted to the others, prior sizes and noise held."""
+    """Rows that are held out, and the additive model fitted to the others, prior sizes and noise fixed."""
 
     test: Rows
     additive: Additive
@@ -206,8 +206,8 @@ class _Fold:
         """Squared errors of the held-out rows over variances; additive where there are no orders."""
         if not orders:
             return float(self.test.left(self.additive.design, self.base, noise).sum())
-        found = self.fit.fit(orders, 0)
-        return float(self.test.left(found.design, found.posterior, noise).sum())
+        fitted = self.fit.fit(orders, 0)
+        return float(self.test.left(fitted.design, fitted.posterior, noise).sum())
 
 
 def best_products(
@@ -215,7 +215,7 @@ def best_products(
 ) -> tuple[Additive, tuple[int, ...]]:
     """Choose product units, and then once more the series beside them.
 
-    Every choice is fitted to all but one of `FOLDS` parts of the rows at a time, and judged on that part. As long as
+    Every choice is fitted to all but one of `FOLDS` folds of the rows at a time, and judged on that fold. As long as
     interactions between joints are not modelled, a series takes up some of them; with product units fewer
     harmonics may be better.
 
@@ -276,20 +276,20 @@ def _judged(
 
 
 def _folds(search: Search, additive: Additive) -> list[_Fold]:
-    """Parts of at most `MOST_CONFIGURATIONS` configurations."""
+    """Folds of at most `MOST_CONFIGURATIONS` configurations."""
     rows, design = search.rows, additive.design
     order = torch.randperm(rows.configurations, generator=torch.Generator().manual_seed(0))
     order = order[:MOST_CONFIGURATIONS]
-    parts = []
+    folds = []
     for k in range(FOLDS):
-        held = torch.zeros(rows.configurations, dtype=torch.bool)
-        held[order[k::FOLDS]] = True
-        seen = torch.zeros_like(held)
-        seen[order] = True
+        tested = torch.zeros(rows.configurations, dtype=torch.bool)
+        tested[order[k::FOLDS]] = True
+        judged = torch.zeros_like(tested)
+        judged[order] = True
         device = rows.configuration.device
-        train, test = rows.of((seen & ~held).to(device)), rows.of(held.to(device))
+        train, test = rows.of((judged & ~tested).to(device)), rows.of(tested.to(device))
         sums = sum_up(design, train.values, train.start(design))
         base = solve_posterior(sums, additive.posterior.prior, additive.posterior.noise)
         fit = ProductFit(design, train.values, train.start(design), base, sums)
-        parts.append(_Fold(test, additive, base, fit))
-    return parts
+        folds.append(_Fold(test, additive, base, fit))
+    return folds

@@ -1,4 +1,4 @@
-"""All measured values seen from one point: residuals and their derivatives by geometry and by joint values."""
+"""All measured values linearised at one point: residuals and their derivatives by geometry and by joint values."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -27,33 +27,33 @@ class SensorValues:
         geometry: derivative of the predicted values by the free parameters.
         joints: the same by the joint values.
         residual: measured minus predicted.
-        root: 1 / standard deviation where the rows give their own, else 1.
-        given: whether the rows give their own.
-        certain: whether the values are known rather than measured.
+        root: 1 / standard deviation where the rows state their own, else 1.
+        stated: whether the rows state their own standard deviation.
+        certain: whether the values are certain rather than measured.
         other_row: of distances between the targets of two rows, the number of the other one; else None.
         other_joints: derivative by the joint values of that row.
     """
 
     name: str
-    row: Int64[Tensor, " seen"]
-    geometry: Float64[Tensor, "seen components active"]
-    joints: Float64[Tensor, "seen components dof"]
-    residual: Float64[Tensor, "seen components"]
-    root: Float64[Tensor, " seen"]
-    given: bool
+    row: Int64[Tensor, " values"]
+    geometry: Float64[Tensor, "values components active"]
+    joints: Float64[Tensor, "values components dof"]
+    residual: Float64[Tensor, "values components"]
+    root: Float64[Tensor, " values"]
+    stated: bool
     certain: bool
-    other_row: Int64[Tensor, " seen"] | None = None
-    other_joints: Float64[Tensor, "seen components dof"] | None = None
+    other_row: Int64[Tensor, " values"] | None = None
+    other_joints: Float64[Tensor, "values components dof"] | None = None
 
     def feature_columns(
         self, chosen: AbstractFeature, state: JointState, rows: slice
-    ) -> Float64[Tensor, "seen components weights"]:
+    ) -> Float64[Tensor, "values components weights"]:
         """Derivative of the predicted values by the weights of the used columns of some features.
 
         Args:
             chosen: the features.
             state: of all rows of the problem.
-            rows: which of the seen rows.
+            rows: which of the rows of this sensor.
         """
         used = chosen.used.flatten()
         block = _spread(self.joints[rows], chosen.columns(state[self.row[rows]]))
@@ -79,7 +79,7 @@ class SensorValues:
             other_joints=None if self.other_joints is None else self.other_joints[chosen],
         )
 
-    def weighted(self, weight: Float64[Tensor, " seen"]) -> "SensorValues":
+    def weighted(self, weight: Float64[Tensor, " values"]) -> "SensorValues":
         """The same with rows that count more or less; those that do not count at all are left out."""
         kept = weight > 0
         return replace(self.select(kept), root=(self.root * weight.sqrt())[kept])
@@ -87,7 +87,7 @@ class SensorValues:
     def collapsed(self, pose: Int64[Tensor, " rows"]) -> "SensorValues":
         """Repeats of a pose as one row that counts for all of them.
 
-        What a model gets wrong at a pose is the same in all its repeats; counted one by one they would tell
+        What a model gets wrong at a pose is the same in all its repeats; counted one by one they would say
         more than they do. Rows of a pose that see something else of it, such as touches along another axis or
         distances from another anchor, have other derivatives and stay apart.
         """
@@ -116,17 +116,17 @@ class SensorValues:
             root=total.sqrt(),
         )
 
-    def _sights(self) -> Int64[Tensor, " seen"]:
+    def _sights(self) -> Int64[Tensor, " values"]:
         """Number of every row's derivatives among the different ones."""
-        seen = self.geometry.new_zeros(len(self.row))
+        key = self.geometry.new_zeros(len(self.row))
         for J in (self.geometry.flatten(1), self.joints.flatten(1)):
-            seen = seen + J @ torch.arange(1, J.shape[1] + 1).to(J).sin()
-        return renumbered((seen / seen.abs().max().clamp(min=1e-300) * 1e6).round().to(torch.int64))
+            key = key + J @ torch.arange(1, J.shape[1] + 1).to(J).sin()
+        return renumbered((key / key.abs().max().clamp(min=1e-300) * 1e6).round().to(torch.int64))
 
 
 def _spread(
-    joints: Float64[Tensor, "seen components dof"], columns: Float64[Tensor, "seen dof columns"]
-) -> Float64[Tensor, "seen components _weights"]:
+    joints: Float64[Tensor, "values components dof"], columns: Float64[Tensor, "values dof columns"]
+) -> Float64[Tensor, "values components _weights"]:
     """Derivative by joint values times columns, side by side for all joints."""
     return (joints[..., None] * columns[:, None]).flatten(2)
 
@@ -145,19 +145,19 @@ def sensor_values(
     moved = problem if shift is None else replace(problem, q=problem.q + shift(problem.state))
     index = torch.cat([problem.active, joint_columns(problem.space).to(problem.q.device)])
     direction = problem.q.new_tensor(robot.directions)
-    own = problem.space.sensor_unknowns(point)
-    parts: list[list[tuple[Tensor, ...]]] = [[] for _ in problem.sensors]
+    unknowns = problem.space.sensor_unknowns(point)
+    collected: list[list[tuple[Tensor, ...]]] = [[] for _ in problem.sensors]
     for rows in moved.chunks():
         motion = moved.motion(point, rows, index)
-        for sensor, found in zip(moved.sensors, parts, strict=True):
-            seen = sensor.present[rows].nonzero()[:, 0]
-            J = moved.derivative(sensor, motion, own, rows, index)[..., seen].permute(2, 1, 0)
-            r = sensor.residual(motion, own, rows)[:, seen].t()
-            other = sensor.partner_derivative(motion)[len(problem.active) :][..., seen].permute(2, 1, 0)
-            found.append((seen + rows.start, J, r, other))
+        for sensor, columns in zip(moved.sensors, collected, strict=True):
+            present = sensor.present[rows].nonzero()[:, 0]
+            J = moved.derivative(sensor, motion, unknowns, rows, index)[..., present].permute(2, 1, 0)
+            r = sensor.residual(motion, unknowns, rows)[..., present].t()
+            other = sensor.partner_derivative(motion)[len(problem.active) :][..., present].permute(2, 1, 0)
+            columns.append((present + rows.start, J, r, other))
     values = []
-    for sensor, found in zip(problem.sensors, parts, strict=True):
-        row, J, r, other = (torch.cat(column) for column in zip(*found, strict=True))
+    for sensor, columns in zip(problem.sensors, collected, strict=True):
+        row, J, r, other = (torch.cat(column) for column in zip(*columns, strict=True))
         joints, paired = J[..., len(problem.active) :] * direction, sensor.paired
         root = torch.ones_like(r[:, 0]) if sensor.sigma is None else 1 / sensor.sigma[row]
         values.append(
@@ -168,7 +168,7 @@ def sensor_values(
                 joints=joints - other * direction if paired else joints,
                 residual=r.contiguous(),
                 root=root,
-                given=sensor.sigma is not None,
+                stated=sensor.sigma is not None,
                 certain=sensor.certain,
                 other_row=row + 1 if paired else None,
                 other_joints=other * direction if paired else None,

@@ -24,23 +24,23 @@ CHUNK = 512
 MOST_CONFIGURATIONS = 2_000
 """Left-out rows are looked at on so many configurations at most."""
 FEW_CONFIGURATIONS = 600
-"""Up to so many, whole parts are left out instead of single configurations."""
+"""Up to so many, whole folds are left out instead of single configurations."""
 LEAST_EFFECTIVE = 0.5
-"""Prior sizes of groups of which the data tell less than so many unknowns do not matter."""
-MOST_WIDENING = 1e4
+"""Prior sizes of groups of which the data determine fewer unknowns do not matter."""
+LARGEST_SCALE = 1e4
 """Largest factor on variances."""
 
 
 @dataclass(frozen=True, eq=False)
 class PositionUncertainty:
-    """How well positions are known: `sqrt(x C x^T)` with x the derivative of a coordinate by all unknowns.
+    """Standard deviations of positions: `sqrt(x C x^T)` with x the derivative of a coordinate by all unknowns.
 
     Attributes:
         space: the parameters.
         geometry: where the derivative is taken.
         features: what the weights belong to.
         root: `R` with `C = R R^T`, of all parameters of the space (0 for those that were not free) and then all
-            weights, widened so that left-out rows are missed by as much as it says.
+            weights, scaled so that left-out rows are missed by as much as it says.
         prior_scale: factor on the variances that this took.
     """
 
@@ -62,13 +62,13 @@ class PositionUncertainty:
         state = JointState.of(measurements)
         frame = numbers_of(measurements.frame, self.space.frames, measurements.rows)
         target = numbers_of(measurements.target, self.space.targets, measurements.rows)
-        found = torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
+        deviation = torch.full((measurements.rows, 3), torch.nan, dtype=torch.float64)
         for f in range(len(self.space.frames)):
             for t in range(len(self.space.targets)):
                 rows = ((frame == f) & (target == t)).nonzero()[:, 0]
                 for part in torch.split(rows, CHUNK):
-                    found[part] = self._of_rows(state[part], q_moved[part], f, t)
-        return found
+                    deviation[part] = self._of_rows(state[part], q_moved[part], f, t)
+        return deviation
 
     def _of_rows(
         self, state: JointState, q_moved: Float64[Tensor, "rows dof"], frame: int, target: int
@@ -79,9 +79,9 @@ class PositionUncertainty:
         J = identification_jacobian(robot, q_moved)[1][:, :3]
         columns = J.new_zeros((len(q_moved), 3, self.root.shape[0]))
         columns[..., : space.arm_size] = J[..., : space.arm_size]
-        for group, number, place in (("base", frame, space.arm_size), ("tool", target, space.arm_size + 6)):
+        for group, number, first in (("base", frame, space.arm_size), ("tool", target, space.arm_size + 6)):
             start = space.of(group).start + 6 * number
-            columns[..., start : start + 6] = J[..., place : place + 6]
+            columns[..., start : start + 6] = J[..., first : first + 6]
         columns[..., len(space.parameters) :] = self._weight_columns(J, state)
         return (columns @ self.root).square().sum(-1).sqrt()
 
@@ -112,29 +112,28 @@ def covariance_root(
 
 
 def covariance_of_sizes(posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
-    """What the uncertainty of the prior's own sizes adds to the covariance of the unknowns.
+    """What the uncertainty of the prior's sizes adds to the covariance of the unknowns.
 
-    With `dx / d log s_g = 2 C Λ_g x` for the unknowns of group g and `var(log s_g) = 1 / (2 told_g)`, where told_g of
-    them are told by the data (first order; Kass and Steffey 1989, J. Amer. Statist. Assoc. 84(407), 717-726).
+    With `dx / d log s_g = 2 C Λ_g x` for the unknowns of group g and `var(log s_g) = 1 / (2 n_g)`, where n_g of
+    them are determined by the data (first order; Kass and Steffey 1989, J. Amer. Statist. Assoc. 84(407), 717-726).
     """
     prior, x = posterior.prior, posterior.x
-    held = prior.precision * posterior.covariance.diagonal()
     groups = torch.zeros(len(x), len(prior.sizes), dtype=x.dtype, device=x.device)
     groups[torch.arange(len(x)), prior.group] = 1.0
-    told = (groups * ((1 - held) * (prior.base > 0))[:, None]).sum(0)
+    determined = (groups * (posterior.determined * (prior.base > 0))[:, None]).sum(0)
     moved = 2 * posterior.covariance @ (groups * (prior.precision * x)[:, None])
-    moved = moved[:, told > LEAST_EFFECTIVE] * (2 * told[told > LEAST_EFFECTIVE]).rsqrt()
+    moved = moved[:, determined > LEAST_EFFECTIVE] * (2 * determined[determined > LEAST_EFFECTIVE]).rsqrt()
     return moved @ moved.t()
 
 
-def left_out_widening(errors: LeftOut) -> float:
+def left_out_scale(errors: LeftOut) -> float:
     """Factor on the unknowns' covariance with which left-out values are missed by as much as predicted; 1 or more.
 
     With errors e and predicted deviations s in units of the noise, it solves `mean(e² / (1 + f (s² - 1))) = 1`.
     What the model cannot express makes it larger than 1.
     """
     square, extra = errors.error.square(), errors.spread.square() - 1
-    low, high = 0.0, math.log(MOST_WIDENING)
+    low, high = 0.0, math.log(LARGEST_SCALE)
     if float((square / (1 + extra)).mean()) <= 1:
         return 1.0
     for _ in range(60):
@@ -147,7 +146,7 @@ def left_out_widening(errors: LeftOut) -> float:
 
 
 def degrees_of_freedom_factor(posterior: Posterior, sums: Sums) -> float:
-    """`n / (n - told)` with n values of which the unknowns use up `told`.
+    """`n / (n - determined)` with n values of which the unknowns use up `determined`.
 
     Features, prior sizes and noise are chosen on the same rows, which makes the posterior a little too sure; new rows
     err by about so much more (as in generalised cross-validation, Craven and Wahba 1979).
@@ -158,7 +157,7 @@ def degrees_of_freedom_factor(posterior: Posterior, sums: Sums) -> float:
 def position_uncertainty(
     rows: Rows, design: Design, posterior: Posterior, sums: Sums, geometry: IdentifiedGeometry
 ) -> PositionUncertainty:
-    """Of the positions that a posterior predicts, widened by what left-out rows show.
+    """Of the positions that a posterior predicts, scaled by what left-out rows show.
 
     Args:
         rows: linearised values.
@@ -171,7 +170,7 @@ def position_uncertainty(
         missed = folds_left_out(rows, design, posterior, sums)
     else:
         missed = left_out(rows.sample(MOST_CONFIGURATIONS), design, posterior)
-    prior_scale = max(left_out_widening(missed), degrees_of_freedom_factor(posterior, sums))
+    prior_scale = max(left_out_scale(missed), degrees_of_freedom_factor(posterior, sums))
     space = design.problem.space
     active = design.problem.active.cpu()
     covariance = posterior.covariance + covariance_of_sizes(posterior)

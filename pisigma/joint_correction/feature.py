@@ -139,7 +139,7 @@ class AbstractFeature(ABC):
         """Whether a full turn of a revolute joint changes nothing, with these weights."""
         return True
 
-    def places_in(self, larger: "AbstractFeature") -> Int64[Tensor, "dof columns"]:
+    def columns_in(self, larger: "AbstractFeature") -> Int64[Tensor, "dof columns"]:
         """Which columns of a feature of the same name and at least this size are the columns of this one."""
         return torch.arange(self.count).expand(self.used.shape)
 

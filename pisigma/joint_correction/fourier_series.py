@@ -140,7 +140,7 @@ class FourierSeries(AbstractFeature):
         angle = (q * self._rate.to(q))[..., None] * k
         return torch.cat([angle.sin(), angle.cos()], -1)
 
-    def places_in(self, larger: AbstractFeature) -> Int64[Tensor, "dof columns"]:
+    def columns_in(self, larger: AbstractFeature) -> Int64[Tensor, "dof columns"]:
         """The first sines and the first cosines."""
         k = torch.arange(self.harmonics)
         return torch.cat([k, larger.size + k]).expand(self.used.shape)

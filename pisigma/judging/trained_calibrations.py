@@ -87,7 +87,7 @@ def without_missing(calibrator: Calibrator, rows: Measurements, of: Measurements
     if isinstance(calibrator, HybridCalibrator):
         geometric = without_missing(calibrator.geometric, rows, of)
         assert isinstance(geometric, GeometricCalibrator)
-        return replace(calibrator, geometric=geometric)
+        return replace(calibrator, robot=geometric)
     no_frame = set(of.frame) - set(rows.frame)
     no_socket = (set(of.socket or ()) - set(rows.socket or ())) - {""}
     return replace(

@@ -67,7 +67,7 @@ def test_sums_of_a_smaller_design_are_a_part_of_those_of_a_larger(
     large = Design(arm.rows.problem, features(robot, 7))
     small = Design(arm.rows.problem, tuple(features(robot, 3)[k] for k in chosen))
     whole, part = (sum_up(design, arm.rows.values, arm.rows.start(design)) for design in (large, small))
-    places = large.places(small.features)
+    places = large.indices(small.features)
     assert len(places) == len(set(places.tolist())) == small.unknowns
     found = whole.select(places)
     assert_close(found.normal, part.normal, atol=1e-13 * float(part.normal.abs().max()))

@@ -8,7 +8,6 @@ from testing.models import no_type_checker
 
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.result import HybridResult
-from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
@@ -20,18 +19,12 @@ def rms(result: HybridResult | CalibrationResult, measurements: Measurements) ->
 
 
 def calibrator(robot: Robot) -> HybridCalibrator:
-    return HybridCalibrator(GeometricCalibrator(robot), harmonics=(8, 24), orders=())
+    return HybridCalibrator(robot, harmonics=(8, 24), orders=())
 
 
 @pytest.mark.parametrize(
     ("joint", "upper"),
-    [
-        (1, False),
-        (3, True),
-        (5, True),
-        (0, False),
-        (2, True),
-    ],
+    [(1, False), (3, True), (0, False)],
 )
 def test_ur5_beyond_half_of_a_joints_range(shared_data: Path, joint: int, upper: bool) -> None:
     data, robot = Measurements.read_csv(shared_data / "ur5" / "grid.csv"), Robot.load("ur5")
@@ -46,21 +39,22 @@ def test_ur5_with_100_poses(shared_data: Path) -> None:
     data, robot = Measurements.read_csv(shared_data / "ur5" / "grid.csv"), Robot.load("ur5")
     order = torch.randperm(data.rows, generator=torch.Generator().manual_seed(0))
     train, test = data.select(order[:100]), data.select(order[100:])
-    result = calibrator(robot).fit(train)
-    assert rms(result.geometric, test) > 0.11e-3
-    assert rms(result, test) < 0.085e-3
+    with no_type_checker():
+        result = calibrator(robot).fit(train)
+        assert rms(result.geometric, test) > 0.11e-3
+        assert rms(result, test) < 0.085e-3
 
 
 def test_fanuc_with_20_poses_is_not_made_worse(shared_data: Path) -> None:
-    """24 poses, each measured 30 times; RMS over six parts of them left out."""
+    """24 poses, each measured 30 times; RMS over six folds of them."""
     data = Measurements.read_csv(shared_data / "fanuc_r2000" / "positions.csv")
     poses = torch.unique(data.q, dim=0, return_inverse=True)[1]
     square = {"hybrid": 0.0, "geometric": 0.0}
     with no_type_checker():
         for fold in range(6):
-            held = poses % 6 == fold
-            result = calibrator(Robot.load("fanuc_r2000")).fit(data.select(~held))
-            test = data.select(held)
+            tested = poses % 6 == fold
+            result = calibrator(Robot.load("fanuc_r2000")).fit(data.select(~tested))
+            test = data.select(tested)
             square["hybrid"] += test.rows * rms(result, test) ** 2
             square["geometric"] += test.rows * rms(result.geometric, test) ** 2
     assert (square["hybrid"] / square["geometric"]) ** 0.5 < 1.02

@@ -8,9 +8,9 @@ import torch
 from testing.closeness import assert_close
 from testing.linearised import Fitted, LinearisedArm, drawn_joints, linearised, tracker_data
 
+from pisigma.hybrid.alternating_products import AlternatingProducts, normalised
 from pisigma.hybrid.design import sum_up
 from pisigma.hybrid.evidence import maximise_evidence, solve_mean
-from pisigma.hybrid.held_products import HeldProducts, normalised
 from pisigma.hybrid.products import ROUNDS, FittedProducts, ProductFit
 from pisigma.hybrid.refinement import network
 from pisigma.identification.prediction import predicted_poses
@@ -81,7 +81,7 @@ def test_with_sizes_held_all_unknowns_are_those_of_the_whole_solve() -> None:
     fitted = arm.fitted((FourierSeries(robot, SERIES),))
     fit = fit_to(arm, fitted)
     factors = torch.randn(6, 4, 13, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    held = HeldProducts(robot, (2, 2), normalised(factors), 0)
+    held = AlternatingProducts(robot, (2, 2), normalised(factors), 0)
     fit._reduce(fitted.posterior)
     posterior = fit._completed(*fit._reduced(held, None, 0))
     design = replace(fitted.design, features=(*fitted.design.features, held))
@@ -104,7 +104,7 @@ def test_quick_fits_leave_sizes_and_noise_of_the_rest_as_they_were(
     """Without updates at the end; geometry and series then are the best beside the products' weights."""
     arm, fitted = exact
     found = fit_to(arm, fitted).fit((2, 2), final_iterations=0)
-    assert found.held.turn == ROUNDS - 1
+    assert found.units.turn == ROUNDS - 1
     design, x = found.design, found.posterior.x
     sums = sum_up(design, arm.rows.values, arm.rows.start(design))
     precision = found.posterior.prior.precision
@@ -169,7 +169,7 @@ def test_products_fitted_to_noise_alone_cost_little() -> None:
         off.append(float((T[:, :3, 3] - new.position).square().sum(1).mean().sqrt()))
     assert off[1] < 3 * off[0]
     assert off[1] < 3**0.5 * 3e-5  # what one measured position is off
-    held = found.held
-    assert isinstance(held, HeldProducts)
-    lengths = held.factors.norm(dim=-1).numpy()
+    units = found.units
+    assert isinstance(units, AlternatingProducts)
+    lengths = units.factors.norm(dim=-1).numpy()
     assert_close(lengths, np.ones_like(lengths), atol=1e-12)

@@ -5,9 +5,9 @@ import torch
 from testing.closeness import assert_close
 from testing.linearised import drawn_joints, tracker_data
 
+from pisigma.hybrid.alternating_products import AlternatingProducts, product_values
 from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.hybrid.held_products import HeldProducts, product_values
-from pisigma.hybrid.refinement import Refined, refine, with_held_factors
+from pisigma.hybrid.refinement import Refined, refine, with_all_factors
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import HampelLoss
 from pisigma.kinematics.forward import forward_kinematics
@@ -50,13 +50,13 @@ def test_no_row_is_left_worse_than_noise_and_model_allow(refined: Refined) -> No
 
 def test_held_factors_are_uncertain_too(refined: Refined) -> None:
     """What they change is the derivative of the products by them, and nothing moves at the solution."""
-    whole = with_held_factors(refined)
+    whole = with_all_factors(refined)
     if not refined.correction.orders:
         assert whole is refined
         return
     held, other = whole.design.features[-2], whole.design.features[-1]
-    assert isinstance(held, HeldProducts)
-    assert isinstance(other, HeldProducts)
+    assert isinstance(held, AlternatingProducts)
+    assert isinstance(other, AlternatingProducts)
     assert sorted((*held.free, *other.free)) == [0, 1, 2, 3]
     q = drawn_joints(ROBOT, 10, 5)
     factors = other.factors

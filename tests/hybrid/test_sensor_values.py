@@ -10,8 +10,8 @@ from testing.linearised import drawn_joints, tracker_data, with_directions
 from testing.sensors import mixed_data, pair_data
 from torch import Tensor
 
+from pisigma.hybrid.alternating_products import AlternatingProducts
 from pisigma.hybrid.design import Design
-from pisigma.hybrid.held_products import HeldProducts
 from pisigma.hybrid.sensor_values import joint_columns, sensor_values
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.problem import CalibrationProblem, MotionMemory
@@ -155,7 +155,7 @@ def test_columns_are_the_derivative_by_the_weights(name: str) -> None:
         made.weight.add_(0.1)
     made.requires_grad_(False)
     factors = torch.cat([made.bias[..., None], made.weight], -1)
-    held = HeldProducts(robot, (2, 3), factors, 1)
+    held = AlternatingProducts(robot, (2, 3), factors, 1)
     problem, point = case(name, made)
     design = Design(problem, (*made.features, held))
     values = sensor_values(problem, point, made)
@@ -210,7 +210,7 @@ def test_given_standard_deviations_are_the_rows_roots() -> None:
     values = sensor_values(problem.with_active([0, 1]), problem.nominal)
     found = {sensor.name: sensor for sensor in values}
     assert_close(found["position"].root, 1 / sigma[problem_rows(problem, data)], rtol=1e-12)
-    assert (found["position"].given, found["rotation"].given) == (True, False)
+    assert (found["position"].stated, found["rotation"].stated) == (True, False)
     assert_close(found["rotation"].root, torch.ones(data.rows))
 
 

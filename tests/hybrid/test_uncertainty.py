@@ -13,13 +13,13 @@ from torch import Tensor
 from pisigma.hybrid.evidence import GaussianPrior, Posterior, Sums, solve_mean, solve_posterior
 from pisigma.hybrid.left_out import LeftOut
 from pisigma.hybrid.uncertainty import (
+    LARGEST_SCALE,
     LEAST_EFFECTIVE,
-    MOST_WIDENING,
     PositionUncertainty,
     covariance_of_sizes,
     covariance_root,
     degrees_of_freedom_factor,
-    left_out_widening,
+    left_out_scale,
     position_uncertainty,
 )
 from pisigma.identification.prediction import predicted_poses
@@ -90,16 +90,16 @@ def missed(error: Tensor, spread: Tensor) -> LeftOut:
 def test_widening_makes_left_out_errors_as_large_as_predicted() -> None:
     spread = 1 + normal(500, seed=0).abs()
     error = 3 * spread * normal(500, seed=1)
-    factor = left_out_widening(missed(error, spread))
+    factor = left_out_scale(missed(error, spread))
     assert factor > 2
     assert_close((error.square() / (1 + factor * (spread.square() - 1))).mean(), 1.0, atol=1e-9)
 
 
 def test_errors_as_small_as_predicted_widen_nothing_and_there_is_a_limit() -> None:
     spread = 1 + normal(500, seed=0).abs()
-    assert left_out_widening(missed(0.9 * normal(500, seed=1), spread)) == 1.0
-    hopeless = left_out_widening(missed(100 + spread, torch.ones_like(spread)))
-    assert_close(hopeless, MOST_WIDENING, rtol=1e-9)
+    assert left_out_scale(missed(0.9 * normal(500, seed=1), spread)) == 1.0
+    hopeless = left_out_scale(missed(100 + spread, torch.ones_like(spread)))
+    assert_close(hopeless, LARGEST_SCALE, rtol=1e-9)
 
 
 def test_values_that_the_unknowns_use_up_widen() -> None:

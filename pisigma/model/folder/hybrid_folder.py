@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pisigma.hybrid.alternating_products import AlternatingProducts
 from pisigma.hybrid.arms import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
-from pisigma.hybrid.held_products import HeldProducts
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.joint_correction.feature import AbstractFeature, turning_rate
@@ -56,7 +56,7 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
         found["uncertainty"] = {
             **_unknowns_section(known.space.unknowns),
             "free": _free_rows(known),
-            "turns": [chosen.turn for chosen in known.features if isinstance(chosen, HeldProducts)],
+            "turns": [chosen.turn for chosen in known.features if isinstance(chosen, AlternatingProducts)],
             "prior_scale": known.prior_scale,
             "unexplained_m": model.unexplained,
         }
@@ -267,5 +267,5 @@ def _weighted(known: UncertaintySection, hybrid: HybridArm | None) -> tuple[Abst
         return ()
     correction = hybrid.correction
     factors = torch.cat([correction.bias[..., None], correction.weight], -1).detach()
-    held = [HeldProducts(correction.robot, correction.orders, factors, turn) for turn in known.turns]
+    held = [AlternatingProducts(correction.robot, correction.orders, factors, turn) for turn in known.turns]
     return (*correction.features, *held)

@@ -68,7 +68,7 @@ class UncertaintySection(Section):
         others: the unknowns of other sensors by group.
         free: which parameters have a row in the root; the others' rows are 0. Behind them come all weights.
         turns: whose turn it is, for every stretch of weights of product units that stands behind the others: see
-            `pisigma.hybrid.held_products.HeldProducts`.
+            `pisigma.hybrid.alternating_products.AlternatingProducts`.
         prior_scale: see `pisigma.hybrid.uncertainty.PositionUncertainty`.
         unexplained_m: see `pisigma.model.calibrated_model.CalibratedModel`.
     """

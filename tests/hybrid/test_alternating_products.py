@@ -6,7 +6,13 @@ from testing.closeness import assert_close
 from testing.linearised import drawn_joints
 from torch import Tensor
 
-from pisigma.hybrid.held_products import HeldProducts, InputPairs, normalised, product_values, with_bias
+from pisigma.hybrid.alternating_products import (
+    AlternatingProducts,
+    InputPairs,
+    normalised,
+    product_values,
+    with_bias,
+)
 from pisigma.joint_correction.feature import unit_inputs
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.conditions import JointState
@@ -44,7 +50,7 @@ def test_columns_times_free_weights_are_the_products(name: str, orders: tuple[in
         network.weight.copy_(factors[..., 1:])
         assert_close(network(q), expected, atol=1e-12)
     for turn in range(max(orders) + 1):
-        held = HeldProducts(robot, orders, factors, turn)
+        held = AlternatingProducts(robot, orders, factors, turn)
         assert all(0 <= free - sum(orders[:u]) < orders[u] for u, free in enumerate(held.free))
         weights = factors[:, list(held.free)].flatten()
         columns = held.columns(JointState(q))
@@ -59,14 +65,16 @@ def test_columns_times_free_weights_are_the_products(name: str, orders: tuple[in
 
 def test_every_factor_gets_its_turn() -> None:
     robot = Robot.load("ur5")
-    free = [HeldProducts(robot, (2, 3), torch.zeros(6, 5, 13).double(), turn).free for turn in range(6)]
+    free = [
+        AlternatingProducts(robot, (2, 3), torch.zeros(6, 5, 13).double(), turn).free for turn in range(6)
+    ]
     assert free == [(0, 2), (1, 3), (0, 4), (1, 2), (0, 3), (1, 4)]
 
 
 def test_batches_of_any_shape_have_columns() -> None:
     robot = Robot.load("kiro3")
     pairs = InputPairs(robot)
-    held = HeldProducts(robot, (2,), normal(4, 2, pairs.inputs + 1), 0)
+    held = AlternatingProducts(robot, (2,), normal(4, 2, pairs.inputs + 1), 0)
     q = drawn_joints(robot, 6, 0)
     for features in (pairs, held):
         flat = features.columns(JointState(q))

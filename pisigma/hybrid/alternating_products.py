@@ -1,4 +1,4 @@
-"""Product units with all factors but one held: linear in that one."""
+"""Product units with all factors fixed but one: linear in that one."""
 
 from collections.abc import Sequence
 
@@ -15,8 +15,8 @@ Factors = Float64[Tensor, "dof factors inputs"]
 """Weights of every factor of every joint's product units, the bias first."""
 
 
-class HeldProducts(AbstractFeature):
-    """Columns `Π_{others} h · [1, φ]` of the free factor of every unit: asynchronous learning, solved exactly.
+class AlternatingProducts(AbstractFeature):
+    """Columns `Π_{others} h · [1, φ]` of the free factor of every unit: alternating least squares.
 
     Attributes:
         orders: number of factors of every unit.
@@ -30,7 +30,7 @@ class HeldProducts(AbstractFeature):
     def __init__(
         self, robot: Robot, orders: Sequence[int], factors: Float64[Tensor, "dof factors inputs"], turn: int
     ) -> None:
-        """Hold all factors but those whose turn it is: factor `turn` modulo its unit's order."""
+        """Fix all factors but those whose turn it is: factor `turn` modulo its unit's order."""
         super().__init__(robot)
         self.orders = tuple(orders)
         self.factors = factors
@@ -43,16 +43,16 @@ class HeldProducts(AbstractFeature):
         self.group_names = tuple(f"products, {joint.name}" for joint in robot.joints)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
-        """The inputs of the free factors times what the held ones come to."""
+        """The inputs of the free factors times the product of the fixed ones."""
         x = with_bias(self.robot, state.q)
-        held = torch.einsum("...i,jsi->...js", x, self.factors.to(x))
+        values = torch.einsum("...i,jsi->...js", x, self.factors.to(x))
         parts = []
         start = 0
         for order, free in zip(self.orders, self.free, strict=True):
-            product = torch.ones_like(held[..., 0])
+            product = torch.ones_like(values[..., 0])
             for factor in range(start, start + order):
                 if factor != free:
-                    product = product * held[..., factor]
+                    product = product * values[..., factor]
             parts.append(product[..., None] * x[..., None, :])
             start += order
         return torch.cat(parts, -1)
@@ -60,9 +60,9 @@ class HeldProducts(AbstractFeature):
     def solved(self, weights: Float64[Tensor, " weights"]) -> Float64[Tensor, "dof factors inputs"]:
         """All factors, the free ones as solved."""
         dof, _, inputs = self.factors.shape
-        found = self.factors.clone()
-        found[:, list(self.free)] = weights.reshape(dof, len(self.orders), inputs)
-        return found
+        factors = self.factors.clone()
+        factors[:, list(self.free)] = weights.reshape(dof, len(self.orders), inputs)
+        return factors
 
 
 class InputPairs(AbstractFeature):
@@ -101,21 +101,21 @@ class InputPairs(AbstractFeature):
         Further factors of a unit start as the constant 1.
         """
         dof, size = self.used.shape[0], self.inputs
-        found = weights.new_zeros((dof, sum(orders), size + 1))
+        factors = weights.new_zeros((dof, sum(orders), size + 1))
         first, second = (torch.tensor(side) for side in zip(*self.pairs, strict=True))
-        for j, own in enumerate(weights.reshape(dof, -1)):
+        for j, values in enumerate(weights.reshape(dof, -1)):
             M = weights.new_zeros((size, size))
-            M[first, second] = own / 2
+            M[first, second] = values / 2
             eigenvalues, vectors = torch.linalg.eigh(M + M.t())
             start = 0
             for u, order in enumerate(orders):
                 low, high = min(u, size - 1), max(size - 1 - u, 0)
                 plus = eigenvalues[high].clamp(min=0).sqrt() * vectors[:, high]
                 minus = (-eigenvalues[low]).clamp(min=0).sqrt() * vectors[:, low]
-                found[j, start, 1:], found[j, start + 1, 1:] = plus + minus, plus - minus
-                found[j, start + 2 : start + order, 0] = 1.0
+                factors[j, start, 1:], factors[j, start + 1, 1:] = plus + minus, plus - minus
+                factors[j, start + 2 : start + order, 0] = 1.0
                 start += order
-        return found
+        return factors
 
 
 def with_bias(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch inputs"]:
@@ -136,5 +136,5 @@ def product_values(
     robot: Robot, factors: Float64[Tensor, "dof factors inputs"], orders: Sequence[int], q: Tensor
 ) -> Tensor:
     """What the product units come to [rad or m]."""
-    held = torch.einsum("...i,jsi->...js", with_bias(robot, q), factors.to(q))
-    return sum_of_products(held, orders)
+    values = torch.einsum("...i,jsi->...js", with_bias(robot, q), factors.to(q))
+    return sum_of_products(values, orders)
