@@ -12,7 +12,7 @@ from torch import Tensor
 from pisigma.errors import RecipeError
 from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_from_rpy, transform
-from pisigma.simulation.errors.source import joint_index
+from pisigma.simulation.errors.source import stated_joints
 from pisigma.yaml_file import Section
 
 Triple = tuple[float, float, float]
@@ -109,18 +109,10 @@ class JointsRandom(Section):
         with np.errstate(invalid="ignore"):  # joints without limits are complained of below
             middle, half = robot.limits.mean(1, keepdims=True), np.diff(robot.limits) / 2
             bounds: np.ndarray = middle + self.share * half * np.array([-1.0, 1.0])
-        for field, other, ranges, kind in (
-            ("range_deg", "range_mm", self.range_deg, "revolute"),
-            ("range_mm", "range_deg", self.range_mm, "prismatic"),
-        ):
-            for name, stated in ranges.items():
-                index = joint_index(robot, name, "joints_random")
-                if robot.joints[index].type != kind:
-                    raise RecipeError(
-                        f"joints_random: joint '{name}' is {robot.joints[index].type}, "
-                        f"so state it in {other}, not in {field}."
-                    )
-                bounds[index] = np.deg2rad(stated) if kind == "revolute" else np.array(stated) / 1e3
+        fields = ("range_deg", "range_mm")
+        ranges = stated_joints(robot, self.range_deg, self.range_mm, fields, "joints_random")
+        for index, stated in ranges.items():
+            bounds[index] = np.deg2rad(stated) if robot.revolute[index] else np.array(stated) / 1e3
         for joint, (lower, upper) in zip(robot.joints, bounds, strict=True):
             if not np.isfinite([lower, upper]).all():
                 raise RecipeError(

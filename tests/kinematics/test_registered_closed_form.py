@@ -7,6 +7,7 @@ import pytest
 import torch
 from testing.closeness import assert_close
 
+from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.kinematics.closed_form import (
     AbstractClosedForm,
     closed_form_solver,
@@ -18,6 +19,7 @@ from pisigma.kinematics.closed_form.scara import Scara
 from pisigma.kinematics.components import Frame, Scalar, as_tensors
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot import Robot, Row
 
 
@@ -76,3 +78,18 @@ def test_the_registered_form_inverts_the_forward_kinematics(mast, registered):
 def test_forms_are_asked_in_their_order_and_registered_once(registered):
     assert [*registry.CLOSED_FORMS[:-1], register_closed_form(Mast)] == registry.CLOSED_FORMS
     assert type(closed_form_solver(Robot.load("kiro3"))) is Scara
+
+
+def test_corrected_inverse_kinematics_solves_by_it(mast, registered):
+    """Without a compiled form the model goes through the reference, on the registered branches."""
+    q = torch.tensor([[0.4, -1.2], [1.9, 2.5]], dtype=torch.float64)
+    model = CalibratedModel(
+        name="mast", kind="geometric_calibration", robot=mast, network=None, domain=None, branches=(), starts=q,
+        calibrated=mast,
+    )  # fmt: skip
+    ik = CorrectedIK(model)
+    assert ik.branches == ("only",)
+    T = forward_kinematics(mast, q)
+    solution = ik(T, throw=False)
+    assert_close(solution.q, q, atol=1e-9)
+    assert solution.status.tolist() == [Status.REACHED, Status.REACHED]

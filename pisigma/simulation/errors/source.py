@@ -3,6 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -11,6 +12,8 @@ from torch import Tensor
 from pisigma.errors import RecipeError, nearest_choice
 from pisigma.robot.description import Robot
 from pisigma.yaml_file import Section
+
+Value = TypeVar("Value")
 
 JointErrorFunction = Callable[[Tensor], Tensor]
 """From commanded joint values `(*batch, dof)` to what is added to them [rad or m], of the same shape."""
@@ -127,14 +130,14 @@ def joint_index(robot: Robot, name: str, place: str) -> int:
     return names.index(name)
 
 
-def joint_values(
+def stated_joints(
     robot: Robot,
-    for_revolute: Mapping[str, float],
-    for_prismatic: Mapping[str, float],
+    for_revolute: Mapping[str, Value],
+    for_prismatic: Mapping[str, Value],
     fields: tuple[str, str],
     place: str,
-) -> Float64[np.ndarray, " dof"]:
-    """One value per joint from the two mappings of a recipe; a joint that neither names has 0.
+) -> dict[int, Value]:
+    """What the two mappings of a recipe state, by index of the joint.
 
     Args:
         robot: the robot.
@@ -146,7 +149,7 @@ def joint_values(
     Raises:
         RecipeError: an unknown joint, or one in the mapping of the other type.
     """
-    values = np.zeros(robot.dof)
+    values: dict[int, Value] = {}
     for mapping, field, other, kind in (
         (for_revolute, fields[0], fields[1], "revolute"),
         (for_prismatic, fields[1], fields[0], "prismatic"),
@@ -160,3 +163,15 @@ def joint_values(
                 )
             values[index] = value
     return values
+
+
+def joint_values(
+    robot: Robot,
+    for_revolute: Mapping[str, float],
+    for_prismatic: Mapping[str, float],
+    fields: tuple[str, str],
+    place: str,
+) -> Float64[np.ndarray, " dof"]:
+    """One value per joint, 0 where none is stated. See `stated_joints`."""
+    stated = stated_joints(robot, for_revolute, for_prismatic, fields, place)
+    return np.array([stated.get(index, 0.0) for index in range(robot.dof)])
