@@ -5,15 +5,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pisigma.cli.output import command_line, print_json, print_lines, print_table
+from pisigma.cli.completion import complete_robot
+from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:
     from pisigma.judging.calibration_summary import CalibrationSummary
 
 RobotName = Annotated[
-    str, typer.Argument(metavar="ROBOT", help="Catalogue name or robot file (YAML or URDF).")
+    str,
+    typer.Argument(
+        metavar="ROBOT", help="Catalogue name or robot file (YAML or URDF).", autocompletion=complete_robot
+    ),
 ]
-Data = Annotated[Path, typer.Argument(help="Measurements (CSV).")]
+Data = Annotated[Path, typer.Argument(metavar="DATA", help="Measurements (CSV).")]
 Out = Annotated[Path, typer.Option(help="Model folder to write.")]
 Model = Annotated[
     str,
@@ -91,7 +95,6 @@ def calibrate(
 
     Geometry, base and tool, and with them a correction of the joints where it predicts left-out rows better.
     """
-    from pisigma.cli.output import progress_of
     from pisigma.model.folder.staging import check_replaceable
     from pisigma.robot.description import Robot
     from pisigma.workflow import calibrate as workflow

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.output import command_line, print_json, print_lines, print_table
+from pisigma.cli.completion import complete_model
+from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:
     from pisigma.workflow.distill import Distillation
@@ -15,7 +16,12 @@ if TYPE_CHECKING:
 
 Box = tuple[float, float, float, float, float, float]
 
-Model = Annotated[Path, typer.Argument(help="Model folder that `pisigma calibrate` wrote.")]
+Model = Annotated[
+    Path,
+    typer.Argument(
+        metavar="MODEL", help="Model folder that `pisigma calibrate` wrote.", autocompletion=complete_model
+    ),
+]
 Out = Annotated[Path, typer.Option(help="Model folder to write.")]
 RegionMm = Annotated[
     Box | None,
@@ -62,7 +68,6 @@ def distill(
 
     Its error against the full solution, on poses that were not fitted to, is printed and on its card.
     """
-    from pisigma.cli.output import progress_of
     from pisigma.errors import RecipeError
     from pisigma.model.folder.staging import check_replaceable
     from pisigma.workflow.distill import DistillationSettings

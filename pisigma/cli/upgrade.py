@@ -6,9 +6,15 @@ from typing import Annotated
 
 import typer
 
+from pisigma.cli.completion import complete_model
 from pisigma.cli.output import print_json
 
-Model = Annotated[Path, typer.Argument(help="Model folder that an earlier version wrote.")]
+Model = Annotated[
+    Path,
+    typer.Argument(
+        metavar="MODEL", help="Model folder that an earlier version wrote.", autocompletion=complete_model
+    ),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
