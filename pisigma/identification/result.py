@@ -109,7 +109,6 @@ class CalibrationResult:
         noise: per sensor.
         redundancy: rank, chosen parameters and dependencies at the start.
         pairwise: redundancy the paper's way, by Pearson correlation.
-        arm_rank: rank of the arm's parameters alone, when bases and tools may take any value.
         extended: parameters that were added because at the solution the data do determine them.
         weak_directions: directions that the data hardly determine, in words; there the nominal value stands.
         observability: indices O1 to O5 of the free parameters at the solution.
@@ -132,7 +131,6 @@ class CalibrationResult:
     noise: tuple[SensorNoise, ...]
     redundancy: Redundancy
     pairwise: PairwiseRedundancy
-    arm_rank: int
     extended: tuple[str, ...]
     weak_directions: tuple[str, ...]
     observability: Observability

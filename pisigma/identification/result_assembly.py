@@ -11,7 +11,7 @@ from torch import Tensor
 from pisigma.identification.identifiability.observability import find_weak_directions, observability_of
 from pisigma.identification.identifiability.pairwise import find_pairwise_redundancy
 from pisigma.identification.identifiability.plausibility import misfitting_frames
-from pisigma.identification.identifiability.redundancy import Redundancy, find_redundancy
+from pisigma.identification.identifiability.redundancy import Redundancy
 from pisigma.identification.problem.information import Information
 from pisigma.identification.problem.least_squares import Linearisation, Solution, covariance_of
 from pisigma.identification.problem.noise import effective_parameters, values_used, view_of
@@ -105,7 +105,6 @@ def assemble_result(
         noise=_noise(problem, here),
         redundancy=findings.redundancy,
         pairwise=find_pairwise_redundancy(findings.information, findings.sizes),
-        arm_rank=_arm_rank(findings),
         extended=tuple(problem.space.names[i] for i in findings.extended),
         weak_directions=find_weak_directions(problem, here),
         observability=observability_of(gram * usual * usual[:, None], poses),
@@ -115,13 +114,6 @@ def assemble_result(
         rms_path=tuple(view_of(passed).sums[0].rms for passed in solution.path),
         warnings=(*findings.warnings, *_warnings(problem, here, solution)),
     )
-
-
-def _arm_rank(findings: Findings) -> int:
-    """The rank of the arm's parameters alone, after bases and tools."""
-    groups = [parameter.group for parameter in findings.information.parameters]
-    rest = findings.information.after([k for k, group in enumerate(groups) if group in ("base", "tool")])
-    return find_redundancy(rest, np.zeros(len(rest.parameters)), findings.redundancy.tolerance).rank
 
 
 def _covariance(

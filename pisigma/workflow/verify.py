@@ -13,7 +13,7 @@ from pisigma.judging.bootstrap import Bootstrap
 from pisigma.judging.frame_fits import FRAMES_FITTED
 from pisigma.judging.model_comparison import ModelComparison, QuantityErrors, compare_models
 from pisigma.judging.reference_models import geometric_model, nominal_model
-from pisigma.measurement.csv.rows import LIMIT_TOLERANCE
+from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model

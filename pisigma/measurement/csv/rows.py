@@ -6,13 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
+from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.measurement.csv.header import QUATERNION, Column, Layout, quoted
 from pisigma.measurement.csv.table import Faults, Table
 from pisigma.measurement.readings import READINGS, from_si, to_si
 from pisigma.robot import Robot, Row
-
-LIMIT_TOLERANCE = 1e-9
-"""How far [rad or m] a joint value may lie outside its limits, for rounding."""
 
 LARGEST = 1e9
 """In the file's units: nothing that is measured is larger."""
