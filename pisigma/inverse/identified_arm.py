@@ -62,15 +62,15 @@ def search(
         pose, attempt = usable.nonzero().unbind(1)
         if not len(pose):
             continue
-        found = _solve(robot, T[pose], starts[:, tried][pose, attempt], hybrid)
-        good = found.status != Status.NOT_CONVERGED
+        result = _solve(robot, T[pose], starts[:, tried][pose, attempt], hybrid)
+        good = result.status != Status.NOT_CONVERGED
         if inside:
-            attempt = attempt + starts.shape[1] * (found.status == Status.OUTSIDE_JOINT_LIMITS)
+            attempt = attempt + starts.shape[1] * (result.status == Status.OUTSIDE_JOINT_LIMITS)
         first = torch.full((len(T),), 2 * starts.shape[1]).scatter_reduce(
             0, pose[good], attempt[good], "amin"
         )
         kept = (good & (attempt == first[pose])).nonzero()[:, 0]
-        q[pose[kept]], status[pose[kept]] = found.q[kept], found.status[kept]
+        q[pose[kept]], status[pose[kept]] = result.q[kept], result.status[kept]
     return q, status
 
 
@@ -79,11 +79,11 @@ def _solve(robot: Robot, T: Tensor, start: Tensor, hybrid: HybridArm | None) -> 
 
     First with a Jacobian that is cheap; what it does not solve, near singular poses, with the exact one.
     """
-    found = solve_numeric(robot, T, start, max_iterations=ITERATIONS)
+    result = solve_numeric(robot, T, start, max_iterations=ITERATIONS)
     if hybrid is None:
-        return found
-    close = (found.position_residual < NEARLY * robot.reach) & (found.rotation_residual < NEARLY)
-    q, status = found.q.clone(), torch.full_like(found.status, int(Status.NOT_CONVERGED))
+        return result
+    close = (result.position_residual < NEARLY * robot.reach) & (result.rotation_residual < NEARLY)
+    q, status = result.q.clone(), torch.full_like(result.status, int(Status.NOT_CONVERGED))
     for exact, rounds in ((False, CHEAP_ITERATIONS), (True, EXACT_ITERATIONS)):
         rows = (close & (status == Status.NOT_CONVERGED)).nonzero()[:, 0]
         motion = partial(hybrid_motion, hybrid, exact=exact)
@@ -96,7 +96,7 @@ def _solve(robot: Robot, T: Tensor, start: Tensor, hybrid: HybridArm | None) -> 
             motion=motion,
         )
         q[rows], status[rows] = better.q, better.status
-    return replace(found, q=q, status=status)
+    return replace(result, q=q, status=status)
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,10 +125,10 @@ class IdentifiedArm:
         Returns:
             Joint values [rad or m] on the turns of q, and a status.
         """
-        found, status = search(
+        result, status = search(
             self.calibrated, T.reshape(-1, 4, 4), q.reshape(-1, 1, q.shape[-1]), self.hybrid
         )
-        return self.turned_like(found.reshape(q.shape), q), status.reshape(q.shape[:-1])
+        return self.turned_like(result.reshape(q.shape), q), status.reshape(q.shape[:-1])
 
     def recover(
         self,
@@ -162,12 +162,12 @@ class IdentifiedArm:
         first = drawn[torch.arange(len(chosen)), wanted][:, None]
         others = torch.cat([drawn, self.starts.q[index]], 1)
         others = torch.where(anywhere[chosen, None, None], others, torch.nan)
-        found, reached = search(self.calibrated, T_near, torch.cat([first, others], 1), self.hybrid)
-        lies = self.branch_of(found)
+        result, reached = search(self.calibrated, T_near, torch.cat([first, others], 1), self.hybrid)
+        lies = self.branch_of(result)
         lost = (lies != wanted) & ~anywhere[chosen]
-        found[lost], reached[lost] = torch.nan, int(Status.UNREACHABLE)
+        result[lost], reached[lost] = torch.nan, int(Status.UNREACHABLE)
         branch = branch.index_copy(0, chosen, torch.where(anywhere[chosen], lies, wanted))
-        return q.index_copy(0, chosen, found), status.index_copy(0, chosen, reached), branch
+        return q.index_copy(0, chosen, result), status.index_copy(0, chosen, reached), branch
 
     def branch_of(self, q: Float64[Tensor, "poses dof"]) -> Int64[Tensor, " poses"]:
         """Index of the nominal arm's branch that is nearest to joint values; 0 for NaN."""

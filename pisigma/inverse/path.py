@@ -143,23 +143,23 @@ def _guide(
 def _jumps(ik: "pisigma.inverse.corrected_ik.CorrectedIK", T: Array, q: Array) -> Array:
     """Whether staying on a branch is a jump `(poses - 1, branches)`; long steps are looked at halfway."""
     step = np.abs(wrapped(np.diff(q, axis=0), ik.revolute)).max(-1)
-    found = np.zeros(step.shape, dtype=bool)
+    result = np.zeros(step.shape, dtype=bool)
     rows = np.flatnonzero((np.nan_to_num(step, nan=0.0) > 0.1).any(-1))
     if len(rows):
         middle = np.asarray(ik.all_branches(halfway(T[rows], T[rows + 1])).q)
-        found[rows] = is_jump(q[rows], middle, q[rows + 1], ik.revolute)
-    return found
+        result[rows] = is_jump(q[rows], middle, q[rows + 1], ik.revolute)
+    return result
 
 
 def _one_by_one(ik: "pisigma.inverse.corrected_ik.CorrectedIK", T: Array, near: Array | None) -> Array:
     """Joint values of every pose from those of the pose before."""
-    found, last = np.empty((len(T), len(ik.joints))), near
+    result, last = np.empty((len(T), len(ik.joints))), near
     for row, wanted in enumerate(T):
         q = np.asarray(_solve(ik, wanted, last).q)
         if np.isfinite(q).all():
             last = q
-        found[row] = np.clip(0.0, ik.limits[:, 0], ik.limits[:, 1]) if last is None else last
-    return found
+        result[row] = np.clip(0.0, ik.limits[:, 0], ik.limits[:, 1]) if last is None else last
+    return result
 
 
 def _switches(
@@ -168,7 +168,7 @@ def _switches(
     reached = np.isfinite(q).all(-1)
     rows = np.flatnonzero(reached)
     status, lies = np.asarray(solution.status), np.asarray(solution.branch)
-    found = [_gap(index, status, reached) for index in _starts_of_gaps(reached)]
+    result = [_gap(index, status, reached) for index in _starts_of_gaps(reached)]
     before, after = rows[:-1], rows[1:]
     step = q[after] - q[before]
     far = np.flatnonzero((np.abs(step).max(-1) > 0.1) | (lies[after] != lies[before]))
@@ -177,8 +177,8 @@ def _switches(
     way = np.asarray(_solve(ik, middle, between).q) if len(far) else between
     jumps = is_jump(q[before[far]], way, q[after[far]], ik.revolute)
     for place, jump in zip(far, jumps, strict=True):
-        found += _at(ik, int(after[place]), step[place], bool(jump), lies[before[place]], lies[after[place]])
-    return tuple(sorted(found, key=lambda switch: switch.index))
+        result += _at(ik, int(after[place]), step[place], bool(jump), lies[before[place]], lies[after[place]])
+    return tuple(sorted(result, key=lambda switch: switch.index))
 
 
 def _at(
@@ -253,7 +253,7 @@ def unroll(
 
 def _within(values: Array, lower: float, upper: float, meant: float) -> tuple[Array, list[int]]:
     """One joint's continuous values, moved by turns into its limits; and where that needs another turn than before."""
-    found, breaks, start = values.copy(), [], 0
+    result, breaks, start = values.copy(), [], 0
     lower, upper = lower - LIMIT_TOLERANCE, upper + LIMIT_TOLERANCE
     while start < len(values):
         rest = values[start:]
@@ -266,12 +266,12 @@ def _within(values: Array, lower: float, upper: float, meant: float) -> tuple[Ar
         else:
             last = length - 1
             turns = np.clip(np.round((meant - rest[0]) / _TURN), lowest[last], highest[last])
-        found[start : start + length] = rest[:length] + turns * _TURN
-        if start and abs(found[start] - found[start - 1] - (values[start] - values[start - 1])) > 1:
+        result[start : start + length] = rest[:length] + turns * _TURN
+        if start and abs(result[start] - result[start - 1] - (values[start] - values[start - 1])) > 1:
             breaks.append(start)
         start += length
-        meant = found[start - 1]
-    return found, breaks
+        meant = result[start - 1]
+    return result, breaks
 
 
 def wrapped(step: Array, revolute: Array) -> Array:

@@ -37,17 +37,17 @@ def as_tensors(
         model: what solved for the poses, where gradients are wanted.
         owner: see `Solution`.
     """
-    found = solution.map(_tensor)
+    result = solution.map(_tensor)
     if model is not None and torch.is_grad_enabled():
-        every = poses.unsqueeze(-3) if found.status.ndim > poses.ndim - 2 else poses
-        found = differentiable(model, found, every.expand(*found.status.shape, 4, 4))
+        every = poses.unsqueeze(-3) if result.status.ndim > poses.ndim - 2 else poses
+        result = differentiable(model, result, every.expand(*result.status.shape, 4, 4))
     return replace(
-        found,
-        q=found.q.to(poses),
-        q_nominal=found.q_nominal.to(poses),
-        branch=found.branch.to(poses.device),
-        status=found.status.to(poses.device),
-        domain_measure=found.domain_measure.to(poses),
+        result,
+        q=result.q.to(poses),
+        q_nominal=result.q_nominal.to(poses),
+        branch=result.branch.to(poses.device),
+        status=result.status.to(poses.device),
+        domain_measure=result.domain_measure.to(poses),
         owner=owner,
     )
 
@@ -56,7 +56,7 @@ def _tensor(values: Any) -> Tensor:
     return values if isinstance(values, Tensor) else torch.from_numpy(np.asarray(values, order="C"))
 
 
-def differentiable(model: CalibratedModel, found: Solution, T: Float[Tensor, "*batch 4 4"]) -> Solution:
+def differentiable(model: CalibratedModel, result: Solution, T: Float[Tensor, "*batch 4 4"]) -> Solution:
     """The same solutions, from whose `q` and `q_nominal` gradients flow to the poses.
 
     A solution satisfies `FK(q) = T`. When the pose moves by a twist ξ (translation, rotation vector, both in the base
@@ -71,27 +71,27 @@ def differentiable(model: CalibratedModel, found: Solution, T: Float[Tensor, "*b
 
     Args:
         model: what solved for the poses.
-        found: the solutions, on the CPU in float64.
+        result: the solutions, on the CPU in float64.
         T: the poses that require gradients, in any dtype and on any device.
     """
     T = T.to("cpu", torch.float64)
     twist = _twist(T)
-    q_nominal = _attached(model.robot, twist, found.q_nominal, lambda q: joint_jacobian(model.robot, q)[1])
+    q_nominal = _attached(model.robot, twist, result.q_nominal, lambda q: joint_jacobian(model.robot, q)[1])
     if model.calibrated is not None:
         calibrated, hybrid = model.calibrated, model.hybrid
 
         def jacobian(q: Tensor) -> Tensor:
             return joint_jacobian(calibrated, q)[1] if hybrid is None else hybrid_motion(hybrid, q)[1]
 
-        q = _attached(model.robot, twist, found.q, jacobian)
-        return replace(found, q=q, q_nominal=q_nominal)
+        q = _attached(model.robot, twist, result.q, jacobian)
+        return replace(result, q=q, q_nominal=q_nominal)
     if model.network is None:
-        return replace(found, q=q_nominal + found.correction, q_nominal=q_nominal)
-    known = torch.isfinite(found.q).all(-1, keepdim=True)
+        return replace(result, q=q_nominal + result.correction, q_nominal=q_nominal)
+    known = torch.isfinite(result.q).all(-1, keepdim=True)
     safe = torch.where(known, q_nominal, 0.0)
-    seen = safe + (as_trained(model, safe.detach()) - safe.detach())
-    correction = torch.where(known, model.network(T, seen), torch.nan)
-    return replace(found, q=q_nominal + correction, q_nominal=q_nominal)
+    on_turn = safe + (as_trained(model, safe.detach()) - safe.detach())
+    correction = torch.where(known, model.network(T, on_turn), torch.nan)
+    return replace(result, q=q_nominal + correction, q_nominal=q_nominal)
 
 
 def _twist(T: Float64[Tensor, "*batch 4 4"]) -> Float64[Tensor, "*batch 6"]:
@@ -109,18 +109,18 @@ def _attached(robot: Robot, twist: Tensor, q: Tensor, jacobian: Any) -> Tensor:
     inverse = flat.new_zeros(len(flat), q.shape[-1], 6)
     if len(rows):
         inverse[rows] = pseudo_inverse(robot, jacobian(flat[rows]))
-    found: Tensor = _Implicit.apply(twist, q.detach(), inverse.reshape(*q.shape, 6))  # type: ignore[no-untyped-call]
-    return found
+    result: Tensor = _Implicit.apply(twist, q.detach(), inverse.reshape(*q.shape, 6))  # type: ignore[no-untyped-call]
+    return result
 
 
 def pseudo_inverse(robot: Robot, J: Float64[Tensor, "poses 6 dof"]) -> Float64[Tensor, "poses dof 6"]:
     """Takes twists [m, rad] to joint motions [rad or m]; see `differentiable`."""
     length = characteristic_length(robot)
-    found: Tensor = torch.linalg.pinv(
+    result: Tensor = torch.linalg.pinv(
         dimensionless_jacobian(robot, J).contiguous(), atol=SINGULAR_TOLERANCE, rtol=0.0
     )
     joints = J.new_tensor([1.0 if revolute else length for revolute in robot.revolute])
-    scaled: Tensor = joints[:, None] * found * J.new_tensor([1 / length] * 3 + [1.0] * 3)
+    scaled: Tensor = joints[:, None] * result * J.new_tensor([1 / length] * 3 + [1.0] * 3)
     return scaled
 
 

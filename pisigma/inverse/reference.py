@@ -100,14 +100,14 @@ class ReferenceIK:
             start, finite = self._joint_rows(near, "near", T.shape[:-2], throw)
             fine = fine & finite
         order = self.order if branch is None else (self.branches.index(branch),)
-        found = self._by_approach(approach, T.shape[:-2], lambda ik: ik._solve(T, given, start, order))
-        return _marked(self._with_residuals(found, T), fine)
+        result = self._by_approach(approach, T.shape[:-2], lambda ik: ik._solve(T, given, start, order))
+        return _marked(self._with_residuals(result, T), fine)
 
     def all_branches(self, T_base_tool: Any, *, approach: Any = None, single: bool | None = None) -> Solution:
         """Solutions on every branch, as `(*batch, branches)`; one for a robot without closed-form inverse."""
         T, given, _ = _checked_poses(T_base_tool, single, True)
-        found = self._by_approach(approach, T.shape[:-2], lambda ik: ik._solve_branches(T, given))
-        return self._with_residuals(found, T.unsqueeze(-3).expand(*found.status.shape, 4, 4))
+        result = self._by_approach(approach, T.shape[:-2], lambda ik: ik._solve_branches(T, given))
+        return self._with_residuals(result, T.unsqueeze(-3).expand(*result.status.shape, 4, 4))
 
     def _by_approach(
         self, approach: Any, batch: Sequence[int], solve: Callable[["ReferenceIK"], Solution]
@@ -118,13 +118,13 @@ class ReferenceIK:
             return solve(self)
         sides, _ = self._joint_rows(approach, "approach", batch, True)
         kinds, index = torch.unique(sides.reshape(-1, sides.shape[-1]), dim=0, return_inverse=True)
-        found = solve(self) if not len(kinds) else None
+        result = solve(self) if not len(kinds) else None
         for kind, side in enumerate(kinds):
             arm = replace(hybrid, approach=side)
             solved = solve(ReferenceIK(replace(self.model, hybrid=arm)))
-            found = solved if found is None else _where(index.reshape(tuple(batch)) == kind, solved, found)
-        assert found is not None
-        return found
+            result = solved if result is None else _where(index.reshape(tuple(batch)) == kind, solved, result)
+        assert result is not None
+        return result
 
     def _joint_rows(self, values: Any, what: str, batch: Sequence[int], throw: bool) -> tuple[Tensor, Tensor]:
         """Joint values for every pose, and where they are finite; elsewhere they are 0.
@@ -153,18 +153,18 @@ class ReferenceIK:
             ) from None
         return rows, finite.all(-1).expand(*batch)
 
-    def _with_residuals(self, found: Solution, T: Tensor) -> Solution:
+    def _with_residuals(self, result: Solution, T: Tensor) -> Solution:
         """The same with translation [m] and angle [rad] from where the tool goes to where it was to go."""
-        q = found.q.reshape(-1, found.q.shape[-1])
+        q = result.q.reshape(-1, result.q.shape[-1])
         left = torch.full((len(q), 6), torch.nan, dtype=torch.float64)
         rows = torch.isfinite(q).all(-1).nonzero()[:, 0]
         if len(rows):
             reached = self.model.forward(q[rows])
             error = pose_error(T.reshape(-1, 4, 4)[rows], torch.nan_to_num(reached))
             left[rows] = torch.where(torch.isfinite(reached).flatten(1).all(-1)[:, None], error, torch.nan)
-        left = left.reshape(*found.status.shape, 6)
+        left = left.reshape(*result.status.shape, 6)
         position, rotation = left[..., :3].norm(dim=-1), left[..., 3:].norm(dim=-1)
-        return replace(found, position_residual=position, rotation_residual=rotation)
+        return replace(result, position_residual=position, rotation_residual=rotation)
 
     def _solve(self, T: Tensor, given: Tensor, near: Tensor | None, order: Sequence[int]) -> Solution:
         """Find a solution for every pose.
@@ -181,14 +181,14 @@ class ReferenceIK:
         free = len(order) == len(self.branches)
         if near is not None and free:
             every = self._on_branches(T, given, near, range(len(self.branches)))
-            found = _on_branch(every, self._nearest(every, near))
+            result = _on_branch(every, self._nearest(every, near))
         else:
-            found = self._in_order(T, given, near, order)
+            result = self._in_order(T, given, near, order)
         if self.arm is not None:
-            found = self._recovered(T, found, near, anywhere=free)
+            result = self._recovered(T, result, near, anywhere=free)
             if near is not None and free:
-                found = self._continued(T, found, near)
-        return found
+                result = self._continued(T, result, near)
+        return result
 
     def _solve_branches(self, T: Tensor, given: Tensor) -> Solution:
         """Solutions on every branch, as a last batch axis."""
@@ -204,15 +204,15 @@ class ReferenceIK:
         """On the first branch that leads to the pose inside the limits, else on the first that leads there at all."""
         if self.arm is None:  # all branches cost little
             return self._first(self._on_branches(T, given, near, range(len(self.branches))), order)
-        found = self._first(self._on_branches(T, given, near, order[:1]), (0,))
-        status = found.status.reshape(-1)
+        result = self._first(self._on_branches(T, given, near, order[:1]), (0,))
+        status = result.status.reshape(-1)
         rows = ((status == Status.UNREACHABLE) | (status == Status.OUTSIDE_JOINT_LIMITS)).nonzero()[:, 0]
         if not len(rows) or len(order) == 1:
-            return found
+            return result
         beside = None if near is None else near.reshape(-1, near.shape[-1])[rows]
         as_given = given.reshape(-1, 4, 4)[rows]
         every = self._on_branches(T.reshape(-1, 4, 4)[rows], as_given, beside, order)
-        return _with_rows(found, rows, self._first(every, range(len(order))))
+        return _with_rows(result, rows, self._first(every, range(len(order))))
 
     def _first(self, every: Solution, order: Sequence[int]) -> Solution:
         """Of solutions on some branches the first in an order that is inside the limits, else outside, else any."""
@@ -224,9 +224,9 @@ class ReferenceIK:
     def _on_branches(self, T: Tensor, given: Tensor, near: Tensor | None, indices: Sequence[int]) -> Solution:
         """Solutions on some branches, as a last batch axis, each from its nominal joint values on."""
         assert self._solver is not None
-        found = self._solver.solve(given)
+        result = self._solver.solve(given)
         branch = torch.tensor(indices).expand(*T.shape[:-2], len(indices))
-        q, status = found.q[..., indices, :].double(), found.status[..., indices]
+        q, status = result.q[..., indices, :].double(), result.status[..., indices]
         each = T.unsqueeze(-3).expand(*branch.shape, 4, 4)
         beside = None if near is None else near.unsqueeze(-2).expand(*branch.shape, -1)
         if self.arm is None:
@@ -234,29 +234,29 @@ class ReferenceIK:
         reached, status = self.arm.follow(each, q)
         return self._finishing.of_identified(each, reached, q, status, branch, beside)
 
-    def _recovered(self, T: Tensor, found: Solution, near: Tensor | None, anywhere: bool) -> Solution:
+    def _recovered(self, T: Tensor, result: Solution, near: Tensor | None, anywhere: bool) -> Solution:
         """Look again for what was not found, where the identified arm reaches and the nominal one does not.
 
         Any other branch than the wanted one will do where `anywhere`.
         """
         assert self.arm is not None
-        lost = (found.status == Status.UNREACHABLE).reshape(-1).nonzero()[:, 0]
+        lost = (result.status == Status.UNREACHABLE).reshape(-1).nonzero()[:, 0]
         if not len(lost):
-            return found
-        T_lost, branch = T.reshape(-1, 4, 4)[lost], found.branch.reshape(-1)[lost]
+            return result
+        T_lost, branch = T.reshape(-1, 4, 4)[lost], result.branch.reshape(-1)[lost]
         q, status, branch = self.arm.recover(T_lost, branch, torch.full((len(lost),), anywhere))
         beside = None if near is None else near.reshape(-1, q.shape[-1])[lost]
         nominal = torch.full_like(q, torch.nan)
         finished = self._finishing.of_identified(T_lost, q, nominal, status, branch, beside)
-        return _with_rows(found, lost, finished)
+        return _with_rows(result, lost, finished)
 
-    def _continued(self, T: Tensor, found: Solution, near: Tensor) -> Solution:
+    def _continued(self, T: Tensor, result: Solution, near: Tensor) -> Solution:
         """Look from `near` itself where nothing was found close to it.
 
         Near singular poses the nominal arm may lack the branch on which the identified one is.
         """
         assert self.arm is not None
-        q_near, q_found = near.reshape(-1, near.shape[-1]), found.q.reshape(-1, near.shape[-1])
+        q_near, q_found = near.reshape(-1, near.shape[-1]), result.q.reshape(-1, near.shape[-1])
         off = (q_found - q_near).norm(dim=-1).nan_to_num(torch.inf)
         away = (off > AWAY).nonzero()[:, 0]
         T_away, start = T.reshape(-1, 4, 4)[away], q_near[away]
@@ -266,7 +266,7 @@ class ReferenceIK:
         other = self._finishing.of_identified(T_away, q, nominal, status, lies, start)
         good = (other.status != Status.UNREACHABLE) & (other.status != Status.OUTSIDE_JOINT_LIMITS)
         kept = (good & ((other.q - start).norm(dim=-1) < off[away])).nonzero()[:, 0]
-        return _with_rows(found, away[kept], other.select(kept))
+        return _with_rows(result, away[kept], other.select(kept))
 
     def _numeric(self, T: Tensor, near: Tensor | None) -> Solution:
         """Numeric inverse from `near`, then from the training rows whose poses are nearest, then from more of them."""
@@ -315,15 +315,15 @@ def _checked_poses(values: Any, single: bool | None, throw: bool) -> tuple[Tenso
     return T, T.float() if single else T, fine
 
 
-def _marked(found: Solution, fine: Tensor) -> Solution:
+def _marked(result: Solution, fine: Tensor) -> Solution:
     """The solutions, INVALID_POSE and NaN where there was no pose to solve for."""
     if bool(fine.all()):
-        return found
-    nothing = found.map(
+        return result
+    nothing = result.map(
         lambda values: torch.full_like(values, torch.nan) if values.is_floating_point() else values
     )
-    kept = _where(fine, found, nothing)
-    return replace(kept, status=torch.where(fine, found.status, int(Status.INVALID_POSE)))
+    kept = _where(fine, result, nothing)
+    return replace(kept, status=torch.where(fine, result.status, int(Status.INVALID_POSE)))
 
 
 def _where(condition: Tensor, first: Solution, second: Solution) -> Solution:
@@ -360,12 +360,12 @@ def _on_branch(every: Solution, index: Tensor) -> Solution:
     return every.map(pick)
 
 
-def _with_rows(found: Solution, index: Tensor, rows: Solution) -> Solution:
+def _with_rows(result: Solution, index: Tensor, rows: Solution) -> Solution:
     """The same with other solutions at an index that counts through all batch axes."""
-    batch, others = found.status.ndim, iter(vars(rows)[name] for name in _VALUES)
+    batch, others = result.status.ndim, iter(vars(rows)[name] for name in _VALUES)
 
     def put(values: Tensor) -> Tensor:
         flat = values.reshape(-1, *values.shape[batch:])
         return flat.index_copy(0, index, next(others)).reshape(values.shape)
 
-    return found.map(put)
+    return result.map(put)

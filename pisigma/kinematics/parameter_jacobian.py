@@ -191,13 +191,13 @@ def _row_matrices(dh: Float64[np.ndarray, "rows 5"], like: Tensor) -> Float[Tens
 
     `Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; a joint that slides comes on top.
     """
-    found = []
+    result = []
     for _, d, a, alpha, beta in dh.tolist():
         ca, cb, sa, sb = math.cos(alpha), math.cos(beta), math.sin(alpha), math.sin(beta)
         z, origin = (sb, -sa * cb, ca * cb, 0.0), (a, 0.0, d, 1.0)
         x, x_back = (cb, sa * sb, -ca * sb, 0.0), (-cb, -sa * sb, ca * sb, 0.0)
-        found.append((z, origin, x, (0.0, ca, sa, 0.0), x_back))
-    return like.new_tensor(found)
+        result.append((z, origin, x, (0.0, ca, sa, 0.0), x_back))
+    return like.new_tensor(result)
 
 
 def _frame_axes(
@@ -209,7 +209,7 @@ def _frame_axes(
     the axes x, y, z and the origin before `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`; with an index
     one a pose.
     """
-    found = []
+    result = []
     for x, y, z, *angles in xyzrpy.t().tolist():
         (cr, cp, cy), (sr, sp, sy) = (tuple(map(turn, angles)) for turn in (math.cos, math.sin))
         x_axis = (cr * cp, sr * cp, -sp, 0.0)
@@ -218,8 +218,8 @@ def _frame_axes(
         turns = ((0.0, 0.0, 1.0, 0.0), (-sr, cr, 0.0, 0.0), x_axis)
         shifts = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
         origin, x_back = (x, y, z, 1.0), tuple(-part for part in x_axis)
-        found.append((*turns, *shifts, x_axis, y_axis, z_axis, origin, x_axis, y_axis, x_back))
-    axes = like.new_tensor(found).permute(1, 2, 0)
+        result.append((*turns, *shifts, x_axis, y_axis, z_axis, origin, x_axis, y_axis, x_back))
+    axes = like.new_tensor(result).permute(1, 2, 0)
     return axes if index is None else axes[..., index]
 
 
@@ -227,5 +227,5 @@ def _behind(frame: Float[Tensor, "4 3 poses"], axes: Float[Tensor, "13 4 frames"
     """Axes and origins that are given in a frame, seen from outside of it."""
     if axes.shape[-1] == 1:
         return (axes[..., 0] @ frame.flatten(1)).view(13, *frame.shape[1:])
-    found: Tensor = (axes[:, :, None] * frame).sum(1)
-    return found
+    result: Tensor = (axes[:, :, None] * frame).sum(1)
+    return result

@@ -26,7 +26,7 @@ def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) ->
         NaN where a joint value is NaN, and everywhere where the model holds no uncertainty.
     """
     flat = q.detach().to("cpu", torch.float64).reshape(-1, q.shape[-1])
-    found = torch.full((len(flat),), torch.nan, dtype=torch.float64)
+    result = torch.full((len(flat),), torch.nan, dtype=torch.float64)
     rows = torch.isfinite(flat).all(-1).nonzero()[:, 0]
     if model.uncertainty is not None and len(rows):
         frame, target = (next(iter(known), "") for known in (model.bases, model.tools))
@@ -41,8 +41,8 @@ def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) ->
             payload=payload,
             temperature=temperature,
         )
-        found[rows] = deviation_of_rows(model, at).norm(dim=-1)
-    return found.reshape(q.shape[:-1])
+        result[rows] = deviation_of_rows(model, at).norm(dim=-1)
+    return result.reshape(q.shape[:-1])
 
 
 def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 3"]:

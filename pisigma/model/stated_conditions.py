@@ -61,7 +61,7 @@ def _scaled(
     Raises:
         ModelError: one is far from all that were measured, not finite, or a payload below 0.
     """
-    found = []
+    result = []
     for known, mean, spread in zip(learned.names, learned.mean, learned.spread, strict=True):
         value = given.get(known, mean)
         low, high = mean - MOST_SPREADS * spread, mean + MOST_SPREADS * spread
@@ -73,8 +73,8 @@ def _scaled(
                 f"standard deviation of {spread:.4g}; give {low:.4g} to {high:.4g}, or calibrate with rows "
                 "measured there."
             )
-        found.append((value - mean) / spread)
-    return torch.tensor(found, dtype=torch.float64)
+        result.append((value - mean) / spread)
+    return torch.tensor(result, dtype=torch.float64)
 
 
 def _shifted(robot: Robot, shift: Float64[Tensor, " dof"]) -> Robot:

@@ -39,11 +39,11 @@ class StoredStarts:
         """
         count = min(count, len(self.q))
         poses, rows = self._as_points(T), self._as_points(self.T)
-        found = [torch.zeros((0, count), dtype=torch.int64)]
+        result = [torch.zeros((0, count), dtype=torch.int64)]
         for first in range(0, len(poses), _CHUNK):
             distance = torch.cdist(poses[first : first + _CHUNK], rows)
-            found.append(distance.topk(count, largest=False).indices)
-        return torch.cat(found)
+            result.append(distance.topk(count, largest=False).indices)
+        return torch.cat(result)
 
     def _as_points(self, T: Tensor) -> Tensor:
         """Poses as points; their distance is that of the tools [m], plus half a reach per radian of turn."""

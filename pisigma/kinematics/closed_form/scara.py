@@ -12,10 +12,8 @@ from pisigma.kinematics.closed_form.canonical import canonical_rows
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
 from pisigma.kinematics.closed_form.two_link import rounding, solve_two_link
 from pisigma.kinematics.components import Frame, Scalar, as_tensors
+from pisigma.kinematics.tolerances import TILT_TOLERANCE
 from pisigma.robot.description import Robot
-
-TILT_TOLERANCE = 1e-9
-"""Largest tilt [rad] of the wanted tool axis from the joint axes that is taken for rounding."""
 
 
 @dataclass(frozen=True, eq=False)

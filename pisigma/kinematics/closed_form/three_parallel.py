@@ -12,12 +12,11 @@ from pisigma.kinematics.closed_form.canonical import canonical_rows
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
 from pisigma.kinematics.closed_form.two_link import TwoLink, rounding, singular_tolerance, solve_two_link
 from pisigma.kinematics.components import Columns, Frame, Scalar, as_tensors
+from pisigma.kinematics.tolerances import TRIANGLE_MARGIN
 from pisigma.robot.description import Robot
 
 _RIGHT = math.pi / 2
 _TWISTS = (_RIGHT, 0.0, 0.0, _RIGHT, -_RIGHT)
-_MARGIN = 1e-9
-"""Share of the arm by which the elbow stays short of stretched or folded where joint 6 is free to choose."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +142,7 @@ class ThreeParallelArm(AbstractClosedForm):
         a, b = abs(self.rows.a[1]), abs(self.rows.a[2])
         turn = t_234 + math.atan2(across, along) - torch.atan2(y, x)
         square = far * far + hand * hand - 2 * far * hand * torch.cos(turn)
-        nearest, farthest = abs(a - b) + _MARGIN * (a + b), (a + b) * (1 - _MARGIN)
+        nearest, farthest = abs(a - b) + TRIANGLE_MARGIN * (a + b), (a + b) * (1 - TRIANGLE_MARGIN)
         wanted = square.clamp(nearest**2, farthest**2)
         safe = torch.where(far > 0, far, torch.ones_like(far))
         cosine = ((far * far + hand * hand - wanted) / (2 * safe * hand)).clamp(-1, 1)

@@ -7,6 +7,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from pisigma.kinematics.components import Scalar
+from pisigma.kinematics.tolerances import ROUNDINGS
 
 SINGULAR_TOLERANCE = 1e-6
 """A solution is SINGULAR where the sine of its elbow angle or of its wrist's bend, or the distance of the
@@ -20,7 +21,7 @@ def singular_tolerance(dtype: torch.dtype) -> float:
 
 def rounding(dtype: torch.dtype) -> float:
     """Relative size below which a cosine beyond 1 or a length is taken for rounding (1.1e-13 in float64)."""
-    return 500 * torch.finfo(dtype).eps
+    return ROUNDINGS * torch.finfo(dtype).eps
 
 
 @dataclass(frozen=True, eq=False)

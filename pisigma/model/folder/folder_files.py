@@ -13,10 +13,10 @@ COMPILED = "compiled.npz"
 
 def folder_hash(folder: Path) -> str | None:
     """SHA-256 of description and weights one after the other; None where one cannot be read."""
-    found = hashlib.sha256()
+    result = hashlib.sha256()
     try:
         for name in (DESCRIPTION, WEIGHTS):
-            found.update((folder / name).read_bytes())
+            result.update((folder / name).read_bytes())
     except OSError:
         return None
-    return found.hexdigest()
+    return result.hexdigest()

@@ -43,9 +43,9 @@ _GEOMETRY = ("dh", "base", "tool")
 
 def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
     """Sections of `model.yaml` that only models of a hybrid calibration have."""
-    found: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     if (arm := model.hybrid) is not None:
-        found["learned"] = {
+        result["learned"] = {
             "features": [chosen.describe().model_dump(mode="json") for chosen in arm.correction.features],
             "orders": list(arm.correction.orders),
             "fade_rad": arm.coverage.fade,
@@ -53,32 +53,32 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
             "tools": {name: frame.tolist() for name, frame in model.hybrid_tools.items()},
         }
     if (known := model.uncertainty) is not None:
-        found["uncertainty"] = {
+        result["uncertainty"] = {
             **_unknowns_section(known.space.unknowns),
             "free": _free_rows(known),
             "turns": [chosen.turn for chosen in known.features if isinstance(chosen, AlternatingProducts)],
             "prior_scale": known.prior_scale,
             "unexplained_m": model.unexplained,
         }
-    return found
+    return result
 
 
 def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
     """Tensors of the weights file that only models of a hybrid calibration have."""
-    found: dict[str, Tensor] = {}
+    result: dict[str, Tensor] = {}
     if (drawn := model.drawn) is not None:
-        found |= _geometry("drawn", drawn)
-        found["drawn.limits"] = torch.from_numpy(drawn.limits[_limited(drawn)])
+        result |= _geometry("drawn", drawn)
+        result["drawn.limits"] = torch.from_numpy(drawn.limits[_limited(drawn)])
         assert model.calibrated is not None
-        found |= _geometry("calibrated", model.calibrated)
+        result |= _geometry("calibrated", model.calibrated)
     if (arm := model.hybrid) is not None:
-        found |= _geometry("learned", arm.hybrid)
-        found |= {f"correction.{key}": value for key, value in arm.correction.state_dict().items()}
-        found |= {f"coverage.{name}": getattr(arm.coverage, name) for name in ("joint", "middle", "half")}
+        result |= _geometry("learned", arm.hybrid)
+        result |= {f"correction.{key}": value for key, value in arm.correction.state_dict().items()}
+        result |= {f"coverage.{name}": getattr(arm.coverage, name) for name in ("joint", "middle", "half")}
     if (known := model.uncertainty) is not None:
         weights = range(len(known.space.parameters), known.root.shape[0])
-        found["uncertainty.root"] = known.root[[*_free_rows(known), *weights]].float()
-    return found
+        result["uncertainty.root"] = known.root[[*_free_rows(known), *weights]].float()
+    return result
 
 
 def hybrid_shapes(document: ModelDocument, robot: Robot) -> dict[str, Shape]:
@@ -91,20 +91,20 @@ def hybrid_shapes(document: ModelDocument, robot: Robot) -> dict[str, Shape]:
     if learned is None and known is None:
         return {}
     rows = len(robot.rows)
-    found: dict[str, Shape] = {"drawn.limits": (int(_limited(robot).sum()), 2)}
+    result: dict[str, Shape] = {"drawn.limits": (int(_limited(robot).sum()), 2)}
     for name in ("drawn", "calibrated", *(["learned"] if learned else [])):
-        found |= {f"{name}.dh": (rows, 5), f"{name}.base": (6,), f"{name}.tool": (6,)}
+        result |= {f"{name}.dh": (rows, 5), f"{name}.base": (6,), f"{name}.tool": (6,)}
     weights = 0
     if learned is not None:
         empty = _empty_correction(learned, robot)
-        found |= {f"correction.{key}": tuple(value.shape) for key, value in empty.state_dict().items()}
-        found |= {f"coverage.{name}": (None,) for name in ("joint", "middle", "half")}
+        result |= {f"correction.{key}": tuple(value.shape) for key, value in empty.state_dict().items()}
+        result |= {f"coverage.{name}": (None,) for name in ("joint", "middle", "half")}
         weights = sum(int(chosen.used.sum()) for chosen in empty.features)
         turns = 0 if known is None else len(known.turns)
         weights += turns * robot.dof * len(empty.orders) * (empty.weight.shape[2] + 1)
     if known is not None:
-        found["uncertainty.root"] = (len(known.free) + weights, None)
-    return found
+        result["uncertainty.root"] = (len(known.free) + weights, None)
+    return result
 
 
 def with_hybrid(
@@ -145,14 +145,14 @@ def with_hybrid(
 
 def _free_rows(known: PositionUncertainty) -> list[int]:
     """Parameters that were free: those whose row of the root is not 0."""
-    found: list[int] = known.root[: len(known.space.parameters)].any(1).nonzero()[:, 0].tolist()
-    return found
+    result: list[int] = known.root[: len(known.space.parameters)].any(1).nonzero()[:, 0].tolist()
+    return result
 
 
 def _limited(robot: Robot) -> np.ndarray:
     """Which joints have limits, which a file holds both or none of."""
-    found: np.ndarray = np.isfinite(robot.limits).all(1)
-    return found
+    result: np.ndarray = np.isfinite(robot.limits).all(1)
+    return result
 
 
 def _geometry(name: str, robot: Robot) -> dict[str, Tensor]:
