@@ -295,7 +295,9 @@ def _follow(document: type[BaseModel], path: _Path) -> list[_Schema]:
             if part in candidate.get("properties", {}):
                 following.append(candidate["properties"][part])
             elif isinstance(part, int) and ("items" in candidate or "prefixItems" in candidate):
-                following.append(candidate.get("items") or candidate["prefixItems"][part])
+                following.append(
+                    candidate["prefixItems"][part] if "prefixItems" in candidate else candidate["items"]
+                )
             elif isinstance(candidate.get("additionalProperties"), dict):
                 following.append(candidate["additionalProperties"])
         if following:

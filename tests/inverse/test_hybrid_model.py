@@ -251,7 +251,7 @@ def _known(**values):
 @pytest.mark.parametrize(
     ("change", "complaint"),
     [
-        (lambda document: document.update(format=3), "format 3 is newer"),
+        (lambda document: document.update(format=99), "format 99 is newer"),
         (_learned(features=[{"name": "seris", "harmonics": 3}]), "features"),
         (_learned(features=[{"name": "series", "harmonics": 3}]), "'correction.linear.1' is unknown"),
         (_learned(features=[{"name": "series", "harmonics": 3}] * 2), "of shape"),
