@@ -25,11 +25,9 @@ from pisigma.recipes.recipe import (
     SimulatedData,
 )
 from pisigma.robot.description import Robot
-from pisigma.training.networks import fit_networks
 from pisigma.training.pairs import TrainingPairs, build_pairs
 from pisigma.training.patterns import build_network, build_patterns
 from pisigma.training.sections import LevenbergMarquardtSection
-from pisigma.training.trainer import Checkpoints
 
 Progress = Callable[[str], None]
 
@@ -73,6 +71,9 @@ def train_networks(
     Raises:
         PisigmaError: the data or the recipe do not allow it; the message says what to do.
     """
+    from pisigma.training.networks import fit_networks  # imports lightning, which takes seconds
+    from pisigma.training.trainer import Checkpoints
+
     measurements, _ = measurements.split_sets()
     robot = Robot.load(recipe.robot)
     if isinstance(recipe.data, MeasuredData):
@@ -85,12 +86,16 @@ def train_networks(
     generator = torch.Generator().manual_seed(recipe.fit.seed)
     share = recipe.fit.validation_share if isinstance(recipe.fit, LevenbergMarquardtSection) else 0.0
     patterns = build_patterns(network, pairs, share, groups_of_equal_joints(measurements.q), generator)
+    checkpoints = None
+    if settings.checkpoints is not None:
+        fingerprint = f"{recipe.model_dump_json()}|{measurements.content_hash()}"
+        checkpoints = Checkpoints(settings.checkpoints, fingerprint, settings.resume)
     history = fit_networks(
         [net for _, net in network.members()],
         patterns,
         [section.joints for section in recipe.network],
         recipe.fit,
-        checkpoints=_checkpoints(recipe, measurements, settings),
+        checkpoints=checkpoints,
         show_progress=settings.show_progress,
         logs=settings.logs,
     )
@@ -142,15 +147,6 @@ def cross_validate(
     rotated = measurements.rotation is not None
     before, after = (PoseErrors(store[0], store[1] if rotated else None) for store in (nominal, corrected))
     return CrossValidation(len(folds), Comparison(before, after, not_predicted))
-
-
-def _checkpoints(
-    recipe: InverseRecipe, measurements: Measurements, settings: TrainSettings
-) -> Checkpoints | None:
-    if settings.checkpoints is None:
-        return None
-    fingerprint = f"{recipe.model_dump_json()}|{measurements.content_hash()}"
-    return Checkpoints(settings.checkpoints, fingerprint, settings.resume)
 
 
 def _check_one_pose(measurements: Measurements) -> None:

@@ -41,18 +41,24 @@ def test_the_folder_is_whole(trained):
     assert not list(folder.glob(".*"))
 
 
-def test_tables_for_people_fit_in_80_columns(run, trained, tmp_path):
+def test_tables_fit_in_80_columns_and_the_next_free_name_is_taken(run, trained, tmp_path, monkeypatch):
     folder, _, _ = trained
-    result = run("train", folder / "kiro3.yaml", "--out", tmp_path / "model")
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "runs" / "kiro3").mkdir(parents=True)
+    (tmp_path / "runs" / "kiro3" / "mine.txt").write_text("not a model")
+    result = run("train", folder / "kiro3.yaml", "--logs", "logs")
     assert result.exit_code == 0
     table = result.stdout.splitlines()[:-1]
     assert max(map(len, table)) <= 80
     for word in ("theta_1", "theta_2", "training", "held-out", "paper", "average", "maximum", "deg"):
         assert word in result.stdout
     assert "100 rows used, 0 left out." in result.stdout
-    assert f"Model written to {tmp_path / 'model'}" in result.stdout
-    card = (tmp_path / "model" / "README.md").read_text()
+    assert "Model written to runs/kiro3-2 in" in result.stdout
+    card = (tmp_path / "runs" / "kiro3-2" / "README.md").read_text()
     assert "Trained on 100 simulated rows, none left out." in card
+    assert load_model(tmp_path / "runs" / "kiro3-2").name == "kiro3"
+    assert (tmp_path / "logs" / "metrics.csv").read_text().splitlines()[0].count("energy_") == 2
+    assert not list((tmp_path / "runs").glob(".*"))
 
 
 def test_a_model_is_replaced_and_other_folders_are_not(refuses, trained, tmp_path):

@@ -34,7 +34,7 @@ python training/papers
 ```
 
 Joint errors are absolute, "deviation" is the standard deviation of the absolute error; "new poses" are 2000 random
-poses of the same region that the fit never saw. Tests make this page again from the stored results and compare
+poses of the same region that the fit did not see. Tests make this page again from the stored results and compare
 it byte for byte, and run the small recipes again and compare their results."""
 
 
