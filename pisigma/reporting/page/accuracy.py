@@ -8,6 +8,7 @@ import torch
 
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.judging.pose_statistics import PoseErrors, error_statistics
+from pisigma.judging.training_summary import BeforeAfter, TrainingSummary
 from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel
@@ -24,6 +25,7 @@ LABELS = {
     "distilled": "distilled",
 }
 """Models, in the order of the tables, and what they are called there."""
+_JOINT_ROWS = (("held_out", True), ("training", False))
 MOSTLY = 0.8
 """Share of the squared error from which on scatter is what limits."""
 LEAST_REPEATS = 10
@@ -151,34 +153,31 @@ def _how(key: str, rows: int, summary: CalibrationSummary | None) -> str:
 
 
 @dataclass(frozen=True)
-class JointFigures:
-    """Errors of one joint of a network on some rows; average, deviation and maximum of their sizes.
+class JudgedJoint:
+    """Errors of one joint of a network on some rows.
 
     Attributes:
         name: of the joint.
         held_out: whether the network was made without the rows.
-        unit: "deg" or "mm".
-        before: without the network.
-        after: with it.
+        errors: average, deviation and maximum of their sizes without and with the network.
     """
 
     name: str
     held_out: bool
-    unit: str
-    before: tuple[float, float, float]
-    after: tuple[float, float, float]
+    errors: BeforeAfter
+
+    @property
+    def unit(self) -> str:
+        """Unit of the errors: "deg" or "mm"."""
+        return self.errors.after.unit
 
 
-def joint_figures(model: CalibratedModel) -> tuple[JointFigures, ...]:
+def judged_joints(model: CalibratedModel) -> tuple[JudgedJoint, ...]:
     """Read the errors of joints that a network was judged by, held-out rows first; none of other models."""
-    figures = []
-    for joint in model.metrics.get("joints") or ():
-        for rows in ("held_out", "training") if "training" in joint else ():
-            if rows in joint:
-                before, after = (tuple(joint[rows][when].values()) for when in ("before", "after"))
-                unit = next(iter(joint[rows]["before"])).rsplit("_", 1)[1]
-                figures.append(JointFigures(joint["name"], rows == "held_out", unit, before, after))
-    return tuple(figures)
+    summary = TrainingSummary.read(model)
+    joints = () if summary is None else summary.joints
+    rows = ((joint.name, held_out, getattr(joint, key)) for joint in joints for key, held_out in _JOINT_ROWS)
+    return tuple(JudgedJoint(name, held_out, errors) for name, held_out, errors in rows if errors is not None)
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_figures import CORRELATION_PNG
 from pisigma.reporting.calibration_files import CORRELATION_CSV
 from pisigma.reporting.calibration_tables import coverage_line, learned_lines
-from pisigma.reporting.page.accuracy import Accuracy, JointFigures, Limit, accuracies, joint_figures, limit_of
+from pisigma.reporting.page.accuracy import Accuracy, JudgedJoint, Limit, accuracies, judged_joints, limit_of
 from pisigma.reporting.page.advice import advice_for
 from pisigma.reporting.page.corrections import (
     CorrectionCurve,
@@ -76,7 +76,7 @@ class ReportContent:
     learning_curve: tuple[LearningPoint, ...]
     advice: tuple[str, ...]
     provenance: tuple[tuple[str, str], ...]
-    joints: tuple[JointFigures, ...]
+    joints: tuple[JudgedJoint, ...]
     missing: tuple[str, ...]
     correlation_png: bytes = b""
 
@@ -140,7 +140,7 @@ def report_content(
         rows = rows_of_file(model, measurements, held_out)
     elif held_out is not None:
         rows = rows_of_folder(model, held_out)
-    figures, joints = accuracies(model, summary, rows), joint_figures(model)
+    figures, joints = accuracies(model, summary, rows), judged_joints(model)
     limit = limit_of(model, summary, figures[0] if figures else None, rows)
     return ReportContent(
         model=model,

@@ -11,7 +11,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from pisigma.reporting.page.accuracy import LABELS, Accuracy, JointFigures
+from pisigma.reporting.page.accuracy import LABELS, Accuracy, JudgedJoint
 from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.error_map import ErrorMap
 from pisigma.reporting.page.figures import (
@@ -166,7 +166,8 @@ def _better(cells: Sequence[float | None]) -> str:
     return f"{first / last:.1f} ×" if len(cells) > 1 and first is not None and last else ""
 
 
-def _joint_line(joint: JointFigures) -> tuple[str, ...]:
+def _joint_line(joint: JudgedJoint) -> tuple[str, ...]:
     """Write a joint's name, rows, unit, and average, deviation and maximum before and after."""
     rows = "held-out" if joint.held_out else "training"
-    return (joint.name, rows, joint.unit, *map(figure_text, (*joint.before, *joint.after)))
+    figures = (*joint.errors.before.values, *joint.errors.after.values)
+    return (joint.name, rows, joint.unit, *map(figure_text, figures))

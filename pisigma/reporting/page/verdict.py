@@ -8,7 +8,7 @@ from jaxtyping import Float64
 
 from pisigma.judging.rank_tests import SIGNIFICANT, groups_differ
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.page.accuracy import Accuracy, JointFigures, Limit, percent_text
+from pisigma.reporting.page.accuracy import Accuracy, JudgedJoint, Limit, percent_text
 from pisigma.reporting.page.dependence import LEAST_ROWS, error_lengths, root_mean_square
 from pisigma.reporting.page.judged_rows import JudgedRows
 from pisigma.reporting.tables import figure_text
@@ -75,7 +75,7 @@ class Region:
 def verdict_of(
     model: CalibratedModel,
     accuracies: tuple[Accuracy, ...],
-    joints: tuple[JointFigures, ...],
+    joints: tuple[JudgedJoint, ...],
     rows: JudgedRows | None,
     limit: Limit,
 ) -> Verdict:
@@ -141,7 +141,7 @@ def _tiles(best: Accuracy) -> list[Tile]:
     return tiles
 
 
-def _without_poses(model: CalibratedModel, joints: tuple[JointFigures, ...]) -> Verdict:
+def _without_poses(model: CalibratedModel, joints: tuple[JudgedJoint, ...]) -> Verdict:
     """Say what joint errors say where no pose was judged."""
     if not joints:
         sentence = (
@@ -151,13 +151,18 @@ def _without_poses(model: CalibratedModel, joints: tuple[JointFigures, ...]) -> 
         advice = "Give a file with measurements that the model was not made of."
         return Verdict(sentence, (), "", advice, held_out=False)
     held_out = joints[0].held_out
-    worst = max((one for one in joints if one.held_out == held_out), key=lambda one: one.after[0])
-    before, after = (f"{figure_text(average)} {worst.unit}" for average in (worst.before[0], worst.after[0]))
-    times = f", {worst.before[0] / worst.after[0]:.0f} times better than nominal ({before})"
+    worst = max(
+        (one for one in joints if one.held_out == held_out), key=lambda one: one.errors.after.values[0]
+    )
+    averages = worst.errors.before.values[0], worst.errors.after.values[0]
+    before, after = (f"{figure_text(average)} {worst.unit}" for average in averages)
+    times = (
+        f", {averages[0] / averages[1]:.0f} times better than nominal ({before})" if averages[1] > 0 else ""
+    )
     sentence = (
         f"{'On rows that it never saw' if held_out else 'On the very rows that it was made of'}, {model.name} "
         f"gives the joint values of poses to {after} on average at its worst joint, {worst.name}"
-        f"{times if worst.after[0] > 0 else ''}; no pose errors were judged, so nothing is known of a measured robot."
+        f"{times}; no pose errors were judged, so nothing is known of a measured robot."
     )
     tile = Tile(
         f"worst joint, {worst.name}", after, f"average, {'held-out' if held_out else 'training'} rows"
