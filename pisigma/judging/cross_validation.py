@@ -31,7 +31,7 @@ class CrossValidation:
         """Whether the correction helps, in a sentence."""
         figures = self.comparison.in_file_units()
         nominal, corrected = figures["nominal"], figures["corrected"]
-        findings, harm, help_, careful = [], False, False, False
+        findings, harm, help_, larger = [], False, False, False
         for name, quantity, unit in (("position", "rms_mm", "mm"), ("orientation", "rms_deg", "deg")):
             if quantity in nominal:
                 before, after = nominal[quantity], corrected[quantity]
@@ -40,9 +40,9 @@ class CrossValidation:
                 harm, help_ = harm or change == "raises", help_ or change == "lowers"
                 rise = _rise(nominal[f"max_{unit}"], corrected[f"max_{unit}"], unit)
                 rise = rise and f", {'and' if change == 'raises' else 'but'} {rise}"
-                careful = careful or bool(rise)
+                larger = larger or bool(rise)
                 findings.append(f"{change} the {name} error ({before:.3f} to {after:.3f} {unit} RMS{rise})")
-        advice = "; use it with care" if harm or careful else ""
+        advice = "; use it with care" if harm or larger else ""
         advice = advice if help_ else "; do not use it"
         return f"On held-out rows the correction {' and '.join(findings)}{advice}."
 

@@ -83,11 +83,11 @@ class PoseErrors:
         return ErrorVectors.between(measurements, expected).sizes
 
     @staticmethod
-    def joined(parts: Sequence["PoseErrors"]) -> "PoseErrors":
-        """Errors of one part after the other; all have orientations or none has."""
-        rotations = [part.rotation for part in parts if part.rotation is not None]
+    def joined(several: Sequence["PoseErrors"]) -> "PoseErrors":
+        """Join errors one after the other; all have orientations or none has."""
+        rotations = [errors.rotation for errors in several if errors.rotation is not None]
         return PoseErrors(
-            torch.cat([part.position for part in parts]), torch.cat(rotations) if rotations else None
+            torch.cat([errors.position for errors in several]), torch.cat(rotations) if rotations else None
         )
 
     def only(self, rows: Bool[Tensor, " rows"]) -> "PoseErrors":

@@ -29,19 +29,19 @@ def nominal_model(model: CalibratedModel, turned: bool) -> CalibratedModel:
     if model.calibrated is None:
         return replace(model, network=None, domain=None)
     try:
-        found = base_and_tool(GeometricCalibrator(model.robot)).fit(_predicted(model, turned))
+        fitted = base_and_tool(GeometricCalibrator(model.robot)).fit(_predicted(model, turned))
     except IdentificationError as problem:
         raise ModelError(
             f"model {model.name}: base and tool of the robot as drawn cannot be fitted to the {len(model.starts)} "
             f"joint values that it keeps ({' '.join(str(problem).rstrip('.').split())}); compare models by name."
         ) from problem
-    robot = model.robot.with_geometry(base=found.robot.base, tool=found.robot.tool)
+    robot = model.robot.with_geometry(base=fitted.robot.base, tool=fitted.robot.tool)
     return replace(
         geometric_model(model),
         robot=robot,
         calibrated=robot,
-        bases=dict(found.bases),
-        tools=dict(found.tools),
+        bases=dict(fitted.bases),
+        tools=dict(fitted.tools),
     )
 
 

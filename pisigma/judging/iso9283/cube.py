@@ -82,7 +82,7 @@ def largest_cube(
         reaches: whether the robot reaches positions in its base [m], with the orientation that is to be tested.
         low: lowest corner of the region to look in [m].
         high: highest corner of it.
-        spacing: of the grid [m]; the cube is found to so much.
+        spacing: of the grid [m]; the edge of the cube is a multiple of it.
 
     Raises:
         MeasurementError: no cube of the grid's spacing is within the workspace.

@@ -17,7 +17,7 @@ class DistanceRepeatability:
 
     Attributes:
         length: of the distance [m].
-        axes: of its parts along x, y, z [m].
+        axes: of its components along x, y, z [m].
     """
 
     length: Float[Tensor, "*batch"]
@@ -53,7 +53,7 @@ def distance_repeatability(
 ) -> DistanceRepeatability:
     """Positioning distance repeatability RD and RD_x, RD_y, RD_z [m] (ISO 9283:1998, 7.3.3).
 
-    `RD = ± 3 √(Σ (D_j - D̄)² / (n - 1))`, and the same of the parts `D_xj` along an axis.
+    `RD = ± 3 √(Σ (D_j - D̄)² / (n - 1))`, and the same of the components `D_xj` along an axis.
 
     Raises:
         MeasurementError: there is one repeat only.

@@ -74,11 +74,11 @@ def resample_paths(
     """
     tangents = path_tangents(command) if tangents is None else tangents
     step = max(1, _CROSSINGS // max(1, measured[..., 0].numel()))
-    found = [
+    crossings = [
         _crossings(measured, command[first : first + step], tangents[first : first + step], first)
         for first in range(0, len(command), step)
     ]
-    piece, share = (torch.cat(parts, 1)[..., None] for parts in zip(*found, strict=True))
+    piece, share = (torch.cat(chunks, 1)[..., None] for chunks in zip(*crossings, strict=True))
     position = _between(measured, measured[:, 1:] - measured[:, :-1], piece, share)
     if angles is None:
         return PathPoints(position, None)
