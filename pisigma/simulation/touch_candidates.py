@@ -131,6 +131,12 @@ class TouchCandidates:
         """The candidates of an index, in its order, or of a mask."""
         return replace(self, **{name: getattr(self, name)[index] for name in _ARRAYS})
 
+    @staticmethod
+    def joined(parts: Sequence["TouchCandidates"]) -> "TouchCandidates":
+        """Candidates one after the other, with the placements of the first."""
+        arrays = {name: torch.cat([getattr(part, name) for part in parts]) for name in _ARRAYS}
+        return TouchCandidates(parts[0].placements, **arrays)
+
     def as_measurements(self) -> Measurements:
         """What the nominal robot would measure if it and the placements were as believed, for planning."""
         return Measurements(
@@ -188,10 +194,10 @@ class TouchCandidatesSection(Section):
         """
         check_names(placements)
         generator = torch.Generator().manual_seed(self.seed)
-        found = [self._of_placement(robot, placement, generator) for placement in placements]
-        arrays = {name: torch.cat([getattr(part, name) for part in found]) for name in _ARRAYS}
-        arrays["placement"] = torch.arange(len(found)).repeat_interleave(self.count)
-        return TouchCandidates(tuple(placement.name for placement in placements), **arrays)
+        parts = [self._of_placement(robot, placement, generator) for placement in placements]
+        numbers = torch.arange(len(parts)).repeat_interleave(self.count)
+        names = tuple(placement.name for placement in placements)
+        return replace(TouchCandidates.joined(parts), placements=names, placement=numbers)
 
     def _of_placement(
         self, robot: Robot, placement: JigPlacement, generator: torch.Generator
@@ -201,26 +207,21 @@ class TouchCandidatesSection(Section):
         axes = sorted(set(jig.axis.tolist()))
         share = {axis: (self.count + len(axes) - 1 - place) // len(axes) for place, axis in enumerate(axes)}
         parts: list[TouchCandidates] = []
-        found = dict.fromkeys(axes, 0)
         for _ in range(ROUNDS):
             drawn = self._draw(jig, placement.name, robot.dof, generator)
             parts.append(self._reachable(robot, jig, placement, drawn))
-            for axis in axes:
-                found[axis] += int((parts[-1].axis == axis).sum())
-            if all(found[axis] >= share[axis] for axis in axes):
-                break
-        else:
-            lacking = next(axis for axis in axes if found[axis] < share[axis])
-            raise RecipeError(
-                f"touches: robot '{robot.name}' can make {found[lacking]} of {share[lacking]} touches along "
-                f"{'xyz'[lacking]} of jig '{placement.name}' ({ROUNDS * DRAWN} drawn); place the "
-                "jig nearer, allow more "
-                "tilt, ask for less margin, travel or shaft, or state another branch."
-            )
-        arrays = {name: torch.cat([getattr(part, name) for part in parts]) for name in _ARRAYS}
-        whole = TouchCandidates((placement.name,), **arrays)
-        kept = [(whole.axis == axis).nonzero()[: share[axis], 0] for axis in axes]
-        return whole.select(torch.cat(kept).sort().values)
+            reachable = TouchCandidates.joined(parts)
+            of_axis = {axis: (reachable.axis == axis).nonzero()[:, 0] for axis in axes}
+            if all(len(of_axis[axis]) >= share[axis] for axis in axes):
+                return reachable.select(
+                    torch.cat([of_axis[axis][: share[axis]] for axis in axes]).sort().values
+                )
+        lacking = next(axis for axis in axes if len(of_axis[axis]) < share[axis])
+        raise RecipeError(
+            f"touches: robot '{robot.name}' can make {len(of_axis[lacking])} of {share[lacking]} touches along "
+            f"{'xyz'[lacking]} of jig '{placement.name}' ({ROUNDS * DRAWN} drawn); place the jig nearer, allow more "
+            "tilt, ask for less margin, travel or shaft, or state another branch."
+        )
 
     def _draw(self, jig: Jig, name: str, dof: int, generator: torch.Generator) -> TouchCandidates:
         """Faces, points and torches that are clear of the jig and may or may not be reached."""

@@ -95,8 +95,7 @@ def simulate_touches(
     if left_out and on_miss == "error":
         raise UnreachablePoseError(
             f"{source}: {left_out[0].reason} ({len(left_out)} of {candidates.count} touches "
-            "miss); correct the "
-            "placement, ask for more margin or travel, or leave such touches out with on_miss."
+            "miss); correct the placement, ask for more margin or travel, or leave such touches out with on_miss."
         )
     touched = candidates.select(met)
     return Measurements(
@@ -139,10 +138,8 @@ def _approach(
     The true tip moves as far as the commanded one but for the errors' share, so each step leaves a few
     percent.
     """
-    Ts_jig_base = torch.stack([placement.T_jig_base for placement in placements])[candidates.placement]
-    true_Ts_jig_base = torch.stack([placement.true_T_jig_base for placement in placements])[
-        candidates.placement
-    ]
+    Ts_jig_base = torch.stack([p.T_jig_base for p in placements])[candidates.placement]
+    true_Ts_jig_base = torch.stack([p.true_T_jig_base for p in placements])[candidates.placement]
     T = invert(Ts_jig_base) @ candidates.T_jig_tool
     along = torch.nn.functional.one_hot(candidates.axis, 3).to(T)
     inward = -(Ts_jig_base[:, :3, :3].mT @ (along * candidates.sign[:, None])[..., None])[..., 0]
