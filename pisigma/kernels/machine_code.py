@@ -19,9 +19,8 @@ import llvmlite  # type: ignore[import-untyped]
 import llvmlite.binding as llvm  # type: ignore[import-untyped]
 
 from pisigma.errors import ModelError
-from pisigma.kernels.build import ARGUMENTS, ENTRY, intermediate_code
+from pisigma.kernels.build import ARGUMENTS, ENTRY, intermediate_code, read_ready, ready_features, source_hash
 from pisigma.kernels.features import FORMS
-from pisigma.kernels.ready import read_ready, ready_features, source_hash
 
 _ALLOWED = frozenset(
     (

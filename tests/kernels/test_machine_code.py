@@ -9,28 +9,28 @@ from pathlib import Path
 import pytest
 
 from pisigma.errors import ModelError
-from pisigma.kernels import build, machine_code, ready
+from pisigma.kernels import build, machine_code
 
 TRIPLES = ["x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "arm64-apple-macosx14.0.0"]
 
 
 def test_the_intermediate_code_is_that_of_the_sources():
-    assert ready.read_ready() is not None, (
+    assert build.read_ready() is not None, (
         "the kernels changed: run python -m pisigma.joint_correction.registry"
     )
 
 
 def test_the_hash_covers_every_kernel_and_no_comment(tmp_path, monkeypatch):
-    files = {path.name for path in ready.source_files()}
+    files = {path.name for path in build.source_files()}
     assert {"newton.py", "kernels.py", "layout.py", "tolerances.py", "status.py"} <= files
-    for path in (Path(ready.__file__).parent).glob("*.py"):
+    for path in (Path(build.__file__).parent).glob("*.py"):
         assert ("numba import" not in path.read_text() or path.name in files) or path.name == "build.py"
     sources = tmp_path / "kernels.py"
-    monkeypatch.setattr(ready, "source_files", lambda: [sources])
+    monkeypatch.setattr(build, "source_files", lambda: [sources])
 
     def hash_of(text: str) -> str:
         sources.write_text(text, encoding="utf-8")
-        return ready.source_hash()
+        return build.source_hash()
 
     before = hash_of('def f(x):\n    """Double."""\n    return 2 * x\n')
     assert hash_of('def f(x):\n    """Twice\n    as much."""\n\n    return 2 * x  # why\n') == before
@@ -39,14 +39,14 @@ def test_the_hash_covers_every_kernel_and_no_comment(tmp_path, monkeypatch):
 
 
 def test_code_of_other_sources_or_damaged_code_is_not_used(tmp_path, monkeypatch):
-    monkeypatch.setattr(ready, "FILE", tmp_path / "kernels.ll.zlib")
-    assert ready.read_ready() is None
-    ready.write_ready("define", ("series",), numba="1")
-    assert (ready.read_ready(), ready.ready_features()) == ("define", ("series",))
-    whole = ready.FILE.read_bytes()
+    monkeypatch.setattr(build, "FILE", tmp_path / "kernels.ll.zlib")
+    assert build.read_ready() is None
+    build.write_ready("define", ("series",), numba="1")
+    assert (build.read_ready(), build.ready_features()) == ("define", ("series",))
+    whole = build.FILE.read_bytes()
     for wrong in (whole[:-3], b"", b"[1]\nx", whole.replace(b'"sources": "', b'"sources": "0')):
-        ready.FILE.write_bytes(wrong)
-        assert ready.read_ready() is None
+        build.FILE.write_bytes(wrong)
+        assert build.read_ready() is None
 
 
 def test_without_code_and_without_numba_one_sentence_says_what_to_install(monkeypatch):
@@ -155,5 +155,5 @@ def test_loading_kernels_on_a_fresh_cache_needs_no_compiler(tmp_path):
 
 
 def test_the_code_names_its_compilers():
-    assert b'"numba"' in ready.FILE.read_bytes().partition(b"\n")[0]
-    assert build.ENTRY in (ready.read_ready() or "")
+    assert b'"numba"' in build.FILE.read_bytes().partition(b"\n")[0]
+    assert build.ENTRY in (build.read_ready() or "")
