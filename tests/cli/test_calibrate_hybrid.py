@@ -27,8 +27,8 @@ def few_choices():
     whole = HybridCalibrator.__init__
     few = {"features": ("gravity", "series"), "harmonics": (4, 8), "orders": ()}
 
-    def with_few(self, geometric, **options):
-        whole(self, geometric, **(few | options))
+    def with_few(self, robot, **options):
+        whole(self, robot, **(few | options))
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(HybridCalibrator, "__init__", with_few)
