@@ -103,16 +103,45 @@ def test_commands_and_options_within_sentences_exist() -> None:
 RUNNABLE = [page for page in PAGES if "<!-- runs -->" in _text(page)]
 
 
+RUN_ALL = """import json, os, runpy, sys, traceback
+faults = {}
+for page in sys.argv[1:]:
+    os.chdir(os.path.join(sys.path[0], page))
+    try:
+        runpy.run_path("snippets.py", run_name="__main__")
+    except BaseException:
+        faults[page] = traceback.format_exc()
+os.chdir(sys.path[0])
+print("\\n" + json.dumps(faults))
+"""
+"""Runs every page's snippets, a folder each; one process for all, as most of the time goes into imports."""
+
+
+@pytest.fixture(scope="module")
+def faults(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Tracebacks of the pages whose snippets fail, warnings being errors; by the number of the page."""
+    folder = tmp_path_factory.mktemp("snippets")
+    (folder / "run_all.py").write_text(RUN_ALL)
+    for number, page in enumerate(RUNNABLE):
+        blocks = re.findall(
+            r"<!-- runs -->\n+```python\n(.*?)^```", _text(page), flags=re.MULTILINE | re.DOTALL
+        )
+        assert len(blocks) == _text(page).count("<!-- runs -->")
+        (folder / str(number)).mkdir()
+        (folder / str(number) / "models").symlink_to(ROOT / "models")
+        (folder / str(number) / "snippets.py").write_text("\n".join(blocks), encoding="utf-8")
+    command = [sys.executable, "-W", "error", str(folder / "run_all.py"), *map(str, range(len(RUNNABLE)))]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    result: dict[str, str] = json.loads(done.stdout.splitlines()[-1])
+    return result
+
+
 @pytest.mark.parametrize("page", RUNNABLE, ids=_name)
-def test_snippets_that_are_marked_run(page: Path, tmp_path: Path) -> None:
-    """All of a page together, in a process of their own as a reader has it, warnings being errors."""
-    blocks = re.findall(r"<!-- runs -->\n+```python\n(.*?)^```", _text(page), flags=re.MULTILINE | re.DOTALL)
-    assert len(blocks) == _text(page).count("<!-- runs -->")
-    (tmp_path / "models").symlink_to(ROOT / "models")
-    (tmp_path / "snippets.py").write_text("\n".join(blocks), encoding="utf-8")
-    command = [sys.executable, "-W", "error", "snippets.py"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, f"{_name(page)}: {done.stderr}"
+def test_snippets_that_are_marked_run(page: Path, faults: dict[str, str]) -> None:
+    """All of a page together, as a reader runs it."""
+    fault = faults.get(str(RUNNABLE.index(page)))
+    assert fault is None, f"{_name(page)}: {fault}"
 
 
 @pytest.mark.parametrize("page", PAGES, ids=_name)

@@ -1,7 +1,7 @@
 """Simulation: error sources of a true robot, and what sensors would measure on it."""
 
 from pisigma.simulation.distances import SimulatedDistances, SimulatedPairs, SimulatedSockets
-from pisigma.simulation.measure import SimulatedMeasurements, SimulatedSensors
+from pisigma.simulation.measure import SimulatedMeasurements, SimulatedSensors, simulate
 from pisigma.simulation.touch_candidates import JigPlacement, TouchCandidatesSection
 from pisigma.simulation.touching import SimulatedTouches, simulate_touches
 from pisigma.simulation.true_robot import TrueRobot, TrueRobotSection, register_error_source
@@ -18,5 +18,6 @@ __all__ = [
     "TrueRobot",
     "TrueRobotSection",
     "register_error_source",
+    "simulate",
     "simulate_touches",
 ]
