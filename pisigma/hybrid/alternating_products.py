@@ -8,7 +8,6 @@ from torch import Tensor
 
 from pisigma.joint_correction.feature import AbstractFeature, unit_inputs
 from pisigma.measurement.conditions import JointState
-from pisigma.network.pi_sigma import sum_of_products
 from pisigma.robot.description import Robot
 
 Factors = Float64[Tensor, "dof factors inputs"]
@@ -130,11 +129,3 @@ def normalised(factors: Float64[Tensor, "dof factors inputs"]) -> Float64[Tensor
     constant = torch.zeros_like(factors)
     constant[..., 0] = 1.0
     return torch.where(length > 1e-12, factors / length.clamp(min=1e-12), constant)
-
-
-def product_values(
-    robot: Robot, factors: Float64[Tensor, "dof factors inputs"], orders: Sequence[int], q: Tensor
-) -> Tensor:
-    """What the product units come to [rad or m]."""
-    values = torch.einsum("...i,jsi->...js", with_bias(robot, q), factors.to(q))
-    return sum_of_products(values, orders)

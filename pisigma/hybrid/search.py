@@ -122,29 +122,19 @@ class Search:
         self.fitted.append(fitted)
         return fitted
 
-    def left_out_rms(self, design: Design, posterior: Posterior) -> float:
+    def _left_out_rms(self, tried: Additive) -> float:
         """RMS of left-out values over the noise of the geometric calibration."""
-        errors = left_out(self.rows, design, posterior)
-        scale = posterior.x.new_tensor(
-            [mine / first for mine, first in zip(posterior.noise, self.noise, strict=True)]
-        )
+        errors = left_out(self.rows, tried.design, tried.posterior)
+        scale = errors.error.new_tensor(tried.posterior.noise) / errors.error.new_tensor(self.noise)
         return float((errors.error * scale[errors.sensor]).square().mean().sqrt())
 
-    def note(
-        self, name: str, design: Design, posterior: Posterior, rms: float, began: float, kept: bool
-    ) -> None:
+    def _note(self, tried: Additive, rms: float, began: float, kept: bool) -> None:
         """Add a line to the table."""
         if not self.trials:
             self._unit = rms
+        seconds, evidence = time.monotonic() - began, tried.posterior.log_evidence
         self.trials.append(
-            Trial(
-                name,
-                design.unknowns,
-                posterior.log_evidence,
-                rms / self._unit,
-                time.monotonic() - began,
-                kept,
-            )
+            Trial(tried.name, tried.design.unknowns, evidence, rms / self._unit, seconds, kept)
         )
 
     def best_additive(
@@ -153,8 +143,8 @@ class Search:
         """Geometry alone, then other features, then ever larger ones, as long as it gets better."""
         began = time.monotonic()
         best = self.geometry
-        rms = self.left_out_rms(best.design, best.posterior)
-        self.note("geometry", best.design, best.posterior, rms, began, True)
+        rms = self._left_out_rms(best)
+        self._note(best, rms, began, True)
         without: list[AbstractFeature] = []
         for chosen in others:
             best, rms, better = self._tried([*without, chosen], best, rms)
@@ -182,14 +172,14 @@ class Search:
         self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()
         tried = self.additive(features, best)
-        left_out_rms = self.left_out_rms(tried.design, tried.posterior)
+        left_out_rms = self._left_out_rms(tried)
         gain = tried.posterior.log_evidence - best.posterior.log_evidence
         better = (
             gain > CLEARLY
             and left_out_rms < rms * LEVEL
             and effective_share(tried.sums, tried.posterior) < LARGEST_EFFECTIVE_SHARE
         )
-        self.note(tried.name, tried.design, tried.posterior, left_out_rms, began, better)
+        self._note(tried, left_out_rms, began, better)
         return (tried, left_out_rms, True) if better else (best, rms, False)
 
 

@@ -3,6 +3,7 @@
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.hybrid import product_values
 from testing.linearised import drawn_joints
 from torch import Tensor
 
@@ -10,7 +11,6 @@ from pisigma.hybrid.alternating_products import (
     AlternatingProducts,
     InputPairs,
     normalised,
-    product_values,
     with_bias,
 )
 from pisigma.joint_correction.feature import unit_inputs

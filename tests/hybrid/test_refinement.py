@@ -3,9 +3,10 @@
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.hybrid import product_values
 from testing.linearised import drawn_joints, tracker_data
 
-from pisigma.hybrid.alternating_products import AlternatingProducts, product_values
+from pisigma.hybrid.alternating_products import AlternatingProducts
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.refinement import Refined, refine, with_all_factors
 from pisigma.identification.calibrator import GeometricCalibrator

@@ -1,16 +1,19 @@
 """Hybrid calibrations of simulated arms, for tests."""
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from testing.models import no_type_checker
 
+from pisigma.hybrid.alternating_products import with_bias
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
+from pisigma.network.pi_sigma import sum_of_products
 from pisigma.robot import Robot
 from pisigma.se3 import invert, transform_from_xyzrpy
 from pisigma.simulation import TrueRobot
@@ -119,3 +122,11 @@ def hybrid_of(
             GeometricCalibrator(true.nominal), features=features, harmonics=(4, 8), orders=orders
         )
         return HybridArmUnderTest(true, measurements, calibrator.fit(measurements))
+
+
+def product_values(
+    robot: Robot, factors: torch.Tensor, orders: Sequence[int], q: torch.Tensor
+) -> torch.Tensor:
+    """What product units come to [rad or m], from their factors' weights `(dof, factors, inputs)`."""
+    values = torch.einsum("...i,jsi->...js", with_bias(robot, q), factors.to(q))
+    return sum_of_products(values, orders)
