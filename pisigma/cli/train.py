@@ -56,11 +56,11 @@ def train(
     with progress_of("training") as progress:
         training = train_recipe(recipe, data, settings, progress)
     command = ["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])]
-    training.save(folder, name, shlex.join(command))
+    model = training.save(folder, name, shlex.join(command))
     shutil.rmtree(checkpoints, ignore_errors=True)
     seconds = time.perf_counter() - started
     if as_json:
-        print_json({"model": str(folder), **training.to_json(), "seconds": round(seconds, 3)})
+        print_json({"model": str(folder), "seconds": round(seconds, 3), **model.metrics})
     elif isinstance(training, InverseTraining):
         _print_training(training.summary)
         typer.echo(f"Model written to {folder} in {seconds:.1f} s; read its README.md.")

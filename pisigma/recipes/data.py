@@ -69,16 +69,16 @@ def simulate_repeats(recipe: HybridRecipe) -> tuple[Measurements, tuple[TrainTes
     Raises:
         RecipeError: the recipe is for measured data.
     """
-    robot, rows, parts, start = Robot.load(recipe.robot), [], [], 0
+    robot, rows, splits, start = Robot.load(recipe.robot), [], [], 0
     for repeat in range(recipe.repeats):
         data = repeated(simulated_data(recipe), repeat)
         true = TrueRobot(robot, data.errors)
         train, test = data.training.measure(true), data.held_out.measure(true)
         middle, end = start + train.rows, start + train.rows + test.rows
-        parts.append((torch.arange(start, middle), torch.arange(middle, end)))
+        splits.append((torch.arange(start, middle), torch.arange(middle, end)))
         rows += [train, test]
         start = end
-    return join(rows), tuple(parts)
+    return join(rows), tuple(splits)
 
 
 def simulated_data(recipe: InverseRecipe | HybridRecipe) -> SimulatedData:

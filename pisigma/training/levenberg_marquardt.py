@@ -185,8 +185,8 @@ class LevenbergMarquardt(nn.Module):
         rows = max(1, _CHUNK // (self.cost.numel() * size))
         total = x.new_zeros(*self.cost.shape, size, size)
         chunks = (torch.split(values, rows) for values in (x, weighted, fitted))
-        for part, sums, mask in zip(*chunks, strict=True):
-            J = output_jacobian(part, sums, self.fixed, self.orders)
+        for inputs, sums, mask in zip(*chunks, strict=True):
+            J = output_jacobian(inputs, sums, self.fixed, self.orders)
             total = total + (J * mask[:, None]).mT @ J
         return total
 

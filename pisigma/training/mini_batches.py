@@ -16,7 +16,7 @@ from pisigma.training.trainer import Checkpoints, train
 FINAL_RATE = 0.1
 """The learning rate falls along a cosine to this share of what it begins with."""
 AVERAGED = 0.5
-"""The last part of the steps, over which the unknowns are averaged."""
+"""Share of the steps, the last ones, over which the unknowns are averaged."""
 MOMENTA = (0.9, 0.99)
 """Of Adam: of the gradient, and of its square."""
 

@@ -151,17 +151,17 @@ class SolverSteps(torch.optim.Optimizer):
         super().__init__([{"params": [network.weight, network.bias]} for network in networks], {})
 
     def step(self, closure: Closure) -> Any:  # type: ignore[override]
-        """Do what the closure does: the solvers keep their own state."""
+        """Do what the closure does: the solvers keep the state."""
         return closure()
 
 
 class NetworkTraining(lightning.LightningModule):
-    """Trains the networks of all joint groups side by side, each output on its own.
+    """Trains the networks of all joint groups side by side, each output for itself.
 
     Attributes:
         energies: `(epochs, joints)`: see `TrainingHistory`; NaN for epochs that have not been.
         epochs_done: epochs that have been.
-        resumed_from: epochs that the checkpoint had seen with which the training went on.
+        resumed_from: epochs that were done in the checkpoint with which the training went on.
     """
 
     energies: Tensor
@@ -237,7 +237,7 @@ class NetworkTraining(lightning.LightningModule):
         self._stop_when_done()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Look how many epochs the checkpoint had seen."""
+        """Read how many epochs were done in the checkpoint."""
         self.resumed_from = int(checkpoint["state_dict"]["epochs_done"])
 
     def write_networks(self) -> None:

@@ -53,7 +53,7 @@ class TrainingPairs:
 def build_pairs(robot: Robot, measurements: Measurements, singular_below: float | None) -> TrainingPairs:
     """Turn measured poses into pairs: `Δθ = θ_measured - θ_analytic` (Jeong et al. 1998, eq. 5).
 
-    No truth is needed: the commanded joint values q take the place of θ_measured, and the nominal inverse
+    No truth is needed: the commanded joint values q stand for θ_measured, and the nominal inverse
     kinematics of the measured pose gives θ_analytic, on the branch nearest to q.
 
     Args:
@@ -67,9 +67,9 @@ def build_pairs(robot: Robot, measurements: Measurements, singular_below: float 
     """
     T, q = measurements.T, measurements.q
     if closed_form_solver(robot) is None:
-        found = solve_numeric(robot, T, q)
-        q_nominal, index = found.q, torch.zeros(len(q), dtype=torch.int64)
-        unreachable = found.status == Status.NOT_CONVERGED
+        solution = solve_numeric(robot, T, q)
+        q_nominal, index = solution.q, torch.zeros(len(q), dtype=torch.int64)
+        unreachable = solution.status == Status.NOT_CONVERGED
         names: tuple[str, ...] = ()
     else:
         q_nominal, index, names = _nearest_branch(robot, T, q)

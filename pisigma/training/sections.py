@@ -69,9 +69,9 @@ class GradientDescentSection(Section):
         """
         for joint in joints:
             if joint not in self.learning_rate:
-                given = ", ".join(sorted(self.learning_rate)) or "none"
+                stated = ", ".join(sorted(self.learning_rate)) or "none"
                 raise RecipeError(
-                    f"'fit.learning_rate' has no rate for joint '{joint}'; add one to those given ({given})."
+                    f"'fit.learning_rate' has no rate for joint '{joint}'; add one to those stated ({stated})."
                 )
         return torch.tensor([self.learning_rate[joint] for joint in joints], dtype=torch.float64)
 

@@ -115,6 +115,11 @@ def train(
     return replace(result, seconds=time.perf_counter() - started)
 
 
+def _call(recipe: Recipe) -> str:
+    """The call that gives such a training again, for the card."""
+    return f"pisigma.train({recipe.name!r})"
+
+
 def _refuse_useless(recipe: Recipe, data: bool, settings: TrainSettings) -> None:
     """Refuse data and settings that a kind of recipe has no use for."""
     option = ""
@@ -136,6 +141,7 @@ def _train_geometric(recipe: GeometricRecipe, sha256: str) -> Calibration:
     result = recipe.calibration.calibrator(robot).fit(rows)
     errors = ErrorFigures.model_validate(errors_under(result, held_out).in_file_units())
     summary = summarise(result).having(
+        command=_call(recipe),
         redundant_sets=tuple(tuple(members) for members in result.pairwise.sets),
         no_effect=tuple(result.pairwise.no_effect),
         pairwise_parameters=len(result.pairwise.kept),
@@ -168,6 +174,7 @@ def _train_hybrid(
     validation = validate(calibrator, judged, splits, lambda what: progress(f"held-out rows: {what}"))
     test = None if test_rows is None else judge(calibrator, result, rows, test_rows)
     summary = summarise(result).having(
+        command=_call(recipe),
         rows=rows.rows,
         fit_seconds=round(seconds, 3),
         cross_validation=validation.figures() if measured else None,
@@ -228,6 +235,6 @@ def _train_inverse(
         test = compare_on(run.model, test_rows)
     count = 0 if test_rows is None else test_rows.rows
     summary = summarise_training(run, recipe.paper, validation, test, count)
-    summary = summary.having(command=f"pisigma.train({recipe.name!r})")
+    summary = summary.having(command=_call(recipe))
     model = replace(run.model, metrics=summary.to_json())
     return InverseTraining(model, recipe, run, validation, test, summary)

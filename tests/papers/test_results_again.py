@@ -6,7 +6,7 @@ import pytest
 from testing.closeness import assert_close
 from testing.models import no_type_checker, shipped_training
 
-from recipe_runs import extra_figures
+from recipe_runs import extra_figures, figures_of
 from stored_results import read_results
 
 RELATIVE = 1e-6
@@ -27,7 +27,7 @@ def again(repository):
         folder = repository / "training"
         with no_type_checker():
             training = shipped_training(name)
-            result = {**training.to_json(), **extra_figures(folder, name, training)}
+            result = {**figures_of(training), **extra_figures(folder, name, training)}
         stored = dict(read_results(folder)[name])
         assert stored.pop("model") == f"runs/{name}"
         return json.loads(json.dumps(result, allow_nan=False)), stored

@@ -40,9 +40,16 @@ def run_recipe(folder: Path, name: str, data: Path | None, out: Path | None) -> 
         path = folder / f"{name}.yaml"
         training = train(path, data, TrainSettings(show_progress=True))
         training.save(out, name, command_of(name))
-        result = {"model": str(out), **training.to_json(), **extra_figures(folder, name, training)}
+        result = {"model": str(out), **figures_of(training), **extra_figures(folder, name, training)}
     (folder / RESULTS).mkdir(exist_ok=True)
     write_whole(folder / RESULTS / f"{name}.json", result_text(result))
+
+
+def figures_of(training: Training) -> dict[str, Any]:
+    """All figures of a training; the command stands on the page."""
+    figures = training.to_json()
+    del figures["command"]
+    return figures
 
 
 def extra_figures(folder: Path, name: str, training: Training) -> dict[str, Any]:
