@@ -218,16 +218,16 @@ class GeometricCalibrator:
     def _chosen(
         self,
         space: ParameterSpace,
-        seen: Information,
+        at_start: Information,
         sizes: Float64[np.ndarray, " candidates"],
         redundancy: Redundancy,
     ) -> list[int]:
         """Indices of the parameters to start with."""
         if self.elimination == "exact":
             return [space.index(name) for name in redundancy.kept]
-        names = seen.names
+        names = at_start.names
         if self.elimination == "pairwise":
-            names = find_pairwise_redundancy(seen, sizes).kept
+            names = find_pairwise_redundancy(at_start, sizes).kept
         return [space.index(name) for name in names]
 
     def _solved(

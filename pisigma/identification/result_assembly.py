@@ -249,15 +249,15 @@ def _residuals(
 ) -> dict[str, Float64[np.ndarray, "rows components"]]:
     """Residuals turned back into the measuring frames."""
     R = setup.anchors.bases[:, :3, :3].to(problem.frame.device)[problem.frame]
-    found = {}
+    residuals = {}
     for sensor, sums in zip(problem.sensors, view_of(here).sums, strict=True):
         own = sums.residual.t()
         if sensor.components == 3:
             own = (R @ own[..., None])[..., 0]
         values = torch.full((measurements.q.shape[0], sensor.components), torch.nan, dtype=own.dtype)
         values[setup.rows.cpu()] = torch.where(sensor.present[:, None], own, torch.nan).cpu()
-        found[sensor.name] = values.numpy()
-    return found
+        residuals[sensor.name] = values.numpy()
+    return residuals
 
 
 def _outliers(
@@ -266,7 +266,7 @@ def _outliers(
     problem: CalibrationProblem,
     here: Linearisation[Tensor],
 ) -> tuple[Outlier, ...]:
-    found = []
+    outliers = []
     view = view_of(here)
     for number, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
         deviations = sums.distance / view.scale(number)
@@ -275,10 +275,10 @@ def _outliers(
         ):
             row = int(setup.rows[k])
             length = float(sums.residual[:, k].norm())
-            found.append(
+            outliers.append(
                 Outlier(row, measurements.place(row), sensor.name, length, float(deviations[k]), sensor.unit)
             )
-    return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
+    return tuple(sorted(outliers, key=lambda outlier: -outlier.deviations))
 
 
 def _noise(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[SensorNoise, ...]:
@@ -293,7 +293,7 @@ def _noise(problem: CalibrationProblem, here: Linearisation[Tensor]) -> tuple[Se
                 sensor=sensor.name,
                 sigma=sigma,
                 unit=unit,
-                values=problem.values_seen[k],
+                values=problem.values_measured[k],
                 used=used[k],
                 rms=sums.rms,
                 quantity=sensor.unit,

@@ -40,7 +40,7 @@ class JointState:
             APPROACH: measurements.approach,
         }
         return JointState(
-            measurements.q, {name: found for name, found in columns.items() if found is not None}
+            measurements.q, {name: values for name, values in columns.items() if values is not None}
         )
 
     def __getitem__(self, rows: slice | Tensor) -> "JointState":
@@ -54,19 +54,19 @@ class JointState:
 
 def stated_conditions(measurements: Measurements) -> tuple[str, ...]:
     """Names of the conditions that every row states and that are not always the same."""
-    found = []
+    stated = []
     for name, values in zip(CONDITIONS, conditions_of(measurements, CONDITIONS).t(), strict=True):
         if bool(torch.isfinite(values).all()) and float(values.max() - values.min()) > SMALLEST_SPREAD:
-            found.append(name)
-    return tuple(found)
+            stated.append(name)
+    return tuple(stated)
 
 
 def conditions_of(measurements: Measurements, names: Sequence[str]) -> Float64[Tensor, "rows _conditions"]:
     """Conditions of every row [kg, deg C], NaN where a row does not state one."""
     columns = {"payload_kg": measurements.payload, "temperature_c": measurements.temperature}
     missing = torch.full((measurements.rows,), torch.nan, dtype=torch.float64, device=measurements.q.device)
-    found = [values if (values := columns[name]) is not None else missing for name in names]
-    return torch.stack(found, 1) if found else missing.new_zeros((measurements.rows, 0))
+    stacked = [values if (values := columns[name]) is not None else missing for name in names]
+    return torch.stack(stacked, 1) if stacked else missing.new_zeros((measurements.rows, 0))
 
 
 def repeat_key(measurements: Measurements) -> Float64[Tensor, "rows _key"]:

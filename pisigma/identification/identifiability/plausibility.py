@@ -61,17 +61,17 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
         IdentificationError: see above.
     """
     robot = problem.space.robot
-    drawn, found = (
+    drawn, fitted = (
         torch.from_numpy(robot.dh[:, 2].copy()),
         point.cpu()[: problem.space.arm_size].view(-1, 5)[:, 2],
     )
-    ruined = (drawn.abs() > LONG_SHARE * robot.reach) & ((found - drawn).abs() > RUINED_SHARE * drawn.abs())
+    ruined = (drawn.abs() > LONG_SHARE * robot.reach) & ((fitted - drawn).abs() > RUINED_SHARE * drawn.abs())
     for row in ruined.nonzero()[:1, 0].tolist():
         raise IdentificationError(
             f"{source}: the best fit makes {problem.space.names[5 * row + 2]} of robot '{robot.name}' "
-            f"{float(found[row]) * 1e3:.4g} mm instead of {float(drawn[row]) * 1e3:.4g} mm, which no calibration error "
-            "explains; check the units (metres in a _mm column?), order and directions of the joints, and whether this "
-            "robot was measured."
+            f"{float(fitted[row]) * 1e3:.4g} mm instead of {float(drawn[row]) * 1e3:.4g} mm, which no calibration "
+            "error explains; check the units (metres in a _mm column?), order and directions of the joints, and "
+            "whether this robot was measured."
         )
 
 
@@ -107,9 +107,9 @@ def misfitting_frames(problem: CalibrationProblem, here: Linearisation[Tensor]) 
 
 def residual_sizes(problem: CalibrationProblem, here: Linearisation[Tensor]) -> Tensor:
     """Length of every row's residual per component [m], NaN where no length was measured."""
-    found = torch.full_like(problem.q[:, 0], torch.nan)
+    sizes = torch.full_like(problem.q[:, 0], torch.nan)
     for sensor, sums in zip(problem.sensors, view_of(here).sums, strict=True):
         if sensor.unit == "m" and sensor.name != "socket distance":
             size = sums.residual.norm(dim=0) / sensor.components**0.5
-            found = torch.where(sensor.present, size, found)
-    return found
+            sizes = torch.where(sensor.present, size, sizes)
+    return sizes

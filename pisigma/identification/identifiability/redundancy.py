@@ -17,7 +17,7 @@ PREFERENCE = ("base", "tool", "theta", "a", "d", "alpha", "beta")
 CLEARLY_SEEN = 1.0
 """A parameter is added when the data alone determine it to this many mm or mrad."""
 EXPLAINED = 0.5
-"""All that can be seen at all are added when they explain this share of what is left of the residuals."""
+"""All visible ones are added when they explain this share of what is left of the residuals."""
 SIGNIFICANT = 20.0
 """And when the F statistic of that is at least so large."""
 VISIBLE = 1e-7

@@ -83,7 +83,7 @@ def distinct_rows(problem: CalibrationProblem) -> int:
 def distinct_values(problem: CalibrationProblem) -> int:
     """Number of measured values, repeats counted once."""
     share = distinct_rows(problem) / problem.q.shape[0]
-    return round(sum(problem.values_seen) * share)
+    return round(sum(problem.values_measured) * share)
 
 
 def _still_joints(robot: Robot, problem: CalibrationProblem) -> list[str]:

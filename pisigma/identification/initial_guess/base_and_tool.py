@@ -65,7 +65,7 @@ def fit_base_and_tool(
         maximum_iterations: steps of the least squares.
 
     Raises:
-        IdentificationError: no positions, several frames, or too few rows for what has to be found.
+        IdentificationError: no positions, several frames, or too few rows for what has to be fitted.
         PoseError: the joint values do not fit the robot.
     """
     problem, solution = _solved(robot, measurements, free_base, free_tool, maximum_iterations)
@@ -92,10 +92,10 @@ def _solved(
     problem = build_base_and_tool_problem(robot, measurements, free_base, free_tool)
     best: tuple[float, Solution[BaseToolState]] | None = None
     for start in base_and_tool_starts(robot, problem):
-        found = levenberg_marquardt(problem, start, maximum_iterations)
-        off = _off(robot, problem, found)  # not the cost, which every search divides by its own noise
+        solution = levenberg_marquardt(problem, start, maximum_iterations)
+        off = _off(robot, problem, solution)  # not the cost, which every search divides by its own noise
         if best is None or off < best[0] * (1 - 1e-6):
-            best = off, found
+            best = off, solution
         if _rms_position(problem, best[1]) < CLEAR_FIT * robot.reach:
             break
     assert best is not None

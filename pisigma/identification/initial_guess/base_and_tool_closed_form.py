@@ -30,28 +30,28 @@ def base_and_tool_starts(robot: Robot, problem: BaseToolProblem) -> Iterator[Bas
     rows = problem.rotated if problem.turned else problem.target == problem.target.mode().values
     R_flange, p_flange = problem.R_flange[rows], problem.p_flange[rows]
     position, rotation = problem.position[rows], problem.rotation[rows]
-    found: Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]
+    candidates: Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]
     if not problem.free_base and not problem.free_tool:
-        found = iter([(R_base, p_base, R_tool, point)])
+        candidates = iter([(R_base, p_base, R_tool, point)])
     elif not problem.free_base:
-        found = iter(
+        candidates = iter(
             [_tool_start(R_base, p_base, R_flange, p_flange, position, rotation, problem.turned, R_tool)]
         )
     elif not problem.free_tool:
         arm = p_flange + R_flange @ point
-        R_found = _procrustes(arm, position)
+        R_fitted = _procrustes(arm, position)
         if problem.turned:
-            R_found = nearest_rotation((rotation @ R_tool.mT @ R_flange.mT).sum(0))
-        found = iter([(R_found, (position - arm @ R_found.mT).mean(0), R_tool, point)])
+            R_fitted = nearest_rotation((rotation @ R_tool.mT @ R_flange.mT).sum(0))
+        candidates = iter([(R_fitted, (position - arm @ R_fitted.mT).mean(0), R_tool, point)])
     else:
         starts = starts_from_positions(R_flange, p_flange, position, point, robot.reach)
         if problem.turned:
             first = start_from_poses(R_flange, p_flange, position, rotation, R_tool)
             rest = ((R, p, _mean_turn(R, R_flange, rotation), place) for R, p, place in starts)
-            found = itertools.chain([first], rest)
+            candidates = itertools.chain([first], rest)
         else:
-            found = ((R, p, R_tool, place) for R, p, place in starts)
-    for R_start, p_start, R_tool_start, place in found:
+            candidates = ((R, p, R_tool, place) for R, p, place in starts)
+    for R_start, p_start, R_tool_start, place in candidates:
         yield BaseToolState(R_start, p_start, R_tool_start, place.expand(len(problem.targets), 3))
 
 
@@ -154,8 +154,8 @@ def _tool_start(
     R_tool: Tensor,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """The tool for a fixed base: the mean of what each row says."""
-    seen = (position - p_base) @ R_base
-    point = (R_flange.mT @ (seen - p_flange)[..., None])[..., 0].mean(0)
+    in_base = (position - p_base) @ R_base
+    point = (R_flange.mT @ (in_base - p_flange)[..., None])[..., 0].mean(0)
     if turned:
         R_tool = _mean_turn(R_base, R_flange, rotation)
     return R_base, p_base, R_tool, point
@@ -184,12 +184,12 @@ def _translations(
 
 def _cube_rotations(like: Tensor) -> Tensor:
     """The 24 rotations that map a cube onto itself."""
-    found = []
+    rotations = []
     for order in itertools.permutations(range(3)):
         for signs in itertools.product((1.0, -1.0), repeat=3):
             M = torch.zeros(3, 3).to(like)
             for row, (column, sign) in enumerate(zip(order, signs, strict=True)):
                 M[row, column] = sign
             if torch.linalg.det(M) > 0:
-                found.append(M)
-    return torch.stack(found)
+                rotations.append(M)
+    return torch.stack(rotations)

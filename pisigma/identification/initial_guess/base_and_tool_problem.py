@@ -59,8 +59,8 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         targets: names of the targets.
         sigma_position: per row [m]; None: the scatter is estimated.
         sigma_rotation: per row [rad]; None: the scatter is estimated.
-        free_base: whether the base is to be found.
-        free_tool: whether the tool is to be found.
+        free_base: whether the base is to be fitted.
+        free_tool: whether the tool is to be fitted.
     """
 
     R_flange: Float64[Tensor, "rows 3 3"]
@@ -182,8 +182,8 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
         J[..., 3:6] = -skew(self._arm(state) @ state.R_base.mT)
         own = R_base_flange
         if targets > 1:
-            seen = torch.nn.functional.one_hot(self.target, targets).to(J.dtype)
-            own = (own[:, :, None, :] * seen[:, None, :, None]).reshape(rows, 3, 3 * targets)
+            of_target = torch.nn.functional.one_hot(self.target, targets).to(J.dtype)
+            own = (own[:, :, None, :] * of_target[:, None, :, None]).reshape(rows, 3, 3 * targets)
         J[..., 6:-3] = own
         return J
 

@@ -112,9 +112,9 @@ def information(
                 sensor.residual(motion, unknowns, rows),
             )
             weight = torch.full_like(r[0], 1e3) if view is None else problem.row_weights(view, k, rows)
-            if not problem.all_seen[k]:
-                seen = sensor.present[rows]
-                J, r, weight = J[..., seen], r[..., seen], weight[seen]
+            if not problem.measured_everywhere[k]:
+                present = sensor.present[rows]
+                J, r, weight = J[..., present], r[..., present], weight[present]
             block = r.new_empty((len(candidates) + 2, *r.shape))
             block[0] = weight
             torch.mul(J, usual * weight, out=block[1:-1])
@@ -122,6 +122,6 @@ def information(
             blocks.append(block.flatten(1))
             values += r.numel()
         root = torch.linalg.qr(torch.cat(blocks, 1).t(), mode="r").R
-    seen = torch.stack([sensor.present for sensor in problem.sensors]).any(0)
+    present = torch.stack([sensor.present for sensor in problem.sensors]).any(0)
     parameters = tuple(problem.space.parameters[i] for i in candidates)
-    return Information(parameters, root.cpu().numpy(), values, int(seen.sum()))
+    return Information(parameters, root.cpu().numpy(), values, int(present.sum()))

@@ -39,7 +39,7 @@ class SolutionStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Linearisation(Generic[Point]):
-    """A least-squares problem seen from one point, with cost `Σ (r / sigma)²`.
+    """A least-squares problem linearised from one point, with cost `Σ (r / sigma)²`.
 
     Attributes:
         point: where.
@@ -120,8 +120,8 @@ def levenberg_marquardt(
     Returns:
         The best point, with the reason for stopping (see `SolutionStatus`).
     """
-    seen = start if isinstance(start, Linearisation) else problem.linearise(start, None)
-    best, settled = problem.renewed(seen)
+    first = start if isinstance(start, Linearisation) else problem.linearise(start, None)
+    best, settled = problem.renewed(first)
     here, path = best, [best]
     damping, uphill, iterations = START_DAMPING, 0, 0
     status = SolutionStatus.ITERATION_LIMIT

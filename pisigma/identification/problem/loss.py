@@ -33,7 +33,7 @@ class AbstractLoss(ABC):
         """Standard deviation of one value while the scale is still unknown.
 
         Args:
-            distance: distances of the rows that were seen, in the sensor's unit.
+            distance: distances of the rows that were measured, in the sensor's unit.
             components: values a row.
             used: how many values the estimated parameters use up.
         """
@@ -45,7 +45,7 @@ class AbstractLoss(ABC):
         """Standard deviation of one value, from all good rows.
 
         Args:
-            distance: distances of the rows that were seen, in the sensor's unit.
+            distance: distances of the rows that were measured, in the sensor's unit.
             components: values a row.
             used: how many values the estimated parameters use up.
             scale: about what it is, to distinguish the good rows.

@@ -49,21 +49,21 @@ class SensorSums:
     Attributes:
         normal: `Σ w J J^T / sigma_row²` over its rows.
         descent: `Σ w J r / sigma_row²`.
-        residual: measured minus predicted, 0 where nothing was seen [m or rad].
-        distance: length of the residual over sigma_row, 0 where nothing was seen.
-        seen: number of rows that were seen.
+        residual: measured minus predicted, 0 where nothing was measured [m or rad].
+        distance: length of the residual over sigma_row, 0 where nothing was measured.
+        measured: number of rows that were measured.
     """
 
     normal: Float64[Tensor, "active active"]
     descent: Float64[Tensor, " active"]
     residual: Float64[Tensor, "components rows"]
     distance: Float64[Tensor, " rows"]
-    seen: int
+    measured: int
 
     @property
     def rms(self) -> float:
         """Root mean square of the residuals' lengths [m or rad]."""
-        return float((self.residual.square().sum() / max(self.seen, 1)).sqrt())
+        return float((self.residual.square().sum() / max(self.measured, 1)).sqrt())
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,20 +122,20 @@ def loss_scale(
 
     `refine` uses all good rows instead of the median.
     """
-    found = []
+    scales = []
     for k, sensor in enumerate(sensors):
         if sensor.certain:
-            found.append(1.0)
+            scales.append(1.0)
             continue
         distance = view.sums[k].distance
-        if view.sums[k].seen < len(distance):
+        if view.sums[k].measured < len(distance):
             distance = distance[sensor.present]
         if refine:
             scale = loss.deviation(distance, sensor.components, used[k], view.scale(k))
         else:
             scale = loss.scale(distance, sensor.components, used[k])
-        found.append(max(scale, SMALLEST_NOISE if sensor.sigma is None else 1.0))
-    return tuple(found)
+        scales.append(max(scale, SMALLEST_NOISE if sensor.sigma is None else 1.0))
+    return tuple(scales)
 
 
 def renumbered(keys: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
@@ -165,10 +165,10 @@ def group_variance_ratio(
         pose: number of every row's pose; None where none is repeated.
         configuration: number of every row's joint values and frame; None where none has several targets.
     """
-    found = []
+    ratios = []
     for k, (sensor, sums) in enumerate(zip(sensors, view.sums, strict=True)):
         if sensor.certain:
-            found.append(1.0)
+            ratios.append(1.0)
             continue
         weight = loss.weight(sums.distance / view.scale(k), sensor.components) * sensor.present
         if sensor.sigma is not None:
@@ -180,8 +180,8 @@ def group_variance_ratio(
         if configuration is not None and square > 0:
             shared, fewer = _group_squares(sums.residual, weight, configuration)
             ratio *= max((shared / fewer) / (square / values), 1.0)
-        found.append(ratio)
-    return tuple(found)
+        ratios.append(ratio)
+    return tuple(ratios)
 
 
 def _group_squares(
@@ -195,8 +195,10 @@ def _group_squares(
     groups = int(group.max()) + 1
     total = weight.new_zeros(groups).index_add(0, group, weight)
     summed = weight.new_zeros((len(residual), groups)).index_add(1, group, residual * weight)
-    seen = total > 0
-    return float((summed[:, seen].square().sum(0) / total[seen]).sum()), int(seen.sum()) * len(residual)
+    measured = total > 0
+    return float((summed[:, measured].square().sum(0) / total[measured]).sum()), int(measured.sum()) * len(
+        residual
+    )
 
 
 def prior_group_of(column: str, drawn: bool) -> int:

@@ -96,7 +96,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return torch.from_numpy(self.space.usual_errors).to(self.q.device)[self.active]
 
     @cached_property
-    def values_seen(self) -> tuple[int, ...]:
+    def values_measured(self) -> tuple[int, ...]:
         """Number of values of every sensor."""
         return tuple(int(sensor.present.sum()) * sensor.components for sensor in self.sensors)
 
@@ -104,11 +104,11 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def prior_group(self) -> Int64[Tensor, " active"]:
         """Which size of the prior every free parameter has: of its `PriorGroup`, or for lengths and for angles."""
         drawn = (self.nominal.square() * self.precision > 1).tolist()
-        found = []
+        groups = []
         for parameter, is_drawn in zip(self.space.parameters, drawn, strict=True):
             own = prior_group_of(parameter.group, is_drawn)
-            found.append(own if self.prior_sizes == "estimated" else int(parameter.unit == "m"))
-        return torch.tensor(found, dtype=torch.int64, device=self.q.device)[self.active]
+            groups.append(own if self.prior_sizes == "estimated" else int(parameter.unit == "m"))
+        return torch.tensor(groups, dtype=torch.int64, device=self.q.device)[self.active]
 
     def with_active(self, active: Sequence[int]) -> "CalibrationProblem":
         """The same with other free parameters."""
@@ -177,9 +177,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         noise = loss_scale(self.sensors, self.loss, view, used, refine)
         repetition = view.repetition
         if self.pose is not None or self.configuration is not None:
-            seen = replace(view, noise=noise)
+            renewed_noise = replace(view, noise=noise)
             repetition = group_variance_ratio(
-                self.sensors, self.loss, seen, used, self.pose, self.configuration
+                self.sensors, self.loss, renewed_noise, used, self.pose, self.configuration
             )
         off = (linearisation.point - self.nominal)[self.active]
         prior_scale = view.prior_scale
@@ -263,7 +263,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             normal.add_(sums.normal, alpha=1 / variance)
             descent.add_(sums.descent, alpha=1 / variance)
             size = self._reach if sensor.unit == "m" else 1.0
-            rounding += self.values_seen[k] * (torch.finfo(point.dtype).eps * size) ** 2 / variance
+            rounding += self.values_measured[k] * (torch.finfo(point.dtype).eps * size) ** 2 / variance
         return Linearisation(point, misfit + float(off.dot(pull)), descent, normal, misfit, rounding, view)
 
     @cached_property
@@ -280,12 +280,12 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return self.precision[self.active]
 
     @cached_property
-    def all_seen(self) -> tuple[bool, ...]:
+    def measured_everywhere(self) -> tuple[bool, ...]:
         """Per sensor, whether it has a value in every row."""
         rows = self.q.shape[0]
         return tuple(
-            seen == rows * sensor.components
-            for seen, sensor in zip(self.values_seen, self.sensors, strict=True)
+            values == rows * sensor.components
+            for values, sensor in zip(self.values_measured, self.sensors, strict=True)
         )
 
     def _empty(self, sensor: int) -> SensorSums:
@@ -295,7 +295,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             descent=self.q.new_zeros(size),
             residual=self.q.new_empty((components, rows)),
             distance=self.q.new_empty(rows),
-            seen=self.values_seen[sensor] // components,
+            measured=self.values_measured[sensor] // components,
         )
 
     def _add(
@@ -304,7 +304,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """Add one sensor's part of some rows, in place."""
         sensor = self.sensors[number]
         residual = sensor.residual(motion, unknowns, rows)
-        if not self.all_seen[number]:
+        if not self.measured_everywhere[number]:
             residual = torch.where(sensor.present[rows], residual, 0.0)
         distance = residual.square().sum(0).sqrt()
         if sensor.sigma is not None:
@@ -312,7 +312,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         root = self.loss_of(sensor).weight(distance / max(sigma, ALWAYS_GOOD), sensor.components).sqrt()
         if sensor.sigma is not None:
             root = root / sensor.sigma[rows]
-        if not self.all_seen[number]:
+        if not self.measured_everywhere[number]:
             root = torch.where(sensor.present[rows], root, 0.0)
         A = (self.derivative(sensor, motion, unknowns, rows, self.active) * root).flatten(1)
         sums.normal.addmm_(A, A.t())
