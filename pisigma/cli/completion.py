@@ -1,6 +1,9 @@
 """What shells complete: names of robots, model folders and export formats."""
 
 from pathlib import Path
+from typing import Annotated
+
+import typer
 
 
 def complete_robot(incomplete: str) -> list[str]:
@@ -23,3 +26,7 @@ def complete_export(incomplete: str) -> list[str]:
     from pisigma.export.registry import export_names
 
     return [name for name in export_names() if name.startswith(incomplete)]
+
+
+ModelFolder = Annotated[Path, typer.Argument(help="Model folder.", autocompletion=complete_model)]
+"""The argument of commands that read one model."""

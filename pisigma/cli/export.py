@@ -5,14 +5,13 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.completion import complete_export, complete_model
+from pisigma.cli.completion import ModelFolder, complete_export
 from pisigma.cli.conditions import PayloadKg, TemperatureC
 from pisigma.export.registry import BUILT_IN
 
 if TYPE_CHECKING:
     from pisigma.export.export_format import Exported
 
-Model = Annotated[Path, typer.Argument(help="Model folder.", autocompletion=complete_model)]
 Out = Annotated[
     Path,
     typer.Option(
@@ -58,7 +57,7 @@ Config = Annotated[
 
 
 def export(
-    model: Model,
+    model: ModelFolder,
     out: Out,
     form: Form,
     like: Like = None,

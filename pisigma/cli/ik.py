@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pisigma.cli.completion import ModelFolder
 from pisigma.cli.conditions import PayloadKg, TemperatureC, given_conditions
 
 if TYPE_CHECKING:
@@ -18,7 +19,7 @@ Pose = tuple[float, float, float, float, float, float]
 
 
 def ik(
-    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    model: ModelFolder,
     pose: Annotated[
         Pose | None, typer.Option(help="X Y Z ROLL PITCH YAW of the tool in the base frame [mm, deg].")
     ] = None,

@@ -5,9 +5,11 @@ from typing import Annotated
 
 import typer
 
+from pisigma.cli.completion import ModelFolder
+
 
 def report(
-    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    model: ModelFolder,
     data: Annotated[
         Path | None,
         typer.Argument(
