@@ -136,12 +136,7 @@ def solve_posterior(sums: Sums, prior: GaussianPrior, noise: tuple[float, ...]) 
     The log evidence is that of MacKay 1992, eq. (4.9), for several sensors.
     """
     precision = prior.precision
-    weight = precision.new_tensor([sigma**-2 for sigma in noise])
-    normal = torch.einsum("s,sij->ij", weight, sums.normal)
-    normal.diagonal().add_(precision)
-    descent = weight @ sums.descent
-    scale, factor = _factored(normal)
-    x = scale * torch.cholesky_solve((scale * descent)[:, None], factor)[:, 0]
+    x, scale, factor = _solved(sums, prior, noise)
     covariance = torch.cholesky_inverse(factor) * scale * scale[:, None]
     log_det = 2 * float(factor.diagonal().log().sum()) - 2 * float(scale.log().sum())
     log_prior = float(precision[precision > 0].log().sum())
@@ -153,11 +148,17 @@ def solve_posterior(sums: Sums, prior: GaussianPrior, noise: tuple[float, ...]) 
 
 def solve_mean(sums: Sums, prior: GaussianPrior, noise: tuple[float, ...]) -> Float64[Tensor, " unknowns"]:
     """Most probable values alone, without covariance and evidence; see `solve_posterior`."""
+    return _solved(sums, prior, noise)[0]
+
+
+def _solved(sums: Sums, prior: GaussianPrior, noise: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
+    """Most probable values, and column scale and Cholesky factor of the matrix that they solve."""
     weight = prior.base.new_tensor([sigma**-2 for sigma in noise])
     normal = torch.einsum("s,sij->ij", weight, sums.normal)
     normal.diagonal().add_(prior.precision)
     scale, factor = _factored(normal)
-    return scale * torch.cholesky_solve((scale * (weight @ sums.descent))[:, None], factor)[:, 0]
+    descent = weight @ sums.descent
+    return scale * torch.cholesky_solve((scale * descent)[:, None], factor)[:, 0], scale, factor
 
 
 def _factored(normal: Float64[Tensor, "unknowns unknowns"]) -> tuple[Tensor, Tensor]:
