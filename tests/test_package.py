@@ -52,9 +52,6 @@ LAYERS = (
 )
 """Every module or package may import those before it, and itself."""
 
-CROWDED = ("kernels",)
-"""Folders of more than 20 files; to be emptied."""
-
 PACKAGE = Path(pisigma.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 TESTS = Path(__file__).parent
@@ -135,7 +132,6 @@ def test_files_and_folders_stay_small():
     lines = {name_of(path): path.read_text(encoding="utf-8").count("\n") for path in MODULES}
     assert not {name for name, count in lines.items() if count > MOST_LINES}
     folders = Counter(name_of(path.parent) for path in MODULES)
-    folders.subtract(dict.fromkeys(CROWDED, 10))
     assert not {folder: count for folder, count in folders.items() if count > MOST_FILES}
 
 
