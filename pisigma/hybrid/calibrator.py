@@ -129,13 +129,7 @@ class HybridCalibrator:
             return _geometric_alone(solved, search, verdict)
         progress("looking beyond the measured joint values")
         learned = self._learned(solved, refined)
-        names = [feature.label for feature in additive.design.features]
-        names += [f"product units of orders {orders}"] if orders else []
-        share = [trial.left_out for trial in search.trials if trial.kept][-1]
-        verdict = (
-            f"A joint correction was kept ({' + '.join(names)}): left-out rows are predicted with {share:.2f} "
-            f"times the error of the geometric calibration. {trained}".rstrip()
-        )
+        verdict = _kept_sentence(search, additive, orders, trained)
         whole = with_all_factors(refined)
         uncertainty = position_uncertainty(
             whole.rows, whole.design, whole.posterior, whole.sums, learned.geometry
@@ -215,6 +209,17 @@ class HybridCalibrator:
             else:
                 growing += tried
         return growing, others
+
+
+def _kept_sentence(search: Search, additive: Additive, orders: tuple[int, ...], trained: str) -> str:
+    """What was kept, and how much better left-out rows are predicted with it."""
+    names = [feature.label for feature in additive.design.features]
+    names += [f"product units of orders {orders}"] if orders else []
+    share = [trial.left_out for trial in search.trials if trial.kept][-1]
+    return (
+        f"A joint correction was kept ({' + '.join(names)}): left-out rows are predicted with {share:.2f} "
+        f"times the error of the geometric calibration. {trained}".rstrip()
+    )
 
 
 def _geometric_alone(solved: SolvedCalibration, search: Search, verdict: str) -> HybridResult:
