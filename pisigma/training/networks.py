@@ -289,7 +289,8 @@ class NetworkTraining(lightning.LightningModule):
         self.epochs_done += 1
         if self.trainer.loggers or self.trainer.progress_bar_callback:
             values = dict(zip((f"energy_{name}" for name in self.labels), energies, strict=True))
-            self.log_dict(values, prog_bar=True, batch_size=1)
+            self.log_dict(values, batch_size=1)
+            self.log("energy", energies.sum(), prog_bar=True, logger=False, batch_size=1)
 
     def _stop_when_done(self) -> None:
         converged = len(self.solvers) > 0 and all(solver.converged for solver in self.solvers)

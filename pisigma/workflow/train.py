@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from pisigma.errors import RecipeError
+from pisigma.hybrid.mini_batches import MANY_ROWS
 from pisigma.judging.calibration_summary import CalibrationSummary, summarise
 from pisigma.judging.calibration_validation import (
     CalibrationValidation,
@@ -104,9 +105,10 @@ def train(
     if isinstance(recipe, str | os.PathLike):
         path = recipe
         recipe, sha256 = read_recipe(path), recipe_hash(path)
-    _refuse_useless(recipe, data is not None, settings)
     result: Training
     if isinstance(recipe, GeometricRecipe):
+        if data is not None or settings.resume:
+            _refuse(recipe, "--resume" if settings.resume else "--data")
         result = _train_geometric(recipe, sha256)
     elif isinstance(recipe, HybridRecipe):
         result = _train_hybrid(recipe, sha256, data, settings, progress)
@@ -120,19 +122,10 @@ def _call(recipe: Recipe) -> str:
     return f"pisigma.train({recipe.name!r})"
 
 
-def _refuse_useless(recipe: Recipe, data: bool, settings: TrainSettings) -> None:
-    """Refuse data and settings that a kind of recipe has no use for."""
-    option = ""
-    if isinstance(recipe, GeometricRecipe):
-        option = "--data" if data else "--resume" if settings.resume else ""
-    elif (
-        isinstance(recipe, HybridRecipe) and settings.resume and recipe.hybrid.mini_batches in ("auto", False)
-    ):
-        option = "--resume"
-    if option:
-        raise RecipeError(
-            f"recipe '{recipe.name}': a recipe of kind {recipe.kind} has no use for {option}; leave it out."
-        )
+def _refuse(recipe: Recipe, option: str) -> None:
+    raise RecipeError(
+        f"recipe '{recipe.name}': a recipe of kind {recipe.kind} has no use for {option}; leave it out."
+    )
 
 
 def _train_geometric(recipe: GeometricRecipe, sha256: str) -> Calibration:
@@ -160,6 +153,9 @@ def _train_hybrid(
     progress: Progress,
 ) -> Calibration:
     rows, test_rows = load_measurements(recipe, data).split_sets()
+    batches = recipe.hybrid.mini_batches
+    if settings.resume and (batches is False or (batches == "auto" and rows.rows < MANY_ROWS)):
+        _refuse(recipe, "--resume: it does not train on mini-batches")
     measured = isinstance(recipe.data, MeasuredData)
     if isinstance(recipe.data, MeasuredData):
         judged, splits = rows, k_folds(rows, recipe.data.folds, recipe.data.seed)

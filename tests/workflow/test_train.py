@@ -54,6 +54,11 @@ def test_what_a_kind_of_recipe_has_no_use_for_is_refused(repository, settings, d
         pisigma.train(repository / "training" / "rb5_redundancy.yaml", data, settings)
 
 
+def test_a_hybrid_without_mini_batches_cannot_be_resumed(repository):
+    with pytest.raises(RecipeError, match="has no use for --resume: it does not train on mini-batches"):
+        pisigma.train(repository / "training" / "rb5_hybrid.yaml", settings=TrainSettings(resume=True))
+
+
 def test_rows_that_are_left_out_are_a_warning():
     recipe, run = trained_run("kiro4")
     singular = SingularRows(rule="leave_out", below=0.06)
