@@ -41,10 +41,7 @@ def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
         line = {"part": "row", "name": row.name, "type": row.type, "direction": str(row.direction)}
         for side, limit in (("lower", row.lower), ("upper", row.upper)):
             if np.isfinite(limit):
-                revolute = row.type == "revolute"
-                line[f"{side}_deg" if revolute else f"{side}_mm"] = (
-                    repr(float(np.rad2deg(limit))) if revolute else repr(float(limit * 1e3))
-                )
+                line[f"{side}_{row.file_unit}"] = repr(row.in_file_unit(limit))
         writer.writerow(line | cells(DH_COLUMNS, values))
     writer.writerow({"part": "tool", **cells(FRAME_COLUMNS, robot.tool)})
     return head((CONVENTION, *comments)) + text.getvalue()

@@ -5,8 +5,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pisigma.errors import OutputError
-
 if TYPE_CHECKING:
     from pisigma.model.calibrated_model import CalibratedModel
 
@@ -119,15 +117,3 @@ class ExportFormat:
 def model_facts(model: "CalibratedModel") -> dict[str, object]:
     """The model's robot and its number of joints, for `Exported.facts`."""
     return {"robot": model.robot.name, "joints": model.robot.dof}
-
-
-def option_name(name: str) -> str:
-    """An option as the command line calls it, such as `--payload-kg`."""
-    return f"--{name.replace('_', '-')}"
-
-
-def refuse_option(name: str, takers: tuple[str, ...], form: str) -> OutputError:
-    """The complaint on an option that a format does not take, with those that do."""
-    return OutputError(
-        f"{option_name(name)} goes with --format {' or '.join(takers)}, not with {form}; leave it out."
-    )

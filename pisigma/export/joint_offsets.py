@@ -312,12 +312,11 @@ def offsets_yaml(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
 
 def _joints(offsets: JointOffsets) -> list[dict[str, object]]:
     return [
-        {"name": joint.name, "type": joint.type}
-        | (
-            {"offset_deg": float(np.rad2deg(value))}
-            if joint.type == "revolute"
-            else {"offset_mm": float(value * 1e3)}
-        )
+        {
+            "name": joint.name,
+            "type": joint.type,
+            f"offset_{joint.file_unit}": joint.in_file_unit(value),
+        }
         for joint, value in zip(offsets.robot.joints, offsets.values, strict=True)
     ]
 

@@ -3,7 +3,7 @@
 from importlib import import_module
 
 from pisigma.errors import OutputError, nearest_choice
-from pisigma.export.export_format import OPTIONS, Exported, ExportFormat, ExportRequest, refuse_option
+from pisigma.export.export_format import OPTIONS, Exported, ExportFormat, ExportRequest
 from pisigma.export.output_file import check_output, write_whole
 
 BUILT_IN = {
@@ -69,8 +69,10 @@ def export_model(name: str, request: ExportRequest) -> Exported:
     form = export_format(name)
     for option in request.stated:
         if option not in form.options:
-            takers = tuple(other for other in export_names() if option in export_format(other).options)
-            raise refuse_option(option, takers, name)
+            takers = " or ".join(other for other in export_names() if option in export_format(other).options)
+            raise OutputError(
+                f"--{option.replace('_', '-')} goes with --format {takers}, not with {name}; leave it out."
+            )
     form.check(request)
     check_output(request.out, form.suffixes, form.contents)
     exported = form.write(request)

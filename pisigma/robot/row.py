@@ -53,6 +53,15 @@ class Row:
     lower: float = -np.inf
     upper: float = np.inf
 
+    @property
+    def file_unit(self) -> str:
+        """Unit of its joint values in files: "deg", or "mm" of a joint that slides."""
+        return "mm" if self.type == "prismatic" else "deg"
+
+    def in_file_unit(self, value: float) -> float:
+        """A joint value [rad or m] in the unit of files."""
+        return float(value * 1e3 if self.type == "prismatic" else np.rad2deg(value))
+
 
 class Drawing(NamedTuple):
     """What a file says of a robot, not yet checked as a whole; see `Robot`, which has the same attributes.

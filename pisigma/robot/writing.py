@@ -43,9 +43,7 @@ def _limits_entry(row: Row) -> dict[str, list[float]]:
         return {}
     if not bounded.all():
         raise RobotError(f"row '{row.name}' has one limit only; a robot file holds both or none.")
-    if row.type == "revolute":
-        return {"limits_deg": [float(np.rad2deg(row.lower)), float(np.rad2deg(row.upper))]}
-    return {"limits_mm": [row.lower * 1e3, row.upper * 1e3]}
+    return {f"limits_{row.file_unit}": [row.in_file_unit(row.lower), row.in_file_unit(row.upper)]}
 
 
 BASE_LINK = "base_link"

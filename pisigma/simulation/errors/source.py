@@ -114,18 +114,18 @@ def row_index(robot: Robot, name: str, place: str) -> int:
     Raises:
         RecipeError: the robot has no such row; the message gives the nearest name.
     """
-    names = [row.name for row in robot.rows]
-    if name not in names:
-        raise RecipeError(f"{place}: robot '{robot.name}' has no row '{name}'; {nearest_choice(name, names)}")
-    return names.index(name)
+    return _index(robot, [row.name for row in robot.rows], name, "row", place)
 
 
 def joint_index(robot: Robot, name: str, place: str) -> int:
     """Index of the joint called `name`, counted among the rows that move. See `row_index`."""
-    names = [joint.name for joint in robot.joints]
+    return _index(robot, [joint.name for joint in robot.joints], name, "joint", place)
+
+
+def _index(robot: Robot, names: list[str], name: str, what: str, place: str) -> int:
     if name not in names:
         raise RecipeError(
-            f"{place}: robot '{robot.name}' has no joint '{name}'; {nearest_choice(name, names)}"
+            f"{place}: robot '{robot.name}' has no {what} '{name}'; {nearest_choice(name, names)}"
         )
     return names.index(name)
 
