@@ -75,45 +75,35 @@ class SolvedCalibration:
     findings: Findings
 
     def result(self) -> CalibrationResult:
-        """The calibration in the user's coordinates."""
-        return assemble_result(self.measurements, self.setup, self.problem, self.solution, self.findings)
-
-
-def assemble_result(
-    measurements: Measurements,
-    setup: CalibrationSetup,
-    problem: CalibrationProblem,
-    solution: Solution[Tensor],
-    findings: Findings,
-) -> CalibrationResult:
-    """Make the result; see `CalibrationResult` for its fields."""
-    here = problem.refined(solution.linearisation)
-    geometry = identified_geometry(setup, here.point)
-    covariance = _covariance(here, problem, geometry)
-    gram = sum((sums.normal for sums in view_of(here).sums), torch.zeros_like(here.normal))
-    usual = problem.step_scale * 1e3  # to rows in mm and mrad, columns per 1 mm and 1 mrad
-    poses = int(torch.stack([sensor.present for sensor in problem.sensors]).any(0).sum())
-    return CalibrationResult(
-        robot=geometry.robot,
-        bases=geometry.bases,
-        tools=geometry.tools,
-        unknowns=geometry.unknowns,
-        parameters=_table(setup, problem, here, geometry, covariance, findings),
-        covariance=covariance,
-        residuals=_residuals(measurements, setup, problem, here),
-        outliers=_outliers(measurements, setup, problem, here),
-        noise=_noise(problem, here),
-        redundancy=findings.redundancy,
-        pairwise=find_pairwise_redundancy(findings.information, findings.sizes),
-        extended=tuple(problem.space.names[i] for i in findings.extended),
-        weak_directions=find_weak_directions(problem, here),
-        observability=observability_of(gram * usual * usual[:, None], poses),
-        iterations=solution.iterations,
-        cost=here.cost,
-        status=solution.status,
-        rms_path=tuple(view_of(passed).sums[0].rms for passed in solution.path),
-        warnings=(*findings.warnings, *_warnings(problem, here, solution)),
-    )
+        """The calibration in the user's coordinates; see `CalibrationResult` for its fields."""
+        problem, findings, solution = self.problem, self.findings, self.solution
+        here = problem.refined(solution.linearisation)
+        geometry = identified_geometry(self.setup, here.point)
+        covariance = _covariance(here, problem, geometry)
+        gram = sum((sums.normal for sums in view_of(here).sums), torch.zeros_like(here.normal))
+        usual = problem.step_scale * 1e3  # to rows in mm and mrad, columns per 1 mm and 1 mrad
+        poses = int(torch.stack([sensor.present for sensor in problem.sensors]).any(0).sum())
+        return CalibrationResult(
+            robot=geometry.robot,
+            bases=geometry.bases,
+            tools=geometry.tools,
+            unknowns=geometry.unknowns,
+            parameters=_table(self, here, geometry, covariance),
+            covariance=covariance,
+            residuals=_residuals(self, here),
+            outliers=_outliers(self, here),
+            noise=_noise(problem, here),
+            redundancy=findings.redundancy,
+            pairwise=find_pairwise_redundancy(findings.information, findings.sizes),
+            extended=tuple(problem.space.names[i] for i in findings.extended),
+            weak_directions=find_weak_directions(problem, here),
+            observability=observability_of(gram * usual * usual[:, None], poses),
+            iterations=solution.iterations,
+            cost=here.cost,
+            status=solution.status,
+            rms_path=tuple(view_of(passed).sums[0].rms for passed in solution.path),
+            warnings=(*findings.warnings, *_warnings(self, here)),
+        )
 
 
 def _covariance(
@@ -126,11 +116,10 @@ def _covariance(
     return (geometry.change @ full @ geometry.change.mT).numpy()
 
 
-def _warnings(
-    problem: CalibrationProblem, here: Linearisation[Tensor], solution: Solution[Tensor]
-) -> tuple[str, ...]:
+def _warnings(solved: SolvedCalibration, here: Linearisation[Tensor]) -> tuple[str, ...]:
     """Sentences on the search, on errors far larger than the prior, and on frames that do not fit."""
-    sentences = [] if solution.status.good else [f"the search {solution.status.value}."]
+    problem, status = solved.problem, solved.solution.status
+    sentences = [] if status.good else [f"the search {status.value}."]
     view, group = view_of(here), problem.prior_group
     precision = problem.precision[problem.active]
     effective = effective_parameters(precision, group, view, covariance_of(here.normal))
@@ -152,13 +141,12 @@ def _warnings(
 
 
 def _table(
-    setup: CalibrationSetup,
-    problem: CalibrationProblem,
+    solved: SolvedCalibration,
     here: Linearisation[Tensor],
     geometry: IdentifiedGeometry,
     covariance: np.ndarray,
-    findings: Findings,
 ) -> tuple[ParameterEstimate, ...]:
+    setup, problem, findings = solved.setup, solved.problem, solved.findings
     space, robot = problem.space, problem.space.robot
     bases, tools = np.tile(robot.base, (len(space.frames), 1)), np.tile(robot.tool, (len(space.targets), 1))
     nominal = space.values(bases, tools, unknowns_in_frames(setup, setup.start))
@@ -242,12 +230,10 @@ def _remark(name: str, free: bool, extended: bool, redundancy: Redundancy) -> tu
 
 
 def _residuals(
-    measurements: Measurements,
-    setup: CalibrationSetup,
-    problem: CalibrationProblem,
-    here: Linearisation[Tensor],
+    solved: SolvedCalibration, here: Linearisation[Tensor]
 ) -> dict[str, Float64[np.ndarray, "rows components"]]:
     """Residuals turned back into the measuring frames."""
+    measurements, setup, problem = solved.measurements, solved.setup, solved.problem
     R = setup.anchors.bases[:, :3, :3].to(problem.frame.device)[problem.frame]
     residuals = {}
     for sensor, sums in zip(problem.sensors, view_of(here).sums, strict=True):
@@ -260,12 +246,8 @@ def _residuals(
     return residuals
 
 
-def _outliers(
-    measurements: Measurements,
-    setup: CalibrationSetup,
-    problem: CalibrationProblem,
-    here: Linearisation[Tensor],
-) -> tuple[Outlier, ...]:
+def _outliers(solved: SolvedCalibration, here: Linearisation[Tensor]) -> tuple[Outlier, ...]:
+    measurements, setup, problem = solved.measurements, solved.setup, solved.problem
     outliers = []
     view = view_of(here)
     for number, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
