@@ -6,7 +6,7 @@ never computed. Written this way, forward kinematics is 25 times as fast as with
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -168,36 +168,12 @@ def frame_of(T: Tensor) -> Frame:
     return x, y, z, p
 
 
-def constant_frame(T: Tensor) -> Frame:
-    """A transform `(4, 4)` as floats; entries that are 0 or ±1 but for rounding are exactly so."""
-    entries = [[_rounded(value) for value in column] for column in T[:3].T.tolist()]
-    x, y, z, p = ((column[0], column[1], column[2]) for column in entries)
-    return x, y, z, p
-
-
-def _rounded(value: float) -> float:
-    return float(round(value)) if abs(value - round(value)) < 1e-15 else value
-
-
-def compose(T_a_b: Frame, T_b_c: Frame) -> Frame:
-    """`T_a_b · T_b_c`."""
-    x, y, z, p = T_a_b
-
-    def turned(v: Vector) -> Vector:
-        return combine(1.0, combine(v[0], x, v[1], y), v[2], z)
-
-    moved = turned(T_b_c[3])
-    origin = (add(p[0], moved[0]), add(p[1], moved[1]), add(p[2], moved[2]))
-    return turned(T_b_c[0]), turned(T_b_c[1]), turned(T_b_c[2]), origin
-
-
 def as_tensors(frame: Frame) -> Columns:
     """The same with a tensor for every scalar; those that are the same for every pose have no batch axes."""
     like = next(value for column in frame for value in column if isinstance(value, Tensor))
-    return map_scalars(lambda value: value if isinstance(value, Tensor) else like.new_tensor(value), frame)
 
+    def tensor(value: Scalar) -> Tensor:
+        return value if isinstance(value, Tensor) else like.new_tensor(value)
 
-def map_scalars(function: Callable[[Scalar], Tensor], frame: Frame) -> Columns:
-    """The same with a function of every scalar in its place."""
-    x, y, z, p = ((function(u), function(v), function(w)) for u, v, w in frame)
+    x, y, z, p = ((tensor(u), tensor(v), tensor(w)) for u, v, w in frame)
     return x, y, z, p

@@ -26,18 +26,12 @@ from pisigma.robot import Robot, Row
 class Mast(AbstractClosedForm):
     """A joint that turns on one that slides along the same axis."""
 
+    branches = ("only",)
+
     @classmethod
     def of(cls, robot: Robot) -> "Mast | None":
         rows = canonical_rows(robot, ("prismatic", "revolute"), (0.0,))
         return cls(robot, rows) if rows and not rows.a[0] else None
-
-    @property
-    def branches(self) -> tuple[str, ...]:
-        return ("only",)
-
-    @property
-    def _forks(self) -> int:
-        return 0
 
     def _solve_components(self, T: Frame, signs: Sequence[Scalar]):
         (r_00, r_10, _), _, (_, _, r_22), (x, y, z) = as_tensors(T)

@@ -1,6 +1,5 @@
-"""What every closed form gives: all branches of a pose, each with its status, or one branch of many poses."""
+"""What every closed form gives: all branches of a pose, each with its status."""
 
-import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from pisigma.kinematics.closed_form.canonical import CanonicalRows
-from pisigma.kinematics.components import Frame, Scalar, compose, constant_frame, frame_of
+from pisigma.kinematics.components import Frame, Scalar, frame_of
 from pisigma.kinematics.joint_limits import wrap_into_limits
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
@@ -41,11 +40,14 @@ class AbstractClosedForm(ABC):
     """A closed-form inverse of one robot.
 
     Attributes:
+        branches: names of the branches, in the order in which they come: 2 to the number of choices between two
+            solutions (forks), through which they count, the last one fastest.
         robot: the robot it belongs to.
         rows: its rows with canonical twists.
         compiled: name of the compiled form of the same formulas, see `model.compiled_model`; None where there is none.
     """
 
+    branches: ClassVar[tuple[str, ...]]
     compiled: ClassVar[str | None] = None
     robot: Robot
     rows: CanonicalRows
@@ -54,16 +56,6 @@ class AbstractClosedForm(ABC):
     @abstractmethod
     def of(cls: type[Own], robot: Robot) -> Own | None:
         """The solver for a robot, or None where the robot's rows are not of this family."""
-
-    @property
-    @abstractmethod
-    def branches(self) -> tuple[str, ...]:
-        """Names of the branches, in the order in which they come."""
-
-    @property
-    @abstractmethod
-    def _forks(self) -> int:
-        """Number of choices between two solutions; `branches` counts through them, the last one fastest."""
 
     @abstractmethod
     def _solve_components(
@@ -94,37 +86,13 @@ class AbstractClosedForm(ABC):
         status = torch.where(reached, status, int(Status.UNREACHABLE))
         return InverseSolutions(torch.where(reached[..., None], q, torch.nan), status, self.branches)
 
-    def solve_branch(
-        self, T_base_tool: Frame, branch: int
-    ) -> tuple[Float[Tensor, "poses dof"], Bool[Tensor, " poses"]]:
-        """Joint values on one branch, unchecked: some times as fast as `solve`, for many poses.
-
-        Args:
-            T_base_tool: rigid transforms on components, each `(poses,)`.
-            branch: index into `branches`.
-
-        Returns:
-            Joint values as `solve` gives them, but some numbers where the branch does not reach the pose; and whether
-            it does.
-        """
-        signs = tuple(itertools.product((1.0, -1.0), repeat=self._forks))[branch]
-        first, last = (constant_frame(invert(T)) for T in (self.rows.T_base_first, self.rows.T_last_tool))
-        variables, reached, _ = self._solve_components(compose(compose(first, T_base_tool), last), signs)
-        like = T_base_tool[3][0]
-        assert isinstance(like, Tensor)
-        columns = torch.stack(
-            [torch.broadcast_to(torch.as_tensor(v).to(like), like.shape) for v in variables]
-        )
-        q, _ = self._turned(self.rows.joint_values(columns.T))
-        return q, reached
-
     def _solve_canonical(
         self, T: Float[Tensor, "*batch 4 4"]
     ) -> tuple[
         Float[Tensor, "*batch branches dof"], Bool[Tensor, "*batch branches"], Bool[Tensor, "*batch branches"]
     ]:
         """Canonical joint variables of all branches, whether they reach the pose, and whether it is singular."""
-        n, batch = self._forks, T.shape[:-2]
+        n, batch = len(self.branches).bit_length() - 1, T.shape[:-2]
         signs = [T.new_tensor([1.0, -1.0]).reshape([2 if i == k else 1 for i in range(n)]) for k in range(n)]
         each = T.reshape(*batch, *[1] * n, 4, 4)
         variables, reached, singular = self._solve_components(frame_of(each), signs)

@@ -29,6 +29,7 @@ class Scara(AbstractClosedForm):
     0.
     """
 
+    branches = ("elbow_positive", "elbow_negative")
     compiled = "scara"
 
     @classmethod
@@ -39,20 +40,11 @@ class Scara(AbstractClosedForm):
         return solver if solver and solver.rows.a[0] != 0 and solver._second_link[0] != 0 else None
 
     @property
-    def branches(self) -> tuple[str, ...]:
-        """`elbow_positive`, `elbow_negative`."""
-        return ("elbow_positive", "elbow_negative")
-
-    @property
     def _second_link(self) -> tuple[float, float]:
         """Length [m] of link 2, from axis 2 to axis 4, and its angle [rad] at t_2 = 0."""
         x = self.rows.a[1] + self.rows.a[2] * math.cos(self.rows.theta[2])
         y = self.rows.a[2] * math.sin(self.rows.theta[2])
         return math.hypot(x, y), math.atan2(y, x)
-
-    @property
-    def _forks(self) -> int:
-        return 1
 
     def _solve_components(
         self, T: Frame, signs: Sequence[Scalar]

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.kinematics.closed_form.canonical import canonical_rows
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
-from pisigma.kinematics.closed_form.two_link import rounding, singular_tolerance, solve_two_link
+from pisigma.kinematics.closed_form.two_link import ARM_BRANCHES, rounding, singular_tolerance, solve_two_link
 from pisigma.kinematics.components import Columns, Frame, Scalar, as_tensors
 from pisigma.robot.description import Robot
 
@@ -40,6 +40,7 @@ class SphericalWristArm(AbstractClosedForm):
     values are given.
     """
 
+    branches = ARM_BRANCHES
     compiled = "spherical_wrist"
 
     @classmethod
@@ -56,20 +57,6 @@ class SphericalWristArm(AbstractClosedForm):
         ):
             return None
         return cls(robot, rows)
-
-    @property
-    def branches(self) -> tuple[str, ...]:
-        """`front/elbow_up/no_flip`, `front/elbow_up/flip`, `front/elbow_down/no_flip` and so on, 8 in all."""
-        return tuple(
-            f"{shoulder}/elbow_{elbow}/{wrist}"
-            for shoulder in ("front", "back")
-            for elbow in ("up", "down")
-            for wrist in ("no_flip", "flip")
-        )
-
-    @property
-    def _forks(self) -> int:
-        return 3
 
     def _solve_components(
         self, T: Frame, signs: Sequence[Scalar]

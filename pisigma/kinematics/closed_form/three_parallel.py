@@ -10,7 +10,13 @@ from torch import Tensor
 
 from pisigma.kinematics.closed_form.canonical import canonical_rows
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
-from pisigma.kinematics.closed_form.two_link import TwoLink, rounding, singular_tolerance, solve_two_link
+from pisigma.kinematics.closed_form.two_link import (
+    ARM_BRANCHES,
+    TwoLink,
+    rounding,
+    singular_tolerance,
+    solve_two_link,
+)
 from pisigma.kinematics.components import Columns, Frame, Scalar, as_tensors
 from pisigma.kinematics.tolerances import TRIANGLE_MARGIN
 from pisigma.robot.description import Robot
@@ -43,6 +49,7 @@ class ThreeParallelArm(AbstractClosedForm):
     Near, but not at, such a place the exact values are given.
     """
 
+    branches = ARM_BRANCHES
     compiled = "three_parallel"
 
     @classmethod
@@ -54,24 +61,10 @@ class ThreeParallelArm(AbstractClosedForm):
         return cls(robot, rows)
 
     @property
-    def branches(self) -> tuple[str, ...]:
-        """`front/elbow_up/no_flip`, `front/elbow_up/flip`, `front/elbow_down/no_flip` and so on, 8 in all."""
-        return tuple(
-            f"{shoulder}/elbow_{elbow}/{wrist}"
-            for shoulder in ("front", "back")
-            for elbow in ("up", "down")
-            for wrist in ("no_flip", "flip")
-        )
-
-    @property
     def _scale(self) -> float:
         """How long the arm is [m]: what lengths are compared with."""
         a, d = self.rows.a, self.rows.d
         return abs(a[0]) + abs(a[1]) + abs(a[2]) + math.hypot(a[3], d[4]) + abs(d[1] + d[2] + d[3])
-
-    @property
-    def _forks(self) -> int:
-        return 3
 
     def _solve_components(
         self, T: Frame, signs: Sequence[Scalar]

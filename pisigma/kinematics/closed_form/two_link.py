@@ -1,5 +1,6 @@
 """Two links in a plane, which all closed forms here share, and from what size on they take a number for 0."""
 
+import itertools
 from dataclasses import dataclass
 
 import torch
@@ -8,6 +9,12 @@ from torch import Tensor
 
 from pisigma.kinematics.components import Scalar
 from pisigma.kinematics.tolerances import ROUNDINGS
+
+ARM_BRANCHES = tuple(
+    "/".join(choices)
+    for choices in itertools.product(("front", "back"), ("elbow_up", "elbow_down"), ("no_flip", "flip"))
+)
+"""Names `shoulder/elbow/wrist` of the branches of arms with six joints."""
 
 SINGULAR_TOLERANCE = 1e-6
 """A solution is SINGULAR where the sine of its elbow angle or of its wrist's bend, or the distance of the
@@ -42,12 +49,7 @@ class TwoLink:
 
 
 def solve_two_link(
-    x: Tensor,
-    y: Tensor,
-    a: float,
-    b: float,
-    elbow_sign: Scalar,
-    first_when_free: float,
+    x: Tensor, y: Tensor, a: float, b: float, elbow_sign: Scalar, first_when_free: float
 ) -> TwoLink:
     """Angles of two links that end in a point: appendix A's `C_2`, `S_2`, `K_1`, `K_2` for any lengths.
 
