@@ -19,12 +19,7 @@ from pisigma.robot.description import Robot
 class Finishing:
     """The last steps to solutions of one model, the same for all ways that lead to joint values."""
 
-    def __init__(
-        self,
-        model: CalibratedModel,
-        branches: tuple[str, ...],
-        trained: Sequence[int],
-    ) -> None:
+    def __init__(self, model: CalibratedModel, branches: tuple[str, ...], trained: Sequence[int]) -> None:
         """Prepare for a model.
 
         Args:

@@ -11,14 +11,7 @@ from pisigma.hybrid.arms import HybridArm
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
 from pisigma.kinematics.numeric import NumericSolution, solve_numeric
 from pisigma.kinematics.status import Status
-from pisigma.kinematics.tolerances import (
-    ATTEMPTS,
-    HYBRID_TOLERANCE,
-    ITERATIONS,
-    NEARLY,
-    PULL,
-    REACH_ROUNDING,
-)
+from pisigma.kinematics.tolerances import ATTEMPTS, HYBRID_TOLERANCE, ITERATIONS, NEARLY, PULL, REACH_ROUNDING
 from pisigma.model.hybrid_motion import hybrid_motion
 from pisigma.model.stored_starts import StoredStarts, nearest_branch, wrapped_difference
 from pisigma.robot.description import Robot
@@ -88,12 +81,7 @@ def _solve(robot: Robot, T: Tensor, start: Tensor, hybrid: HybridArm | None) -> 
         rows = (close & (status == Status.NOT_CONVERGED)).nonzero()[:, 0]
         motion = partial(hybrid_motion, hybrid, exact=exact)
         better = solve_numeric(
-            hybrid.hybrid,
-            T[rows],
-            q[rows],
-            tolerance=HYBRID_TOLERANCE,
-            max_iterations=rounds,
-            motion=motion,
+            hybrid.hybrid, T[rows], q[rows], tolerance=HYBRID_TOLERANCE, max_iterations=rounds, motion=motion
         )
         q[rows], status[rows] = better.q, better.status
     return replace(result, q=q, status=status)

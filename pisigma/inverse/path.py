@@ -182,12 +182,7 @@ def _switches(
 
 
 def _at(
-    ik: "pisigma.inverse.corrected_ik.CorrectedIK",
-    index: int,
-    step: Array,
-    jump: bool,
-    left: int,
-    taken: int,
+    ik: "pisigma.inverse.corrected_ik.CorrectedIK", index: int, step: Array, jump: bool, left: int, taken: int
 ) -> Sequence[PathSwitch]:
     """What happens before a pose, if anything does."""
     turned = np.abs(step - wrapped(step, ik.revolute)) > 1

@@ -18,13 +18,7 @@ from pisigma.inverse.joint_input import as_array, pose_array
 from pisigma.inverse.solution import Solution
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.status import Status
-from pisigma.kinematics.tolerances import (
-    ATTEMPTS,
-    AWAY,
-    MORE_ATTEMPTS,
-    POSE_TOLERANCE,
-    POSE_TOLERANCE_SINGLE,
-)
+from pisigma.kinematics.tolerances import ATTEMPTS, AWAY, MORE_ATTEMPTS, POSE_TOLERANCE, POSE_TOLERANCE_SINGLE
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stored_starts import StoredStarts
 from pisigma.se3 import check_transforms, pose_error, transform_faults
@@ -337,15 +331,7 @@ def _where(condition: Tensor, first: Solution, second: Solution) -> Solution:
     return first.map(choose)
 
 
-_VALUES = (
-    "q",
-    "q_nominal",
-    "branch",
-    "status",
-    "position_residual",
-    "rotation_residual",
-    "domain_measure",
-)
+_VALUES = ("q", "q_nominal", "branch", "status", "position_residual", "rotation_residual", "domain_measure")
 """The fields of a solution in the order in which `Solution.map` changes them."""
 
 

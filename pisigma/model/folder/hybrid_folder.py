@@ -233,10 +233,7 @@ def _uncertainty(
 def _unknowns_section(groups: Sequence[UnknownGroup]) -> dict[str, object]:
     """What the sensors had to find out about themselves: of sockets and anchors the names, of others all."""
     owners = {group.name: list(group.owners) for group in groups}
-    section: dict[str, object] = {
-        "sockets": owners.get("socket", []),
-        "anchors": owners.get("anchor", []),
-    }
+    section: dict[str, object] = {"sockets": owners.get("socket", []), "anchors": owners.get("anchor", [])}
     others = {
         group.name: {
             "columns": list(group.columns),
