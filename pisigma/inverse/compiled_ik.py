@@ -11,20 +11,7 @@ import numpy as np
 
 from pisigma.errors import PoseError, nearest_choice
 from pisigma.inverse.solution import Solution
-from pisigma.kernels.arrays import (
-    ANY_BRANCH,
-    BLENDED,
-    EVALUATE,
-    EVERY_BRANCH,
-    GEOMETRIC,
-    LAST_ROW,
-    LEFT_HANDED,
-    NEAR_NOT_FINITE,
-    NOT_FINITE,
-    NOT_ORTHONORMAL,
-    SOLVE,
-    Description,
-)
+from pisigma.kernels import arrays
 from pisigma.kernels.description_file import read_description
 from pisigma.kernels.layout import make_memory, pack
 from pisigma.kernels.machine_code import address_of, kernel_features, load_kernels
@@ -37,15 +24,15 @@ CHUNK = 2_048
 """Poses that a thread takes at a time."""
 
 _WRONG = {
-    NOT_FINITE: "T_base_tool{} has entries that are not finite numbers; give 16 finite numbers.",
-    LAST_ROW: "T_base_tool{} does not end with the row 0 0 0 1; give a homogeneous transform.",
-    NOT_ORTHONORMAL: (
+    arrays.NOT_FINITE: "T_base_tool{} has entries that are not finite numbers; give 16 finite numbers.",
+    arrays.LAST_ROW: "T_base_tool{} does not end with the row 0 0 0 1; give a homogeneous transform.",
+    arrays.NOT_ORTHONORMAL: (
         "T_base_tool{} has a rotation part that is not orthonormal; normalise it or check its source."
     ),
-    LEFT_HANDED: (
+    arrays.LEFT_HANDED: (
         "T_base_tool{} has a left-handed rotation part (determinant -1); a reflection is no pose, check its axes."
     ),
-    NEAR_NOT_FINITE: "near{} holds joint values that are no finite numbers; give a number for every joint.",
+    arrays.NEAR_NOT_FINITE: "near{} holds joint values that are no finite numbers; give a number for every joint.",
 }
 
 _PATIENCE = 2.0
@@ -80,7 +67,7 @@ class CompiledIK:
 
     def __init__(
         self,
-        description: Description,
+        description: arrays.Description,
         branches: Sequence[str],
         joints: Sequence[str],
         name: str = "model",
@@ -160,7 +147,7 @@ class CompiledIK:
         beside = self._none if near is None else self._rows(near, (), "near", throw)
         sides = self._none if approach is None else self._rows(approach, (), "approach", True)
         out = np.empty((1, 1, 2 * dof + 5))
-        wrong = self._run(SOLVE, T, 0, 1, beside, sides, self._branch(branch), not throw, out)
+        wrong = self._run(arrays.SOLVE, T, 0, 1, beside, sides, self._branch(branch), not throw, out)
         if wrong >= 0:
             raise PoseError(_WRONG[wrong % 8].format(""))
         row = out[0, 0]
@@ -216,7 +203,7 @@ class CompiledIK:
         T = self._poses(T_base_tool, throw)
         sides = self._none if approach is None else self._rows(approach, T.shape[:-2], "approach", True)
         count = len(self.branches)
-        out = self._solve_rows(T, self._none, sides, EVERY_BRANCH, count, threads, throw, single)
+        out = self._solve_rows(T, self._none, sides, arrays.EVERY_BRANCH, count, threads, throw, single)
         return self._solution(out.reshape(*T.shape[:-2], count, out.shape[-1]), owner)
 
     def forward(self, q: Any, arm: int | None = None, approach: Any = None) -> tuple[Any, Any, Any, Any]:
@@ -235,8 +222,8 @@ class CompiledIK:
         rows = self._rows(q, (len(q),), "q", True)
         sides = self._none if approach is None else self._rows(approach, (len(rows),), "approach", True)
         T, out = np.empty((len(rows), 4, 4)), np.empty((len(rows), 7 * dof + 1))
-        default = BLENDED if self.description.arms.hybrid else GEOMETRIC
-        self._run(EVALUATE, T, 0, len(rows), rows, sides, default if arm is None else arm, False, out)
+        default = arrays.BLENDED if self.description.arms.hybrid else arrays.GEOMETRIC
+        self._run(arrays.EVALUATE, T, 0, len(rows), rows, sides, default if arm is None else arm, False, out)
         J = out[:, : 6 * dof].reshape(-1, 6, dof)
         return T, J, out[:, 6 * dof : 7 * dof], out[:, 7 * dof]
 
@@ -276,7 +263,7 @@ class CompiledIK:
 
         def solve_chunk(start: int) -> int:
             stop = min(start + CHUNK, len(rows))
-            return self._run(SOLVE, rows, start, stop, near, approach, branch, not throw, out, single)
+            return self._run(arrays.SOLVE, rows, start, stop, near, approach, branch, not throw, out, single)
 
         starts = range(0, len(rows), CHUNK)
         workers = min(threads or _processors(), len(starts))
@@ -335,7 +322,7 @@ class CompiledIK:
 
     def _branch(self, name: str | None) -> int:
         if name is None:
-            return ANY_BRANCH
+            return arrays.ANY_BRANCH
         if name not in self.branches:
             raise PoseError(f"there is no branch '{name}'; {nearest_choice(name, self.branches)}")
         return self.branches.index(name)

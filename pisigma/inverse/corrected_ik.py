@@ -3,14 +3,15 @@
 import os
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pisigma.errors import ModelError
-from pisigma.inverse.joint_input import Postures, as_array, is_tensor, pose_array
+from pisigma.inverse.joint_input import Postures, as_array, pose_array
+from pisigma.kernels.array_kinematics import by_torch, is_tensor
 from pisigma.model.folder.folder_files import COMPILED, folder_hash
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
@@ -190,7 +191,7 @@ class CorrectedIK:
         """
         kernels = self._kernels_of(q)
         if kernels is None:
-            return self._by_model(q, lambda model, values: model.forward(values))
+            return by_torch(self.model.forward, q)
         values = np.asarray(q, dtype=np.float64)
         T = kernels.forward(values.reshape(-1, values.shape[-1]), approach=_flat(approach))[0]
         return T.reshape(*values.shape[:-1], 4, 4)
@@ -203,7 +204,7 @@ class CorrectedIK:
         """
         kernels = self._kernels_of(q, forward=False)
         if kernels is None:
-            return self._by_model(q, lambda model, values: model.jacobian(values))
+            return by_torch(self.model.jacobian, q)
         values = np.asarray(q, dtype=np.float64)
         J = kernels.forward(values.reshape(-1, values.shape[-1]))[1]
         return J.reshape(*values.shape[:-1], 6, values.shape[-1])
@@ -227,13 +228,9 @@ class CorrectedIK:
 
         A tensor for a tensor, else an array.
         """
-        import torch
-
         from pisigma.model.accuracy import position_accuracy
 
-        if is_tensor(q):
-            return position_accuracy(self.model, q)
-        return position_accuracy(self.model, torch.from_numpy(np.array(q, dtype=np.float64))).numpy()
+        return by_torch(partial(position_accuracy, self.model), q)
 
     def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":
         """The geometry as a chain of pytorch-kinematics; see `CalibratedModel.to_pytorch_kinematics`."""
@@ -245,24 +242,13 @@ class CorrectedIK:
             return None
         return None if forward and self.compiled.description.network.used else self.compiled
 
-    def _by_model(self, q: Any, function: Callable[[Any, Any], Any]) -> Any:
-        """A function of the model and joint values in torch; of an array as an array."""
-        import torch
-
-        if is_tensor(q):
-            return function(self.model, q)
-        return function(self.model, torch.from_numpy(np.array(q, dtype=np.float64))).numpy()
-
     def _like(
         self, poses: Any, solution: "pisigma.inverse.solution.Solution"
     ) -> "pisigma.inverse.solution.Solution":
         """The solutions of tensors as tensors, with gradients where these are wanted; other ones as arrays."""
         if not is_tensor(poses):
-            return (
-                solution
-                if isinstance(solution.q, np.ndarray)
-                else replace(solution.map(as_array), owner=self)
-            )
+            arrays = isinstance(solution.q, np.ndarray)
+            return solution if arrays else replace(solution.map(as_array), owner=self)
         from pisigma.inverse.pose_gradients import as_tensors
 
         return as_tensors(solution, poses, self.model if poses.requires_grad else None, self)

@@ -116,7 +116,8 @@ class IdentifiedArm:
         result, status = search(
             self.calibrated, T.reshape(-1, 4, 4), q.reshape(-1, 1, q.shape[-1]), self.hybrid
         )
-        return self.turned_like(result.reshape(q.shape), q), status.reshape(q.shape[:-1])
+        turned = q + wrapped_difference(self.nominal, result.reshape(q.shape), q)
+        return turned, status.reshape(q.shape[:-1])
 
     def recover(
         self,
@@ -137,10 +138,8 @@ class IdentifiedArm:
         Returns:
             Joint values [rad or m], status, and index of the branch; UNREACHABLE where nothing was found.
         """
-        q, status = (
-            T.new_full((len(T), self.nominal.dof), torch.nan),
-            torch.full_like(branch, Status.UNREACHABLE),
-        )
+        q = T.new_full((len(T), self.nominal.dof), torch.nan)
+        status = torch.full_like(branch, Status.UNREACHABLE)
         chosen = within_reach(self.calibrated, T).nonzero()[:, 0]
         if not len(chosen) or not len(self.starts.q):
             return q, status, branch
@@ -151,21 +150,11 @@ class IdentifiedArm:
         others = torch.cat([drawn, self.starts.q[index]], 1)
         others = torch.where(anywhere[chosen, None, None], others, torch.nan)
         result, reached = search(self.calibrated, T_near, torch.cat([first, others], 1), self.hybrid)
-        lies = self.branch_of(result)
+        lies = nearest_branch(self.nominal, self.solver, result)
         lost = (lies != wanted) & ~anywhere[chosen]
         result[lost], reached[lost] = torch.nan, int(Status.UNREACHABLE)
         branch = branch.index_copy(0, chosen, torch.where(anywhere[chosen], lies, wanted))
         return q.index_copy(0, chosen, result), status.index_copy(0, chosen, reached), branch
-
-    def branch_of(self, q: Float64[Tensor, "poses dof"]) -> Int64[Tensor, " poses"]:
-        """Index of the nominal arm's branch that is nearest to joint values; 0 for NaN."""
-        return nearest_branch(self.nominal, self.solver, q)
-
-    def turned_like(
-        self, q: Float64[Tensor, "*batch dof"], like: Float64[Tensor, "*batch dof"]
-    ) -> Float64[Tensor, "*batch dof"]:
-        """The same joint values on the turns that are nearest to others."""
-        return like + wrapped_difference(self.nominal, q, like)
 
     def drawn(
         self, T: Float64[Tensor, "poses 4 4"], towards: Float64[Tensor, "poses 3"]

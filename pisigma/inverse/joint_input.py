@@ -1,20 +1,14 @@
 """What users give as poses and joint values, as arrays; known without torch."""
 
-import sys
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from pisigma.errors import PoseError
+from pisigma.kernels.array_kinematics import is_tensor
 
 _POSES = "homogeneous transforms of shape (*batch, 4, 4)"
-
-
-def is_tensor(values: Any) -> bool:
-    """Whether values are a tensor; torch need not be imported to know."""
-    torch = sys.modules.get("torch")
-    return torch is not None and isinstance(values, torch.Tensor)
 
 
 def as_array(values: Any) -> Any:

@@ -20,7 +20,7 @@ from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.status import Status
 from pisigma.kinematics.tolerances import ATTEMPTS, AWAY, MORE_ATTEMPTS, POSE_TOLERANCE, POSE_TOLERANCE_SINGLE
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.stored_starts import StoredStarts
+from pisigma.model.stored_starts import StoredStarts, nearest_branch
 from pisigma.se3 import check_transforms, pose_error, transform_faults
 
 NUMERIC = "numeric"
@@ -255,7 +255,7 @@ class ReferenceIK:
         away = (off > AWAY).nonzero()[:, 0]
         T_away, start = T.reshape(-1, 4, 4)[away], q_near[away]
         q, status = search(self.arm.calibrated, T_away, start[:, None], self.model.hybrid)
-        lies = self.arm.branch_of(q)
+        lies = nearest_branch(self.model.robot, self.arm.solver, q)
         nominal, _ = search(self.model.robot, T_away, q[:, None])
         other = self._finishing.of_identified(T_away, q, nominal, status, lies, start)
         good = (other.status != Status.UNREACHABLE) & (other.status != Status.OUTSIDE_JOINT_LIMITS)
@@ -322,17 +322,12 @@ def _marked(result: Solution, fine: Tensor) -> Solution:
 
 def _where(condition: Tensor, first: Solution, second: Solution) -> Solution:
     """One solution where a condition holds, another elsewhere."""
-    rest = iter(vars(second)[name] for name in _VALUES)
 
-    def choose(values: Tensor) -> Tensor:
+    def choose(values: Tensor, others: Tensor) -> Tensor:
         axes = values.ndim - condition.ndim
-        return torch.where(condition.reshape(*condition.shape, *(1,) * axes), values, next(rest))
+        return torch.where(condition.reshape(*condition.shape, *(1,) * axes), values, others)
 
-    return first.map(choose)
-
-
-_VALUES = ("q", "q_nominal", "branch", "status", "position_residual", "rotation_residual", "domain_measure")
-"""The fields of a solution in the order in which `Solution.map` changes them."""
+    return first.map(choose, second)
 
 
 def _on_branch(every: Solution, index: Tensor) -> Solution:
@@ -348,10 +343,10 @@ def _on_branch(every: Solution, index: Tensor) -> Solution:
 
 def _with_rows(result: Solution, index: Tensor, rows: Solution) -> Solution:
     """The same with other solutions at an index that counts through all batch axes."""
-    batch, others = result.status.ndim, iter(vars(rows)[name] for name in _VALUES)
+    batch = result.status.ndim
 
-    def put(values: Tensor) -> Tensor:
+    def put(values: Tensor, others: Tensor) -> Tensor:
         flat = values.reshape(-1, *values.shape[batch:])
-        return flat.index_copy(0, index, next(others)).reshape(values.shape)
+        return flat.index_copy(0, index, others).reshape(values.shape)
 
-    return result.map(put)
+    return result.map(put, rows)

@@ -1,7 +1,7 @@
 """What corrected inverse kinematics gives back."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -71,21 +71,17 @@ class Solution:
         """The solutions at an index of the first batch axes."""
         return self.map(lambda values: values[index])
 
-    def reshaped(self, batch: tuple[int, ...]) -> "Solution":
-        """The same with other batch axes."""
-        axes = np.ndim(self.status)
-        return self.map(lambda values: values.reshape(*batch, *values.shape[axes:]))
+    def map(self, change: Callable[..., Any], *others: "Solution") -> "Solution":
+        """The same with all values changed by one function, which keeps an axis of joints last.
 
-    def map(self, change: Callable[[Any], Any]) -> "Solution":
-        """The same with all values changed by one function, which keeps an axis of joints last."""
-        return Solution(
-            q=change(self.q),
-            q_nominal=change(self.q_nominal),
-            branch=change(self.branch),
-            branches=self.branches,
-            status=change(self.status),
-            position_residual=change(self.position_residual),
-            rotation_residual=change(self.rotation_residual),
-            domain_measure=change(self.domain_measure),
-            owner=self.owner,
-        )
+        Args:
+            change: takes values, and the same values of every other solution.
+            others: further solutions, of the same branches.
+        """
+        changed = {
+            name: change(*(getattr(solution, name) for solution in (self, *others))) for name in _VALUES
+        }
+        return replace(self, **changed)
+
+
+_VALUES = ("q", "q_nominal", "branch", "status", "position_residual", "rotation_residual", "domain_measure")

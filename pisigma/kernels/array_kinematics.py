@@ -5,6 +5,7 @@ import math
 import sys
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -42,7 +43,7 @@ def forward_kinematics(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
         return chain.move(q, False)[0]
     from pisigma.kinematics.forward import forward_kinematics as of_tensors
 
-    return _by_torch(functools.partial(of_tensors, robot), q)
+    return by_torch(functools.partial(of_tensors, robot), q)
 
 
 def joint_jacobian(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
@@ -66,14 +67,20 @@ def joint_jacobian(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
         return chain.move(q, True)[1]
     from pisigma.kinematics.jacobian import joint_jacobian as of_tensors
 
-    return _by_torch(lambda values: of_tensors(robot, values)[1], q)
+    return by_torch(lambda values: of_tensors(robot, values)[1], q)
 
 
-def _by_torch(function: Callable[[Any], Any], q: Any) -> Any:
-    """A function of tensors; of an array as an array."""
+def is_tensor(values: Any) -> bool:
+    """Whether values are a tensor; torch need not be imported to know."""
+    torch = sys.modules.get("torch")
+    return torch is not None and isinstance(values, torch.Tensor)
+
+
+def by_torch(function: Callable[[Any], Any], q: Any) -> Any:
+    """A function of tensors; of an array in float64, as an array."""
     import torch
 
-    if isinstance(q, torch.Tensor):
+    if is_tensor(q):
         return function(q)
     return function(torch.from_numpy(np.array(q, dtype=np.float64))).numpy()
 
@@ -127,19 +134,14 @@ _chains: "WeakKeyDictionary[pisigma.robot.description.Robot, _Chain | None]" = W
 
 def _chain(robot: "pisigma.robot.description.Robot", q: Any) -> _Chain | None:
     """The robot for kernels; None of tensors, and where there are no kernels."""
-    torch = sys.modules.get("torch")
-    if torch is not None and isinstance(q, torch.Tensor):
+    if is_tensor(q):
         return None
     try:
         return _chains[robot]
     except KeyError:
-        pass
-    try:
-        made: _Chain | None = _Chain(robot)
-    except ModelError:
-        made = None
-    _chains[robot] = made
-    return made
+        with suppress(ModelError):
+            return _chains.setdefault(robot, _Chain(robot))
+        return _chains.setdefault(robot, None)
 
 
 def arm_rows(robot: "pisigma.robot.description.Robot") -> np.ndarray:
