@@ -31,7 +31,6 @@ class BaseToolFit:
         tools: for every target x, y, z [m], roll, pitch, yaw [rad] of its tool.
         rms_position: root mean square of the position errors' lengths [m].
         rms_rotation: root mean square of the rotation errors' angles [rad]; NaN where none was measured.
-        iterations: steps of the least squares.
         status: how the least squares ended, and which freedom the data leave open.
     """
 
@@ -39,7 +38,6 @@ class BaseToolFit:
     tools: dict[str, Float64[np.ndarray, " 6"]]
     rms_position: float
     rms_rotation: float
-    iterations: int
     status: str
 
 
@@ -69,20 +67,22 @@ def fit_base_and_tool(
         PoseError: the joint values do not fit the robot.
     """
     problem, solution = _solved(robot, measurements, free_base, free_tool, maximum_iterations)
-    return _result(robot, problem, solution)
-
-
-def find_base_and_tool(
-    robot: Robot, measurements: Measurements, free_base: bool, free_tool: bool, maximum_iterations: int
-) -> tuple[Float64[np.ndarray, " 6"], dict[str, Float64[np.ndarray, " 6"]]]:
-    """Base and tools alone that `fit_base_and_tool` finds.
-
-    Raises:
-        IdentificationError: as there.
-        PoseError: as there.
-    """
-    problem, solution = _solved(robot, measurements, free_base, free_tool, maximum_iterations)
-    return _base_and_tools(robot, problem, solution.linearisation.point)
+    state = solution.linearisation.point
+    rpy_tool = rpy_from_rotation(state.R_tool).cpu().numpy() if problem.turned else robot.tool[3:]
+    tools = {
+        name: np.concatenate([point.cpu().numpy(), rpy_tool])
+        for name, point in zip(problem.targets, state.points, strict=True)
+    }
+    base = torch.cat([state.p_base, rpy_from_rotation(state.R_base)]).cpu().numpy()
+    return BaseToolFit(
+        robot=robot.with_geometry(
+            base=base if free_base else None, tool=tools[problem.targets[0]] if free_tool else None
+        ),
+        tools=tools,
+        rms_position=_rms_position(problem, solution),
+        rms_rotation=_rms_rotation(problem, state) if problem.turned else float("nan"),
+        status=_status(solution),
+    )
 
 
 def _solved(
@@ -115,33 +115,6 @@ def _rms_position(problem: BaseToolProblem, solution: Solution[BaseToolState]) -
 def _rms_rotation(problem: BaseToolProblem, state: BaseToolState) -> float:
     turn = problem.rotation_residual(state)[problem.rotated]
     return float(turn.square().sum(-1).mean().sqrt())
-
-
-def _result(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolState]) -> BaseToolFit:
-    state = solution.linearisation.point
-    base, tools = _base_and_tools(robot, problem, state)
-    return BaseToolFit(
-        robot=robot.with_geometry(
-            base=base if problem.free_base else None,
-            tool=tools[problem.targets[0]] if problem.free_tool else None,
-        ),
-        tools=tools,
-        rms_position=_rms_position(problem, solution),
-        rms_rotation=_rms_rotation(problem, state) if problem.turned else float("nan"),
-        iterations=solution.iterations,
-        status=_status(solution),
-    )
-
-
-def _base_and_tools(
-    robot: Robot, problem: BaseToolProblem, state: BaseToolState
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    rpy_tool = rpy_from_rotation(state.R_tool).cpu().numpy() if problem.turned else robot.tool[3:]
-    tools = {
-        name: np.concatenate([point.cpu().numpy(), rpy_tool])
-        for name, point in zip(problem.targets, state.points, strict=True)
-    }
-    return torch.cat([state.p_base, rpy_from_rotation(state.R_base)]).cpu().numpy(), tools
 
 
 def _status(solution: Solution[BaseToolState]) -> str:

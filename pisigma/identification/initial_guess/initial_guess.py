@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError, nearest_choice
-from pisigma.identification.initial_guess.base_and_tool import find_base_and_tool
+from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.identification.initial_guess.base_and_tool_closed_form import base_by_points, nearest_rotation
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.kinematics.forward import forward_kinematics
@@ -155,11 +155,11 @@ def _from_positions(
         if find_base and 3 <= len(rows) < FEW and not turned and set(part.target) <= set(tools):
             bases[name] = _base_by_tools(robot, part, tools)
             continue
-        base, own_tools = find_base_and_tool(robot, part, find_base, free_tool, GUESS_STEPS)
+        fit = fit_base_and_tool(robot, part, find_base, free_tool, GUESS_STEPS)
         if free_base:
-            bases[name] = base if find_base else robot.base
+            bases[name] = fit.robot.base
         if free_tool:
-            tools = {**own_tools, **tools}
+            tools = {**fit.tools, **tools}
     return bases, tools
 
 

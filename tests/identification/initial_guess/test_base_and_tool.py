@@ -8,7 +8,7 @@ from testing.simulated_arm import BASE, simulate
 
 from pisigma.errors import IdentificationError, PoseError
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.initial_guess.base_and_tool import find_base_and_tool, fit_base_and_tool
+from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.identification.initial_guess.base_and_tool_closed_form import nearest_rotation, start_from_poses
 from pisigma.identification.problem.loss import SquaredLoss
 from pisigma.kinematics.forward import forward_kinematics
@@ -45,8 +45,7 @@ def test_poses_of_a_robot_with_parallel_axes_start_well_wherever_base_and_tool_a
     rng = np.random.default_rng(seed)
     base, tool = (np.concatenate([rng.normal(size=3), rng.uniform(-1.5, 1.5, 3)]) for _ in range(2))
     arm = simulate("kiro3", seed, rows=40, noise=5e-5, turn_noise=5e-5, base=base, tool=tool)
-    base_found, tools = find_base_and_tool(arm.nominal, arm.measurements, True, True, 2)
-    robot = arm.nominal.with_geometry(base=base_found, tool=tools[""])
+    robot = fit_base_and_tool(arm.nominal, arm.measurements, maximum_iterations=2).robot
     errors = forward_kinematics(robot, arm.measurements.q)[:, :3, 3] - arm.measurements.position
     assert float(errors.norm(dim=1).mean()) < 0.02  # 0.3 to 1 m from starts that are wrong
     result = GeometricCalibrator(arm.nominal).fit(arm.measurements)
