@@ -1,6 +1,6 @@
 """Rows that belong together: equal joint values, the two rows of a pair, and those of one placement."""
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 
 import torch
 from jaxtyping import Float64, Int64
@@ -22,6 +22,16 @@ def groups_of_equal_joints(q: Float64[Tensor, "rows dof"]) -> Int64[Tensor, " ro
     if q.shape[0] == 0:
         return torch.zeros(0, dtype=torch.int64, device=q.device)
     return _numbered(torch.unique(q + 0.0, dim=0, return_inverse=True)[1])  # -0.0 becomes 0.0
+
+
+def numbers_of_names(names: Sequence[Hashable]) -> Int64[Tensor, " rows"]:
+    """Number the different names in the order of their first row.
+
+    Returns:
+        For every row the number of its name, from 0.
+    """
+    index = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    return torch.tensor([index[name] for name in names], dtype=torch.int64)
 
 
 def groups_to_keep_whole(measurements: Measurements) -> Int64[Tensor, " rows"]:

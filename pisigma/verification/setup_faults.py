@@ -10,6 +10,7 @@ from torch import Tensor
 
 from pisigma.judging.frame_fits import LEVER_SHARE, MeasuredPoses, best_base, best_base_and_tool, best_tool
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import numbers_of_names
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
 from pisigma.se3 import rotation_vector
@@ -222,7 +223,7 @@ def _all_frames(model: CalibratedModel, some: Measurements, here: _Hypothesis) -
 
 def _elsewhere(model: CalibratedModel, some: Measurements, here: _Hypothesis) -> Iterator[_Hypothesis]:
     """Add another frame, another tool, or both."""
-    frames, targets = _numbered(some.frame), _numbered(some.target)
+    frames, targets = numbers_of_names(some.frame), numbers_of_names(some.target)
     per_tool = 6 if bool(here.measured.has_rotation.any()) else 3
     count, tools = int(frames.max()) + 1, int(targets.max()) + 1
     X, Y = _per_group(best_base, frames, here), _per_group(best_tool, targets, here)
@@ -232,11 +233,6 @@ def _elsewhere(model: CalibratedModel, some: Measurements, here: _Hypothesis) ->
         base, tool = best_base_and_tool(here.T, here.measured, model.robot.reach)
         moved = here.with_cause(_frame_moved(base[None]), base @ here.T, 6)
         yield moved.with_cause(_tool_moved(tool[None]), base @ here.T @ tool, per_tool)
-
-
-def _numbered(names: tuple[str, ...]) -> Int64[Tensor, " rows"]:
-    index = {name: number for number, name in enumerate(dict.fromkeys(names))}
-    return torch.tensor([index[name] for name in names], dtype=torch.int64)
 
 
 def _per_group(

@@ -13,7 +13,7 @@ from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_tables import cross_validation_text
-from pisigma.reporting.page.judged_rows import JudgedRows
+from pisigma.reporting.page.judged_rows import JudgedRows, means_by_name
 from pisigma.reporting.tables import figure_text
 
 LABELS = {
@@ -280,15 +280,12 @@ def _repeated(rows: JudgedRows | None) -> float | None:
     measurements = rows.measurements.select(finite)
     group = groups_of_equal_joints(measurements.q).tolist()
     names = list(zip(group, measurements.frame, measurements.target, strict=True))
-    index = {name: number for number, name in enumerate(dict.fromkeys(names))}
-    number = torch.tensor([index[name] for name in names])
-    values = rows.residual[finite]
-    counts = torch.bincount(number).double()
-    freedom = float((counts - 1).sum())
+    freedom = len(names) - len(set(names))
     if freedom < LEAST_REPEATS:
         return None
-    means = torch.zeros(len(index), 3, dtype=torch.float64).index_add_(0, number, values) / counts[:, None]
-    return math.sqrt(float((values - means[number]).square().sum()) / freedom) * 1e3
+    values = rows.residual[finite]
+    mean, _ = means_by_name(values, names)
+    return math.sqrt(float((values - mean).square().sum()) / freedom) * 1e3
 
 
 def _identified_noise(summary: CalibrationSummary | None) -> float | None:

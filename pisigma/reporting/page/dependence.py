@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int64
 
 from pisigma.judging.rank_tests import SIGNIFICANT, groups_differ, rank_correlation
 from pisigma.measurement.conditions import CONDITIONS, conditions_of
-from pisigma.measurement.groups import groups_of_equal_joints
+from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
 from pisigma.reporting.page.judged_rows import JudgedRows
 from pisigma.reporting.tables import figure_text
 from pisigma.robot.description import Robot
@@ -133,13 +133,12 @@ def by_name(rows: JudgedRows, names: Sequence[str]) -> tuple[tuple[NameErrors, .
     """
     before, after, unit = error_lengths(rows)
     judged = np.isfinite(after)
-    index = {name: number for number, name in enumerate(dict.fromkeys(names))}
-    number = np.array([index[name] for name in names])
-    if len(index) < 2:
+    number, different = numbers_of_names(names).numpy(), dict.fromkeys(names)
+    if len(different) < 2:
         return (), ""
     residual = rows.residual.numpy() * 1e3
     result = []
-    for name, k in index.items():
+    for k, name in enumerate(different):
         inside = judged & (number == k)
         signed = residual[inside]
         bias = tuple(np.nanmean(signed, 0).tolist()) if np.isfinite(signed).all(1).any() else None

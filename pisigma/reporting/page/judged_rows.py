@@ -1,6 +1,6 @@
 """What a report holds of every row: where it is, and how far off before and after the calibration."""
 
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -14,6 +14,7 @@ from pisigma.judging.pose_statistics import PoseErrors
 from pisigma.judging.reference_models import nominal_model
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import numbers_of_names
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
@@ -233,10 +234,15 @@ def _errors(
 
 def _from_socket(rows: Measurements, ball: Float64[Tensor, "rows 3"]) -> Float64[Tensor, "rows 3"]:
     """Compute the mean position of every row's socket minus the row's ball; NaN in sockets of a single row."""
-    names = list(zip(rows.frame, rows.socket or (), strict=True))
-    index = {name: number for number, name in enumerate(dict.fromkeys(names))}
-    number = torch.tensor([index[name] for name in names])
-    counts = torch.bincount(number, minlength=len(index)).double()
-    sums = torch.zeros(len(index), 3, dtype=torch.float64).index_add_(0, number, ball)
-    apart = (sums / counts[:, None])[number] - ball
-    return torch.where((counts[number] > 1)[:, None], apart, torch.nan)
+    mean, count = means_by_name(ball, list(zip(rows.frame, rows.socket or (), strict=True)))
+    return torch.where((count > 1)[:, None], mean - ball, torch.nan)
+
+
+def means_by_name(
+    values: Float64[Tensor, "rows 3"], names: Sequence[Hashable]
+) -> tuple[Float64[Tensor, "rows 3"], Float64[Tensor, " rows"]]:
+    """Compute for every row the mean of the values of its name, and how many rows have this name."""
+    number = numbers_of_names(names)
+    counts = torch.bincount(number).double()
+    sums = torch.zeros(len(counts), 3, dtype=torch.float64).index_add_(0, number, values)
+    return (sums / counts[:, None])[number], counts[number]

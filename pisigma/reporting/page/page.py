@@ -11,6 +11,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
+from pisigma.measurement.groups import numbers_of_names
 from pisigma.reporting.page.accuracy import LABELS, Accuracy, JudgedJoint
 from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.error_map import ErrorMap
@@ -99,8 +100,6 @@ def script_json(value: Any) -> Markup:
 
 def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
     """Pack what the viewer reads; arrays as base64 of little-endian float32."""
-    frames, frame = _numbered(error_map.frame)
-    targets, target = _numbered(error_map.target)
     return {
         "place": _packed(error_map.place),
         "layers": [vars(layer) | {"values": _packed(layer.values)} for layer in error_map.layers],
@@ -110,10 +109,10 @@ def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
             {"name": joint.name, "unit": "°" if turns else "mm"}
             for joint, turns in zip(robot.joints, robot.revolute, strict=True)
         ],
-        "frames": frames,
-        "frame": _packed(frame),
-        "targets": targets,
-        "target": _packed(target),
+        "frames": list(dict.fromkeys(error_map.frame)),
+        "frame": _packed(numbers_of_names(error_map.frame)),
+        "targets": list(dict.fromkeys(error_map.target)),
+        "target": _packed(numbers_of_names(error_map.target)),
         "inside": _packed(error_map.inside),
     }
 
@@ -124,11 +123,6 @@ def _resource(name: str) -> str:
 
 def _packed(values: Any) -> str:
     return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()
-
-
-def _numbered(names: Sequence[str]) -> tuple[list[str], list[int]]:
-    order = {name: number for number, name in enumerate(dict.fromkeys(names))}
-    return list(order), [order[name] for name in names]
 
 
 def _image(drawing: Drawing) -> str:
