@@ -16,7 +16,6 @@ from pisigma.kinematics.forward import forward_kinematics
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_files import CORRELATION_CSV
 from pisigma.reporting.calibration_tables import (
-    PARAMETER_COLUMNS,
     parameter_table,
     undetermined_lines,
     warning_lines,
@@ -41,33 +40,35 @@ INDICES = (
 )
 
 
+Correlations = tuple[tuple[str, ...], Float64[np.ndarray, "_names _names"]]
+"""Names of parameters, and the table of their correlations."""
+
+
 @dataclass(frozen=True, eq=False)
 class ParameterFindings:
     """What is said of parameters.
 
     Attributes:
-        columns: of the table.
-        table: its rows; empty for a model without identified geometry.
+        pairs: strongly correlated parameters and their correlation, strongest first.
+        correlations: names and table of lengths and of angles; empty where they are not kept.
+        missing: what the folder does not keep, in sentences.
+        table: rows of the table of parameters; empty for a model without identified geometry.
         estimated: number of parameters with a standard error.
         not_identified: in sentences.
         observability: name, value and meaning of every index; empty where the model has none.
         rank: independent combinations that the data see, or None.
         condition: condition number, or None.
-        pairs: strongly correlated parameters and their correlation, strongest first.
-        correlations: names and table of lengths and of angles; empty where they are not kept.
-        missing: what the folder does not keep, in sentences.
     """
 
-    columns: tuple[str, ...]
-    table: tuple[tuple[str, ...], ...]
-    estimated: int
-    not_identified: tuple[str, ...]
-    observability: tuple[tuple[str, float, str], ...]
-    rank: int | None
-    condition: float | None
     pairs: tuple[tuple[str, str, float], ...]
-    correlations: tuple[tuple[tuple[str, ...], Float64[np.ndarray, "_names _names"]], ...]
+    correlations: tuple[Correlations, ...]
     missing: tuple[str, ...]
+    table: tuple[tuple[str, ...], ...] = ()
+    estimated: int = 0
+    not_identified: tuple[str, ...] = ()
+    observability: tuple[tuple[str, float, str], ...] = ()
+    rank: int | None = None
+    condition: float | None = None
 
 
 def parameter_findings(
@@ -75,36 +76,28 @@ def parameter_findings(
 ) -> ParameterFindings:
     """Gather it from the figures of a calibration, if there are some, and the files of the model's folder."""
     tables = read_correlations(folder / CORRELATION_CSV)
-    missing = []
     if summary is None:
-        missing.append(
+        missing = (
             "This model has no identified parameters: its geometry is the nominal one."
             if model.calibrated is None
             else "The model folder does not keep the figures of its parameters; calibrate again."
         )
-    elif not tables:
-        missing.append(
-            "The model folder does not keep the correlations as numbers; calibrate again to have them."
-        )
-    if summary is None:
-        return ParameterFindings(
-            PARAMETER_COLUMNS, (), 0, (), (), None, None, _pairs(tables), tables, tuple(missing)
-        )
+        return ParameterFindings(_pairs(tables), tables, (missing,))
+    missing = "The model folder does not keep the correlations as numbers; calibrate again to have them."
     return ParameterFindings(
-        columns=PARAMETER_COLUMNS,
+        pairs=_pairs(tables),
+        correlations=tables,
+        missing=() if tables else (missing,),
         table=parameter_table(summary.parameters).rows,
         estimated=sum(row.standard_error is not None for row in summary.parameters),
         not_identified=(*undetermined_lines(summary), *warning_lines(summary)),
         observability=tuple((name, getattr(summary.observability, name), text) for name, text in INDICES),
         rank=summary.rank,
         condition=summary.condition_number,
-        pairs=_pairs(tables),
-        correlations=tables,
-        missing=tuple(missing),
     )
 
 
-def read_correlations(path: Path) -> tuple[tuple[tuple[str, ...], Float64[np.ndarray, "_names _names"]], ...]:
+def read_correlations(path: Path) -> tuple[Correlations, ...]:
     """Read the tables of lengths and of angles; nothing where there is no such file, or it holds something else."""
     if not path.is_file():
         return ()
@@ -124,7 +117,7 @@ def read_correlations(path: Path) -> tuple[tuple[tuple[str, ...], Float64[np.nda
     return tuple(tables)
 
 
-def _pairs(tables: tuple[tuple[tuple[str, ...], np.ndarray], ...]) -> tuple[tuple[str, str, float], ...]:
+def _pairs(tables: tuple[Correlations, ...]) -> tuple[tuple[str, str, float], ...]:
     """List strongly correlated parameters, the strongest first."""
     strong = [
         (name, names[k], float(values[i, k]))
@@ -186,11 +179,10 @@ def correction_curves(model: CalibratedModel) -> tuple[CorrectionCurve, ...]:
 
 def correction_at(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows dof"]:
     """Compute the learned correction in full at joint values [rad or m]."""
-    hybrid = model.hybrid
+    hybrid, chunks = model.hybrid, torch.split(q, CHUNK)
     with torch.no_grad():
         if hybrid is not None:
-            return torch.cat([hybrid.correction(chunk) for chunk in torch.split(q, CHUNK)])
-        chunks = torch.split(q, CHUNK)
+            return torch.cat([hybrid.correction(chunk) for chunk in chunks])
         return torch.cat(
             [model.correction(forward_kinematics(model.robot, chunk), chunk) for chunk in chunks]
         )

@@ -12,7 +12,6 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Float64
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -21,7 +20,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocato
 
 from pisigma.errors import OutputError
 from pisigma.judging.validation_figures import LearningPoint
-from pisigma.reporting.page.corrections import CorrectionCurve
+from pisigma.reporting.page.corrections import CorrectionCurve, Correlations
 from pisigma.reporting.page.dependence import Dependence, binned
 from pisigma.reporting.page.error_map import ErrorMap
 
@@ -164,17 +163,14 @@ def draw_correction(curve: CorrectionCurve) -> Drawing:
     return Drawing(f"correction_{curve.joint}", curve.joint, curve.sentence, figure)
 
 
-def draw_correlations(
-    tables: Sequence[tuple[tuple[str, ...], Float64[np.ndarray, "_names _names"]]],
-) -> tuple[Drawing, ...]:
+def draw_correlations(tables: Sequence[Correlations]) -> tuple[Drawing, ...]:
     """Draw correlations of lengths and of angles; pairs that act alike bear their sign."""
-    named = [(title, *table) for title, table in zip(("lengths", "angles"), tables, strict=False)]
-    return tuple(_correlations(title, names, values) for title, names, values in named if names)
+    named = zip(("lengths", "angles"), tables, strict=False)
+    return tuple(_correlations(title, table) for title, table in named if table[0])
 
 
-def _correlations(
-    title: str, names: tuple[str, ...], values: Float64[np.ndarray, "_names _names"]
-) -> Drawing:
+def _correlations(title: str, table: Correlations) -> Drawing:
+    names, values = table
     with drawing_style():
         side = float(np.clip(0.25 * len(names) + 1.3, 3.4, 9.0))
         figure = Figure(figsize=(side + 0.9, side), layout="constrained")

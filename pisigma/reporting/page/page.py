@@ -12,7 +12,8 @@ import numpy as np
 from markupsafe import Markup
 
 from pisigma.measurement.groups import numbers_of_names
-from pisigma.reporting.page.accuracy import LABELS, Accuracy, JudgedJoint
+from pisigma.reporting.calibration_tables import PARAMETER_COLUMNS
+from pisigma.reporting.page.accuracy import LABELS, Accuracy
 from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.error_map import ErrorMap
 from pisigma.reporting.page.figures import (
@@ -79,14 +80,15 @@ def render_page(content: ReportContent, figures: ReportFigures) -> str:
         "image": _image,
         "png": lambda content: _address("png", content),
         "figure": figure_text,
+        "error_lines": _error_lines,
         "signed": "{:+.4f}".format,
     }
     template = environment.from_string(_resource("template.html.j2"))
     return template.render(
         c=content,
         figures=figures,
-        tables=[_table(accuracy) for accuracy in content.accuracies],
-        joint_table=[_joint_line(joint) for joint in content.joints],
+        labels=LABELS,
+        columns=PARAMETER_COLUMNS,
         map_data=script_json(map_data(content.map, content.model.robot)),
         style=Markup(_resource("style.css")),  # ours
         script=Markup(_resource("viewer.js")),
@@ -134,34 +136,19 @@ def _address(kind: str, content: bytes) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
 
 
-@dataclass(frozen=True)
-class _ErrorTable:
-    """A table of errors: heads of the columns; lines of a label, cells, and how much better the last is."""
-
-    accuracy: Accuracy
-    heads: tuple[str, ...]
-    lines: tuple[tuple[str, tuple[str, ...], str], ...]
-
-
-def _table(accuracy: Accuracy) -> _ErrorTable:
+def _error_lines(accuracy: Accuracy) -> list[tuple[str, list[str], str]]:
+    """Write the lines of a table of errors: a label, a cell per model, and how much better the last is."""
     lines = []
     for unit, quantity in (("mm", "position"), ("deg", "orientation")):
         for key, label in _STATISTICS:
             cells = [getattr(figures, f"{key}_{unit}") for figures in accuracy.models.values()]
             if any(cell is not None for cell in cells):
-                texts = tuple("" if cell is None else figure_text(cell) for cell in cells)
+                texts = ["" if cell is None else figure_text(cell) for cell in cells]
                 lines.append((f"{quantity}, {label} [{unit}]", texts, _better(cells)))
-    return _ErrorTable(accuracy, tuple(LABELS[name] for name in accuracy.models), tuple(lines))
+    return lines
 
 
 def _better(cells: Sequence[float | None]) -> str:
     """Say how much smaller the last figure is than the first."""
     first, last = cells[0], cells[-1]
     return f"{first / last:.1f} ×" if len(cells) > 1 and first is not None and last else ""
-
-
-def _joint_line(joint: JudgedJoint) -> tuple[str, ...]:
-    """Write a joint's name, rows, unit, and average, deviation and maximum before and after."""
-    rows = "held-out" if joint.held_out else "training"
-    figures = (*joint.errors.before.values, *joint.errors.after.values)
-    return (joint.name, rows, joint.unit, *map(figure_text, figures))
