@@ -13,12 +13,6 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting import calibration_figures as figures
 from pisigma.reporting import calibration_tables as tables
-from pisigma.reporting.calibration_files import (
-    CORRELATION_CSV,
-    PARAMETERS_CSV,
-    write_correlations,
-    write_parameters,
-)
 from pisigma.reporting.tables import CARD, markdown_table, pose_table, use_text
 
 
@@ -50,10 +44,10 @@ def write_calibration_card(
         texts: description, and what was not validated.
         folder: where to write.
     """
-    write_parameters(summary.parameters, folder / PARAMETERS_CSV)
+    tables.write_parameters(summary.parameters, folder / tables.PARAMETERS_CSV)
     geometric = geometric_result(result)
     correlations = (geometric.pairwise.lengths, geometric.pairwise.angles)
-    write_correlations(correlations, folder / CORRELATION_CSV)
+    tables.write_correlations(correlations, folder / tables.CORRELATION_CSV)
     figures.draw_correlations(correlations, folder / figures.CORRELATION_PNG)
     figures.draw_residuals(
         geometric.residuals,
@@ -171,7 +165,7 @@ def _parameter_sections(summary: CalibrationSummary) -> list[str]:
         "DH rows `RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; base and tool "
         "`Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`. A standard error is what the measurement noise "
         "makes of the estimate; a parameter without one was left at its nominal value. "
-        f"In full digits and with full remarks: [{PARAMETERS_CSV}]({PARAMETERS_CSV}).",
+        f"In full digits and with full remarks: [{tables.PARAMETERS_CSV}]({tables.PARAMETERS_CSV}).",
         markdown_table(*tables.parameter_table(summary.parameters)),
         "## What these data cannot determine",
         "\n".join(

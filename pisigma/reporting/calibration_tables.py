@@ -1,7 +1,11 @@
-"""Tables and sentences of a calibration, for its card, the screen and report pages."""
+"""Tables and sentences of a calibration, for its card, the screen, report pages and CSV files."""
 
+import csv
+import math
 from collections.abc import Sequence
+from pathlib import Path
 
+from pisigma.identification.identifiability.pairwise import CorrelationTable
 from pisigma.judging.calibration_summary import (
     CalibrationSummary,
     HybridFigures,
@@ -11,8 +15,11 @@ from pisigma.judging.calibration_summary import (
 from pisigma.judging.validation_figures import AbstractValidationFigures, LearningPoint, ValidationFigures
 from pisigma.reporting.tables import Table, figure_text
 
+PARAMETERS_CSV = "parameters.csv"
+CORRELATION_CSV = "correlation.csv"
 PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")
 TRIAL_COLUMNS = ("tried", "unknowns", "log evidence", "left-out error", "seconds", "kept")
+_FIGURES = ("nominal", "estimated", "change", "standard_error")
 
 
 def parameter_table(parameters: Sequence[ParameterFigures]) -> Table:
@@ -177,3 +184,35 @@ def noise_text(noise: NoiseFigures) -> str:
 
 def _sentence(line: str) -> str:
     return f"{line.rstrip('.')}."
+
+
+def write_parameters(parameters: Sequence[ParameterFigures], path: Path) -> None:
+    """Write the parameter table in full digits; a cell is empty where there is no figure.
+
+    Args:
+        parameters: in mm and deg.
+        path: the CSV to write.
+    """
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["name", "unit", *_FIGURES, "remark"])
+        for row in parameters:
+            figures = (getattr(row, name) for name in _FIGURES)
+            texts = ("" if value is None else repr(value) for value in figures)
+            writer.writerow([row.name, row.unit, *texts, row.remark])
+
+
+def write_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:
+    """Write the tables of lengths and of angles, a cell a line; an undefined correlation is an empty cell.
+
+    Args:
+        tables: of lengths and of angles.
+        path: the CSV to write.
+    """
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(["of", "parameter", "with", "correlation"])
+        for kind, table in zip(("lengths", "angles"), tables, strict=True):
+            for name, values in zip(table.names, table.values.tolist(), strict=True):
+                for other, value in zip(table.names, values, strict=True):
+                    writer.writerow([kind, name, other, "" if math.isnan(value) else f"{value:.6f}"])

@@ -10,7 +10,7 @@ from testing.report import geometric_under_test, hybrid_under_test, measured
 from pisigma.judging.held_out_rows import HELD_OUT_CSV
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.reporting.calibration_files import CORRELATION_CSV
+from pisigma.reporting.calibration_tables import CORRELATION_CSV
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
-from pisigma.reporting.calibration_files import CORRELATION_CSV, write_correlations
+from pisigma.reporting.calibration_tables import CORRELATION_CSV, write_correlations
 
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&\u2028$x_1$"
 """A name that breaks pages which do not show it as text."""

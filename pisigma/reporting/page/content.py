@@ -11,8 +11,7 @@ from pisigma.judging.validation_figures import LearningPoint
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_figures import CORRELATION_PNG
-from pisigma.reporting.calibration_files import CORRELATION_CSV
-from pisigma.reporting.calibration_tables import coverage_line, learned_lines
+from pisigma.reporting.calibration_tables import CORRELATION_CSV, coverage_line, learned_lines
 from pisigma.reporting.page.accuracy import Accuracy, JudgedJoint, Limit, accuracies, judged_joints, limit_of
 from pisigma.reporting.page.advice import advice_for
 from pisigma.reporting.page.corrections import (

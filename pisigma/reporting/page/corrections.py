@@ -14,8 +14,8 @@ from pisigma.hybrid.coverage import share_beyond
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.calibration_files import CORRELATION_CSV
 from pisigma.reporting.calibration_tables import (
+    CORRELATION_CSV,
     parameter_table,
     undetermined_lines,
     warning_lines,
