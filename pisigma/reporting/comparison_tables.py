@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pisigma.judging.model_comparison import Difference, Interval, ModelComparison, QuantityErrors
 from pisigma.reporting.tables import Table, figure_text
 
-_SHOWN = (("rms", "RMS"), ("mean", "mean"), ("p95", "95 %"), ("max", "maximum"))
+_SHOWN = {"rms": "RMS", "mean": "mean", "p95": "95 %", "max": "maximum"}
 _NONE = "-"
 
 
@@ -56,11 +56,7 @@ def _error_lines(comparison: ModelComparison) -> _Lines:
     lines: _Lines = []
     for quantity, first in models[0].quantities.items():
         errors = [model.quantities[quantity] for model in models]
-        for key, shown in _SHOWN:
-            values = [figure_text(one.statistics[key]) for one in errors]
-            lines.append((f"{quantity}, {shown} [{first.unit}]", values))
-            if first.intervals.get(key) is not None:
-                lines.append((_confidence(comparison), [_interval(one.intervals[key]) for one in errors]))
+        lines += _statistic_lines(comparison, f"{quantity}, {{}} [{first.unit}]", _SHOWN, errors)
         word = "along" if quantity == "position" else "about"
         for axis in "xyz":
             values = [figure_text(one.axes[axis]["rms"]) for one in errors]
@@ -76,19 +72,30 @@ def _error_lines(comparison: ModelComparison) -> _Lines:
     return lines
 
 
+def _statistic_lines(
+    comparison: ModelComparison,
+    label: str,
+    shown: Mapping[str, str],
+    errors: Sequence[QuantityErrors | Difference],
+) -> _Lines:
+    """Write statistics of every model, each followed by its confidence intervals where there are some."""
+    lines: _Lines = []
+    for key, statistic in shown.items():
+        lines.append((label.format(statistic), [figure_text(one.statistics[key]) for one in errors]))
+        if errors[0].intervals.get(key) is not None:
+            confidence = f"  {100 * comparison.bootstrap.confidence:.0f} % confidence"
+            lines.append((confidence, [_interval(one.intervals[key]) for one in errors]))
+    return lines
+
+
 def _difference_lines(comparison: ModelComparison) -> _Lines:
     """Write the differences of every later model to the first, with intervals and Wilcoxon's p."""
     first, *others = comparison.models
     lines: _Lines = []
     for quantity, errors in first.quantities.items():
         differences = [_difference(model.quantities[quantity]) for model in others]
-        for key, shown in (("mean", "mean"), ("rms", "RMS")):
-            values = [figure_text(one.statistics[key]) for one in differences]
-            lines.append((f"{quantity}, {shown} [{errors.unit}]", values))
-            if differences[0].intervals[key] is not None:
-                lines.append(
-                    (_confidence(comparison), [_interval(one.intervals[key]) for one in differences])
-                )
+        label = f"{quantity}, {{}} [{errors.unit}]"
+        lines += _statistic_lines(comparison, label, {"mean": "mean", "rms": "RMS"}, differences)
         shares = [f"{100 * one.better_share:.0f} %" for one in differences]
         lines.append((f"{quantity}, better in", shares))
         lines.append((f"{quantity}, Wilcoxon's p", [_p(one.test.p) for one in differences]))
@@ -98,10 +105,6 @@ def _difference_lines(comparison: ModelComparison) -> _Lines:
 def _difference(errors: QuantityErrors) -> Difference:
     assert errors.difference is not None  # only the first model has none
     return errors.difference
-
-
-def _confidence(comparison: ModelComparison) -> str:
-    return f"  {100 * comparison.bootstrap.confidence:.0f} % confidence"
 
 
 def _domain(statistics: Mapping[str, float], rows: int | None) -> str:

@@ -77,17 +77,14 @@ def reversed_signs(dof: int) -> JointMaps:
 
 def other_orders(dof: int) -> JointMaps:
     """List all orders of the joints; of more than seven the exchanges of two."""
-    orders: list[tuple[int, ...]] = []
     if math.factorial(dof) <= MOST_ORDERS:
-        orders = list(itertools.permutations(range(dof)))[1:]
-    else:
-        for i, j in itertools.combinations(range(dof), 2):
-            order = list(range(dof))
-            order[i], order[j] = j, i
-            orders.append(tuple(order))
-    return replace(
-        JointMaps.unchanged(len(orders), dof), order=torch.tensor(orders).reshape(len(orders), dof)
-    )
+        orders = torch.tensor(list(itertools.permutations(range(dof)))[1:], dtype=torch.int64).reshape(
+            -1, dof
+        )
+        return replace(JointMaps.unchanged(len(orders), dof), order=orders)
+    pairs = torch.combinations(torch.arange(dof))
+    maps = JointMaps.unchanged(len(pairs), dof)
+    return replace(maps, order=maps.order.scatter(1, pairs, pairs.flip(1)))
 
 
 def other_units(robot: Robot) -> JointMaps:
@@ -96,10 +93,11 @@ def other_units(robot: Robot) -> JointMaps:
     for revolute, per_unit in ((True, math.degrees(1)), (False, 1e3)):
         joints = [i for i, turns in enumerate(robot.revolute) if turns == revolute]
         for count in range(1, len(joints) + 1):
-            for some, factor in itertools.product(
-                itertools.combinations(joints, count), (per_unit, 1 / per_unit)
-            ):
-                rows.append([factor if i in some else 1.0 for i in range(robot.dof)])
+            for some in itertools.combinations(joints, count):
+                rows += [
+                    [factor if i in some else 1.0 for i in range(robot.dof)]
+                    for factor in (per_unit, 1 / per_unit)
+                ]
     factors = torch.tensor(rows, dtype=torch.float64).reshape(len(rows), robot.dof)
     return replace(JointMaps.unchanged(len(rows), robot.dof), factor=factors)
 

@@ -69,18 +69,15 @@ class SetupFault:
 
     def to_json(self) -> dict[str, object]:
         """Return kinds, sentence and figures in mm and, where measured, in deg."""
-        values: dict[str, object] = {
-            "kinds": list(self.kinds),
-            "sentence": self.sentence,
+        figures = {
             "before_rms_mm": self.before * 1e3,
             "after_rms_mm": self.after * 1e3,
+            "after_nominal_rms_mm": self.after_nominal * 1e3,
+            "before_rms_deg": float(np.rad2deg(self.before_rotation)),
+            "after_rms_deg": float(np.rad2deg(self.after_rotation)),
         }
-        if np.isfinite(self.after_nominal):
-            values["after_nominal_rms_mm"] = self.after_nominal * 1e3
-        if np.isfinite(self.before_rotation):
-            values["before_rms_deg"] = float(np.rad2deg(self.before_rotation))
-            values["after_rms_deg"] = float(np.rad2deg(self.after_rotation))
-        return values
+        measured = {name: value for name, value in figures.items() if np.isfinite(value)}
+        return {"kinds": list(self.kinds), "sentence": self.sentence, **measured}
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,17 +172,16 @@ def _spread(measurements: Measurements) -> Measurements:
 
 
 def _hypotheses(model: CalibratedModel, some: Measurements, here: _Hypothesis) -> Iterator[_Hypothesis]:
-    """Go through everything that may explain the errors."""
-    yield from _elsewhere(model, some, here)
+    """Go through everything that may explain the errors; first that nothing is wrong, which explains none."""
+    yield from _all_frames(model, some, here)
     for factor, are, named in ((1e-3, "millimetres", "metres"), (1e3, "metres", "millimetres")):
         clause = f"x, y and z are {are} that are named {named}"
         unit = Cause("position_unit", clause, "correct the unit in the column names", 1.0)
         scaled = replace(here, measured=here.measured.scaled(factor), causes=(unit,))
         yield from _all_frames(model, some, scaled)
     for T, clause, advice in _other_corrections(model, some, here.T):
-        yield from _all_frames(
-            model, some, here.with_cause(Cause("correction", clause, advice, 1.0), T, fitted=0)
-        )
+        cause = Cause("correction", clause, advice, 1.0)
+        yield from _all_frames(model, some, here.with_cause(cause, T, fitted=0))
     if here.error > SMALL_SHARE * model.robot.reach:
         maps = likely_maps(model, some, here.measured)
         for number, q in enumerate(maps.of(some.q)):
@@ -217,12 +213,8 @@ def _other_corrections(
 
 
 def _all_frames(model: CalibratedModel, some: Measurements, here: _Hypothesis) -> Iterator[_Hypothesis]:
+    """Go on to the same hypothesis with another frame, another tool, and both."""
     yield here
-    yield from _elsewhere(model, some, here)
-
-
-def _elsewhere(model: CalibratedModel, some: Measurements, here: _Hypothesis) -> Iterator[_Hypothesis]:
-    """Add another frame, another tool, or both."""
     frames, targets = numbers_of_names(some.frame), numbers_of_names(some.target)
     per_tool = 6 if bool(here.measured.has_rotation.any()) else 3
     count, tools = int(frames.max()) + 1, int(targets.max()) + 1

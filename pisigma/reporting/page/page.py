@@ -76,13 +76,13 @@ def render_page(content: ReportContent, figures: ReportFigures) -> str:
     environment = jinja2.Environment(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    environment.filters |= {
-        "image": _image,
-        "png": lambda content: _address("png", content),
-        "figure": figure_text,
-        "error_lines": _error_lines,
-        "signed": "{:+.4f}".format,
-    }
+    environment.filters.update(
+        image=_image,
+        png=lambda content: _address("png", content),
+        figure=figure_text,
+        error_lines=_error_lines,
+        signed="{:+.4f}".format,
+    )
     template = environment.from_string(_resource("template.html.j2"))
     return template.render(
         c=content,
