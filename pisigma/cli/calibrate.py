@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pisigma.cli.completion import complete_robot
+from pisigma.cli.arguments import complete_robot
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.completion import complete_model
+from pisigma.cli.arguments import complete_model
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:

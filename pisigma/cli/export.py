@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.completion import ModelFolder, complete_export
+from pisigma.cli.arguments import ModelFolder, complete_export
 from pisigma.cli.conditions import PayloadKg, TemperatureC
 from pisigma.export.registry import BUILT_IN
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.completion import ModelFolder
+from pisigma.cli.arguments import ModelFolder
 from pisigma.cli.conditions import PayloadKg, TemperatureC, given_conditions
 
 if TYPE_CHECKING:

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from pisigma.cli.completion import ModelFolder
+from pisigma.cli.arguments import ModelFolder
 
 
 def report(

@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pisigma.cli.completion import complete_model
+from pisigma.cli.arguments import complete_model
 from pisigma.cli.output import print_json
 
 Model = Annotated[

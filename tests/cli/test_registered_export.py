@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from pisigma.cli.completion import complete_export, complete_model, complete_robot
+from pisigma.cli.arguments import complete_export, complete_model, complete_robot
 from pisigma.errors import OutputError
 from pisigma.export import registry
 from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
