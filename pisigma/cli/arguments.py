@@ -1,4 +1,4 @@
-"""What shells complete: names of robots, model folders and export formats."""
+"""Arguments and options that several commands share, and what shells complete in them."""
 
 from pathlib import Path
 from typing import Annotated
@@ -30,3 +30,14 @@ def complete_export(incomplete: str) -> list[str]:
 
 ModelFolder = Annotated[Path, typer.Argument(help="Model folder.", autocompletion=complete_model)]
 """The argument of commands that read one model."""
+
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+"""The option of all commands that programs call."""
+
+PayloadKg = Annotated[
+    float | None,
+    typer.Option(help="Payload of the robot [kg], if the model learned what that does. [default: the usual]"),
+]
+TemperatureC = Annotated[
+    float | None, typer.Option(help="Temperature of the robot [deg C], likewise. [default: the usual]")
+]

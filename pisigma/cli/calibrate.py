@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pisigma.cli.arguments import complete_robot
+from pisigma.cli.arguments import AsJson, complete_robot
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:
@@ -66,7 +66,6 @@ Tip = Annotated[
     str | None, typer.Option(help="Of a URDF file: link that is the tool. [default: its only leaf]")
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", help="Print all parameters.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 def calibrate(

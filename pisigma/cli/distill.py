@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import complete_model
+from pisigma.cli.arguments import AsJson, complete_model
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:
@@ -49,7 +49,6 @@ Harmonics = Annotated[
     ),
 ]
 Seed = Annotated[int, typer.Option(help="Seed of poses and starts.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 def distill(

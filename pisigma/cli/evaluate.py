@@ -1,11 +1,11 @@
 """`pisigma evaluate`: how well models explain measurements that they were not trained on."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.verify import FitFrame
+from pisigma.cli.arguments import AsJson
+from pisigma.cli.verify import FitFrame, print_comparison
 
 if TYPE_CHECKING:
     from pisigma.workflow.evaluate import Evaluation
@@ -33,7 +33,6 @@ Resamples = Annotated[
     int, typer.Option(min=2, help="Resamples of the configurations, for confidence intervals.")
 ]
 Seed = Annotated[int, typer.Option(help="Seed of the resamples.")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 def evaluate(
@@ -45,7 +44,7 @@ def evaluate(
     fit_frame: FitFrame = False,
     resamples: Resamples = 2000,
     seed: Seed = 0,
-    as_json: Json = False,
+    as_json: AsJson = False,
 ) -> None:
     """Compare models on measurements, with confidence intervals, and accept them or not.
 
@@ -71,8 +70,7 @@ def evaluate(
 
 
 def _print(evaluation: "Evaluation") -> None:
-    from pisigma.cli.output import print_lines, print_table, screen_width
-    from pisigma.reporting.comparison_tables import comparison_tables
+    from pisigma.cli.output import print_lines
 
     stated = evaluation.settings.limits.stated
     if stated and evaluation.accepted:
@@ -80,6 +78,5 @@ def _print(evaluation: "Evaluation") -> None:
         print_lines([f"Accepted: every model stays within {limits}."])
     elif stated:
         print_lines([f"Not accepted: {'; '.join(evaluation.missed)}."])
-    for title, table in comparison_tables(evaluation.comparison, Path(evaluation.data).name, screen_width()):
-        print_table(title, *table)
+    print_comparison(evaluation.comparison, evaluation.data)
     print_lines(evaluation.warnings)

@@ -5,8 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import ModelFolder, complete_export
-from pisigma.cli.conditions import PayloadKg, TemperatureC
+from pisigma.cli.arguments import AsJson, ModelFolder, PayloadKg, TemperatureC, complete_export
 from pisigma.export.registry import BUILT_IN
 
 if TYPE_CHECKING:
@@ -68,7 +67,7 @@ def export(
     config: Config = None,
     payload_kg: PayloadKg = None,
     temperature_c: TemperatureC = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write a model for other programs, whole or not at all.
 

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import ModelFolder
-from pisigma.cli.conditions import PayloadKg, TemperatureC, given_conditions
+from pisigma.cli.arguments import AsJson, ModelFolder, PayloadKg, TemperatureC
 
 if TYPE_CHECKING:
     import numpy as np
@@ -47,7 +46,7 @@ def ik(
     ] = False,
     payload_kg: PayloadKg = None,
     temperature_c: TemperatureC = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Print the joint values that really reach a pose, or write those of a file of poses.
 
@@ -61,7 +60,8 @@ def ik(
     from pisigma.inverse.corrected_ik import load
 
     solver = load(model)
-    if conditions := given_conditions(payload_kg, temperature_c):
+    stated = {"payload_kg": payload_kg, "temperature_c": temperature_c}
+    if conditions := {name: value for name, value in stated.items() if value is not None}:
         solver = solver.under(**conditions)
     if poses is not None and out is not None:
         _write_file(solver, poses, out, branch, accuracy, path, as_json)

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from pisigma.cli.arguments import ModelFolder
+from pisigma.cli.arguments import AsJson, ModelFolder
 
 
 def report(
@@ -20,7 +20,7 @@ def report(
     figures: Annotated[
         Path | None, typer.Option(help="Folder for the figures as PNG and SVG files; made where missing.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write a report as one HTML page: how accurate, where worst, what limits it, what to measure next."""
     from pisigma.cli.output import print_json, print_lines, progress_of

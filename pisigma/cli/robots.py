@@ -1,13 +1,9 @@
 """`pisigma robots`: the catalogue."""
 
-from typing import Annotated
-
-import typer
+from pisigma.cli.arguments import AsJson
 
 
-def robots(
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
-) -> None:
+def robots(as_json: AsJson = False) -> None:
     """List the robots that come with pisigma."""
     from pisigma.cli.output import print_json, print_table
     from pisigma.robot import Robot, catalogue

@@ -5,6 +5,8 @@ from typing import Annotated
 
 import typer
 
+from pisigma.cli.arguments import AsJson
+
 
 def simulate(
     recipe: Annotated[Path, typer.Argument(help="Recipe (YAML) with simulated data.")],
@@ -12,7 +14,7 @@ def simulate(
     held_out: Annotated[
         bool, typer.Option("--held-out", help="Write the held-out rows instead of the training rows.")
     ] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Write the simulated measurements of a recipe as a CSV file."""
     from pisigma.cli.output import print_json

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pisigma.cli.arguments import AsJson
 from pisigma.cli.calibrate import print_calibration
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of
 
@@ -38,7 +39,7 @@ def train(
         Path | None,
         typer.Option(help="Folder for metrics.csv of every epoch, and TensorBoard's events if it is there."),
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Train the model of a recipe and write it as a model folder with card and figures."""
     started = time.perf_counter()

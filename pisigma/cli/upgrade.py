@@ -6,7 +6,7 @@ from typing import Annotated
 
 import typer
 
-from pisigma.cli.arguments import complete_model
+from pisigma.cli.arguments import AsJson, complete_model
 from pisigma.cli.output import print_json
 
 Model = Annotated[
@@ -15,7 +15,6 @@ Model = Annotated[
         metavar="MODEL", help="Model folder that an earlier version wrote.", autocompletion=complete_model
     ),
 ]
-AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 
 
 def upgrade(model: Model, as_json: AsJson = False) -> None:

@@ -5,8 +5,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from pisigma.cli.arguments import AsJson
+
 if TYPE_CHECKING:
-    from pisigma.workflow.verify import Verification
+    from pisigma.judging.model_comparison import ModelComparison
 
 FitFrame = Annotated[
     bool, typer.Option("--fit-frame", help="The sensor was moved since: fit its frame to these rows.")
@@ -20,7 +22,7 @@ def verify(
     model: Annotated[Path, typer.Argument(help="Model folder.")],
     data: Data,
     fit_frame: FitFrame = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Say whether new measurements are explained better by the corrected model than by the nominal robot.
 
@@ -28,7 +30,7 @@ def verify(
     signs or zeros of the joints, a correction that was applied twice or not at all. Rows of the set "train" are
     left out. Exit status 3 where the corrected model does not explain the measurements better.
     """
-    from pisigma.cli.output import print_json, progress_of
+    from pisigma.cli.output import print_json, print_lines, progress_of
     from pisigma.errors import AcceptanceError
     from pisigma.workflow import verify as workflow
 
@@ -37,18 +39,17 @@ def verify(
     if as_json:
         print_json(verification.to_json())
     else:
-        _print(verification)
+        print_lines([verification.sentence])
+        print_comparison(verification.comparison, verification.data)
+        print_lines([*(fault.sentence for fault in verification.setup_faults), *verification.warnings])
     if not verification.accepted:
         raise AcceptanceError(verification.sentence)
 
 
-def _print(verification: "Verification") -> None:
-    from pisigma.cli.output import print_lines, print_table, screen_width
+def print_comparison(comparison: "ModelComparison", data: str) -> None:
+    """Print the tables of models that were compared on the rows of a file."""
+    from pisigma.cli.output import print_table, screen_width
     from pisigma.reporting.comparison_tables import comparison_tables
 
-    print_lines([verification.sentence])
-    for title, table in comparison_tables(
-        verification.comparison, Path(verification.data).name, screen_width()
-    ):
+    for title, table in comparison_tables(comparison, Path(data).name, screen_width()):
         print_table(title, *table)
-    print_lines([*(fault.sentence for fault in verification.setup_faults), *verification.warnings])
