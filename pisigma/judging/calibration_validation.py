@@ -1,6 +1,6 @@
 """Calibrations judged on held-out rows: nominal, geometric and hybrid side by side."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
@@ -13,6 +13,7 @@ from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.prediction import predicted_poses
 from pisigma.judging.pose_statistics import PoseErrors, error_statistics
 from pisigma.judging.predicted_spread import PredictedSpread, predicted_spread
+from pisigma.judging.progress import Progress, stage
 from pisigma.judging.trained_calibrations import (
     Calibrator,
     Result,
@@ -26,8 +27,6 @@ from pisigma.judging.validation_figures import ErrorFigures, LearningPoint, Vali
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import TrainTest, with_fewer
 from pisigma.sensors.registry import SENSORS
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,7 +186,7 @@ def validate(
         sockets += len(_sockets(held_out) - _sockets(training))
         chosen = without_missing(calibrator, training, measurements)
         try:
-            results = trained(chosen, training, lambda what, fold=fold: progress(f"{fold}: {what}"))  # type: ignore[misc]
+            results = trained(chosen, training, stage(progress, fold))
         except IdentificationError as problem:
             raise IdentificationError(
                 f"{fold}, calibrated with {training.rows} of the {measurements.rows} rows: {problem} All rows at once "
@@ -208,12 +207,9 @@ def validate_repeatedly(
         return validate(calibrator, measurements, repeats[0], progress)
     first, *again = (
         validate(
-            calibrator,
-            measurements,
-            splits,
-            lambda what, done=done: progress(f"repeat {done + 1} of {len(repeats)}, {what}"),  # type: ignore[misc]
+            calibrator, measurements, splits, stage(progress, f"repeat {number} of {len(repeats)}", ", ")
         )
-        for done, splits in enumerate(repeats)
+        for number, splits in enumerate(repeats, 1)
     )
     return replace(first, again=tuple(again))
 
@@ -263,18 +259,11 @@ def learning_curve(
         MeasurementError: a split has fewer training rows than are wanted.
         IdentificationError: so few rows do not determine what is asked for.
     """
-    points = [
-        CurvePoint(
-            rows,
-            validate(
-                calibrator,
-                measurements,
-                with_fewer(measurements, splits, rows, seed),
-                lambda what, rows=rows: progress(f"{rows} training rows: {what}"),  # type: ignore[misc]
-            ),
-        )
-        for rows in sorted(sizes)
-    ]
+    points = []
+    for rows in sorted(sizes):
+        fewer = with_fewer(measurements, splits, rows, seed)
+        of_rows = stage(progress, f"{rows} training rows")
+        points.append(CurvePoint(rows, validate(calibrator, measurements, fewer, of_rows)))
     if whole is not None:
         points.append(CurvePoint(min(len(train) for train, _ in splits), whole))
     return tuple(points)

@@ -1,6 +1,5 @@
 """Calibrations that are judged side by side, trained on the same rows, and what of held-out rows they can predict."""
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -14,6 +13,7 @@ from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import SquaredLoss
 from pisigma.identification.result import CalibrationResult
+from pisigma.judging.progress import Progress
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 
@@ -31,7 +31,7 @@ def geometric_result(result: Result) -> CalibrationResult:
     return result.geometric if isinstance(result, HybridResult) else result
 
 
-def fit(calibrator: Calibrator, rows: Measurements, progress: Callable[[str], None]) -> Result:
+def fit(calibrator: Calibrator, rows: Measurements, progress: Progress) -> Result:
     """Calibrate; see the calibrators' `fit`.
 
     Args:
@@ -47,7 +47,7 @@ def fit(calibrator: Calibrator, rows: Measurements, progress: Callable[[str], No
 def trained(
     calibrator: Calibrator,
     rows: Measurements,
-    progress: Callable[[str], None] = lambda what: None,
+    progress: Progress = lambda what: None,
     result: Result | None = None,
 ) -> dict[str, Result]:
     """Give the calibrations of some rows that are compared, by name.

@@ -4,7 +4,7 @@ import math
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Literal, get_args
@@ -18,6 +18,7 @@ from pisigma.identification.problem.parameters import Prior
 from pisigma.judging.calibration_summary import CalibrationSummary, summarise
 from pisigma.judging.calibration_validation import CalibrationValidation, judge, validate_repeatedly
 from pisigma.judging.held_out_rows import HELD_OUT_CSV, HeldOutRows
+from pisigma.judging.progress import Progress, stage
 from pisigma.judging.trained_calibrations import Calibrator, Result, fit
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import (
@@ -186,7 +187,7 @@ def calibrate(
     robot: Robot | str | os.PathLike[str],
     data: Measurements | str | os.PathLike[str],
     settings: CalibrationSettings = CalibrationSettings(),
-    progress: Callable[[str], None] = lambda what: None,
+    progress: Progress = lambda what: None,
 ) -> Calibration:
     """Calibrate a robot, and judge the calibration on rows that it did not see.
 
@@ -210,12 +211,10 @@ def calibrate(
     if settings.train_rows is not None:
         rows = training.select(draw_rows(training, settings.train_rows, settings.seed))
     calibrator = settings.calibrator(nominal, training.socket or ())
-    result = fit(calibrator, rows, lambda what: progress(f"calibration: {what}"))
+    result = fit(calibrator, rows, stage(progress, "calibration"))
     validation = None
     if splits:
-        validation = validate_repeatedly(
-            calibrator, training, splits, lambda what: progress(f"cross-validation: {what}")
-        )
+        validation = validate_repeatedly(calibrator, training, splits, stage(progress, "cross-validation"))
     test = None if test_rows is None else judge(calibrator, result, rows, test_rows)
     summary = summarise(result).having(
         command=_call(nominal, measurements, settings),

@@ -9,7 +9,6 @@ import math
 import os
 import platform
 import time
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -35,6 +34,7 @@ from pisigma.judging.distillation_summary import (
     SizeFigures,
 )
 from pisigma.judging.pose_statistics import PoseErrors
+from pisigma.judging.progress import Progress
 from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
@@ -117,7 +117,7 @@ class Distillation(AbstractModelResult):
 def distill(
     model: CalibratedModel | str | os.PathLike[str],
     settings: DistillationSettings = DistillationSettings(),
-    progress: Callable[[str], None] = lambda what: None,
+    progress: Progress = lambda what: None,
 ) -> Distillation:
     """Fit a small network on nominal joint values to the full solutions of a model.
 
@@ -151,7 +151,7 @@ def distill(
     network, sizes_tried = choose_network(
         parent, every, (fitted, chosen_by), sizes, (settings.seed, settings.epochs), progress
     )
-    held_out = _rows(every, slice(settings.poses + choosing, None))
+    held_out = every.select(slice(settings.poses + choosing, None))
     with torch.no_grad():
         predicted = network(held_out.T, held_out.q_nominal)
         scaled = network.scaled_inputs(every.T[fitted], every.q_nominal[fitted])
@@ -184,18 +184,6 @@ def _check_parent(parent: CalibratedModel) -> None:
             f"model '{parent.name}' has no identified geometry with joint values it was measured at, so there is "
             "nothing to distil; give a model of `pisigma calibrate`."
         )
-
-
-def _rows(poses: SolvedPoses, rows: slice) -> SolvedPoses:
-    return SolvedPoses(
-        poses.T[rows],
-        poses.q_nominal[rows],
-        poses.correction[rows],
-        poses.branch[rows],
-        poses.status[rows],
-        poses.drawn,
-        poses.refused,
-    )
 
 
 def _frequent(ik: CorrectedIK, poses: SolvedPoses) -> tuple[str, ...]:
@@ -344,13 +332,11 @@ def _joint_errors(
 ) -> tuple[JointErrorFigures, ...]:
     """Per joint what the full solution adds, and how far the distilled model is from it."""
     joints = []
-    for j, (unit, factor) in enumerate(_units(robot)):
-        full, error = correction[:, j] * factor, (correction - predicted)[:, j] * factor
-        joints.append(
-            JointErrorFigures(
-                name=robot.joints[j].name, unit=unit, correction=_absolute(full), error=_absolute(error)
-            )
-        )
+    for joint, (unit, factor), full, rest in zip(
+        robot.joints, _units(robot), correction.T, (correction - predicted).T, strict=True
+    ):
+        sizes = {"correction": _absolute(full * factor), "error": _absolute(rest * factor)}
+        joints.append(JointErrorFigures(name=joint.name, unit=unit, **sizes))
     return tuple(joints)
 
 

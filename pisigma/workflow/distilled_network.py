@@ -1,6 +1,6 @@
 """The network that a calibrated model is distilled into: sizes, fitting one, and choosing among them."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 from pisigma.errors import IdentificationError
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.judging.distillation_summary import SizeFigures
+from pisigma.judging.progress import Progress, stage
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.pi_sigma import PiSigma
@@ -89,7 +90,7 @@ def choose_network(
     chosen: tuple[slice, slice],
     sizes: tuple[Size, ...],
     search: tuple[int, int],
-    progress: Callable[[str], None],
+    progress: Progress,
 ) -> tuple[CorrectionNetwork, tuple[SizeFigures, ...]]:
     """Give the smallest network that is about as good as the best, and all that were tried.
 
@@ -104,14 +105,8 @@ def choose_network(
     pairs = _pairs(poses, chosen[0])
     fits: list[tuple[CorrectionNetwork, Size, float]] = []
     for size in sizes:
-        about = f"orders {size.orders}, harmonics {size.harmonics}"
-        network = _fit_size(
-            parent.robot,
-            size,
-            pairs,
-            *search,
-            lambda what, about=about: progress(f"{about}: {what}"),  # type: ignore[misc]
-        )
+        of_size = stage(progress, f"orders {size.orders}, harmonics {size.harmonics}")
+        network = _fit_size(parent.robot, size, pairs, *search, of_size)
         T, q = poses.T[chosen[1]], poses.q_nominal[chosen[1]]
         with torch.no_grad():
             reached = parent.forward(q + network(T, q))
@@ -146,7 +141,7 @@ def _fit_size(
     pairs: TrainingPairs,
     seed: int,
     epochs: int,
-    progress: Callable[[str], None] = lambda what: None,
+    progress: Progress,
 ) -> CorrectionNetwork:
     """Fit a network of a size to corrections by Levenberg-Marquardt.
 

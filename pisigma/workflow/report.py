@@ -2,12 +2,12 @@
 
 import os
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from pisigma.export.output_file import check_output, write_whole
+from pisigma.judging.progress import Progress
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 from pisigma.reporting.page.content import ReportContent, report_content
@@ -72,7 +72,7 @@ def check_report_outputs(page: str | os.PathLike[str], figures: str | os.PathLik
 def report(
     model: str | os.PathLike[str],
     data: str | os.PathLike[str] | Measurements | None = None,
-    progress: Callable[[str], None] = lambda what: None,
+    progress: Progress = lambda what: None,
 ) -> Report:
     """Work out a report on a calibration: how accurate, where worst, what limits it, what to measure next.
 

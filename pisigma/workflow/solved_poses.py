@@ -1,6 +1,5 @@
 """Poses drawn in a region and solved by a calibrated model: what its distilled form learns from."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -9,6 +8,7 @@ from torch import Tensor
 
 from pisigma.errors import IdentificationError
 from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.judging.progress import Progress
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.singularity import singularity_measure
 from pisigma.kinematics.status import Status
@@ -68,13 +68,20 @@ class SolvedPoses:
     drawn: int
     refused: dict[str, int]
 
+    def select(self, rows: slice) -> "SolvedPoses":
+        """Give some of the poses; the counts stay those of all."""
+        T, q_nominal, correction = self.T[rows], self.q_nominal[rows], self.correction[rows]
+        return SolvedPoses(
+            T, q_nominal, correction, self.branch[rows], self.status[rows], self.drawn, self.refused
+        )
+
 
 def draw_solved_poses(
     ik: CorrectedIK,
     region: Region,
     count: int,
     generator: torch.Generator,
-    progress: Callable[[str], None] = lambda what: None,
+    progress: Progress = lambda what: None,
 ) -> SolvedPoses:
     """Draw poses until as many as wanted could be solved.
 

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from pisigma.errors import RecipeError
 from pisigma.hybrid.mini_batches import MANY_ROWS
-from pisigma.judging.calibration_summary import CalibrationSummary, summarise
+from pisigma.judging.calibration_summary import summarise
 from pisigma.judging.calibration_validation import (
-    CalibrationValidation,
     errors_under,
     judge,
     learning_curve,
@@ -17,10 +16,11 @@ from pisigma.judging.calibration_validation import (
 )
 from pisigma.judging.cross_validation import CrossValidation
 from pisigma.judging.pose_statistics import Comparison, compare_on
+from pisigma.judging.progress import Progress, stage
 from pisigma.judging.training_summary import TrainingRun, TrainingSummary, summarise_training
 from pisigma.judging.validation_figures import ErrorFigures, ValidationFigures
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.splits import TrainTest, k_folds
+from pisigma.measurement.splits import k_folds
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.recipes.data import load_measurements, simulate_held_out, simulate_repeats, simulate_training
 from pisigma.recipes.reader import read_recipe, recipe_hash
@@ -36,7 +36,7 @@ from pisigma.reporting.training_card import write_training_card
 from pisigma.robot.description import Robot
 from pisigma.workflow.calibrate import Calibration, compose
 from pisigma.workflow.result import AbstractModelResult
-from pisigma.workflow.train_networks import DEFAULTS, Progress, TrainSettings, cross_validate, train_networks
+from pisigma.workflow.train_networks import DEFAULTS, TrainSettings, cross_validate, train_networks
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,12 +163,15 @@ def _train_hybrid(
         judged, splits = simulate_repeats(recipe)
     calibrator = recipe.calibrator()
     started = time.perf_counter()
-    result = calibrator.fit(
-        rows, lambda what: progress(f"calibration: {what}"), settings.checkpoints, settings.resume
-    )
+    result = calibrator.fit(rows, stage(progress, "calibration"), settings.checkpoints, settings.resume)
     seconds = time.perf_counter() - started
-    validation = validate(calibrator, judged, splits, lambda what: progress(f"held-out rows: {what}"))
+    validation = validate(calibrator, judged, splits, stage(progress, "held-out rows"))
     test = None if test_rows is None else judge(calibrator, result, rows, test_rows)
+    curve = None
+    if (stated := recipe.learning_curve) is not None:
+        of_curve = stage(progress, "learning curve")
+        points = learning_curve(calibrator, judged, splits, stated.rows, stated.seed, of_curve, validation)
+        curve = tuple(point.figures() for point in points)
     summary = summarise(result).having(
         command=_call(recipe),
         rows=rows.rows,
@@ -176,8 +179,8 @@ def _train_hybrid(
         cross_validation=validation.figures() if measured else None,
         test=None if test is None else test.figures(),
         held_out=None if measured else validation.figures(splits),
+        learning_curve=curve,
     )
-    summary = _with_learning_curve(recipe, summary, judged, splits, validation, progress)
     texts = CardTexts(recipe.description, recipe.not_validated)
     return compose(
         Robot.load(recipe.robot),
@@ -190,29 +193,6 @@ def _train_hybrid(
         held_out=rows if measured else None,
         recipe=(recipe.name, sha256),
     )
-
-
-def _with_learning_curve(
-    recipe: HybridRecipe,
-    summary: CalibrationSummary,
-    rows: Measurements,
-    splits: tuple[TrainTest, ...],
-    validation: CalibrationValidation,
-    progress: Progress,
-) -> CalibrationSummary:
-    stated = recipe.learning_curve
-    if stated is None:
-        return summary
-    points = learning_curve(
-        recipe.calibrator(),
-        rows,
-        splits,
-        stated.rows,
-        stated.seed,
-        lambda what: progress(f"learning curve: {what}"),
-        validation,
-    )
-    return summary.having(learning_curve=tuple(point.figures() for point in points))
 
 
 def _train_inverse(

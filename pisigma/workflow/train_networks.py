@@ -1,7 +1,6 @@
 """Train and cross-validate the networks of a recipe of inverse calibration."""
 
 import platform
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -12,6 +11,7 @@ from pisigma.errors import MeasurementError, RecipeError
 from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.judging.cross_validation import CrossValidation
 from pisigma.judging.pose_statistics import Comparison, PoseErrors, compare_on
+from pisigma.judging.progress import Progress
 from pisigma.judging.training_summary import JointErrors, TrainingRun
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import groups_of_equal_joints, k_folds
@@ -28,8 +28,6 @@ from pisigma.robot.description import Robot
 from pisigma.training.pairs import TrainingPairs, build_pairs
 from pisigma.training.patterns import build_network, build_patterns
 from pisigma.training.sections import LevenbergMarquardtSection
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True)
