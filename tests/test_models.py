@@ -9,8 +9,7 @@ from testing.closeness import assert_close
 from testing.models import no_type_checker
 
 import pisigma
-from pisigma.judging.pose_statistics import JointStatistics
-from pisigma.judging.training_summary import TrainingSummary
+from pisigma.judging.training_summary import JointErrorFigures, TrainingSummary
 from pisigma.model.folder.model_folder import load_model
 from pisigma.recipes.data import simulate_held_out, simulate_training
 from pisigma.recipes.reader import read_recipe, recipe_hash
@@ -89,6 +88,6 @@ def test_figures_are_found_again(folder, repository):
         for joint in model.metrics["joints"]:
             index = names.index(joint["name"])
             for when, errors in (("before", before), ("after", after)):
-                found = JointStatistics.of(errors[:, index]).in_file_units(model.robot.revolute[index])
+                found = JointErrorFigures.of(errors[:, index], model.robot.revolute[index])
                 for name, value in joint[part][when].items():
-                    assert_close(found[name], value, rtol=1e-6, atol=1e-9)
+                    assert_close(getattr(found, name), value, rtol=1e-6, atol=1e-9)

@@ -197,14 +197,15 @@ def compare_models(
             f"{measurements.source}: there is no row with a measured position that {', '.join(models)} predict; give "
             "rows nearer to what was calibrated with."
         )
-    compared = [errors.only(common) for errors in vectors.values()]
     domains = [inside_domain(model, measurements) for model in models.values()]
     group = groups_to_keep_whole(measurements)
-    positions = _quantity("position", [errors.position for errors in compared], domains, group, bootstrap)
+    positions = _quantity(
+        "position", [errors.position for errors in vectors.values()], common, domains, group, bootstrap
+    )
     orientations: Sequence[QuantityErrors | None] = [None] * len(models)
-    turns = [errors.rotation for errors in compared if errors.rotation is not None]
-    if turns and bool(torch.isfinite(turns[0]).any()):
-        orientations = _quantity("orientation", turns, domains, group, bootstrap)
+    turns = [errors.rotation for errors in vectors.values() if errors.rotation is not None]
+    if turns and bool(torch.isfinite(turns[0][common]).any()):
+        orientations = _quantity("orientation", turns, common, domains, group, bootstrap)
     figures = [
         ModelFigures(
             name=name,
@@ -241,14 +242,15 @@ def inside_domain(model: CalibratedModel, measurements: Measurements) -> Bool[Te
 def _quantity(
     quantity: str,
     vectors: Sequence[Float64[Tensor, "rows 3"]],
+    common: Bool[Tensor, " rows"],
     domains: Sequence[Bool[Tensor, " rows"] | None],
     group: Int64[Tensor, " rows"],
     bootstrap: Bootstrap,
 ) -> list[QuantityErrors]:
-    """Compute the figures of one quantity of all models on the rows that have it under all of them."""
+    """Compute the figures of one quantity of all models on those of the common rows that have it under all."""
     unit, factor = UNITS[quantity]
     stacked = torch.stack(list(vectors)) * factor
-    there = torch.isfinite(stacked).all(-1).all(0)
+    there = common & torch.isfinite(stacked).all(-1).all(0)
     sizes = stacked.norm(dim=-1)[:, there].numpy()
     index = torch.unique(group[there], return_inverse=True)[1].numpy()
     intervals = bootstrap.intervals(sizes, index)

@@ -1,9 +1,8 @@
-"""Errors of measured poses and of joints under a model, and their statistics."""
+"""Errors of measured poses under a model, and their statistics."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
@@ -52,14 +51,6 @@ class ErrorVectors:
         """Lengths and angles of the errors."""
         return PoseErrors(
             self.position.norm(dim=-1), None if self.rotation is None else self.rotation.norm(dim=-1)
-        )
-
-    def only(self, rows: Bool[Tensor, " rows"]) -> "ErrorVectors":
-        """The errors of some rows; NaN in all others."""
-        chosen = rows[:, None]
-        position = torch.where(chosen, self.position, torch.nan)
-        return ErrorVectors(
-            position, None if self.rotation is None else torch.where(chosen, self.rotation, torch.nan)
         )
 
 
@@ -175,32 +166,3 @@ def compare_on(model: CalibratedModel, measurements: Measurements) -> Comparison
         for poses in (nominal_poses_of_rows, poses_of_rows)
     )
     return Comparison.of(nominal, corrected)
-
-
-@dataclass(frozen=True)
-class JointStatistics:
-    """Of the absolute error of one joint (Jeong et al. 1998, Tables 1 and 2) [rad or m].
-
-    Attributes:
-        average: mean of the absolute error.
-        deviation: standard deviation of the absolute error, over all rows (divided by n, as the paper's
-            figures are).
-        maximum: largest absolute error.
-    """
-
-    average: float
-    deviation: float
-    maximum: float
-
-    @staticmethod
-    def of(errors: Float64[Tensor, " rows"]) -> "JointStatistics":
-        """Statistics of the errors of one joint."""
-        absolute = errors.abs()
-        return JointStatistics(
-            float(absolute.mean()), float(absolute.std(correction=0)), float(absolute.max())
-        )
-
-    def in_file_units(self, revolute: bool) -> dict[str, float]:
-        """The figures in degrees or millimetres, with the unit in the names."""
-        unit, factor = ("deg", float(np.rad2deg(1.0))) if revolute else ("mm", 1e3)
-        return {f"{name}_{unit}": value * factor for name, value in asdict(self).items()}

@@ -1,5 +1,6 @@
 """What a training of networks on joint differences gave: joint errors, and all figures as one typed value."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -8,7 +9,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.judging.cross_validation import CrossValidation
-from pisigma.judging.pose_statistics import Comparison, JointStatistics
+from pisigma.judging.pose_statistics import Comparison
 from pisigma.judging.summary import AbstractSummary
 from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.measurement.dataset import Measurements
@@ -61,7 +62,11 @@ class TrainingRun:
 
 
 class JointErrorFigures(Section):
-    """Average, standard deviation and maximum of the absolute error of a joint, in degrees or millimetres."""
+    """Average, standard deviation and maximum of the absolute error of a joint, in degrees or millimetres.
+
+    They are those of Jeong et al. 1998, Tables 1 and 2; the standard deviation is over all rows (divided by n, as the
+    paper's figures are).
+    """
 
     average_deg: float | None = None
     deviation_deg: float | None = None
@@ -69,6 +74,16 @@ class JointErrorFigures(Section):
     average_mm: float | None = None
     deviation_mm: float | None = None
     maximum_mm: float | None = None
+
+    @staticmethod
+    def of(errors: Float64[Tensor, " rows"], revolute: bool) -> "JointErrorFigures":
+        """Figures of the errors of a joint [rad or m]."""
+        unit, factor = ("deg", math.degrees(1.0)) if revolute else ("mm", 1e3)
+        sizes = errors.abs()
+        figures = {"average": sizes.mean(), "deviation": sizes.std(correction=0), "maximum": sizes.max()}
+        return JointErrorFigures(
+            **{f"{name}_{unit}": float(value) * factor for name, value in figures.items()}
+        )
 
     @property
     def unit(self) -> str:
@@ -199,9 +214,7 @@ def _joint(run: TrainingRun, name: str, paper: Mapping[str, BeforeAfter]) -> Joi
     for rows, errors in (("training", run.training), ("held_out", run.held_out)):
         if errors is not None:
             before, after = (
-                JointErrorFigures.model_validate(
-                    JointStatistics.of(values[:, index]).in_file_units(robot.revolute[index])
-                )
+                JointErrorFigures.of(values[:, index], robot.revolute[index])
                 for values in (errors.before, errors.after)
             )
             figures[rows] = BeforeAfter(before=before, after=after)

@@ -11,7 +11,7 @@ import torch
 
 from pisigma.judging.bootstrap import Bootstrap
 from pisigma.judging.frame_fits import FRAMES_FITTED
-from pisigma.judging.model_comparison import ModelComparison, QuantityErrors, compare_models
+from pisigma.judging.model_comparison import Difference, ModelComparison, compare_models
 from pisigma.judging.reference_models import geometric_model, nominal_model
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.measurement.dataset import Measurements
@@ -160,22 +160,19 @@ def verify(
     ratio = corrected.statistics["mean"] / mean if mean > 0 else float("nan")
     difference = corrected.difference
     assert difference is not None  # it is not the first
-    verdict = _verdict(loaded, comparison, ratio, faults)
+    verdict = _verdict(loaded, comparison, difference, ratio, faults)
     return Verification(
         model=loaded.name if isinstance(model, CalibratedModel) else os.fspath(model),
         data=rows.source,
         rows=rows.rows,
         settings=settings,
         verdict=verdict,
-        sentence=_sentence(verdict, comparison, ratio, faults),
+        sentence=_sentence(verdict, comparison, difference, ratio, faults),
         ratio=ratio,
         better_share=difference.better_share,
         comparison=comparison,
         setup_faults=faults,
-        warnings=(
-            *_warnings(loaded, rows, comparison, faults),
-            *([FRAMES_FITTED] if settings.fit_frame else []),
-        ),
+        warnings=(*_warnings(loaded, rows, comparison, faults), *[FRAMES_FITTED] * settings.fit_frame),
         seconds=time.perf_counter() - begin,
     )
 
@@ -191,19 +188,16 @@ def _setup_faults(
     return tuple(fault for fault in faults if not (fit_frame and fault.kinds == ("frame",)))
 
 
-def _interval(corrected: QuantityErrors) -> tuple[float, float] | None:
-    """Return the confidence interval of the mean difference to the nominal robot [mm]."""
-    assert corrected.difference is not None
-    return corrected.difference.intervals["mean"]
-
-
 def _verdict(
-    model: CalibratedModel, comparison: ModelComparison, ratio: float, faults: Sequence[SetupFault]
+    model: CalibratedModel,
+    comparison: ModelComparison,
+    difference: Difference,
+    ratio: float,
+    faults: Sequence[SetupFault],
 ) -> Verdict:
-    corrected = comparison.models[-1].position
-    smaller = min(comparison.models[0].position.statistics["rms"], corrected.statistics["rms"]) * 1e-3
+    smaller = min(comparison.models[i].position.statistics["rms"] for i in (0, -1)) * 1e-3
     too_large = smaller > PLAUSIBLE_SHARE * model.robot.reach > 0
-    interval = _interval(corrected)
+    interval = difference.intervals["mean"]
     verdict: Verdict = "undecided"
     if comparison.configurations >= FEWEST_CONFIGURATIONS and interval is not None:
         low, high = interval
@@ -217,7 +211,11 @@ def _verdict(
 
 
 def _sentence(
-    verdict: Verdict, comparison: ModelComparison, ratio: float, faults: Sequence[SetupFault]
+    verdict: Verdict,
+    comparison: ModelComparison,
+    difference: Difference,
+    ratio: float,
+    faults: Sequence[SetupFault],
 ) -> str:
     nominal, corrected = comparison.models[0].position, comparison.models[-1].position
     means = [length_text(model.statistics["mean"] / 1e3) for model in (corrected, nominal)]
@@ -235,10 +233,10 @@ def _sentence(
             f"{figures}."
         )
     begin, count = _BEGIN[verdict], comparison.configurations
-    interval, difference = _interval(corrected), corrected.difference
+    interval = difference.intervals["mean"]
     if verdict == "implausible":
         return f"{begin}: {figures}."
-    if count < FEWEST_CONFIGURATIONS or interval is None or difference is None:
+    if count < FEWEST_CONFIGURATIONS or interval is None:
         return f"{begin}: {figures}, but {FEWEST_CONFIGURATIONS} or more different joint values are needed."
     return (
         f"{begin}: {figures}, it differs by {interval[0]:.3g} to {interval[1]:.3g} mm with "

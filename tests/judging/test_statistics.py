@@ -12,36 +12,25 @@ from pisigma.errors import MeasurementError
 from pisigma.judging.pose_statistics import (
     Comparison,
     ErrorVectors,
-    JointStatistics,
     PoseErrors,
     axis_statistics,
     compare_on,
     error_statistics,
 )
+from pisigma.judging.training_summary import JointErrorFigures
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.se3 import rotation_from_vector, transform
 
 
-def test_joint_statistics_are_of_the_absolute_error():
-    found = JointStatistics.of(torch.tensor([-0.3, 0.1, 0.2], dtype=torch.float64))
-    assert_close(found.average, 0.2, atol=1e-15)
-    assert_close(found.deviation, math.sqrt(0.02 / 3), atol=1e-15)  # divided by n, as in the paper
-    assert_close(found.maximum, 0.3)
-
-
-def test_joint_statistics_in_file_units():
-    found = JointStatistics(0.1, 0.2, 0.3)
-    assert found.in_file_units(revolute=True) == pytest.approx(
-        {
-            "average_deg": math.degrees(0.1),
-            "deviation_deg": math.degrees(0.2),
-            "maximum_deg": math.degrees(0.3),
-        }
-    )
-    assert found.in_file_units(revolute=False) == pytest.approx(
-        {"average_mm": 100.0, "deviation_mm": 200.0, "maximum_mm": 300.0}
-    )
+@pytest.mark.parametrize(("revolute", "unit", "factor"), [(True, "deg", math.degrees(1)), (False, "mm", 1e3)])
+def test_joint_errors_are_of_the_absolute_error_in_file_units(revolute, unit, factor):
+    figures = JointErrorFigures.of(torch.tensor([-0.3, 0.1, 0.2], dtype=torch.float64), revolute)
+    assert figures.unit == unit
+    average, deviation, maximum = figures.values
+    assert_close(average, 0.2 * factor, rtol=1e-14)
+    assert_close(deviation, math.sqrt(0.02 / 3) * factor, rtol=1e-14)  # divided by n, as in the paper
+    assert_close(maximum, 0.3 * factor, rtol=1e-14)
 
 
 def test_error_statistics_agree_with_numpy_and_pass_over_nan(generator):
@@ -121,9 +110,9 @@ def test_error_vectors_are_measured_minus_expected_along_the_axes(generator):
         assert_close(figures["rms"], np.sqrt((values**2).mean()), rtol=1e-8)
         assert_close(figures["p95"], np.quantile(np.abs(values), 0.95), rtol=1e-8)
         assert_close(figures["max"], np.abs(values).max(), rtol=1e-8)
-    some = errors.only(torch.tensor([True, False] * 3))
-    assert torch.equal(some.sizes.position.isnan(), torch.tensor([False, True] * 3))
-    assert torch.equal(some.sizes.rotation.isnan(), torch.tensor([False, True] * 3))
+    some = errors.sizes.only(torch.tensor([True, False] * 3))
+    assert torch.equal(some.position.isnan(), torch.tensor([False, True] * 3))
+    assert torch.equal(some.rotation.isnan(), torch.tensor([False, True] * 3))
 
 
 def test_a_bias_shows_in_the_mean_along_an_axis():
