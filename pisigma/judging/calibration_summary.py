@@ -7,11 +7,12 @@ finite value is None.
 
 import math
 from dataclasses import asdict
+from typing import Any
 
 from pydantic import JsonValue
 
 from pisigma.hybrid.result import HybridResult, LearnedPart
-from pisigma.identification.result import CalibrationResult, SensorNoise
+from pisigma.identification.result import CalibrationResult
 from pisigma.judging.summary import AbstractSummary
 from pisigma.judging.trained_calibrations import Result, geometric_result
 from pisigma.judging.validation_figures import LearningPoint, ValidationFigures
@@ -256,7 +257,10 @@ def summarise(result: Result) -> CalibrationSummary:
         rank=geometric.rank,
         condition_number=_or_none(geometric.condition_number),
         observability=ObservabilityFigures(**asdict(geometric.observability)),
-        noise=tuple(_noise(noise) for noise in geometric.noise),
+        noise=tuple(
+            _noise(one.sensor, one.sigma, one.unit, values=one.values, used_by_parameters=one.used)
+            for one in geometric.noise
+        ),
         parameters=_parameters(geometric),
         redundancy=RedundancyFigures(
             kept=exact.kept,
@@ -294,32 +298,22 @@ def _outliers(result: CalibrationResult) -> tuple[OutlierFigures, ...]:
     return tuple(rows)
 
 
-def _noise(noise: SensorNoise) -> NoiseFigures:
-    return NoiseFigures(
-        sensor=noise.sensor,
-        values=noise.values,
-        used_by_parameters=noise.used,
-        **_sigma(noise.sigma, noise.unit),
-    )
-
-
-def _sigma(sigma: float, unit: str) -> dict[str, float]:
+def _noise(sensor: str, sigma: float, unit: str, **counts: Any) -> NoiseFigures:
     if unit not in _UNITS:
-        return {"factor_on_stated_sigma": sigma}
+        return NoiseFigures(sensor=sensor, factor_on_stated_sigma=sigma, **counts)
     name, factor = _UNITS[unit]
-    return {f"sigma_{name}": sigma * factor}
+    return NoiseFigures(sensor=sensor, **{f"sigma_{name}": sigma * factor}, **counts)
 
 
 def _hybrid(result: HybridResult) -> HybridFigures:
-    trials = []
-    for trial in result.trials:
-        figures = asdict(trial) | {
-            "log_evidence": _or_none(trial.log_evidence),
-            "seconds": round(trial.seconds, 3),
-        }
-        trials.append(TrialFigures(**figures))
+    trials = tuple(
+        TrialFigures.model_validate(
+            asdict(trial) | {"log_evidence": _or_none(trial.log_evidence), "seconds": round(trial.seconds, 3)}
+        )
+        for trial in result.trials
+    )
     learned = None if result.learned is None else _learned(result, result.learned)
-    return HybridFigures(verdict=result.verdict, learned=learned, trials=tuple(trials))
+    return HybridFigures(verdict=result.verdict, learned=learned, trials=trials)
 
 
 def _learned(result: HybridResult, learned: LearnedPart) -> LearnedFigures:
@@ -332,10 +326,7 @@ def _learned(result: HybridResult, learned: LearnedPart) -> LearnedFigures:
         unknowns=learned.unknowns,
         effective_parameters=learned.effective,
         linearisations=learned.rounds,
-        noise=tuple(
-            NoiseFigures(sensor=sensor, **_sigma(sigma, units[sensor]))
-            for sensor, sigma in learned.noise.items()
-        ),
+        noise=tuple(_noise(sensor, sigma, units[sensor]) for sensor, sigma in learned.noise.items()),
         prior_scale=result.uncertainty.prior_scale,
         fades_over_deg=math.degrees(learned.coverage.fade),
     )

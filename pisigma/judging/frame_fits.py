@@ -1,6 +1,7 @@
 """Rigid transforms before and behind predicted poses that explain measured ones best, in closed form."""
 
 from dataclasses import dataclass, replace
+from itertools import islice
 
 import torch
 from jaxtyping import Bool, Float64
@@ -68,7 +69,7 @@ class MeasuredPoses:
 
     def scaled(self, factor: float) -> "MeasuredPoses":
         """Multiply the positions by a factor."""
-        return MeasuredPoses(self.position * factor, self.rotation, self.has_rotation, self.lever)
+        return replace(self, position=self.position * factor)
 
     @property
     def values(self) -> int:
@@ -119,14 +120,9 @@ def best_base_and_tool(
     """
     eye = torch.eye(4).to(T)
     starts = [eye]
-    from_positions = next(
-        starts_from_positions(
-            T[:, :3, :3], T[:, :3, 3], measured.position, torch.zeros(3, dtype=T.dtype), reach
-        ),
-        None,
-    )
-    if from_positions is not None:
-        starts.append(transform(eye[:3, :3], from_positions[2]))
+    origin = torch.zeros(3, dtype=T.dtype)
+    closed_forms = starts_from_positions(T[:, :3, :3], T[:, :3, 3], measured.position, origin, reach)
+    starts += [transform(eye[:3, :3], offset) for _, _, offset in islice(closed_forms, 1)]
     return min((_alternated(T, measured, start) for start in starts), key=lambda ends: ends[0])[1:]
 
 

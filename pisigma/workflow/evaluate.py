@@ -291,12 +291,10 @@ def _with_references(
     identified = next((model for model in loaded.values() if model.calibrated is not None), first)
     models = {}
     for label in ["nominal", *labels] if len(labels) == 1 else labels:
-        if label in loaded:
-            models[label] = loaded[label]
-        else:
-            models[label] = (
-                nominal_model(first, turned) if label == "nominal" else geometric_model(identified)
-            )
+        model = loaded.get(label)
+        if model is None:
+            model = nominal_model(first, turned) if label == "nominal" else geometric_model(identified)
+        models[label] = model
     return models
 
 

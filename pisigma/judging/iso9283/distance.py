@@ -6,8 +6,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from pisigma.errors import MeasurementError
-from pisigma.judging.iso9283.pose import Accuracy
+from pisigma.judging.iso9283.pose import Accuracy, check_repeats
 from pisigma.se3 import wrap_to_pi
 
 
@@ -58,7 +57,7 @@ def distance_repeatability(
     Raises:
         MeasurementError: there is one repeat only.
     """
-    _check_repeats(attained_first)
+    check_repeats(attained_first, "a distance")
     length, axes = _distances(attained_first, attained_second)
     return DistanceRepeatability(3 * length.std(-1), 3 * axes.std(-2))
 
@@ -86,7 +85,7 @@ def angular_distance_repeatability(
     Raises:
         MeasurementError: there is one repeat only.
     """
-    _check_repeats(attained_first)
+    check_repeats(attained_first, "a distance")
     return 3 * _turned(attained_first, attained_second).std(-2)
 
 
@@ -101,11 +100,3 @@ def _turned(
     first: Float[Tensor, "*batch n 3"], second: Float[Tensor, "*batch n 3"]
 ) -> Float[Tensor, "*batch n 3"]:
     return wrap_to_pi(first - second).abs()
-
-
-def _check_repeats(attained: Tensor) -> None:
-    if attained.shape[-2] < 2:
-        raise MeasurementError(
-            f"repeatability: 2 repeats of a distance or more were wanted, got {attained.shape[-2]}; the standard asks "
-            "for 30."
-        )

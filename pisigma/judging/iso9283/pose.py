@@ -60,7 +60,7 @@ def position_repeatability(attained: Float[Tensor, "*batch n 3"]) -> Float[Tenso
     Raises:
         MeasurementError: there is one repeat only.
     """
-    _check_repeats(attained)
+    check_repeats(attained, "a command")
     distance = torch.linalg.vector_norm(attained - barycentre(attained)[..., None, :], dim=-1)
     radius: Tensor = distance.mean(-1) + 3 * distance.std(-1)
     return radius
@@ -75,7 +75,7 @@ def orientation_repeatability(attained: Float[Tensor, "*batch n 3"]) -> Float[Te
     Raises:
         MeasurementError: there is one repeat only.
     """
-    _check_repeats(attained)
+    check_repeats(attained, "a command")
     spread: Tensor = wrap_to_pi(attained - attained[..., :1, :]).std(-2)
     return 3 * spread
 
@@ -151,9 +151,18 @@ def barycentre(attained: Float[Tensor, "*batch n 3"]) -> Float[Tensor, "*batch 3
     return first[..., 0, :] + (attained - first).mean(-2)
 
 
-def _check_repeats(attained: Tensor) -> None:
+def check_repeats(attained: Float[Tensor, "*batch n 3"], of: str) -> None:
+    """Make sure that there are enough repeats for a spread.
+
+    Args:
+        attained: what was attained in the n repeats.
+        of: what was repeated, such as "a command".
+
+    Raises:
+        MeasurementError: there is one repeat only.
+    """
     if attained.shape[-2] < 2:
         raise MeasurementError(
-            f"repeatability: 2 repeats of a command or more were wanted, got {attained.shape[-2]}; the standard asks "
-            "for 30."
+            f"repeatability: 2 repeats of {of} or more were wanted, got {attained.shape[-2]}; the standard asks for "
+            "30."
         )
