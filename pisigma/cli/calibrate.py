@@ -7,6 +7,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson, complete_robot
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
+from pisigma.errors import IdentificationError
 
 if TYPE_CHECKING:
     from pisigma.judging.calibration_summary import CalibrationSummary
@@ -177,8 +178,6 @@ def _free(stated: str) -> Any:
 
 def _socket_distances(stated: str | None) -> dict[tuple[str, str], float]:
     """Known distance of two sockets [m], from "A,B,MM"."""
-    from pisigma.errors import IdentificationError
-
     if stated is None:
         return {}
     words = [word.strip() for word in stated.split(",")]

@@ -8,6 +8,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson, complete_model
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
+from pisigma.errors import PoseError, RecipeError
 
 if TYPE_CHECKING:
     from pisigma.workflow.distill import Distillation
@@ -67,28 +68,22 @@ def distill(
 
     Its error against the full solution, on poses that were not fitted to, is printed and on its card.
     """
-    from pisigma.errors import RecipeError
     from pisigma.model.folder.staging import check_replaceable
-    from pisigma.workflow.distill import DistillationSettings
-    from pisigma.workflow.distill import distill as run
+    from pisigma.workflow import distill as workflow
 
     check_replaceable(out)
     if not 0 <= seed < 2**63:
         raise RecipeError(f"--seed {seed}: a whole number from 0 to 2^63 - 1 was wanted.")
-    size, where = _size(orders, harmonics), _region(model, region, joints)
-    settings = DistillationSettings(region=where, poses=poses, size=size, seed=seed)
+    size = _size(orders, harmonics)
+    settings = workflow.DistillationSettings(_region(model, region, joints), poses, size, seed)
     with progress_of("distillation") as progress:
-        distillation = run(model, settings, progress)
+        distillation = workflow.distill(model, settings, progress)
     distillation.save(out, command=command_line(context, ("out", "joints")))
-    if as_json:
-        print_json({"model": str(out), **distillation.to_json()})
-    else:
-        _print(distillation, out)
+    _print(distillation, out, as_json)
 
 
 def _size(orders: str | None, harmonics: int | None) -> "Size | None":
     """The one size that was asked for."""
-    from pisigma.errors import RecipeError
     from pisigma.workflow.distilled_network import Size
 
     if orders is None:
@@ -105,7 +100,6 @@ def _size(orders: str | None, harmonics: int | None) -> "Size | None":
 
 def _region(model: Path, box: Box | None, joints: Path | None) -> "Region | None":
     """Where poses are to be drawn; None: where the model was measured."""
-    from pisigma.errors import PoseError
     from pisigma.measurement.csv.reading import read_joints
     from pisigma.model.folder.model_folder import load_model
     from pisigma.workflow.solved_poses import Region
@@ -125,11 +119,14 @@ def _region(model: Path, box: Box | None, joints: Path | None) -> "Region | None
     return Region(q, (x_min, x_max, y_min, y_max, z_min, z_max))
 
 
-def _print(distillation: "Distillation", out: Path) -> None:
-    """Print for people how well the model follows the full solution."""
+def _print(distillation: "Distillation", out: Path, as_json: bool) -> None:
+    """Print how well the model follows the full solution."""
     from pisigma.reporting.distilled_card import correction_table, size_table
     from pisigma.reporting.tables import pose_rows
 
+    if as_json:
+        print_json({"model": str(out), **distillation.to_json()})
+        return
     summary = distillation.summary
     title = f"tool under the full model, {summary.poses.held_out} held-out poses"
     print_table(title, *pose_rows(summary.held_out.models))

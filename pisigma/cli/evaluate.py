@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
+from pisigma.cli.output import print_json, print_lines
 from pisigma.cli.verify import FitFrame, print_comparison
+from pisigma.errors import AcceptanceError
 
 if TYPE_CHECKING:
     from pisigma.workflow.evaluate import Evaluation
@@ -51,8 +53,6 @@ def evaluate(
     Rows of the set "train" are left out where the file has a column "set". With a limit, every model folder has to
     meet it, else the exit status is 3.
     """
-    from pisigma.cli.output import print_json
-    from pisigma.errors import AcceptanceError
     from pisigma.judging.bootstrap import Bootstrap
     from pisigma.workflow import evaluate as workflow
 
@@ -70,8 +70,6 @@ def evaluate(
 
 
 def _print(evaluation: "Evaluation") -> None:
-    from pisigma.cli.output import print_lines
-
     stated = evaluation.settings.limits.stated
     if stated and evaluation.accepted:
         limits = ", ".join(f"{name} {limit:g}" for name, limit in stated.items())

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder, PayloadKg, TemperatureC, complete_export
+from pisigma.cli.output import fail, print_json
 from pisigma.export.registry import BUILT_IN
 
 if TYPE_CHECKING:
@@ -84,8 +85,6 @@ def export(
 
 def _print(exported: "Exported", form: str, out: Path, contents: str, as_json: bool) -> None:
     """Say what was written, with what is in doubt on stderr."""
-    from pisigma.cli.output import fail, print_json
-
     for sentence in exported.doubts:
         typer.echo(f"pisigma: {sentence}", err=True)
     if as_json:

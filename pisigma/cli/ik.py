@@ -1,13 +1,13 @@
 """`pisigma ik`: corrected joint values for poses."""
 
 import math
-from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder, PayloadKg, TemperatureC
+from pisigma.cli.output import fail, print_json, progress_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -73,7 +73,6 @@ def _print_pose(
     solver: "CorrectedIK", pose: Pose, branch: str | None, all_branches: bool, as_json: bool
 ) -> None:
     """Print the solutions of one pose."""
-    from pisigma.cli.output import fail, print_json
     from pisigma.cli.solutions import failure, print_solutions, solution_records
 
     T, places = _transform(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
@@ -101,25 +100,16 @@ def _write_file(
 ) -> None:
     """Write the joint values of a file of poses, of any length."""
     from pisigma.cli.joint_file import write_joint_file
-    from pisigma.cli.output import fail, print_json, progress_of
 
     with progress_of(f"solving {poses}") as tell:
         outcome = write_joint_file(solver, poses, out, branch, tell, accuracy, path)
-    statuses = dict(outcome.statuses.most_common())
     if as_json:
-        failures = [asdict(row) for row in outcome.first_failed]
-        counts = {"rows": outcome.rows, "statuses": statuses, "failed": outcome.failed}
-        switches = [
-            {"line": line, "kind": switch.kind, "sentence": switch.sentence}
-            for line, switch in outcome.switches
-        ]
-        told = {"switches": switches} if path else {}
-        print_json({"file": str(out), **counts, "first_failures": failures, **told})
+        print_json({"file": str(out), **outcome.to_json(path)})
     else:
-        found = ", ".join(f"{count} {status}" for status, count in statuses.items())
         for line, switch in outcome.switches:
             typer.echo(f"{poses}, line {line}: {switch.sentence}")
-        typer.echo(f"{outcome.rows} rows written to {out}: {found}.")
+        counts = ", ".join(f"{count} {status}" for status, count in outcome.statuses.most_common())
+        typer.echo(f"{outcome.rows} rows written to {out}: {counts}.")
     if problem := outcome.problem(poses):
         fail(problem)
 

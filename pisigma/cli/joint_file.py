@@ -6,7 +6,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +54,7 @@ class FailedRow:
 
 @dataclass
 class Outcome:
-    """What became of a file of poses.
+    """How the poses of a file were solved.
 
     Attributes:
         rows: all of them.
@@ -69,6 +69,17 @@ class Outcome:
     first_failed: list[FailedRow] = field(default_factory=list)
     failed: int = 0
     switches: list[tuple[int, PathSwitch]] = field(default_factory=list)
+
+    def to_json(self, path: bool) -> dict[str, object]:
+        """Return the counts and the first failures as plain values, with the switches of a path."""
+        values: dict[str, object] = {
+            "rows": self.rows,
+            "statuses": dict(self.statuses.most_common()),
+            "failed": self.failed,
+            "first_failures": [asdict(row) for row in self.first_failed],
+        }
+        switches = [{"line": line, "kind": at.kind, "sentence": at.sentence} for line, at in self.switches]
+        return values | ({"switches": switches} if path else {})
 
     def problem(self, source: Path) -> str | None:
         """Say which rows failed and why; None where none did."""
@@ -141,19 +152,14 @@ def _header(solver: CorrectedIK, accuracy: bool) -> list[str]:
 
 
 def _solved_rows(
-    solver: CorrectedIK,
-    chunk: PoseChunk,
-    branch: str | None,
-    accuracy: bool,
-    outcome: Outcome,
-    path: bool,
+    solver: CorrectedIK, chunk: PoseChunk, branch: str | None, accuracy: bool, outcome: Outcome, path: bool
 ) -> Iterator[list[str]]:
     """The first cells of the rows to write for a chunk, in the order of the file; counts them in the outcome."""
     too_far = _too_far(chunk, solver.model.robot)
     near = [line for line, far in zip(chunk.line, too_far, strict=True) if not far]
     bad = [*chunk.bad, *(LeftOut(line, far) for line, far in zip(chunk.line, too_far, strict=True) if far)]
-    rows: list[tuple[int, list[str]]] = []
-    failed: list[FailedRow] = []
+    rows = [(row.line, [str(row.line), BAD_ROW]) for row in bad]
+    failed = [FailedRow(row.line, BAD_ROW, row.reason) for row in bad]
     if near:
         kept = torch.tensor([not far for far in too_far])
         solution, switches = _solve(solver, chunk.T[kept], branch, path)
@@ -166,10 +172,7 @@ def _solved_rows(
             for line, status in zip(near, statuses, strict=True)
             if status in FAILURES
         )
-    rows.extend((row.line, [str(row.line), BAD_ROW]) for row in bad)
-    failed.extend(FailedRow(row.line, BAD_ROW, row.reason) for row in bad)
-    if bad:
-        outcome.statuses[BAD_ROW] += len(bad)
+    outcome.statuses.update([BAD_ROW] * len(bad))
     outcome.rows += len(rows)
     outcome.failed += len(failed)
     failed.sort(key=lambda row: row.line)

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder
+from pisigma.cli.output import print_json, print_lines, progress_of
 
 
 def report(
@@ -23,7 +24,6 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Write a report as one HTML page: how accurate, where worst, what limits it, what to measure next."""
-    from pisigma.cli.output import print_json, print_lines, progress_of
     from pisigma.workflow import report as workflow
 
     workflow.check_report_outputs(out, figures)

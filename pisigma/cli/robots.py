@@ -1,11 +1,11 @@
 """`pisigma robots`: the catalogue."""
 
 from pisigma.cli.arguments import AsJson
+from pisigma.cli.output import print_json, print_table
 
 
 def robots(as_json: AsJson = False) -> None:
     """List the robots that come with pisigma."""
-    from pisigma.cli.output import print_json, print_table
     from pisigma.robot import Robot, catalogue
 
     known = [Robot.load(name) for name in catalogue()]

@@ -6,6 +6,7 @@ from typing import Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
+from pisigma.cli.output import print_json
 
 
 def simulate(
@@ -17,7 +18,6 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Write the simulated measurements of a recipe as a CSV file."""
-    from pisigma.cli.output import print_json
     from pisigma.recipes.data import simulate_held_out, simulate_training
     from pisigma.recipes.reader import read_recipe
     from pisigma.robot import Robot

@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from pisigma.cli.output import print_table
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.inverse.solution import Solution
 from pisigma.kinematics.status import Status
@@ -42,8 +43,6 @@ def solution_records(solution: Solution, solver: CorrectedIK) -> list[dict[str, 
 
 def print_solutions(solution: Solution, solver: CorrectedIK) -> None:
     """Print a table per solution."""
-    from pisigma.cli.output import print_table
-
     for row, status in enumerate(_statuses(solution)):
         values = [_in_file_units(getattr(solution, name)[row].tolist(), solver) for name in _QUANTITIES]
         lines = [

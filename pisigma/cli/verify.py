@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
+from pisigma.cli.output import print_json, print_lines, print_table, progress_of, screen_width
+from pisigma.errors import AcceptanceError
 
 if TYPE_CHECKING:
     from pisigma.judging.model_comparison import ModelComparison
@@ -30,8 +32,6 @@ def verify(
     signs or zeros of the joints, a correction that was applied twice or not at all. Rows of the set "train" are
     left out. Exit status 3 where the corrected model does not explain the measurements better.
     """
-    from pisigma.cli.output import print_json, print_lines, progress_of
-    from pisigma.errors import AcceptanceError
     from pisigma.workflow import verify as workflow
 
     with progress_of(f"verifying {model}"):
@@ -48,7 +48,6 @@ def verify(
 
 def print_comparison(comparison: "ModelComparison", data: str) -> None:
     """Print the tables of models that were compared on the rows of a file."""
-    from pisigma.cli.output import print_table, screen_width
     from pisigma.reporting.comparison_tables import comparison_tables
 
     for title, table in comparison_tables(comparison, Path(data).name, screen_width()):
