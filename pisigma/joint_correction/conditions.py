@@ -8,12 +8,7 @@ from jaxtyping import Float, Float64
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.joint_correction.feature import (
-    AbstractFeature,
-    FeatureOptions,
-    FeatureSection,
-    scaled_joints,
-)
+from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, FeatureSection, scaled_joints
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import Direction, GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -88,17 +83,6 @@ class ConditionFeatures(AbstractFeature):
         values = torch.stack([state.stated[name] for name in options.varying], 1)
         mean, spread = values.mean(0).tolist(), values.std(0).tolist()
         return (ConditionFeatures(robot, options.varying, mean, spread, options.gravity),)
-
-    @classmethod
-    def from_section(cls, robot: Robot, section: ConditionSection) -> "ConditionFeatures":
-        """See `AbstractFeature.from_section`."""
-        return ConditionFeatures(robot, section.names, section.mean, section.spread, section.gravity)
-
-    def describe(self) -> ConditionSection:
-        """See `AbstractFeature.describe`."""
-        return ConditionSection(
-            name="conditions", names=self.names, mean=self.mean, spread=self.spread, gravity=self.gravity
-        )
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """The products; 0 under the usual conditions, and for conditions that are NaN or missing."""

@@ -109,11 +109,12 @@ class AbstractFeature(ABC):
         Raises:
             ValueError: the values make no feature.
         """
-        return cls(robot)
+        return cls(robot, **section.model_dump(exclude={"name"}))
 
     def describe(self) -> FeatureSection:
-        """What `from_section` makes the same feature again from."""
-        return self.section(name=self.name)
+        """What `from_section` makes the same feature again from: the attributes that the section names."""
+        stated = self.section.model_fields.keys() - {"name"}
+        return self.section(name=self.name, **{key: getattr(self, key) for key in stated})
 
     def pack(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, " values"]:
         """The numbers that the compiled form reads, in its own order."""

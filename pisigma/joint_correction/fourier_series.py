@@ -124,15 +124,6 @@ class FourierSeries(AbstractFeature):
         most = max(2 * options.configurations, min(options.harmonics))
         return tuple(FourierSeries(robot, k) for k in options.harmonics if k <= most)
 
-    @classmethod
-    def from_section(cls, robot: Robot, section: SeriesSection) -> "FourierSeries":
-        """See `AbstractFeature.from_section`."""
-        return FourierSeries(robot, section.harmonics)
-
-    def describe(self) -> SeriesSection:
-        """See `AbstractFeature.describe`."""
-        return SeriesSection(name="series", harmonics=self.harmonics)
-
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """All sines, sin(q) first, and then all cosines."""
         q = state.q
@@ -155,11 +146,7 @@ class FourierSeries(AbstractFeature):
         """See `AbstractFeature.add_onnx`."""
         own = graph.reshape(graph.node("Mul", q, self._rate.numpy()), [len(weight), 1])
         angle = graph.node("Mul", own, np.arange(1.0, self.harmonics + 1))
-        sums = [
-            graph.total(graph.node("Mul", graph.node(operator, angle), values), 2)
-            for operator, values in (
-                ("Sin", weight[:, : self.harmonics]),
-                ("Cos", weight[:, self.harmonics :]),
-            )
-        ]
-        return graph.node("Add", *sums)
+        sines, cosines = np.split(weight, 2, axis=1)
+        sine = graph.total(graph.node("Mul", graph.node("Sin", angle), sines), 2)
+        cosine = graph.total(graph.node("Mul", graph.node("Cos", angle), cosines), 2)
+        return graph.node("Add", sine, cosine)

@@ -91,10 +91,9 @@ class GravityTorques(AbstractFeature):
         norm = float(np.linalg.norm(gravity))
         if not norm > 0 or not np.isfinite(norm):
             raise ValueError(f"gravity needs a direction, got {gravity}.")
-        unit = (
-            abs(norm - 1) < 1e-12
-        )  # kept as it is, so that features made again are the same to the last bit
-        x, y, z = (float(value if unit else value / norm) for value in gravity)
+        # A unit vector is kept as it is, so that features made again are the same to the last bit.
+        scale = 1.0 if abs(norm - 1) < 1e-12 else norm
+        x, y, z = (float(value / scale) for value in gravity)
         self.gravity: Direction = (x, y, z)
         self.used = torch.ones(robot.dof, robot.dof, dtype=torch.bool).triu().repeat_interleave(4, 1)
         self.group = torch.zeros_like(self.used, dtype=torch.int64)
@@ -105,15 +104,6 @@ class GravityTorques(AbstractFeature):
     ) -> tuple["GravityTorques", ...]:
         """See `AbstractFeature.candidates`."""
         return (GravityTorques(robot, options.gravity),)
-
-    @classmethod
-    def from_section(cls, robot: Robot, section: GravitySection) -> "GravityTorques":
-        """See `AbstractFeature.from_section`."""
-        return GravityTorques(robot, section.gravity)
-
-    def describe(self) -> GravitySection:
-        """See `AbstractFeature.describe`."""
-        return GravitySection(name="gravity", gravity=self.gravity)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """Torques of unit masses and moments over the reach; 0 for masses before the joint."""
