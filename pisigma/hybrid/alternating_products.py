@@ -10,9 +10,6 @@ from pisigma.joint_correction.feature import AbstractFeature, unit_inputs
 from pisigma.measurement.conditions import JointState
 from pisigma.robot.description import Robot
 
-Factors = Float64[Tensor, "dof factors inputs"]
-"""Weights of every factor of every joint's product units, the bias first."""
-
 
 class AlternatingProducts(AbstractFeature):
     """Columns `Π_{others} h · [1, φ]` of the free factor of every unit: alternating least squares.

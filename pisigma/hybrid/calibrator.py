@@ -165,22 +165,15 @@ class HybridCalibrator:
         here = solved.solution.linearisation
         view = view_of(here)
         values = sensor_values(problem, here.point)
-        weighted = []
+        weights = []
         for number, sensor in enumerate(values):
             distance = sensor.residual.norm(dim=1) * sensor.root / view.scale(number)
             loss = problem.loss_of(problem.sensors[number])
-            weighted.append(sensor.weighted(loss.weight(distance, sensor.components)))
-        if problem.pose is not None:
-            weighted = [sensor.collapsed(problem.pose) for sensor in weighted]
-        rows = Rows(
-            problem,
-            tuple(weighted),
-            (here.point - problem.nominal)[problem.active],
-            groups_of_equal_joints(problem.q),
-        )
+            weights.append(loss.weight(distance, sensor.components))
+        point = (here.point - problem.nominal)[problem.active]
+        rows = Rows(problem, values, point, groups_of_equal_joints(problem.q)).weighted(weights)
         growing, others = self._features(solved, rows)
-        largest = [*others, *growing[-1:]]
-        search = Search(rows, view.noise, view.prior_scale, largest, progress)
+        search = Search(rows, view.noise, view.prior_scale, [*others, *growing[-1:]], progress)
         additive = search.best_additive(growing, others)
         additive, orders = best_products(search, additive, self.orders)
         return search, additive, orders

@@ -53,11 +53,9 @@ class JointCoverage:
         """Stretches around measured joint values."""
         rate = torch.from_numpy(turning_rate(robot))
         turning = tuple(bool(turns) for turns in robot.revolute)
-        stretches: list[tuple[int, float, float]] = []
-        for j, values in enumerate((q.cpu() * rate).t()):
-            stretches += [(j, low, high) for low, high in _stretches(values.numpy(), turning[j])]
-        joint = torch.tensor([j for j, _, _ in stretches], dtype=torch.int64)
-        ends = torch.tensor([[low, high] for _, low, high in stretches], dtype=torch.float64)
+        stretches = [_stretches(angles.numpy(), turning[j]) for j, angles in enumerate((q.cpu() * rate).t())]
+        joint = torch.arange(robot.dof).repeat_interleave(torch.tensor([len(ends) for ends in stretches]))
+        ends = torch.tensor([pair for pairs in stretches for pair in pairs], dtype=torch.float64)
         return JointCoverage(joint, ends.mean(1), (ends[:, 1] - ends[:, 0]) / 2, rate, turning, fade)
 
     def beyond(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:

@@ -76,13 +76,13 @@ class Design:
         """The prior with sizes to start from that another design's fit came to; new bands as its last one."""
         prior_here = self.prior(prior.sizes[: prior.classes].tolist())
         sizes = prior_here.sizes.clone()
-        starts = dict(zip((c.name for c in other.features), other.group_starts(prior.classes), strict=True))
+        others = zip(other.features, other.group_starts(prior.classes), strict=True)
+        fitted = {like.name: (first, len(like.group_names)) for like, first in others}
         for chosen, start in zip(self.features, self.group_starts(prior.classes), strict=True):
-            if chosen.name in starts:
-                like = next(c for c in other.features if c.name == chosen.name)
-                count = len(like.group_names)
+            if chosen.name in fitted:
+                first, count = fitted[chosen.name]
                 for number in range(len(chosen.group_names)):
-                    sizes[start + number] = prior.sizes[starts[chosen.name] + min(number, count - 1)]
+                    sizes[start + number] = prior.sizes[first + min(number, count - 1)]
         return replace(prior_here, sizes=sizes)
 
     def group_starts(self, classes: int) -> list[int]:
@@ -118,11 +118,7 @@ def weighted_columns(
     return columns, targets
 
 
-def sum_up(
-    design: Design,
-    values: Sequence[SensorValues],
-    here: Float64[Tensor, " unknowns"] | None,
-) -> Sums:
+def sum_up(design: Design, values: Sequence[SensorValues], here: Float64[Tensor, " unknowns"] | None) -> Sums:
     """Normal equations of all rows.
 
     Args:
@@ -179,10 +175,23 @@ class Rows:
         """How many different joint values there are."""
         return int(self.configuration.max()) + 1
 
-    def of(self, chosen: Bool[Tensor, " configurations"]) -> "Rows":
-        """The rows of some configurations."""
-        kept = tuple(sensor.select(chosen[self.configuration[sensor.row]]) for sensor in self.values)
+    def of(self, chosen: Bool[Tensor, " configurations"] | Int64[Tensor, " chosen"]) -> "Rows":
+        """The rows of some configurations, by mask or by number."""
+        mask = torch.zeros(self.configurations, dtype=torch.bool, device=self.configuration.device)
+        mask[chosen.to(mask.device)] = True
+        kept = tuple(sensor.select(mask[self.configuration[sensor.row]]) for sensor in self.values)
         return replace(self, values=kept)
+
+    def shuffled(self) -> Int64[Tensor, " configurations"]:
+        """Numbers of all configurations in a random order that is always the same."""
+        return torch.randperm(self.configurations, generator=torch.Generator().manual_seed(0))
+
+    def weighted(self, weights: Sequence[Float64[Tensor, " values"]]) -> "Rows":
+        """The same with the values of every sensor weighted; then repeats of a pose are one row."""
+        kept = [sensor.weighted(weight) for sensor, weight in zip(self.values, weights, strict=True)]
+        if self.problem.pose is not None:
+            kept = [sensor.collapsed(self.problem.pose) for sensor in kept]
+        return replace(self, values=tuple(kept))
 
     def start(self, design: Design) -> Float64[Tensor, " unknowns"]:
         """All unknowns of a design where the values were linearised."""
@@ -193,12 +202,7 @@ class Rows:
 
     def sample(self, most: int) -> "Rows":
         """At most so many configurations, drawn at random but always the same."""
-        if self.configurations <= most:
-            return self
-        order = torch.randperm(self.configurations, generator=torch.Generator().manual_seed(0))
-        mask = torch.zeros(self.configurations, dtype=torch.bool)
-        mask[order[:most]] = True
-        return self.of(mask.to(self.configuration.device))
+        return self if self.configurations <= most else self.of(self.shuffled()[:most])
 
     def left(
         self, design: Design, posterior: Posterior, noise: Sequence[float]

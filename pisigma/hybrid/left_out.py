@@ -61,12 +61,9 @@ def folds_left_out(rows: Rows, design: Design, posterior: Posterior, sums: Sums)
         posterior: of them, with all rows.
         sums: normal equations of all rows.
     """
-    order = torch.randperm(rows.configurations, generator=torch.Generator().manual_seed(0))
     blocks = []
     for k in range(FOLDS):
-        mask = torch.zeros(rows.configurations, dtype=torch.bool)
-        mask[order[k::FOLDS]] = True
-        test = rows.of(mask.to(rows.configuration.device))
+        test = rows.of(rows.shuffled()[k::FOLDS])
         rest = sums.minus(sum_up(design, test.values, test.start(design)))
         without = maximise_evidence(rest, posterior.prior, posterior.noise, FOLD_UPDATES)
         for configuration, kind, X, r in _configurations(test, design, without):

@@ -4,7 +4,6 @@ import hashlib
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,7 +18,7 @@ from pisigma.hybrid.design import Design
 from pisigma.hybrid.evidence import Posterior
 from pisigma.hybrid.refinement import Refined, refine, refined_at, with_all_factors
 from pisigma.hybrid.search import Additive
-from pisigma.hybrid.sensor_values import SensorValues, sensor_values
+from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.hybrid.uncertainty import covariance_root
 from pisigma.identification.problem.loss import AbstractLoss
 from pisigma.identification.problem.problem import CalibrationProblem
@@ -294,10 +293,13 @@ class HybridBatchCost:
         delta = self._unknowns.shift(x, few.state)
         cost = 0.5 * (self._unknowns.precision * x.square()).sum()
         point = few.nominal.index_add(0, few.active, x.detach()[:active])
-        values = sensor_values(few, point, partial(_whatever_the_state, delta.detach()))
+        values = sensor_values(few, point, lambda state: delta.detach())
         square, count = 0.0, 0.0
         for number, sensor in enumerate(values):
-            root = self._root(few, number, sensor) * counts[sensor.row].sqrt()
+            root = sensor.root / self._unknowns.posterior.noise[number]
+            distance = sensor.residual.norm(dim=1) * root
+            loss = few.loss_of(few.sensors[number])
+            root = root * loss.weight(distance, sensor.components).sqrt() * counts[sensor.row].sqrt()
             force = sensor.residual * root[:, None].square()
             moved = sensor.geometry @ x[:active]
             moved = moved + torch.einsum("rcj,rj->rc", sensor.joints, delta[sensor.row])
@@ -307,14 +309,3 @@ class HybridBatchCost:
             square += float((force * sensor.residual).sum())
             count += float(counts[sensor.row].sum()) * sensor.components
         return self._share * cost, square / count
-
-    def _root(self, few: CalibrationProblem, number: int, sensor: SensorValues) -> Float64[Tensor, " values"]:
-        """Root of every row's weight over its variance."""
-        root = sensor.root / self._unknowns.posterior.noise[number]
-        distance = sensor.residual.norm(dim=1) * root
-        loss = few.loss_of(few.sensors[number])
-        return root * loss.weight(distance, sensor.components).sqrt()
-
-
-def _whatever_the_state(delta: Tensor, state: object) -> Tensor:
-    return delta

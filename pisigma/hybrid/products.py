@@ -92,17 +92,19 @@ class ProductFit:
         self._reduce(self._additive)
         robot = self.design.problem.space.robot
         pairs = InputPairs(robot)
-        weights, _, _ = self._reduced(pairs, None, 8)
+        weights, _, _ = self._reduced(pairs, self._first_prior(pairs), 8)
         factors = normalised(pairs.factors(weights, orders))
-        prior: GaussianPrior | None = None
+        prior = self._first_prior(AlternatingProducts(robot, orders, factors, 0))
         quick = self.design.unknowns <= QUICK
         for turn in range(ROUNDS - 1):
             units = AlternatingProducts(robot, orders, factors, turn)
             weights, prior, _ = self._reduced(units, prior, 3)
             if quick and turn in RENEWALS:
-                whole = self._whole(units, prior, 5)
-                self._reduce(replace(whole.posterior, prior=self._without_last(whole.posterior.prior)))
-                weights = whole.posterior.x[self.design.unknowns :]
+                whole = self._whole(units, prior, 5).posterior
+                kept = whole.prior.select(torch.arange(self.design.unknowns))
+                kept = replace(kept, sizes=kept.sizes[: len(self._prior.sizes)])
+                self._reduce(replace(whole, prior=kept))
+                weights = whole.x[self.design.unknowns :]
             factors = normalised(units.solved(weights))
         units = AlternatingProducts(robot, orders, factors, ROUNDS - 1)
         if final_iterations:
@@ -130,7 +132,7 @@ class ProductFit:
         self._square = max(square - float(self._reduced_descent.square().sum()), 0.0)
 
     def _reduced(
-        self, features: AbstractFeature, prior: GaussianPrior | None, iterations: int
+        self, features: AbstractFeature, prior: GaussianPrior, iterations: int
     ) -> tuple[Float64[Tensor, " weights"], GaussianPrior, Float64[Tensor, "unknowns weights"]]:
         """Weights of one more choice of features, their prior, and their columns' part in those taken out."""
         size = int(features.used.sum())
@@ -147,31 +149,27 @@ class ProductFit:
         sums = Sums(
             normal[None], descent[None], (self._square,), (max(self._count, 1.0),), (False,), (False,)
         )
-        if prior is None:
-            whole = self._with(features).prior((1.0,) * self._prior.classes)
-            last = replace(whole, base=whole.base[-size:], group=whole.group[-size:])
-            first = int(last.group.min())
-            prior = GaussianPrior(last.base, last.group - first, last.sizes[first:], 0)
         posterior = maximise_evidence(sums, prior, (1.0,), iterations)
         return posterior.x, posterior.prior, cross
+
+    def _first_prior(self, features: AbstractFeature) -> GaussianPrior:
+        """The prior of the weights of one more choice of features, to start from."""
+        whole = self._with(features).prior((1.0,) * self._prior.classes)
+        size = int(features.used.sum())
+        first = int(whole.group[-size:].min())
+        return GaussianPrior(whole.base[-size:], whole.group[-size:] - first, whole.sizes[first:], 0)
 
     def _completed(self, weights: Tensor, prior: GaussianPrior, cross: Tensor) -> Posterior:
         """All unknowns with the last weights; the covariance is left out."""
         rest = self._reduced_descent - cross @ weights
         base = self._scale * torch.linalg.solve_triangular(self._root.t(), rest[:, None], upper=True)[:, 0]
         x = torch.cat([base, weights])
-        joined = self._joined(prior)
-        return Posterior(x, x.new_zeros((0, 0)), float("nan"), joined, self._noise, 0)
+        return Posterior(x, x.new_zeros((0, 0)), float("nan"), self._joined(prior), self._noise, 0)
 
-    def _whole(
-        self, features: AbstractFeature, prior: GaussianPrior | None, iterations: int
-    ) -> FittedProducts:
+    def _whole(self, features: AbstractFeature, prior: GaussianPrior, iterations: int) -> FittedProducts:
         """Solve for everything, with noise and all prior sizes."""
-        design = self._with(features)
-        if prior is None:
-            _, prior, _ = self._reduced(features, None, 3)
         posterior = maximise_evidence(self._extended(features), self._joined(prior), self._noise, iterations)
-        return FittedProducts(design, posterior)
+        return FittedProducts(self._with(features), posterior)
 
     def _joined(self, last: GaussianPrior) -> GaussianPrior:
         """The prior of everything."""
@@ -183,12 +181,6 @@ class ProductFit:
             first.classes,
             first.fixed,
         )
-
-    def _without_last(self, prior: GaussianPrior) -> GaussianPrior:
-        """The prior of geometry and unit of order 1 alone."""
-        kept = torch.arange(self.design.unknowns)
-        chosen = prior.select(kept)
-        return replace(chosen, sizes=chosen.sizes[: len(self._prior.sizes)])
 
     def _with(self, features: AbstractFeature) -> Design:
         return replace(self.design, features=(*self.design.features, features))

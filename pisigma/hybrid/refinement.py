@@ -74,27 +74,23 @@ def refine(
     problem = solved.problem
     design = Design(problem, additive.design.features)
     posterior, point = additive.posterior, solved.solution.linearisation.point
-    correction: JointCorrection | None = None
-    rows, sums, rounds = None, None, 0
+    refined: Refined | None = None
     for rounds in range(1, MOST_ROUNDS + 1):
-        rows = _rows(solved, point, correction, design, posterior, loss)
+        rows = _rows(solved, point, refined.correction if refined else None, design, posterior, loss)
         before = posterior.x
-        if orders and correction is None:
+        if orders and refined is None:
             design, posterior, sums = _with_products(rows, design, posterior, orders)
         else:
             sums = sum_up(design, rows.values, rows.start(design))
             posterior = maximise_evidence(sums, posterior.prior, posterior.noise)
-        active = len(problem.active)
-        point = problem.nominal.index_add(0, problem.active, posterior.x[:active])
-        correction = network(design, posterior)
+        point = problem.nominal.index_add(0, problem.active, posterior.x[: design.active])
+        refined = Refined(rows, design, posterior, sums, point, network(design, posterior), rounds)
         if rounds > 1:
             moved = (posterior.x - before) / posterior.covariance.diagonal().clamp(min=1e-300).sqrt()
             if float(moved.square().mean().sqrt()) < SETTLED:
                 break
-    assert rows is not None
-    assert correction is not None
-    assert sums is not None
-    return Refined(rows, design, posterior, sums, point, correction, rounds)
+    assert refined is not None
+    return refined
 
 
 def refined_at(
@@ -109,8 +105,8 @@ def refined_at(
         loss: how far-off rows count.
         rounds: rounds that it took to get there.
     """
-    problem, active = solved.problem, design.active
-    point = problem.nominal.index_add(0, problem.active, posterior.x[:active])
+    problem = solved.problem
+    point = problem.nominal.index_add(0, problem.active, posterior.x[: design.active])
     correction = network(design, posterior)
     rows = _rows(solved, point, correction, design, posterior, loss)
     sums = sum_up(design, rows.values, rows.start(design))
@@ -149,23 +145,17 @@ def _rows(
     problem = solved.problem
     values = sensor_values(problem, point, correction)
     here = (point - problem.nominal)[problem.active]
-    active = len(here)
-    weights = None if correction is None else posterior.x[active:]
+    weights = None if correction is None else posterior.x[len(here) :]
     rows = Rows(problem, values, here, groups_of_equal_joints(problem.q), weights)
     change = rows.start(design) - posterior.x
     used = [0.0] * len(values) if correction is None else _used(rows, design, posterior)
-    weighed = weigh(values, design, change, used, loss)
-    kept = [sensor.weighted(weight) for sensor, weight in zip(values, weighed, strict=True)]
-    if problem.pose is not None:
-        kept = [sensor.collapsed(problem.pose) for sensor in kept]
-    return replace(rows, values=tuple(kept))
+    return rows.weighted(weigh(values, design, change, used, loss))
 
 
 def _used(rows: Rows, design: Design, posterior: Posterior) -> list[float]:
     """Values of every sensor that the unknowns use up: those that are determined, shared out by the sensors' values."""
-    determined = float(posterior.determined.sum())
     counts = [0.0 if sensor.certain else float(sensor.residual.numel()) for sensor in rows.values]
-    return [determined * count / max(sum(counts), 1.0) for count in counts]
+    return [float(posterior.determined.sum()) * count / max(sum(counts), 1.0) for count in counts]
 
 
 def _with_products(

@@ -64,12 +64,8 @@ class HybridResult:
         """The arm with the correction, base of the first frame and tool of the first target; None without one."""
         if self.learned is None:
             return None
-        return HybridArm(
-            self.geometric.robot,
-            self.learned.geometry.robot,
-            self.learned.correction,
-            self.learned.coverage,
-        )
+        learned = self.learned
+        return HybridArm(self.geometric.robot, learned.geometry.robot, learned.correction, learned.coverage)
 
     def predicted_poses(self, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
         """Where the targets were, each in the frame of its row.

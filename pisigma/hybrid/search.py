@@ -132,10 +132,8 @@ class Search:
         """Add a line to the table."""
         if not self.trials:
             self._unit = rms
-        seconds, evidence = time.monotonic() - began, tried.posterior.log_evidence
-        self.trials.append(
-            Trial(tried.name, tried.design.unknowns, evidence, rms / self._unit, seconds, kept)
-        )
+        seconds, evidence, share = time.monotonic() - began, tried.posterior.log_evidence, rms / self._unit
+        self.trials.append(Trial(tried.name, tried.design.unknowns, evidence, share, seconds, kept))
 
     def best_additive(
         self, growing: Sequence[AbstractFeature], others: Sequence[AbstractFeature]
@@ -150,8 +148,7 @@ class Search:
             best, rms, better = self._tried([*without, chosen], best, rms)
             if better:
                 without.append(chosen)
-        with_growing: list[AbstractFeature] = list(without)
-        failures = 0
+        with_growing, failures = without, 0
         for chosen in growing:
             best, rms, better = self._tried([*without, chosen], best, rms)
             failures = 0 if better else failures + 1
@@ -188,16 +185,16 @@ class _Fold:
     """Rows that are held out, and the additive model fitted to the others, prior sizes and noise fixed."""
 
     test: Rows
-    additive: Additive
     base: Posterior
     fit: ProductFit
 
     def square(self, orders: tuple[int, ...], noise: tuple[float, ...]) -> float:
         """Squared errors of the held-out rows over variances; additive where there are no orders."""
-        if not orders:
-            return float(self.test.left(self.additive.design, self.base, noise).sum())
-        fitted = self.fit.fit(orders, 0)
-        return float(self.test.left(fitted.design, fitted.posterior, noise).sum())
+        design, posterior = self.fit.design, self.base
+        if orders:
+            fitted = self.fit.fit(orders, 0)
+            design, posterior = fitted.design, fitted.posterior
+        return float(self.test.left(design, posterior, noise).sum())
 
 
 def best_products(
@@ -268,18 +265,13 @@ def _judged(
 def _folds(search: Search, additive: Additive) -> list[_Fold]:
     """Folds of at most `MOST_CONFIGURATIONS` configurations."""
     rows, design = search.rows, additive.design
-    order = torch.randperm(rows.configurations, generator=torch.Generator().manual_seed(0))
-    order = order[:MOST_CONFIGURATIONS]
+    order = rows.shuffled()[:MOST_CONFIGURATIONS]
     folds = []
     for k in range(FOLDS):
-        tested = torch.zeros(rows.configurations, dtype=torch.bool)
-        tested[order[k::FOLDS]] = True
-        judged = torch.zeros_like(tested)
-        judged[order] = True
-        device = rows.configuration.device
-        train, test = rows.of((judged & ~tested).to(device)), rows.of(tested.to(device))
+        others = torch.cat([order[fold::FOLDS] for fold in range(FOLDS) if fold != k])
+        train, test = rows.of(others), rows.of(order[k::FOLDS])
         sums = sum_up(design, train.values, train.start(design))
         base = solve_posterior(sums, additive.posterior.prior, additive.posterior.noise)
         fit = ProductFit(design, train.values, train.start(design), base, sums)
-        folds.append(_Fold(test, additive, base, fit))
+        folds.append(_Fold(test, base, fit))
     return folds

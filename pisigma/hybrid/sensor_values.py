@@ -55,11 +55,10 @@ class SensorValues:
             state: of all rows of the problem.
             rows: which of the rows of this sensor.
         """
-        used = chosen.used.flatten()
-        block = _spread(self.joints[rows], chosen.columns(state[self.row[rows]]))
+        block = weight_columns(self.joints[rows], chosen, state[self.row[rows]])
         if self.other_row is not None and self.other_joints is not None:
-            block = block + _spread(self.other_joints[rows], chosen.columns(state[self.other_row[rows]]))
-        return block if bool(used.all()) else block[..., used]
+            block = block + weight_columns(self.other_joints[rows], chosen, state[self.other_row[rows]])
+        return block
 
     @property
     def components(self) -> int:
@@ -124,11 +123,19 @@ class SensorValues:
         return renumbered((key / key.abs().max().clamp(min=1e-300) * 1e6).round().to(torch.int64))
 
 
-def _spread(
-    joints: Float64[Tensor, "values components dof"], columns: Float64[Tensor, "values dof columns"]
+def weight_columns(
+    joints: Float64[Tensor, "values components dof"], chosen: AbstractFeature, state: JointState
 ) -> Float64[Tensor, "values components _weights"]:
-    """Derivative by joint values times columns, side by side for all joints."""
-    return (joints[..., None] * columns[:, None]).flatten(2)
+    """Derivative by the weights of the used columns of some features, side by side for all joints.
+
+    Args:
+        joints: derivative by the joint values.
+        chosen: the features.
+        state: of every row.
+    """
+    used = chosen.used.flatten()
+    block = (joints[..., None] * chosen.columns(state)[:, None]).flatten(2)
+    return block if bool(used.all()) else block[..., used]
 
 
 def sensor_values(

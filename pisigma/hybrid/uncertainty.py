@@ -10,7 +10,7 @@ from torch import Tensor
 from pisigma.hybrid.design import Design, Rows
 from pisigma.hybrid.evidence import Posterior, Sums, effective_share
 from pisigma.hybrid.left_out import LeftOut, folds_left_out, left_out
-from pisigma.hybrid.sensor_values import joint_columns
+from pisigma.hybrid.sensor_values import joint_columns, weight_columns
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.joint_correction.feature import AbstractFeature
@@ -87,11 +87,8 @@ class PositionUncertainty:
 
     def _weight_columns(self, J: Tensor, state: JointState) -> Float64[Tensor, "rows 3 weights"]:
         joints = J[..., joint_columns(self.space)] * J.new_tensor(self.space.robot.directions)
-        blocks = [joints[..., :0]]
-        for chosen in self.features:
-            block = (joints[..., None] * chosen.columns(state)[:, None]).flatten(2)
-            blocks.append(block[..., chosen.used.flatten()])
-        return torch.cat(blocks, -1)
+        blocks = [weight_columns(joints, chosen, state) for chosen in self.features]
+        return torch.cat([joints[..., :0], *blocks], -1)
 
 
 def covariance_root(

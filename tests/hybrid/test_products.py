@@ -83,7 +83,7 @@ def test_with_sizes_held_all_unknowns_are_those_of_the_whole_solve() -> None:
     factors = torch.randn(6, 4, 13, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     held = AlternatingProducts(robot, (2, 2), normalised(factors), 0)
     fit._reduce(fitted.posterior)
-    posterior = fit._completed(*fit._reduced(held, None, 0))
+    posterior = fit._completed(*fit._reduced(held, fit._first_prior(held), 0))
     design = replace(fitted.design, features=(*fitted.design.features, held))
     sums = sum_up(design, arm.rows.values, arm.rows.start(design))
     whole = solve_mean(sums, posterior.prior, fitted.posterior.noise)
