@@ -120,7 +120,10 @@ def build_planning_problem(
         along = T_jig_base[candidates.axis[chosen], :3]
         start = len(columns) + 6 * number
         rows[chosen, : len(columns)] = torch.einsum("ni,nip->np", along, J[:, :3, columns]) * usual
-        rows[chosen, start : start + 6] = _base_rows(along, T[:, :3, 3]) * usual_base
+        # By a small shift and turn of the base in its own frame: they span what x, y, z, roll, pitch and yaw span, so
+        # the predicted error is the same.
+        by_base = torch.cat([along, torch.linalg.cross(T[:, :3, 3], along)], -1)
+        rows[chosen, start : start + 6] = by_base * usual_base
     _, J = identification_jacobian(free_of_base, workspace)
     J = J[:, :3, columns] * usual * 1e3
     weight = torch.zeros(size, size, dtype=torch.float64)
@@ -214,13 +217,3 @@ def _best_exchange(problem: PlanningProblem, chosen: Int64[Tensor, " chosen"]) -
     best = int(gain.argmax())
     out, into = divmod(best, gain.shape[1])
     return float(gain[out, into]), out, into
-
-
-def _base_rows(
-    along: Float64[Tensor, "touches 3"], position: Float64[Tensor, "touches 3"]
-) -> Float64[Tensor, "touches 6"]:
-    """Derivative of the coordinates by a small shift and turn of the robot's base, both in the robot's frame.
-
-    They span what x, y, z, roll, pitch and yaw span, so the predicted error is the same.
-    """
-    return torch.cat([along, torch.linalg.cross(position, along)], -1)

@@ -54,9 +54,8 @@ class SimulatedSockets(Section):
     @classmethod
     def _names_differ(cls, sockets: tuple[SocketSection, ...]) -> tuple[SocketSection, ...]:
         names = [socket.name for socket in sockets]
-        for name in names:
-            if names.count(name) > 1:
-                raise ValueError(f"the socket '{name}' stands twice; names must differ")
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ValueError(f"the socket '{twice[0]}' stands twice; names must differ")
         return sockets
 
     def measure(self, robot: TrueRobot) -> Measurements:
@@ -68,7 +67,8 @@ class SimulatedSockets(Section):
             UnreachablePoseError: the robot does not reach a socket with an orientation.
             RecipeError: joint values would have to leave the limits of the robot.
         """
-        points = self._points().repeat_interleave(self.poses_per_socket, 0)
+        points = torch.tensor([socket.point_mm for socket in self.sockets], dtype=torch.float64) / 1e3
+        points = points.repeat_interleave(self.poses_per_socket, 0)
         draws = draw_noise(self.noise, len(points))
         generator = torch.Generator().manual_seed(self.seed)
         R = self.orientation.rotations(len(points), generator)
@@ -80,9 +80,6 @@ class SimulatedSockets(Section):
             sigma_position=row_sigma(self.noise, len(points)),
             source=f"simulation of {robot.nominal.name}",
         )
-
-    def _points(self) -> Float64[Tensor, "sockets 3"]:
-        return torch.tensor([socket.point_mm for socket in self.sockets], dtype=torch.float64) / 1e3
 
 
 class AnchorSection(Section):
@@ -152,8 +149,7 @@ class SimulatedPairs(AbstractCommanded):
 
     @model_validator(mode="after")
     def _even(self) -> "SimulatedPairs":
-        count = getattr(self.poses, "count", 0)
-        if count % 2:
+        if getattr(self.poses, "count", 0) % 2:
             raise ValueError("poses are taken two at a time; ask for an even number of them")
         return self
 
@@ -184,8 +180,7 @@ def _not_below_zero(shown: Float64[Tensor, " rows"]) -> Float64[Tensor, " rows"]
     if (shown < 0).any():
         row = int(shown.argmin())
         raise RecipeError(
-            f"distances: the sensor would show {float(shown[row]) * 1e3:.6g} mm at pose {row} "
-            "(counted from 0); state "
-            "poses farther away, less noise, or a larger zero_mm."
+            f"distances: the sensor would show {float(shown[row]) * 1e3:.6g} mm at pose {row} (counted from 0); "
+            "state poses farther away, less noise, or a larger zero_mm."
         )
     return shown

@@ -97,9 +97,7 @@ class SensorNoise(Section):
 
 def draw_noise(noise: SensorNoise | None, rows: int) -> NoiseDraws:
     """The deviations of so many rows; all 0 without noise."""
-    if noise is not None:
-        return noise.draw(rows)
-    return NoiseDraws(*torch.zeros(2, rows, 3, dtype=torch.float64))
+    return (noise or SensorNoise(seed=0)).draw(rows)
 
 
 def row_sigma(noise: SensorNoise | None, rows: int, points: int = 1) -> Float64[Tensor, " rows"] | None:

@@ -60,9 +60,8 @@ class OrientationSection(Section):
         if self.home_rotation is not None:
             home = torch.tensor(self.home_rotation, dtype=torch.float64)
         else:
-            home = rotation_from_rpy(
-                torch.deg2rad(torch.tensor(self.home_rpy_deg or (0.0,) * 3, dtype=torch.float64))
-            )
+            rpy_deg = torch.tensor(self.home_rpy_deg or (0.0,) * 3, dtype=torch.float64)
+            home = rotation_from_rpy(torch.deg2rad(rpy_deg))
         if not self.spread_deg:
             return home.expand(count, 3, 3).clone()
         draws = 2 * torch.rand(count, 3, generator=generator, dtype=torch.float64) - 1
@@ -132,31 +131,33 @@ Seed = Annotated[int, Field(ge=0)]
 
 
 class AbstractPoses(Section, ABC):
-    """Wanted tool poses; whatever is random comes from one generator with the section's seed."""
+    """Wanted tool poses.
 
-    @abstractmethod
-    def transforms(self) -> Float64[Tensor, "count 4 4"]:
-        """The wanted T_base_tool [m], the same at every call."""
-
-
-class AbstractGrid(AbstractPoses):
-    """What grids share: a seed is needed for a spread of orientations only."""
+    Whatever is random comes from one generator with the section's seed, positions before orientations. Grids need a
+    seed for a spread of orientations only.
+    """
 
     orientation: OrientationSection = OrientationSection()
     seed: Seed | None = None
 
     @model_validator(mode="after")
-    def _seed_for_spread(self) -> "AbstractGrid":
+    def _seed_for_spread(self) -> "AbstractPoses":
         if self.orientation.spread_deg and self.seed is None:
             raise ValueError("a spread of orientations is drawn at random; state the seed")
         return self
 
-    def _at(self, positions: Float64[Tensor, "count 3"]) -> Float64[Tensor, "count 4 4"]:
+    def transforms(self) -> Float64[Tensor, "count 4 4"]:
+        """The wanted T_base_tool [m], the same at every call."""
         generator = None if self.seed is None else torch.Generator().manual_seed(self.seed)
+        positions = self._positions(generator)
         return transform(self.orientation.rotations(len(positions), generator), positions)
 
+    @abstractmethod
+    def _positions(self, generator: torch.Generator | None) -> Float64[Tensor, "count 3"]:
+        """The wanted positions [m]."""
 
-class PolarGrid(AbstractGrid):
+
+class PolarGrid(AbstractPoses):
     """Equal steps of radius and angle at one height: `x = r cos(phi)`, `y = r sin(phi)`; phi runs fastest.
 
     Source: Jeong, Kim and Kwak 1998, section 4.1.1 and Fig. 4.
@@ -179,15 +180,14 @@ class PolarGrid(AbstractGrid):
     phi_steps: Count
     z_mm: float
 
-    def transforms(self) -> Float64[Tensor, "count 4 4"]:
-        """The grid. See `AbstractPoses.transforms`."""
+    def _positions(self, generator: torch.Generator | None) -> Float64[Tensor, "count 3"]:
         r = _linspace(self.r_mm, self.r_steps) / 1e3
         phi = torch.deg2rad(_linspace(self.phi_deg, self.phi_steps))
         points = torch.cartesian_prod(r, phi).reshape(-1, 2)
-        return self._at(_from_polar(points[:, 0], points[:, 1], self.z_mm / 1e3))
+        return _from_polar(points[:, 0], points[:, 1], self.z_mm / 1e3)
 
 
-class CubeGrid(AbstractGrid):
+class CubeGrid(AbstractPoses):
     """Equal steps along x, y and z; z runs fastest.
 
     Source: Jeong, Kim and Kwak 1998, section 4.2.1, after ISO 9283.
@@ -208,12 +208,9 @@ class CubeGrid(AbstractGrid):
     z_mm: Range
     steps: tuple[Count, Count, Count]
 
-    def transforms(self) -> Float64[Tensor, "count 4 4"]:
-        """The grid. See `AbstractPoses.transforms`."""
-        axes = [
-            _linspace(r, n) / 1e3 for r, n in zip((self.x_mm, self.y_mm, self.z_mm), self.steps, strict=True)
-        ]
-        return self._at(torch.cartesian_prod(*axes))
+    def _positions(self, generator: torch.Generator | None) -> Float64[Tensor, "count 3"]:
+        ranges = (self.x_mm, self.y_mm, self.z_mm)
+        return torch.cartesian_prod(*(_linspace(r, n) / 1e3 for r, n in zip(ranges, self.steps, strict=True)))
 
 
 class PolarRandom(AbstractPoses):
@@ -237,14 +234,10 @@ class PolarRandom(AbstractPoses):
     r_mm: Range
     phi_deg: Range
     z_mm: float
-    orientation: OrientationSection = OrientationSection()
 
-    def transforms(self) -> Float64[Tensor, "count 4 4"]:
-        """The poses. See `AbstractPoses.transforms`."""
-        generator = torch.Generator().manual_seed(self.seed)
+    def _positions(self, generator: torch.Generator | None) -> Float64[Tensor, "count 3"]:
         draws = _uniform(self.count, [self.r_mm, self.phi_deg], generator)
-        positions = _from_polar(draws[:, 0] / 1e3, torch.deg2rad(draws[:, 1]), self.z_mm / 1e3)
-        return transform(self.orientation.rotations(self.count, generator), positions)
+        return _from_polar(draws[:, 0] / 1e3, torch.deg2rad(draws[:, 1]), self.z_mm / 1e3)
 
 
 class CubeRandom(AbstractPoses):
@@ -268,13 +261,9 @@ class CubeRandom(AbstractPoses):
     x_mm: Range
     y_mm: Range
     z_mm: Range
-    orientation: OrientationSection = OrientationSection()
 
-    def transforms(self) -> Float64[Tensor, "count 4 4"]:
-        """The poses. See `AbstractPoses.transforms`."""
-        generator = torch.Generator().manual_seed(self.seed)
-        positions = _uniform(self.count, [self.x_mm, self.y_mm, self.z_mm], generator) / 1e3
-        return transform(self.orientation.rotations(self.count, generator), positions)
+    def _positions(self, generator: torch.Generator | None) -> Float64[Tensor, "count 3"]:
+        return _uniform(self.count, [self.x_mm, self.y_mm, self.z_mm], generator) / 1e3
 
 
 WhereToMeasure = Annotated[
@@ -293,6 +282,8 @@ def _from_polar(
     return torch.stack([r * torch.cos(phi), r * torch.sin(phi), torch.full_like(r, z)], -1)
 
 
-def _uniform(count: int, bounds: list[Range], generator: torch.Generator) -> Float64[Tensor, "count columns"]:
+def _uniform(
+    count: int, bounds: list[Range], generator: torch.Generator | None
+) -> Float64[Tensor, "count columns"]:
     lower, upper = torch.tensor(bounds, dtype=torch.float64).unbind(-1)
     return lower + (upper - lower) * torch.rand(count, len(bounds), generator=generator, dtype=torch.float64)

@@ -1,6 +1,5 @@
 """Where jigs stand, and which touches are possible there: a face, a point on it and a tilt of the torch."""
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -46,7 +45,7 @@ class JigPlacement(Section):
         Raises:
             MeasurementError: there is no such jig.
         """
-        return Jig.load(os.fspath(self.jig))
+        return Jig.load(self.jig)
 
     @property
     def T_jig_base(self) -> Float64[Tensor, "4 4"]:
@@ -68,12 +67,10 @@ def check_names(placements: Sequence[JigPlacement]) -> None:
     names = [placement.name for placement in placements]
     if not names:
         raise RecipeError("touches: no jig is placed; state at least one placement.")
-    for name in names:
-        if names.count(name) > 1:
-            raise RecipeError(
-                f"touches: the placement '{name}' stands twice; a jig that was moved has a new "
-                "frame, so name it anew."
-            )
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise RecipeError(
+            f"touches: the placement '{twice[0]}' stands twice; a jig that was moved has a new frame, so name it anew."
+        )
 
 
 ROUNDS = 20
@@ -270,14 +267,12 @@ class TouchCandidatesSection(Section):
         drawn = replace(drawn, q=q).select(reached)
         T, outward = T[reached], (T_base_jig[:3, :3] @ jig.outward[drawn.face].mT).mT
         shift = self.travel_mm / 1e3 * torch.stack([outward, -outward])
-        ends = solve_numeric(
-            robot, _shifted(T, shift), drawn.q, tolerance=END_TOLERANCE, max_iterations=MOST_ITERATIONS
-        )
+        Ts_end = transform(T[:, :3, :3].expand(2, -1, 3, 3), T[:, :3, 3] + shift)
+        ends = solve_numeric(robot, Ts_end, drawn.q, tolerance=END_TOLERANCE, max_iterations=MOST_ITERATIONS)
         ends_reached = ends.status == Status.REACHED
         ends_reached &= (ends.q - drawn.q).abs().amax(-1) < LARGEST_MOVE
         ends_reached &= singularity_measure(robot, ends.q) >= self.least_singular_value
-        both_ways = ends_reached.all(0)
-        return drawn.select(both_ways)
+        return drawn.select(ends_reached.all(0))
 
 
 def _draw_faces(jig: Jig, u: Float64[Tensor, " candidates"]) -> Int64[Tensor, " candidates"]:
@@ -286,9 +281,3 @@ def _draw_faces(jig: Jig, u: Float64[Tensor, " candidates"]) -> Int64[Tensor, " 
     weight = 1.0 / per_axis[jig.axis].to(u.dtype)
     bounds = weight.cumsum(0) / weight.sum()
     return torch.searchsorted(bounds, u.contiguous(), right=True).clamp(max=jig.faces - 1)
-
-
-def _shifted(
-    T: Float64[Tensor, "poses 4 4"], shift: Float64[Tensor, "ends poses 3"]
-) -> Float64[Tensor, "ends poses 4 4"]:
-    return transform(T[:, :3, :3].expand(*shift.shape[:-1], 3, 3), T[:, :3, 3] + shift)

@@ -73,11 +73,8 @@ class JointCompliance(AbstractJointSource):
         stated = joint_values(robot, self.compliance_rad_per_Nm, self.compliance_m_per_N, fields, place)
         compliance = torch.from_numpy(stated)
         links = {row_index(robot, name, place): mass for name, mass in self.links.items()}
-
-        def error(q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
-            return compliance.to(q) * gravity_load(robot, q, links, self.payload, self.gravity_m_per_s2)
-
-        return error
+        payload, gravity = self.payload, self.gravity_m_per_s2
+        return lambda q: compliance.to(q) * gravity_load(robot, q, links, payload, gravity)
 
 
 def gravity_load(

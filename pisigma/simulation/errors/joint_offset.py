@@ -4,9 +4,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
 from pydantic import Field
-from torch import Tensor
 
 from pisigma.robot.description import Robot
 from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_values
@@ -34,8 +32,4 @@ class JointOffset(AbstractJointSource):
         """The offsets as a function of the joint values. See `AbstractJointSource.bind`."""
         stated = joint_values(robot, self.offset_deg, self.offset_mm, ("offset_deg", "offset_mm"), place)
         offset = torch.from_numpy(np.where(robot.revolute, np.deg2rad(stated), stated / 1e3))
-
-        def error(q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
-            return torch.zeros_like(q) + offset.to(q)
-
-        return error
+        return lambda q: torch.zeros_like(q) + offset.to(q)
