@@ -1,5 +1,6 @@
 """Figures of a calibration: residuals, held-out errors, correlations, and what was learned beyond the geometry."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -26,6 +27,11 @@ CURVE_PNG = "learning_curve.png"
 SPREAD_PNG = "predicted_spread.png"
 
 _UNITS = {"position": ("mm", 1e3), "rotation": ("deg", float(np.rad2deg(1.0)))}
+JOINT_UNITS = {
+    "revolute": ("deg", math.degrees(1.0), "mdeg", math.degrees(1e3)),
+    "prismatic": ("mm", 1e3, "µm", 1e6),
+}
+"""Unit of a joint's values and of its correction, each with the factor from [rad] or [m]."""
 _REDUNDANT = 1 - 1e-6
 STYLES = {"nominal": (":", "s"), "geometric": ("--", "o"), "hybrid": ("-", "^")}
 """Line and mark of every model, so that they differ without colour too."""
@@ -146,11 +152,7 @@ def draw_corrections(correction: JointCorrection, measurements: Measurements, pa
     with torch.no_grad():
         corrections = correction.of_rows(measurements).numpy()
     for j, (axes, joint) in enumerate(zip(panels, joints, strict=False)):
-        unit, factor, small, scale = (
-            ("deg", float(np.rad2deg(1.0)), "mdeg", float(np.rad2deg(1e3)))
-            if joint.type == "revolute"
-            else ("mm", 1e3, "µm", 1e6)
-        )
+        unit, factor, small, scale = JOINT_UNITS[joint.type]
         values, line = _over_own_value(correction, q, j)
         step = max(len(q) // MOST_DOTS, 1)
         axes.plot(

@@ -43,10 +43,10 @@ def joint_rows(joints: Sequence[JointFigures]) -> list[tuple[str, ...]]:
     """Per joint and rows: joint, unit, rows, then average, deviation, maximum before and after."""
     lines = []
     for joint in joints:
-        for errors, label in (
-            (joint.training, "training"),
-            (joint.held_out, "held-out"),
-            (joint.paper, "paper"),
+        for label, errors in (
+            ("training", joint.training),
+            ("held-out", joint.held_out),
+            ("paper", joint.paper),
         ):
             if errors is not None:
                 figures = (*errors.before.values, *errors.after.values)
@@ -56,13 +56,8 @@ def joint_rows(joints: Sequence[JointFigures]) -> list[tuple[str, ...]]:
 
 def joint_table(joints: Sequence[JointFigures]) -> str:
     """A Markdown table of the joint errors; one line per joint and rows, before and after side by side."""
-    head = [
-        "joint",
-        "unit",
-        "rows",
-        *(f"{when}: {name}" for when in ("before", "after") for name in _STATISTICS),
-    ]
-    return markdown_table(head, joint_rows(joints))
+    figures = (f"{when}: {name}" for when in ("before", "after") for name in _STATISTICS)
+    return markdown_table(("joint", "unit", "rows", *figures), joint_rows(joints))
 
 
 def pose_rows(models: Mapping[str, ErrorFigures]) -> Table:

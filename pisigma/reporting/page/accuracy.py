@@ -185,18 +185,18 @@ class Limit:
     """What limits the accuracy.
 
     Attributes:
+        clause: to go on "what limits it is ...".
+        sentence: the same with figures.
         noise: RMS length of the scatter of a measured position [mm]; None where it is not known.
         share: of the squared error that it makes up; None where it is not known or the scatter exceeds the error.
         source: where the figure of the noise is from.
-        clause: to go on "what limits it is ...".
-        sentence: the same with figures.
     """
 
-    noise: float | None
-    share: float | None
-    source: str
     clause: str
     sentence: str
+    noise: float | None = None
+    share: float | None = None
+    source: str = ""
 
 
 def limit_of(
@@ -207,10 +207,10 @@ def limit_of(
 ) -> Limit:
     """Compare the error with the scatter of repeated rows, or with the noise that a hybrid identified."""
     if accuracy is not None and accuracy.reference:
-        sentence = (
-            " ".join(model.metrics.get("limitations", ())) or "Ask the full model for its own accuracy."
+        sentence = " ".join(model.metrics.get("limitations", ()))
+        return Limit(
+            "the full model that it stands for", sentence or "Ask the full model for its own accuracy."
         )
-        return Limit(None, None, "", "the full model that it stands for", sentence)
     noise, source = _repeated(rows), "rows that were measured more than once"
     if noise is None:
         noise, source = _identified_noise(summary), "the noise that the calibration identified"
@@ -228,7 +228,7 @@ def _compared(noise: float, error: float, source: str) -> Limit:
             f"{scatter}, no less than the error itself ({figure_text(error)} mm RMS): these rows cannot show what the "
             "model adds to it."
         )
-        return Limit(noise, None, source, clause, sentence)
+        return Limit(clause, sentence, noise, None, source)
     share = (noise / error) ** 2
     percent = f"{percent_text(share)} of the squared error"
     if share >= MOSTLY:
@@ -237,13 +237,13 @@ def _compared(noise: float, error: float, source: str) -> Limit:
         sentence = (
             f"{scatter}, which is {percent}: a perfect model would have {less} on the same rows, no more."
         )
-        return Limit(noise, share, source, f"scatter of the measurements ({percent})", sentence)
+        return Limit(f"scatter of the measurements ({percent})", sentence, noise, share, source)
     sentence = (
         f"{scatter}, which is {percent}; the rest, {percent_text(1 - share)}, comes of the model: too few rows, or "
         "effects that it cannot express."
     )
     clause = f"the model more than the measurements, whose scatter is {percent}"
-    return Limit(noise, share, source, clause, sentence)
+    return Limit(clause, sentence, noise, share, source)
 
 
 def percent_text(share: float) -> str:
@@ -261,13 +261,13 @@ def _unknown(summary: CalibrationSummary | None) -> Limit:
         sentence = (
             "How much the measurements scatter by themselves is not known; measure some poses several times."
         )
-        return Limit(None, None, "", clause, sentence)
+        return Limit(clause, sentence)
     sentence = (
         f"What the geometry leaves over, {figure_text(rest)} mm per coordinate, is scatter of the measurements and "
         "everything that geometry cannot express; measure some poses several times, or calibrate a hybrid, to tell "
         "them apart."
     )
-    return Limit(None, None, "", clause, sentence)
+    return Limit(clause, sentence)
 
 
 def _repeated(rows: JudgedRows | None) -> float | None:

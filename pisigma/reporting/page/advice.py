@@ -48,22 +48,18 @@ def advice_for(
         accuracies: figures of the accuracy.
         limit: what limits it.
     """
-    warnings: list[str] = []
-    of_calibration: list[str] = []
-    outliers: list[str] = []
-    if summary is not None:
-        of_calibration = [*_weak_parameters(summary), *_more_rows(model, summary, limit), *_trust(summary)]
-        of_calibration += _orientations(model, summary)
-        outliers = _outliers(summary)
-        warnings = [line[:1].upper() + line[1:] for line in warning_lines(summary)]
+    of_rows = (*_independent(model, accuracies), *_joint_gaps(model, rows), *_outside(rows))
+    if summary is None:
+        return (*of_rows, *_conditions(rows))
     return (
-        *warnings,
-        *_independent(model, accuracies),
-        *_joint_gaps(model, rows),
-        *_outside(rows),
-        *of_calibration,
+        *(line[:1].upper() + line[1:] for line in warning_lines(summary)),
+        *of_rows,
+        *_weak_parameters(summary),
+        *_more_rows(model, summary, limit),
+        *_trust(summary),
+        *_orientations(model, summary),
         *_conditions(rows),
-        *outliers,
+        *_outliers(summary),
     )
 
 

@@ -14,6 +14,7 @@ from pisigma.hybrid.coverage import share_beyond
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.reporting.calibration_figures import JOINT_UNITS
 from pisigma.reporting.calibration_tables import (
     CORRELATION_CSV,
     parameter_table,
@@ -162,15 +163,17 @@ def correction_curves(model: CalibratedModel) -> tuple[CorrectionCurve, ...]:
     Returns:
         Nothing for a model without a learned correction.
     """
-    if (model.hybrid is None and model.network is None) or not len(model.starts):
+    robot, hybrid, q = model.robot, model.hybrid, model.starts
+    if (hybrid is None and model.network is None) or not len(q):
         return ()
-    robot, q = model.robot, model.starts
     at_rows, middle = correction_at(model, q), _middle_row(q)
     curves = []
     for j in range(robot.dof):
         at = middle.repeat(POINTS, 1)
         at[:, j] = torch.linspace(*_range(robot, q, j), POINTS, dtype=torch.float64)
-        share = _share(model, at, j)
+        share = torch.ones(POINTS, dtype=torch.float64)
+        if hybrid is not None:  # the correction fades as the joint leaves its measured values
+            share = share_beyond(hybrid.coverage.beyond(at)[:, j], hybrid.coverage.fade)
         curve = correction_at(model, at)[:, j] * share
         if bool((curve != 0).any()) or bool((at_rows[:, j] != 0).any()):
             curves.append(_curve(robot, j, at[:, j], curve, share == 1, q[:, j], at_rows[:, j]))
@@ -186,16 +189,6 @@ def correction_at(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Flo
         return torch.cat(
             [model.correction(forward_kinematics(model.robot, chunk), chunk) for chunk in chunks]
         )
-
-
-def _share(
-    model: CalibratedModel, q: Float64[Tensor, "points dof"], joint: int
-) -> Float64[Tensor, " points"]:
-    """Compute how much of the correction is in force as one joint leaves its measured values."""
-    if model.hybrid is not None:
-        coverage = model.hybrid.coverage
-        return share_beyond(coverage.beyond(q)[:, joint], coverage.fade)
-    return torch.ones(len(q), dtype=torch.float64)
 
 
 def _middle_row(q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, " dof"]:
@@ -216,9 +209,7 @@ def _curve(
     robot: Robot, joint: int, q: Tensor, curve: Tensor, measured: Tensor, q_rows: Tensor, at_rows: Tensor
 ) -> CorrectionCurve:
     """Convert a curve over joint values, and corrections at measured rows, to units for people."""
-    turns = robot.revolute[joint]
-    factor, small = (math.degrees(1.0), math.degrees(1e3)) if turns else (1e3, 1e6)
-    unit, small_unit = ("deg", "mdeg") if turns else ("mm", "µm")
+    unit, factor, small_unit, small = JOINT_UNITS[robot.joints[joint].type]
     values, dots, inside = q.numpy() * factor, at_rows.numpy() * small, measured.numpy()
     rms = float(np.sqrt((dots**2).mean()))
     sentence = (

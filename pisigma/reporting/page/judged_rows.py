@@ -1,6 +1,7 @@
 """What a report holds of every row: where it is, and how far off before and after the calibration."""
 
 from collections.abc import Hashable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -134,10 +135,8 @@ def predicted_at(model: CalibratedModel, rows: Measurements) -> Float64[Tensor, 
     predicted = torch.full((rows.rows,), torch.nan, dtype=torch.float64)
     chosen = torch.linspace(0, rows.rows - 1, min(rows.rows, MOST_PREDICTED)).round().long()
     if model.uncertainty is not None and len(chosen):
-        try:
+        with suppress(MeasurementError):  # a frame or target that was left out of the model
             predicted[chosen] = deviation_of_rows(model, rows.select(chosen)).norm(dim=-1)
-        except MeasurementError:  # a frame or target that was left out of the model
-            return predicted
     return predicted
 
 
