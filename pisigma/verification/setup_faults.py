@@ -28,6 +28,17 @@ MOST_ROWS = 1_000
 """Rows that explanations are tried on, spread over all of them."""
 FEWEST_SPARE = 6
 """Measured numbers that must be left over beyond what is fitted."""
+_MOVED = {
+    "frame": (
+        "the measuring frame has moved",
+        "the sensor or what it measures from stands elsewhere than when the model was fitted (if it was moved, verify "
+        "with --fit-frame)",
+    ),
+    "tool": (
+        "another tool or target is mounted",
+        "another point of the tool was measured than when the model was fitted",
+    ),
+}
 
 
 @dataclass(frozen=True)
@@ -219,12 +230,12 @@ def _all_frames(model: CalibratedModel, some: Measurements, here: _Hypothesis) -
     per_tool = 6 if bool(here.measured.has_rotation.any()) else 3
     count, tools = int(frames.max()) + 1, int(targets.max()) + 1
     X, Y = _per_group(best_base, frames, here), _per_group(best_tool, targets, here)
-    yield here.with_cause(_frame_moved(X), X @ here.T, 6 * count)
-    yield here.with_cause(_tool_moved(Y), here.T @ Y, per_tool * tools)
+    yield here.with_cause(_moved("frame", X), X @ here.T, 6 * count)
+    yield here.with_cause(_moved("tool", Y), here.T @ Y, per_tool * tools)
     if count == 1 and tools == 1:
         base, tool = best_base_and_tool(here.T, here.measured, model.robot.reach)
-        moved = here.with_cause(_frame_moved(base[None]), base @ here.T, 6)
-        yield moved.with_cause(_tool_moved(tool[None]), base @ here.T @ tool, per_tool)
+        moved = here.with_cause(_moved("frame", base[None]), base @ here.T, 6)
+        yield moved.with_cause(_moved("tool", tool[None]), base @ here.T @ tool, per_tool)
 
 
 def _per_group(
@@ -238,24 +249,13 @@ def _per_group(
     return X
 
 
-def _frame_moved(X: Float64[Tensor, "rows 4 4"]) -> Cause:
-    advice = (
-        "the sensor or what it measures from stands elsewhere than when the model was fitted (if it was moved, verify "
-        "with --fit-frame)"
-    )
-    return Cause("frame", f"the measuring frame has moved ({_motion_text(X)})", advice, 2.0)
-
-
-def _tool_moved(X: Float64[Tensor, "rows 4 4"]) -> Cause:
-    advice = "another point of the tool was measured than when the model was fitted"
-    return Cause("tool", f"another tool or target is mounted ({_motion_text(X)})", advice, 2.0)
-
-
-def _motion_text(X: Float64[Tensor, "rows 4 4"]) -> str:
-    """Say how far the farthest of some transforms shifts and turns."""
-    shift = length_text(float(X[:, :3, 3].norm(dim=-1).max()))
+def _moved(kind: str, X: Float64[Tensor, "rows 4 4"]) -> Cause:
+    """Say that the "frame" or the "tool" has moved, and how far the farthest of some transforms shifts and turns."""
+    clause, advice = _MOVED[kind]
+    motion = f"shifted by {length_text(float(X[:, :3, 3].norm(dim=-1).max()))}"
     turn = float(torch.rad2deg(rotation_vector(X[:, :3, :3]).norm(dim=-1)).max())
-    return f"shifted by {shift}" + (f", turned by {turn:.3g} deg" if turn > 1e-9 else "")
+    motion += f", turned by {turn:.3g} deg" if turn > 1e-9 else ""
+    return Cause(kind, f"{clause} ({motion})", advice, 2.0)
 
 
 def _nominal_error(nominal: CalibratedModel, some: Measurements, other: _Hypothesis) -> float:

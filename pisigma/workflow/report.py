@@ -11,8 +11,8 @@ from pisigma.judging.progress import Progress
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model
 from pisigma.reporting.page.content import ReportContent, report_content
-from pisigma.reporting.page.figures import check_figures, write_figures
-from pisigma.reporting.page.page import ReportFigures, draw_figures, render_page
+from pisigma.reporting.page.figures import ReportFigures, check_figures, draw_figures, write_figures
+from pisigma.reporting.page.page import render_page
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,6 +20,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocato
 
 from pisigma.errors import OutputError
 from pisigma.judging.validation_figures import LearningPoint
+from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.corrections import CorrectionCurve, Correlations
 from pisigma.reporting.page.dependence import Dependence, binned
 from pisigma.reporting.page.error_map import ErrorMap
@@ -84,6 +85,30 @@ class Drawing:
         return stream.getvalue()
 
 
+@dataclass(frozen=True, eq=False)
+class ReportFigures:
+    """Drawings of a report.
+
+    Attributes:
+        map: from above and from the side.
+        dependences: over joint values, order, payload and temperature.
+        correlations: of lengths and of angles.
+        corrections: of every joint.
+        learning_curve: none or one.
+    """
+
+    map: Drawing
+    dependences: tuple[Drawing, ...]
+    correlations: tuple[Drawing, ...]
+    corrections: tuple[Drawing, ...]
+    learning_curve: tuple[Drawing, ...]
+
+    @property
+    def all(self) -> tuple[Drawing, ...]:
+        """Every one of them."""
+        return (self.map, *self.dependences, *self.correlations, *self.corrections, *self.learning_curve)
+
+
 @contextmanager
 def drawing_style() -> Iterator[None]:
     """The style of all figures; characters that no font has are no reason to complain."""
@@ -132,6 +157,18 @@ def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
             f"{folder}: cannot be written ({problem.strerror}); choose another --figures."
         ) from None
     return written
+
+
+def draw_figures(content: ReportContent) -> ReportFigures:
+    """Draw what a report shows."""
+    points = content.learning_curve
+    return ReportFigures(
+        map=draw_map(content.map),
+        dependences=tuple(map(draw_dependence, content.dependences)),
+        correlations=draw_correlations(content.parameters.correlations),
+        corrections=tuple(map(draw_correction, content.curves)),
+        learning_curve=(draw_learning_curve(points),) if len(points) > 1 else (),
+    )
 
 
 def draw_dependence(dependence: Dependence) -> Drawing:

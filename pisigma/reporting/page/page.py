@@ -3,7 +3,6 @@
 import base64
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib.resources import files
 from typing import Any
 
@@ -16,56 +15,13 @@ from pisigma.reporting.calibration_tables import PARAMETER_COLUMNS
 from pisigma.reporting.page.accuracy import LABELS, Accuracy
 from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.error_map import ErrorMap
-from pisigma.reporting.page.figures import (
-    Drawing,
-    draw_correction,
-    draw_correlations,
-    draw_dependence,
-    draw_learning_curve,
-    draw_map,
-)
+from pisigma.reporting.page.figures import Drawing, ReportFigures
 from pisigma.reporting.tables import figure_text
 from pisigma.robot.description import Robot
 
 _ESCAPED = {ord(mark): f"\\u{ord(mark):04x}" for mark in "<>&\u2028\u2029"}
 _PACKAGE = "pisigma.reporting.page"
 _STATISTICS = (("mean", "mean"), ("rms", "RMS"), ("p95", "95 %"), ("max", "maximum"))
-
-
-@dataclass(frozen=True, eq=False)
-class ReportFigures:
-    """Drawings of a report.
-
-    Attributes:
-        map: from above and from the side.
-        dependences: over joint values, order, payload and temperature.
-        correlations: of lengths and of angles.
-        corrections: of every joint.
-        learning_curve: none or one.
-    """
-
-    map: Drawing
-    dependences: tuple[Drawing, ...]
-    correlations: tuple[Drawing, ...]
-    corrections: tuple[Drawing, ...]
-    learning_curve: tuple[Drawing, ...]
-
-    @property
-    def all(self) -> tuple[Drawing, ...]:
-        """Every one of them."""
-        return (self.map, *self.dependences, *self.correlations, *self.corrections, *self.learning_curve)
-
-
-def draw_figures(content: ReportContent) -> ReportFigures:
-    """Draw what a report shows."""
-    points = content.learning_curve
-    return ReportFigures(
-        map=draw_map(content.map),
-        dependences=tuple(map(draw_dependence, content.dependences)),
-        correlations=draw_correlations(content.parameters.correlations),
-        corrections=tuple(map(draw_correction, content.curves)),
-        learning_curve=(draw_learning_curve(points),) if len(points) > 1 else (),
-    )
 
 
 def render_page(content: ReportContent, figures: ReportFigures) -> str:

@@ -8,7 +8,8 @@ from testing.models import no_type_checker
 from testing.report import HOSTILE, hybrid_under_test, measured
 
 from pisigma.reporting.page.content import report_content
-from pisigma.reporting.page.page import draw_figures, render_page
+from pisigma.reporting.page.figures import draw_figures
+from pisigma.reporting.page.page import render_page
 
 OPTIONS = (
     "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
