@@ -218,11 +218,6 @@ class Description(NamedTuple):
 
 
 PARTS: dict[str, Any] = {
-    "arms": Arms,
-    "correction": Correction,
-    "coverage": Coverage,
-    "network": Network,
-    "closed_form": ClosedForm,
-    "starts": Starts,
+    part: kind for part, kind in Description.__annotations__.items() if part != "features"
 }
 """The parts of a description by name."""

@@ -1,15 +1,13 @@
 """Forward kinematics and joint Jacobian of one arm, at one place and at many, on plain numbers."""
 
 import math
-from typing import Any, no_type_check
+from typing import no_type_check
 
 from numba import njit
 
 from pisigma.kernels.arrays import FIXED, REVOLUTE
 from pisigma.kernels.layout import LANES
-
-Array = Any
-Record = Any
+from pisigma.kernels.rows import Array, Record
 
 
 @njit(error_model="numpy", fastmath={"contract"})

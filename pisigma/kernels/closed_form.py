@@ -4,16 +4,14 @@ The formulas and the order of the branches are those of `pisigma.kinematics.clos
 """
 
 import math
-from typing import Any, no_type_check
+from typing import no_type_check
 
 from numba import njit
 
 from pisigma.kernels.arrays import SCARA, SPHERICAL_WRIST, THREE_PARALLEL
 from pisigma.kernels.rotations import wrap
+from pisigma.kernels.rows import Array, Record
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE, TILT_TOLERANCE, TRIANGLE_MARGIN
-
-Array = Any
-Record = Any
 
 
 @njit(error_model="numpy")

@@ -1,12 +1,11 @@
 """Damped least-squares steps and the distance from a singularity, on plain numbers."""
 
 import math
-from typing import Any, no_type_check
+from typing import no_type_check
 
 from numba import njit
 
-Array = Any
-Record = Any
+from pisigma.kernels.rows import Array, Record
 
 _FLOOR = 4 * 2.220446049250313e-16
 _SWEEPS = 30

@@ -1,22 +1,11 @@
 """Corrected inverse kinematics of one pose, on plain numbers: what `correction.corrected_ik` does for batches."""
 
 import math
-from typing import Any, no_type_check
+from typing import no_type_check
 
 from numba import njit
 
-from pisigma.kernels.arrays import (
-    BLENDED,
-    GEOMETRIC,
-    HYBRID,
-    NO_CLOSED_FORM,
-    NOMINAL,
-    OUTSIDE_DOMAIN,
-    OUTSIDE_LIMITS,
-    REACHED,
-    SINGULAR,
-    UNREACHABLE,
-)
+from pisigma.kernels import arrays
 from pisigma.kernels.closed_form import all_branches, nearest_turn, wrap_into_limits
 from pisigma.kernels.damped_step import is_singular
 from pisigma.kernels.motion import move
@@ -24,19 +13,8 @@ from pisigma.kernels.network import add_correction, choose_corrected, finish_cor
 from pisigma.kernels.newton import newton, search
 from pisigma.kernels.recovery import branch_of, nearest_starts, recover, within_reach
 from pisigma.kernels.rotations import pose_error, wrap
-from pisigma.kernels.rows import copy, fill
-from pisigma.kinematics.tolerances import (
-    ACCEPTED,
-    AWAY,
-    LARGEST_CORRECTION,
-    LIMIT_TOLERANCE,
-    MORE_ATTEMPTS,
-    SINGULAR_TOLERANCE,
-    TOLERANCE,
-)
-
-Array = Any
-Record = Any
+from pisigma.kernels.rows import Array, Record, copy, fill
+from pisigma.kinematics import tolerances
 
 
 @njit(error_model="numpy")
@@ -60,7 +38,7 @@ def solve_pose(description: Record, memory: Record, has_near: bool, branch: int,
         return
     if not within_reach(description, memory.pose):
         pass
-    elif form.kind == NO_CLOSED_FORM:
+    elif form.kind == arrays.NO_CLOSED_FORM:
         chosen = 0 if _solve_without_branches(description, memory, has_near) else -1
     else:
         free = has_near and branch < 0
@@ -82,12 +60,12 @@ def _solve_by_network(
 ) -> None:
     """The same where a network corrects the nominal joint values."""
     chosen, inside = choose_corrected(description, memory, has_near, branch, wanted)
-    numeric = description.closed_form.kind == NO_CLOSED_FORM and within_reach(description, memory.pose)
+    numeric = description.closed_form.kind == arrays.NO_CLOSED_FORM and within_reach(description, memory.pose)
     if numeric and _solve_without_branches(description, memory, has_near):
         copy(memory.solution, memory.nominal)
         chosen, inside = 0, add_correction(description, memory, has_near)
     fill(out, math.nan)
-    status = UNREACHABLE
+    status = arrays.UNREACHABLE
     if chosen >= 0:
         status = finish_corrected(description, memory, chosen, inside, out)
     _write(description, memory, chosen >= 0, status, wanted if chosen < 0 else chosen, out)
@@ -161,7 +139,7 @@ def _solve_nearest(description: Record, memory: Record) -> int:
     while True:
         branch, distance = _nearest(description, memory)
         if branch < 0 or (
-            best_rank == 0 and math.sqrt(distance) - LARGEST_CORRECTION > math.sqrt(best_distance)
+            best_rank == 0 and math.sqrt(distance) - tolerances.LARGEST_CORRECTION > math.sqrt(best_distance)
         ):
             break
         others[branch, 0] = math.nan
@@ -187,7 +165,7 @@ def _continue(description: Record, memory: Record, chosen: int) -> int:
         wrap_into_limits(arms, memory.trial)
         nearest_turn(arms, memory.trial, memory.near, True)
         off = math.sqrt(_distance(arms, memory.trial, memory.near))
-    if off <= AWAY:
+    if off <= tolerances.AWAY:
         return chosen
     copy(memory.near, memory.q)
     if not search(description, memory, memory.pose, memory.q):
@@ -208,12 +186,12 @@ def _continue(description: Record, memory: Record, chosen: int) -> int:
 @no_type_check
 def _solve_nominal(description: Record, memory: Record) -> None:
     """Write joint values of the nominal arm near `memory.q` into `memory.nominal`, NaN where there are none."""
-    newton(description, memory, NOMINAL, memory.pose, memory.q, TOLERANCE)
+    newton(description, memory, arrays.NOMINAL, memory.pose, memory.q, tolerances.TOLERANCE)
     square = 0.0
     for i in range(6):
         square += memory.best[i] ** 2
     fill(memory.nominal, math.nan)
-    if square < ACCEPTED * ACCEPTED:
+    if square < tolerances.ACCEPTED * tolerances.ACCEPTED:
         copy(memory.q, memory.nominal)
 
 
@@ -249,7 +227,7 @@ def _solve_without_branches(description: Record, memory: Record, has_near: bool)
 
     The first that leads there inside the joint limits is taken, else the first that leads there.
     """
-    count, reached = nearest_starts(description, memory, memory.pose, MORE_ATTEMPTS), False
+    count, reached = nearest_starts(description, memory, memory.pose, tolerances.MORE_ATTEMPTS), False
     for attempt in range(-1 if has_near else 0, count):
         if attempt < 0:
             copy(memory.near, memory.q)
@@ -283,12 +261,12 @@ def finish(
         inside, reached = _choose_turns(description, memory, has_near)
     if not reached:
         out[place], out[place + 1], out[place + 2] = math.nan, math.nan, math.nan
-        return False, UNREACHABLE
+        return False, arrays.UNREACHABLE
     fresh, share = True, memory.share
     for j in range(arms.dof):
         fresh = fresh and memory.checked[j] == q[j]
     if not fresh:
-        share = move(description, memory, BLENDED if arms.hybrid else GEOMETRIC, q)
+        share = move(description, memory, arrays.BLENDED if arms.hybrid else arrays.GEOMETRIC, q)
         pose_error(memory.pose, memory.T, memory.R, memory.error)
     e = memory.error
     out[place] = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
@@ -296,11 +274,11 @@ def finish(
     out[place + 2] = 2 - share if arms.hybrid else math.nan
     nearest_turn(arms, memory.nominal, q, False)
     if not inside:
-        return True, OUTSIDE_LIMITS
-    reach = arms.reach[HYBRID if arms.hybrid else GEOMETRIC]
-    if is_singular(arms, reach, memory.J, SINGULAR_TOLERANCE, memory):
-        return True, SINGULAR
-    return True, OUTSIDE_DOMAIN if share < 1.0 else REACHED
+        return True, arrays.OUTSIDE_LIMITS
+    reach = arms.reach[arrays.HYBRID if arms.hybrid else arrays.GEOMETRIC]
+    if is_singular(arms, reach, memory.J, tolerances.SINGULAR_TOLERANCE, memory):
+        return True, arrays.SINGULAR
+    return True, arrays.OUTSIDE_DOMAIN if share < 1.0 else arrays.REACHED
 
 
 @njit(error_model="numpy")
@@ -322,6 +300,7 @@ def _choose_turns(description: Record, memory: Record, has_near: bool) -> tuple[
         return inside, False
     nearest_turn(arms, memory.q, q, False)
     copy(memory.q, q)
+    slack = tolerances.LIMIT_TOLERANCE
     for j in range(arms.dof):
-        inside = inside and arms.limits[j, 0] - LIMIT_TOLERANCE <= q[j] <= arms.limits[j, 1] + LIMIT_TOLERANCE
+        inside = inside and arms.limits[j, 0] - slack <= q[j] <= arms.limits[j, 1] + slack
     return inside, True

@@ -8,9 +8,7 @@ from numba import njit
 
 from pisigma.kernels.arrays import DRAWN, FIXED, REVOLUTE
 from pisigma.kernels.features import FORMS
-
-Array = Any
-Record = Any
+from pisigma.kernels.rows import Array, Record
 
 
 def _chained(functions: Iterable[Callable[..., None] | None]) -> Any:

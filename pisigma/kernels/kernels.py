@@ -5,27 +5,13 @@ from typing import Any, no_type_check
 
 from numba import carray, njit  # type: ignore[attr-defined]
 
-from pisigma.kernels.arrays import (
-    BLENDED,
-    EVALUATE,
-    EVERY_BRANCH,
-    FINE,
-    INVALID,
-    LAST_ROW,
-    LEFT_HANDED,
-    NEAR_NOT_FINITE,
-    NOT_FINITE,
-    NOT_ORTHONORMAL,
-    SOLVE,
-)
+from pisigma.kernels import arrays
 from pisigma.kernels.chain import walk_many
 from pisigma.kernels.inverse import solve_pose
 from pisigma.kernels.motion import correct, covered, move
-from pisigma.kernels.rows import fill
+from pisigma.kernels.rows import Array, Record, fill
 from pisigma.kinematics.tolerances import POSE_TOLERANCE, POSE_TOLERANCE_SINGLE, ROUNDINGS
 
-Array = Any
-Record = Any
 Pointer = Any
 
 _EPSILON, _EPSILON_SINGLE = 2.220446049250313e-16, 1.1920928955078125e-07
@@ -73,15 +59,15 @@ def run(
     arm, work = carray(description, 1)[0], carray(memory, 1)[0]
     dof = arm.arms.dof
     poses, joints = carray(T, (rows, 4, 4)), carray(near, (near_rows, dof))
-    if task == SOLVE:
+    if task == arrays.SOLVE:
         sides = carray(approach, (approach_rows, dof))
         solutions = carray(out, (rows, count, 2 * dof + 5))
         return solve_poses(arm, work, poses, joints, sides, branch, mark != 0, single != 0, solutions)
-    if task == EVALUATE:
+    if task == arrays.EVALUATE:
         sides = carray(approach, (approach_rows, dof))
         return evaluate(arm, work, branch, joints, sides, poses, carray(out, (rows, 7 * dof + 1)))
     walk_many(arm.arms, branch, work, joints, poses, carray(out, (rows * count, 6, dof)))
-    return FINE
+    return arrays.FINE
 
 
 @njit(error_model="numpy")
@@ -108,21 +94,21 @@ def solve_poses(
         wrong = _check_pose(T[row], tolerance)
         if has_near:
             _take_row(near, row, memory.near, dof)
-            if wrong == FINE:
+            if wrong == arrays.FINE:
                 wrong = _check_near(memory.near, dof)
         _take_approach(approach, row, memory.approach, dof)
-        if wrong != FINE and not mark:
+        if wrong != arrays.FINE and not mark:
             return 8 * row + wrong
         for i in range(4):
             for k in range(4):
                 memory.pose[i, k] = T[row, i, k]
         for index in range(out.shape[1]):
-            asked = index if branch == EVERY_BRANCH else branch
-            if wrong == FINE:
+            asked = index if branch == arrays.EVERY_BRANCH else branch
+            if wrong == arrays.FINE:
                 solve_pose(description, memory, has_near, asked, out[row, index])
             else:
                 _mark(description, asked, out[row, index])
-    return FINE
+    return arrays.FINE
 
 
 @njit(error_model="numpy")
@@ -152,19 +138,19 @@ def _check_pose(T: Array, tolerance: float) -> int:
         for k in range(4):
             total += T[i, k] * 0.0
     if total != 0.0:
-        return NOT_FINITE
+        return arrays.NOT_FINITE
     for k in range(4):
         if abs(T[3, k] - (1.0 if k == 3 else 0.0)) > tolerance:
-            return LAST_ROW
+            return arrays.LAST_ROW
     for i in range(3):
         for k in range(i + 1):
             product = T[0, i] * T[0, k] + T[1, i] * T[1, k] + T[2, i] * T[2, k]
             if abs(product - (1.0 if i == k else 0.0)) > tolerance:
-                return NOT_ORTHONORMAL
+                return arrays.NOT_ORTHONORMAL
     x = T[1, 0] * T[2, 1] - T[2, 0] * T[1, 1]
     y = T[2, 0] * T[0, 1] - T[0, 0] * T[2, 1]
     z = T[0, 0] * T[1, 1] - T[1, 0] * T[0, 1]
-    return FINE if x * T[0, 2] + y * T[1, 2] + z * T[2, 2] > 0 else LEFT_HANDED
+    return arrays.FINE if x * T[0, 2] + y * T[1, 2] + z * T[2, 2] > 0 else arrays.LEFT_HANDED
 
 
 @njit(error_model="numpy")
@@ -173,7 +159,7 @@ def _check_near(near: Array, dof: int) -> int:
     total = 0.0
     for j in range(dof):
         total += near[j] * 0.0
-    return FINE if total == 0.0 else NEAR_NOT_FINITE
+    return arrays.FINE if total == 0.0 else arrays.NEAR_NOT_FINITE
 
 
 @njit(error_model="numpy")
@@ -181,7 +167,7 @@ def _check_near(near: Array, dof: int) -> int:
 def _mark(description: Record, branch: int, out: Array) -> None:
     """Say that there is no pose to solve for."""
     fill(out, math.nan)
-    out[out.shape[0] - 2] = INVALID
+    out[out.shape[0] - 2] = arrays.INVALID
     out[out.shape[0] - 1] = description.closed_form.order[0] if branch < 0 else branch
 
 
@@ -197,7 +183,7 @@ def evaluate(
             memory.q[j] = q[row, j]
         _take_approach(approach, row, memory.approach, dof)
         fill(out[row], 0.0)
-        if arm == BLENDED:
+        if arm == arrays.BLENDED:
             correct(description, memory, memory.q)
             for j in range(dof):
                 out[row, 6 * dof + j] = memory.delta[j]
@@ -210,4 +196,4 @@ def evaluate(
         for i in range(6):
             for j in range(dof):
                 out[row, i * dof + j] = memory.J[i, j]
-    return FINE
+    return arrays.FINE

@@ -40,12 +40,7 @@ _ARMS = _integers(dof=(), rows_used=(), hybrid=(), kind=(ROWS,), revolute=(DOF,)
     rows=(4, ROWS, 9), ends=(4, 2, 3, 4), reach=(4,), direction=(DOF,), limits=(DOF, 2)
 )
 _CORRECTION = _integers(
-    inputs=(),
-    products=(),
-    frames=(),
-    periodic=(),
-    orders=(UNITS,),
-    first=(MOST_KINDS,),
+    inputs=(), products=(), frames=(), periodic=(), orders=(UNITS,), first=(MOST_KINDS,)
 ) + _floats(
     rate=(DOF,),
     middle=(DOF,),
@@ -88,16 +83,8 @@ _CLOSED_FORM = _integers(kind=(), branches=(), trained=(), order=(BRANCHES,)) + 
 )
 _STARTS = _integers(count=()) + _floats(q=(STARTS, DOF), points=(STARTS, 12), lever=())
 
-DESCRIPTION = np.dtype(
-    [
-        ("arms", np.dtype(_ARMS)),
-        ("correction", np.dtype(_CORRECTION)),
-        ("coverage", np.dtype(_COVERAGE)),
-        ("network", np.dtype(_NETWORK)),
-        ("closed_form", np.dtype(_CLOSED_FORM)),
-        ("starts", np.dtype(_STARTS)),
-    ]
-)
+_STRUCTS = (_ARMS, _CORRECTION, _COVERAGE, _NETWORK, _CLOSED_FORM, _STARTS)
+DESCRIPTION = np.dtype([(part, np.dtype(fields)) for part, fields in zip(PARTS, _STRUCTS, strict=True)])
 """What kernels know of an arm: the fields of `compiled.arrays`, and counts."""
 
 MEMORY = np.dtype(
@@ -142,9 +129,7 @@ MEMORY = np.dtype(
         lane_axes=(DOF, 6, LANES),  # directions and origins of the joints
         seen=(SEEN,),  # scaled inputs of a network
         angles=(3,),  # roll, pitch and yaw
-        distance=(
-            SAMPLES,
-        ),  # squared, of scaled inputs from the rows of a domain, or of poses from stored ones
+        distance=(SAMPLES,),  # squared, of scaled inputs from rows of a domain, or of poses from stored ones
     )
     + _integers(nearest=(128,))  # stored starts
 )
@@ -164,7 +149,7 @@ def pack(description: Description, name: str, features: Sequence[str] = ()) -> n
     """
     packed = np.zeros(1, DESCRIPTION)
     for part, kind in PARTS.items():
-        for field in set(kind._fields) & set(packed[part].dtype.names or ()):
+        for field in (name for name in kind._fields if name in (packed[part].dtype.names or ())):
             value = np.asarray(getattr(getattr(description, part), field))
             room = packed[part][field][0]
             if value.ndim != np.ndim(room) or any(

@@ -1,7 +1,7 @@
 """Where the tool of an arm is and how it moves, with the correction and its fading, on plain numbers."""
 
 import math
-from typing import Any, no_type_check
+from typing import no_type_check
 
 from numba import njit
 
@@ -9,9 +9,7 @@ from pisigma.kernels.arrays import BLENDED, GEOMETRIC, HYBRID
 from pisigma.kernels.chain import jacobian, walk
 from pisigma.kernels.joint_correction import joint_correction
 from pisigma.kernels.rotations import rotation_from_vector, rotation_vector
-
-Array = Any
-Record = Any
+from pisigma.kernels.rows import Array, Record
 
 
 @njit(error_model="numpy")

@@ -4,35 +4,18 @@ The formulas are those of `network.correction_network` and `correction.domain`, 
 """
 
 import math
-from typing import Any, no_type_check
+from typing import no_type_check
 
 from numba import njit
 
-from pisigma.kernels.arrays import (
-    ANGLE,
-    NO_CLOSED_FORM,
-    NOMINAL,
-    OUTSIDE_DOMAIN,
-    OUTSIDE_LIMITS,
-    REACHED,
-    SINE,
-    SINGULAR,
-)
+from pisigma.kernels import arrays
 from pisigma.kernels.chain import walk
 from pisigma.kernels.closed_form import all_branches, nearest_turn, wrap_into_limits
 from pisigma.kernels.damped_step import is_singular
 from pisigma.kernels.motion import move
 from pisigma.kernels.rotations import pose_error
-from pisigma.kernels.rows import copy
-from pisigma.kinematics.tolerances import (
-    FORWARD_ACCEPTED,
-    FORWARD_ITERATIONS,
-    FORWARD_TOLERANCE,
-    SINGULAR_TOLERANCE,
-)
-
-Array = Any
-Record = Any
+from pisigma.kernels.rows import Array, Record, copy
+from pisigma.kinematics import tolerances
 
 
 @njit(error_model="numpy")
@@ -75,7 +58,7 @@ def _input(description: Record, memory: Record, T: Array, q: Array, index: int) 
     source = net.source[index]
     if source < 3:
         return T[source, 3]
-    if source < ANGLE:
+    if source < arrays.ANGLE:
         group = 0
         while index >= net.first[group + 1]:
             group += 1
@@ -84,9 +67,9 @@ def _input(description: Record, memory: Record, T: Array, q: Array, index: int) 
     angle = 0.0
     for j in range(description.arms.dof):
         angle += net.factors[index, j] * q[j]
-    if source == ANGLE:
+    if source == arrays.ANGLE:
         return angle
-    return math.sin(angle) if source == SINE else math.cos(angle)
+    return math.sin(angle) if source == arrays.SINE else math.cos(angle)
 
 
 @njit(error_model="numpy")
@@ -153,7 +136,7 @@ def choose_corrected(
         Index of the branch, -1 where none reaches the pose, and whether it does so inside the limits.
     """
     arms, form = description.arms, description.closed_form
-    if form.kind == NO_CLOSED_FORM:
+    if form.kind == arrays.NO_CLOSED_FORM:
         return -1, False
     only = -1 if branch < 0 else branch
     all_branches(arms, form, memory.pose, only, memory.rounding, memory.wanted, memory.branches)
@@ -207,15 +190,15 @@ def finish_corrected(description: Record, memory: Record, branch: int, inside: b
     out[place + 2] = measure
     _settle(description, memory, out)
     if not inside:
-        return OUTSIDE_LIMITS
-    move(description, memory, NOMINAL, memory.nominal)
-    if is_singular(arms, arms.reach[NOMINAL], memory.J, SINGULAR_TOLERANCE, memory):
-        return SINGULAR
+        return arrays.OUTSIDE_LIMITS
+    move(description, memory, arrays.NOMINAL, memory.nominal)
+    if is_singular(arms, arms.reach[arrays.NOMINAL], memory.J, tolerances.SINGULAR_TOLERANCE, memory):
+        return arrays.SINGULAR
     trained = False
     for index in range(form.trained):
         trained = trained or form.order[index] == branch
     covered = description.network.samples == 0 or (measure <= 1 and trained)
-    return REACHED if covered else OUTSIDE_DOMAIN
+    return arrays.REACHED if covered else arrays.OUTSIDE_DOMAIN
 
 
 @njit(error_model="numpy")
@@ -227,20 +210,20 @@ def _settle(description: Record, memory: Record, out: Array) -> None:
     """
     arms, q, place, moved = description.arms, memory.trial, 2 * description.arms.dof, 0.0
     copy(memory.nominal, q)
-    for _ in range(FORWARD_ITERATIONS):
-        walk(arms, NOMINAL, q, memory.axes, memory.T)
+    for _ in range(tolerances.FORWARD_ITERATIONS):
+        walk(arms, arrays.NOMINAL, q, memory.axes, memory.T)
         network_correction(description, memory, memory.T, q)
         moved = 0.0
         for j in range(arms.dof):
             following = memory.solution[j] - memory.delta[j]
             moved = max(moved, abs(following - q[j]))
             q[j] = following
-        if moved <= FORWARD_TOLERANCE:
+        if moved <= tolerances.FORWARD_TOLERANCE:
             break
     out[place], out[place + 1] = math.nan, math.nan
-    if not moved <= FORWARD_ACCEPTED:
+    if not moved <= tolerances.FORWARD_ACCEPTED:
         return
-    walk(arms, NOMINAL, q, memory.axes, memory.T)
+    walk(arms, arrays.NOMINAL, q, memory.axes, memory.T)
     pose_error(memory.pose, memory.T, memory.R, memory.error)
     e = memory.error
     out[place] = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])

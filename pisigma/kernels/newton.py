@@ -1,7 +1,7 @@
 """Damped Newton from a start to a pose, on plain numbers."""
 
 import math
-from typing import Any, no_type_check
+from typing import no_type_check
 
 from numba import njit
 
@@ -10,22 +10,8 @@ from pisigma.kernels.damped_step import damped_step, scaled_square
 from pisigma.kernels.joint_correction import correction_slope
 from pisigma.kernels.motion import correct, move
 from pisigma.kernels.rotations import pose_error
-from pisigma.kernels.rows import copy, copy_rows, fill
-from pisigma.kinematics.tolerances import (
-    ACCEPTED,
-    DAMPING_DOWN,
-    DAMPING_UP,
-    FIRST_DAMPING,
-    HYBRID_TOLERANCE,
-    ITERATIONS,
-    LEAST_DAMPING,
-    MOST_DAMPING,
-    NEARLY,
-    TOLERANCE,
-)
-
-Array = Any
-Record = Any
+from pisigma.kernels.rows import Array, Record, copy, copy_rows, fill
+from pisigma.kinematics import tolerances
 
 _CLOSE, _LAST, _SETTLED = 0.05, 1e-15, 3e-12
 """Squared errors [reach or rad]: from _CLOSE**2 on quick steps are tried; below _LAST one more step is exact.
@@ -59,9 +45,9 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
     _steepen(description, memory, arm, q, share)
     pose_error(T, memory.T, memory.R, memory.best)
     copy_rows(memory.J, memory.J_best)
-    old, damping = scaled_square(reach, memory.best), FIRST_DAMPING
-    for _ in range(ITERATIONS):
-        if _within(memory.best, tolerance, tolerance) or damping > MOST_DAMPING:
+    old, damping = scaled_square(reach, memory.best), tolerances.FIRST_DAMPING
+    for _ in range(tolerances.ITERATIONS):
+        if _within(memory.best, tolerance, tolerance) or damping > tolerances.MOST_DAMPING:
             break
         possible = damped_step(arms, reach, memory.J_best, memory.best, damping, memory)
         new = math.inf
@@ -77,9 +63,9 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
             copy(memory.trial, q)
             copy(memory.error, memory.best)
             copy_rows(memory.J, memory.J_best)
-            damping = max(damping * DAMPING_DOWN, LEAST_DAMPING)
+            damping = max(damping * tolerances.DAMPING_DOWN, tolerances.LEAST_DAMPING)
         else:
-            damping *= DAMPING_UP
+            damping *= tolerances.DAMPING_UP
 
 
 @njit(error_model="numpy")
@@ -110,13 +96,13 @@ def search(description: Record, memory: Record, T: Array, q: Array) -> bool:
         if _quick(description, memory, T, q):
             return True
         copy(memory.start, q)
-    newton(description, memory, GEOMETRIC, T, q, TOLERANCE)
+    newton(description, memory, GEOMETRIC, T, q, tolerances.TOLERANCE)
     if not arms.hybrid:
-        return _within(memory.best, ACCEPTED, ACCEPTED)
-    if not _within(memory.best, NEARLY * arms.reach[GEOMETRIC], NEARLY):
+        return _within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)
+    if not _within(memory.best, tolerances.NEARLY * arms.reach[GEOMETRIC], tolerances.NEARLY):
         return False
-    newton(description, memory, BLENDED, T, q, HYBRID_TOLERANCE)
-    return _within(memory.best, ACCEPTED, ACCEPTED)
+    newton(description, memory, BLENDED, T, q, tolerances.HYBRID_TOLERANCE)
+    return _within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)
 
 
 @njit(error_model="numpy")
@@ -134,7 +120,7 @@ def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
     if not arms.hybrid:
         move(description, memory, GEOMETRIC, q)
         pose_error(T, memory.T, memory.R, memory.error)
-        return _checked(memory, q, 1.0, TOLERANCE * 4)
+        return _checked(memory, q, 1.0, tolerances.TOLERANCE * 4)
     copy(q, memory.trial)
     before = 1.0
     for attempt in range(20):
@@ -154,7 +140,7 @@ def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
     if share < 1.0:
         return False
     pose_error(T, memory.T, memory.R, memory.error)
-    return _checked(memory, q, share, ACCEPTED)
+    return _checked(memory, q, share, tolerances.ACCEPTED)
 
 
 @njit(error_model="numpy")
@@ -182,7 +168,7 @@ def _converge(description: Record, memory: Record, arm: int, T: Array, q: Array)
             return square < 1e-26
         if square < 1e-30:
             return True
-        if not damped_step(arms, reach, memory.J, memory.error, FIRST_DAMPING, memory):
+        if not damped_step(arms, reach, memory.J, memory.error, tolerances.FIRST_DAMPING, memory):
             return False
         for j in range(dof):
             q[j] += memory.step[j]

@@ -1,7 +1,7 @@
 """Poses that the calibrated arm reaches and the nominal one does not, on plain numbers."""
 
 import math
-from typing import Any, no_type_check
+from typing import no_type_check
 
 from numba import njit
 
@@ -10,11 +10,8 @@ from pisigma.kernels.chain import walk
 from pisigma.kernels.closed_form import all_branches
 from pisigma.kernels.newton import search
 from pisigma.kernels.rotations import wrap
-from pisigma.kernels.rows import copy, fill
+from pisigma.kernels.rows import Array, Record, copy, fill
 from pisigma.kinematics.tolerances import ATTEMPTS, PULL, REACH_ROUNDING
-
-Array = Any
-Record = Any
 
 
 @njit(error_model="numpy")

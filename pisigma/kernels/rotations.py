@@ -1,11 +1,11 @@
 """Rotation vectors and pose differences on plain numbers; the formulas of `pisigma.se3`."""
 
 import math
-from typing import Any, no_type_check
+from typing import no_type_check
 
 from numba import njit
 
-Array = Any
+from pisigma.kernels.rows import Array
 
 
 @njit(error_model="numpy")

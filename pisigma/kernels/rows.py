@@ -8,6 +8,9 @@ from typing import Any, no_type_check
 from numba import njit
 
 Array = Any
+"""Numbers: an array, or a field of a record that is one."""
+Record = Any
+"""One of the structs of `kernels.layout`, or a part of one."""
 
 
 @njit(error_model="numpy")

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from pisigma.errors import PoseError
+from pisigma.kinematics import tolerances
 from pisigma.kinematics.jacobian import joint_jacobian
 from pisigma.kinematics.joint_limits import wrap_into_limits
 from pisigma.kinematics.singularity import (
@@ -18,16 +19,6 @@ from pisigma.kinematics.singularity import (
     smallest_singular_value,
 )
 from pisigma.kinematics.status import Status
-from pisigma.kinematics.tolerances import (
-    DAMPING_DOWN,
-    DAMPING_UP,
-    FIRST_DAMPING,
-    ITERATIONS,
-    LEAST_DAMPING,
-    MOST_DAMPING,
-    SINGULAR_TOLERANCE,
-    TOLERANCE,
-)
 from pisigma.robot.description import Robot
 from pisigma.se3 import check_transforms, pose_error
 
@@ -91,7 +82,7 @@ def solve_numeric(
     start: Float[Tensor, "*starts dof"],
     *,
     tolerance: float | None = None,
-    max_iterations: int = ITERATIONS,
+    max_iterations: int = tolerances.ITERATIONS,
     motion: Motion | None = None,
 ) -> NumericSolution:
     """Joint values near a start that take the tool to the poses.
@@ -121,7 +112,7 @@ def solve_numeric(
     check_transforms(T, "T_base_tool")
     _check_start(robot, T, start)
     if tolerance is None:
-        tolerance = TOLERANCE if T.dtype == torch.float64 else 1e-5
+        tolerance = tolerances.TOLERANCE if T.dtype == torch.float64 else 1e-5
     batch = np.broadcast_shapes(T.shape[:-2], start.shape[:-1])
     T_flat = T.detach().expand(*batch, 4, 4).reshape(-1, 4, 4)
     with torch.no_grad():
@@ -132,7 +123,7 @@ def solve_numeric(
             if active.numel() == 0:
                 break
             _iterate(robot, moving, T_flat, state, active)
-            stalled = state.damping[active] > MOST_DAMPING
+            stalled = state.damping[active] > tolerances.MOST_DAMPING
             active = active[~(state.converged(tolerance)[active] | stalled)]
         return _finish(robot, state, tolerance, batch)
 
@@ -158,7 +149,7 @@ def _check_start(robot: Robot, T: Tensor, start: Tensor) -> None:
 
 def _begin(motion: Motion, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]) -> _Iterate:
     T_now, J = motion(q)
-    damping = torch.full_like(q[:, 0], FIRST_DAMPING)
+    damping = torch.full_like(q[:, 0], tolerances.FIRST_DAMPING)
     return _Iterate(
         q.clone(), pose_error(T, T_now), J.clone(), damping, torch.ones_like(damping, dtype=torch.int64)
     )
@@ -178,8 +169,8 @@ def _iterate(
     error = pose_error(T[active], T_trial)
     better = _scaled(robot, error).square().sum(-1) < old.square().sum(-1)
     state.iterations[active] += 1
-    factor = torch.where(better, DAMPING_DOWN, DAMPING_UP).to(state.damping)
-    state.damping[active] = (state.damping[active] * factor).clamp(min=LEAST_DAMPING)
+    factor = torch.where(better, tolerances.DAMPING_DOWN, tolerances.DAMPING_UP).to(state.damping)
+    state.damping[active] = (state.damping[active] * factor).clamp(min=tolerances.LEAST_DAMPING)
     kept = active[better]
     state.q[kept], state.error[kept], state.J[kept] = trial[better], error[better], J[better]
 
@@ -219,7 +210,7 @@ def damped_step(
 
 def _finish(robot: Robot, state: _Iterate, tolerance: float, batch: tuple[int, ...]) -> NumericSolution:
     q, inside = wrap_into_limits(robot, state.q)
-    singular_tolerance = SINGULAR_TOLERANCE if q.dtype == torch.float64 else 3e-3
+    singular_tolerance = tolerances.SINGULAR_TOLERANCE if q.dtype == torch.float64 else 3e-3
     singular = smallest_singular_value(robot, state.J) < singular_tolerance
     status = torch.where(singular, int(Status.SINGULAR), int(Status.REACHED))
     status = torch.where(inside, status, int(Status.OUTSIDE_JOINT_LIMITS))
