@@ -3,8 +3,9 @@
 import os
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -144,8 +145,7 @@ class CompiledIK:
                 f"T_base_tool has the shape {T.shape}; give one homogeneous transform of shape (4, 4)."
             )
         dof = len(self.joints)
-        beside = self._none if near is None else self._rows(near, (), "near", throw)
-        sides = self._none if approach is None else self._rows(approach, (), "approach", True)
+        beside, sides = self._rows(near, (), "near", throw), self._rows(approach, (), "approach", True)
         out = np.empty((1, 1, 2 * dof + 5))
         wrong = self._run(arrays.SOLVE, T, 0, 1, beside, sides, self._branch(branch), not throw, out)
         if wrong >= 0:
@@ -153,9 +153,8 @@ class CompiledIK:
         row = out[0, 0]
         position, rotation, measure, status, index = row[2 * dof :].tolist()
         q, nominal = row[:dof], row[dof : 2 * dof]
-        return Solution(
-            q, nominal, int(index), self.branches, int(status), position, rotation, measure, owner
-        )
+        index, status = int(index), int(status)
+        return Solution(q, nominal, index, self.branches, status, position, rotation, measure, owner)
 
     def solve_batch(
         self,
@@ -185,8 +184,7 @@ class CompiledIK:
         """
         T = self._poses(T_base_tool, throw)
         batch = T.shape[:-2]
-        beside = self._none if near is None else self._rows(near, batch, "near", throw)
-        sides = self._none if approach is None else self._rows(approach, batch, "approach", True)
+        beside, sides = self._rows(near, batch, "near", throw), self._rows(approach, batch, "approach", True)
         out = self._solve_rows(T, beside, sides, self._branch(branch), 1, threads, throw, single)
         return self._solution(out.reshape(*batch, out.shape[-1]), owner)
 
@@ -201,7 +199,7 @@ class CompiledIK:
     ) -> Solution:
         """Solutions `(*batch, branches)` of poses `(*batch, 4, 4)` on every branch; for the rest see `solve_batch`."""
         T = self._poses(T_base_tool, throw)
-        sides = self._none if approach is None else self._rows(approach, T.shape[:-2], "approach", True)
+        sides = self._rows(approach, T.shape[:-2], "approach", True)
         count = len(self.branches)
         out = self._solve_rows(T, self._none, sides, arrays.EVERY_BRANCH, count, threads, throw, single)
         return self._solution(out.reshape(*T.shape[:-2], count, out.shape[-1]), owner)
@@ -220,7 +218,7 @@ class CompiledIK:
         """
         dof = len(self.joints)
         rows = self._rows(q, (len(q),), "q", True)
-        sides = self._none if approach is None else self._rows(approach, (len(rows),), "approach", True)
+        sides = self._rows(approach, (len(rows),), "approach", True)
         T, out = np.empty((len(rows), 4, 4)), np.empty((len(rows), 7 * dof + 1))
         default = arrays.BLENDED if self.description.arms.hybrid else arrays.GEOMETRIC
         self._run(arrays.EVALUATE, T, 0, len(rows), rows, sides, default if arm is None else arm, False, out)
@@ -232,17 +230,8 @@ class CompiledIK:
         dof = len(self.joints)
         position, rotation, measure, status, branch = np.moveaxis(out[..., 2 * dof :], -1, 0)
         q, nominal = out[..., :dof], out[..., dof : 2 * dof]
-        return Solution(
-            q,
-            nominal,
-            branch.astype(int),
-            self.branches,
-            status.astype(int),
-            position,
-            rotation,
-            measure,
-            owner,
-        )
+        branch, status = branch.astype(int), status.astype(int)
+        return Solution(q, nominal, branch, self.branches, status, position, rotation, measure, owner)
 
     def _solve_rows(
         self,
@@ -267,12 +256,11 @@ class CompiledIK:
 
         starts = range(0, len(rows), CHUNK)
         workers = min(threads or _processors(), len(starts))
+        results: Iterable[int] = map(solve_chunk, starts)
         if workers > 1:
             with ThreadPoolExecutor(workers) as pool:
-                results = list(pool.map(solve_chunk, starts))
-        else:
-            results = [solve_chunk(start) for start in starts]
-        wrong = next((result for result in results if result >= 0), -1)
+                results = pool.map(solve_chunk, starts)
+        wrong = next((result for result in list(results) if result >= 0), -1)
         if wrong >= 0:
             index = tuple(int(i) for i in np.unravel_index(wrong // 8, T.shape[:-2])) if T.ndim > 2 else ()
             at = f" at index {index if len(index) > 1 else index[0]}" if index else ""
@@ -340,15 +328,15 @@ class CompiledIK:
         try:
             return np.ascontiguousarray(values, dtype=np.float64)
         except (TypeError, ValueError):
-            shape = None if throw else _shape(values)
-            if shape is None:
-                raise PoseError(
-                    f"{what} is no array of numbers; give real numbers, lengths in metres."
-                ) from None
-            return np.full(shape, np.nan)
+            with suppress(ValueError):  # of ragged values
+                if not throw:
+                    return np.full(np.shape(values), np.nan)
+            raise PoseError(f"{what} is no array of numbers; give real numbers, lengths in metres.") from None
 
     def _rows(self, values: Any, batch: tuple[int, ...], what: str, throw: bool) -> Any:
-        """Joint values, or approaches, as `(1 or poses, dof)`."""
+        """Joint values, or approaches, as `(1 or poses, dof)`; `(0, dof)` for None."""
+        if values is None:
+            return self._none
         rows, dof = self._numbers(values, what, throw), len(self.joints)
         if rows.shape[-1:] != (dof,):
             raise PoseError(
@@ -369,11 +357,3 @@ class CompiledIK:
 def _processors() -> int:
     """How many processors this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _shape(values: Any) -> tuple[int, ...] | None:
-    """Shape of nested values, None where they are ragged."""
-    try:
-        return tuple(np.shape(values))
-    except ValueError:
-        return None

@@ -13,6 +13,7 @@ from pisigma.kinematics.singularity import singularity_measure
 from pisigma.kinematics.status import Status
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE, SINGULAR_TOLERANCE
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.stored_starts import middle_of_starts
 from pisigma.robot.description import Robot
 
 
@@ -133,5 +134,4 @@ def as_trained(model: CalibratedModel, q: Tensor) -> Tensor:
     """Joint values `(*batch, dof)` turned as those of the training rows, which a network knows."""
     if not len(model.starts):
         return q
-    lower, upper = model.starts.aminmax(dim=0)
-    return nearest_turn(model.robot, q, (lower + upper).double() / 2, within_limits=False)
+    return nearest_turn(model.robot, q, middle_of_starts(model.starts), within_limits=False)

@@ -1,6 +1,5 @@
 """A calibrated model as plain arrays for the compiled inverse kinematics."""
 
-import math
 import os
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,44 +11,29 @@ from pisigma.errors import ModelError
 from pisigma.hybrid.arms import HybridArm
 from pisigma.joint_correction.feature import scaled_joints, turning_rate
 from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.kernels import arrays
 from pisigma.kernels.array_kinematics import KINDS, arm_ends, arm_rows
-from pisigma.kernels.arrays import (
-    ANGLE,
-    COSINE,
-    DRAWN,
-    GEOMETRIC,
-    HYBRID,
-    NO_CLOSED_FORM,
-    NOMINAL,
-    SCARA,
-    SINE,
-    SPHERICAL_WRIST,
-    THREE_PARALLEL,
-    Arms,
-    ClosedForm,
-    Correction,
-    Coverage,
-    Description,
-    Network,
-    Starts,
-)
 from pisigma.kernels.description_file import write_description
 from pisigma.kinematics.closed_form import AbstractClosedForm, closed_form_solver
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.stored_starts import StoredStarts
+from pisigma.model.stored_starts import StoredStarts, middle_of_starts
 from pisigma.network.correction_network import JointGroup
 from pisigma.network.inputs import POSE_INPUTS
 from pisigma.network.pi_sigma import PiSigma
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert
 
-_FORMS = {"scara": SCARA, "spherical_wrist": SPHERICAL_WRIST, "three_parallel": THREE_PARALLEL}
+_FORMS = {
+    "scara": arrays.SCARA,
+    "spherical_wrist": arrays.SPHERICAL_WRIST,
+    "three_parallel": arrays.THREE_PARALLEL,
+}
 _NUMERIC = ("numeric",)
 _Input = tuple[int, list[float]]
 _Member = tuple[JointGroup, PiSigma]
 _COARSE = 0.01
 """Coordinates that vary by less, of the one that varies most, say next to nothing about a distance."""
-_FUNCTIONS = {"": ANGLE, "sin": SINE, "cos": COSINE}
+_FUNCTIONS = {"": arrays.ANGLE, "sin": arrays.SINE, "cos": arrays.COSINE}
 
 
 def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_to: str = "") -> None:
@@ -70,7 +54,7 @@ def save_compiled(model: CalibratedModel, file: str | os.PathLike[str], belongs_
     )
 
 
-def describe(model: CalibratedModel) -> tuple[Description, tuple[str, ...]]:
+def describe(model: CalibratedModel) -> tuple[arrays.Description, tuple[str, ...]]:
     """A model as arrays, and the names of its branches.
 
     Raises:
@@ -90,28 +74,28 @@ def describe(model: CalibratedModel) -> tuple[Description, tuple[str, ...]]:
         )
     geometric = model.calibrated or model.robot
     correction, features = _correction(model)
-    description = Description(
+    stored = StoredStarts(geometric, model.starts.double().cpu())
+    description = arrays.Description(
         arms=_arms(model.robot, geometric, model.hybrid),
         correction=correction,
         features=features,
         coverage=_coverage(geometric, model.hybrid),
         network=_network(model),
         closed_form=_closed_form(model, solver),
-        starts=_starts(geometric, model),
+        starts=arrays.Starts(stored.q.numpy(), stored.points.numpy(), stored.lever),
     )
     return description, solver.branches if solver else _NUMERIC
 
 
-def _arms(nominal: Robot, geometric: Robot, hybrid: HybridArm | None) -> Arms:
-    arms = {NOMINAL: nominal, GEOMETRIC: geometric, HYBRID: geometric, DRAWN: nominal}
+def _arms(nominal: Robot, geometric: Robot, hybrid: HybridArm | None) -> arrays.Arms:
+    arms = (nominal, geometric, geometric, nominal)  # in the order NOMINAL, GEOMETRIC, HYBRID, DRAWN
     if hybrid is not None:
-        arms |= {GEOMETRIC: hybrid.geometric, HYBRID: hybrid.hybrid, DRAWN: hybrid.correction.robot}
-    ordered = [arms[index] for index in range(4)]
-    return Arms(
+        arms = (nominal, hybrid.geometric, hybrid.hybrid, hybrid.correction.robot)
+    return arrays.Arms(
         kind=np.array([KINDS[row.type] for row in nominal.rows]),
-        rows=np.stack([arm_rows(arm) for arm in ordered]),
-        ends=np.stack([arm_ends(arm) for arm in ordered]),
-        reach=np.array([arm.reach or 1.0 for arm in ordered]),
+        rows=np.stack([arm_rows(arm) for arm in arms]),
+        ends=np.stack([arm_ends(arm) for arm in arms]),
+        reach=np.array([arm.reach or 1.0 for arm in arms]),
         direction=nominal.directions,
         revolute=np.array(nominal.revolute, dtype=np.int64),
         limits=nominal.limits,
@@ -119,7 +103,7 @@ def _arms(nominal: Robot, geometric: Robot, hybrid: HybridArm | None) -> Arms:
     )
 
 
-def _correction(model: CalibratedModel) -> tuple[Correction, tuple[str, ...]]:
+def _correction(model: CalibratedModel) -> tuple[arrays.Correction, tuple[str, ...]]:
     """The joint correction of a model, and the names of its features in the order of their numbers.
 
     Raises:
@@ -140,7 +124,7 @@ def _correction(model: CalibratedModel) -> tuple[Correction, tuple[str, ...]]:
                 "(or stands twice)."
             )
     fixed, starts = correction.fixed.numpy(), np.cumsum([0, *(len(values) for values in numbers.values())])
-    compiled = Correction(
+    compiled = arrays.Correction(
         rate=turning_rate(robot),
         middle=-zero * half,
         half=half,
@@ -157,21 +141,21 @@ def _correction(model: CalibratedModel) -> tuple[Correction, tuple[str, ...]]:
     return compiled, tuple(numbers)
 
 
-def _coverage(robot: Robot, hybrid: HybridArm | None) -> Coverage:
+def _coverage(robot: Robot, hybrid: HybridArm | None) -> arrays.Coverage:
     if hybrid is None:
         none = np.zeros(0)
-        return Coverage(np.zeros(0, dtype=np.int64), none, none, turning_rate(robot), 1.0)
+        return arrays.Coverage(np.zeros(0, dtype=np.int64), none, none, turning_rate(robot), 1.0)
     own = hybrid.coverage
-    return Coverage(
+    return arrays.Coverage(
         own.joint.numpy(), own.middle.numpy(), own.half.numpy(), own.rate.numpy(), float(own.fade)
     )
 
 
-def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> ClosedForm:
+def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> arrays.ClosedForm:
     if solver is None:
         none, zeros = np.zeros((3, 4)), np.zeros(model.robot.dof)
         first = np.zeros(1, dtype=np.int64)
-        return ClosedForm(NO_CLOSED_FORM, 1, first, 1, none, none, *[zeros] * 6)
+        return arrays.ClosedForm(arrays.NO_CLOSED_FORM, 1, first, 1, none, none, *[zeros] * 6)
     if solver.compiled not in _FORMS:
         raise ModelError(
             f"model '{model.name}': the closed form {type(solver).__name__} of its robot has no compiled form; use "
@@ -179,7 +163,7 @@ def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> C
         )
     rows, names = solver.rows, solver.branches
     trained = [names.index(name) for name in model.branches] or list(range(len(names)))
-    return ClosedForm(
+    return arrays.ClosedForm(
         kind=_FORMS[solver.compiled],
         branches=len(names),
         order=np.array([*trained, *(index for index in range(len(names)) if index not in trained)]),
@@ -195,15 +179,7 @@ def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> C
     )
 
 
-def _starts(robot: Robot, model: CalibratedModel) -> Starts:
-    lever = robot.reach / 2 / math.sqrt(2)
-    stored = StoredStarts(robot, model.starts.double().cpu())
-    T = stored.T.numpy()
-    points = np.concatenate([T[:, :3, 3], lever * T[:, :3, :3].reshape(-1, 9)], axis=1)
-    return Starts(stored.q.numpy(), points, lever)
-
-
-def _network(model: CalibratedModel) -> Network:
+def _network(model: CalibratedModel) -> arrays.Network:
     """The network of a model and its domain; one that is not used where the model has none."""
     dof = model.robot.dof
     members = model.network.members() if model.network else []
@@ -224,12 +200,12 @@ def _network(model: CalibratedModel) -> Network:
             bias[joint, used] = net.bias.detach().numpy()[output] * fixed[output]
             scaling[:, joint] = float(net.output_offset[output]), float(net.output_scale[output])
     domain = _Domain.of(model, inputs, members)
-    return Network(
+    return arrays.Network(
         used=int(model.network is not None),
         source=np.array([source for source, _ in inputs], dtype=np.int64),
         factors=np.array([terms for _, terms in inputs]).reshape(-1, dof),
-        offset=_joined([net.input_offset.numpy() for _, net in members]),
-        scale=_joined([net.input_scale.numpy() for _, net in members]),
+        offset=np.concatenate([np.zeros(0), *(net.input_offset.numpy() for _, net in members)]),
+        scale=np.concatenate([np.zeros(0), *(net.input_scale.numpy() for _, net in members)]),
         reference=np.array([group.inputs.reference for group, _ in members]).reshape(-1, 3, 3),
         first=first.astype(np.int64),
         orders=orders,
@@ -238,7 +214,7 @@ def _network(model: CalibratedModel) -> Network:
         bias=bias,
         output_offset=scaling[0],
         output_scale=scaling[1],
-        centre=_centre(model),
+        centre=middle_of_starts(model.starts).cpu().numpy() if len(model.starts) else np.zeros(dof),
         samples=len(domain.samples),
         column=domain.column,
         times=domain.times,
@@ -269,7 +245,7 @@ class _Domain(NamedTuple):
             for scale in zip(net.input_offset.tolist(), net.input_scale.tolist(), strict=True)
         ]
         meanings = [
-            (source, *terms, *scale, reference if source < ANGLE else b"")
+            (source, *terms, *scale, reference if source < arrays.ANGLE else b"")
             for (source, terms), scale, reference in zip(inputs, scaling, references, strict=True)
         ]
         column = np.array([index for index, own in enumerate(meanings) if meanings.index(own) == index])
@@ -287,16 +263,3 @@ def _input(group: JointGroup, name: str) -> _Input:
     if not factors:
         return POSE_INPUTS.index(name), [0.0] * len(group.inputs.joint_names)
     return _FUNCTIONS[function], factors
-
-
-def _joined(parts: list[np.ndarray]) -> np.ndarray:
-    return np.concatenate([np.zeros(0), *parts])
-
-
-def _centre(model: CalibratedModel) -> np.ndarray:
-    """Middle of the joint values of training rows [rad or m]."""
-    if not len(model.starts):
-        return np.zeros(model.robot.dof)
-    q = model.starts.double().cpu().numpy()
-    centre: np.ndarray = (q.min(0) + q.max(0)) / 2
-    return centre

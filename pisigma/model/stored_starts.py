@@ -22,6 +22,8 @@ class StoredStarts:
         robot: the robot.
         q: joint values [rad or m].
         T: the poses T_base_tool there.
+        lever: half the robot's reach over sqrt(2) [m]: a small turn changes R by sqrt(2) times its angle.
+        points: `(starts, 12)`: the poses as points, see `as_points`.
     """
 
     def __init__(self, robot: Robot, q: Float64[Tensor, "starts dof"]) -> None:
@@ -29,6 +31,8 @@ class StoredStarts:
         self.robot = robot
         self.q = q
         self.T = forward_kinematics(robot, q)
+        self.lever = robot.reach / 2 / 2**0.5
+        self.points = self.as_points(self.T)
 
     def nearest(self, T: Float64[Tensor, "poses 4 4"], count: int) -> Int64[Tensor, "poses _nearest"]:
         """For every pose the indices of the starts whose poses are nearest, nearest first.
@@ -38,17 +42,19 @@ class StoredStarts:
             count: how many are wanted; fewer where there are fewer starts.
         """
         count = min(count, len(self.q))
-        poses, rows = self._as_points(T), self._as_points(self.T)
-        result = [torch.zeros((0, count), dtype=torch.int64)]
-        for first in range(0, len(poses), _CHUNK):
-            distance = torch.cdist(poses[first : first + _CHUNK], rows)
-            result.append(distance.topk(count, largest=False).indices)
-        return torch.cat(result)
+        chunks = torch.split(self.as_points(T), _CHUNK)
+        nearest = [torch.cdist(chunk, self.points).topk(count, largest=False).indices for chunk in chunks]
+        return torch.cat(nearest)
 
-    def _as_points(self, T: Tensor) -> Tensor:
+    def as_points(self, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses 12"]:
         """Poses as points; their distance is that of the tools [m], plus half a reach per radian of turn."""
-        lever = self.robot.reach / 2 / 2**0.5  # a small turn changes R by sqrt(2) times its angle
-        return torch.cat([T[:, :3, 3], lever * T[:, :3, :3].flatten(1)], -1)
+        return torch.cat([T[:, :3, 3], self.lever * T[:, :3, :3].flatten(1)], -1)
+
+
+def middle_of_starts(starts: Float64[Tensor, "starts dof"]) -> Float64[Tensor, " dof"]:
+    """Middle of the joint values [rad or m] of training rows, on whose turns a network knows joint values."""
+    lower, upper = starts.aminmax(dim=0)
+    return (lower + upper).double() / 2
 
 
 def spread_rows(q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "starts dof"]:
