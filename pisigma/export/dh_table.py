@@ -2,6 +2,7 @@
 
 import csv
 import io
+from collections.abc import Iterable, Mapping
 
 import numpy as np
 
@@ -30,21 +31,29 @@ def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
 
     Lines at the top that begin with # hold the convention and the sentences given.
     """
-    text = io.StringIO()
     limits = ("lower_deg", "upper_deg", "lower_mm", "upper_mm")
     parameters = (*in_file_units(DH_COLUMNS, robot.dh[0]), *in_file_units(FRAME_COLUMNS, robot.base))
     columns = ("part", "name", "type", "direction", *limits, *parameters)
-    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
-    writer.writeheader()
-    writer.writerow({"part": "base", **cells(FRAME_COLUMNS, robot.base)})
+    lines = [{"part": "base", **cells(FRAME_COLUMNS, robot.base)}]
     for row, values in zip(robot.rows, robot.dh, strict=True):
         line = {"part": "row", "name": row.name, "type": row.type, "direction": str(row.direction)}
         for side, limit in (("lower", row.lower), ("upper", row.upper)):
             if np.isfinite(limit):
                 line[f"{side}_{row.file_unit}"] = repr(row.in_file_unit(limit))
-        writer.writerow(line | cells(DH_COLUMNS, values))
-    writer.writerow({"part": "tool", **cells(FRAME_COLUMNS, robot.tool)})
-    return head((CONVENTION, *comments)) + text.getvalue()
+        lines.append(line | cells(DH_COLUMNS, values))
+    lines.append({"part": "tool", **cells(FRAME_COLUMNS, robot.tool)})
+    return csv_table(columns, lines, (CONVENTION, *comments))
+
+
+def csv_table(
+    columns: Iterable[str], lines: Iterable[Mapping[str, object]], sentences: tuple[str, ...]
+) -> str:
+    """Lines as CSV with sentences on top; cells that a line does not have are empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, tuple(columns), restval="", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(lines)
+    return head(sentences) + text.getvalue()
 
 
 def cells(names: tuple[str, ...], values: np.ndarray) -> dict[str, str]:

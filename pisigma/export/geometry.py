@@ -24,9 +24,7 @@ def corrects_joints(model: CalibratedModel) -> bool:
 def remarks(model: CalibratedModel) -> tuple[str, ...]:
     """Sentences for the head of a file that holds the geometry of a model and nothing else."""
     drawn = "as drawn, with the identified base and tool" if model.calibrated is None else "as identified"
-    said = [
-        f"Geometry {drawn}, of model {model.name} (robot {model.robot.name}), by pisigma {__version__}.",
-    ]
+    said = [f"Geometry {drawn}, of model {model.name} (robot {model.robot.name}), by pisigma {__version__}."]
     if corrects_joints(model):
         said.append(
             "The learned joint correction of the model is not in this file: a program that reads it gets the "
@@ -37,15 +35,12 @@ def remarks(model: CalibratedModel) -> tuple[str, ...]:
 
 def frame_remarks(model: CalibratedModel) -> tuple[str, ...]:
     """Sentences on whose base and tool leave pisigma where the model knows several."""
-    said = []
-    for what, names in (("frame", list(model.bases)), ("target", list(model.tools))):
-        if len(names) > 1:
-            part = "base" if what == "frame" else "tool"
-            said.append(
-                f"The {part} is that of the {what} '{names[0]}'; the model knows {len(names)} {what}s "
-                f"({', '.join(names)})."
-            )
-    return tuple(said)
+    several = (("base", "frame", list(model.bases)), ("tool", "target", list(model.tools)))
+    return tuple(
+        f"The {part} is that of the {what} '{names[0]}'; the model knows {len(names)} {what}s ({', '.join(names)})."
+        for part, what, names in several
+        if len(names) > 1
+    )
 
 
 def condition_remarks(model: CalibratedModel) -> tuple[str, ...]:

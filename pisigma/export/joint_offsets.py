@@ -1,7 +1,5 @@
 """Joint offsets alone: the most that a controller can take which knows nothing but its zero positions."""
 
-import csv
-import io
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +9,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import ModelError
-from pisigma.export.dh_table import TABLE_SUFFIXES, cells, head
+from pisigma.export.dh_table import TABLE_SUFFIXES, cells, csv_table, head
 from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.export.geometry import offset_remarks
 from pisigma.kinematics.forward import forward_kinematics
@@ -190,6 +188,13 @@ class JointOffsets:
     lost: Departure
     nominal: Departure
 
+    def departures(self) -> dict[str, object]:
+        """Both departures in the units of files, by their keys there."""
+        return {
+            "off_the_whole_model": self.lost.in_file_units(),
+            "robot_as_drawn": self.nominal.in_file_units(),
+        }
+
 
 def fit_joint_offsets(model: CalibratedModel, seed: int = 0) -> JointOffsets:
     """Fit joint offsets, base and tool of the robot as drawn to a model by least squares.
@@ -287,16 +292,11 @@ def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
 
 def offsets_csv(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
     """One line a joint, then base and tool; cells that do not apply are empty."""
-    text = io.StringIO()
     frame = in_file_units(FRAME_COLUMNS, offsets.robot.base)
     columns = ("part", "name", "type", "offset_deg", "offset_mm", *frame)
-    writer = csv.DictWriter(text, columns, restval="", lineterminator="\n")
-    writer.writeheader()
-    for entry in _joints(offsets):
-        writer.writerow({"part": "joint", **entry})
-    for part in ("base", "tool"):
-        writer.writerow({"part": part, **cells(FRAME_COLUMNS, getattr(offsets.robot, part))})
-    return head((*comments, *offset_sentences(offsets))) + text.getvalue()
+    lines = [{"part": "joint", **entry} for entry in _joints(offsets)]
+    lines += [{"part": p, **cells(FRAME_COLUMNS, getattr(offsets.robot, p))} for p in ("base", "tool")]
+    return csv_table(columns, lines, (*comments, *offset_sentences(offsets)))
 
 
 def offsets_yaml(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
@@ -304,19 +304,13 @@ def offsets_yaml(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
     document: dict[str, object] = {"robot": offsets.robot.name, "joints": _joints(offsets)}
     for part in ("base", "tool"):
         document[part] = in_file_units(FRAME_COLUMNS, getattr(offsets.robot, part))
-    document["off_the_whole_model"] = offsets.lost.in_file_units()
-    document["robot_as_drawn"] = offsets.nominal.in_file_units()
-    body = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+    body = yaml.safe_dump(document | offsets.departures(), sort_keys=False, allow_unicode=True)
     return head((*comments, *offset_sentences(offsets))) + body
 
 
 def _joints(offsets: JointOffsets) -> list[dict[str, object]]:
     return [
-        {
-            "name": joint.name,
-            "type": joint.type,
-            f"offset_{joint.file_unit}": joint.in_file_unit(value),
-        }
+        {"name": joint.name, "type": joint.type, f"offset_{joint.file_unit}": joint.in_file_unit(value)}
         for joint, value in zip(offsets.robot.joints, offsets.values, strict=True)
     ]
 
@@ -324,13 +318,8 @@ def _joints(offsets: JointOffsets) -> list[dict[str, object]]:
 def _write(request: ExportRequest) -> Exported:
     model = request.load()
     offsets, said = fit_joint_offsets(model), offset_remarks(model)
-    facts: dict[str, object] = {
-        **model_facts(model),
-        "off_the_whole_model": {**offsets.lost.in_file_units()},
-        "robot_as_drawn": {**offsets.nominal.in_file_units()},
-    }
     text = (offsets_csv if request.as_csv else offsets_yaml)(offsets, said)
-    return Exported(text, facts, (*said, *offset_sentences(offsets)))
+    return Exported(text, model_facts(model) | offsets.departures(), (*said, *offset_sentences(offsets)))
 
 
 FORMAT = ExportFormat(

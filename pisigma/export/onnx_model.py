@@ -203,7 +203,7 @@ def _inverse(model: CalibratedModel, network: CorrectionNetwork, sha256: str) ->
         f"Corrections of nominal joint values of robot {model.robot.name}, model {model.name}. Nominal joint values "
         "are the inverse kinematics of the nominal robot on the base and with the tool of the model."
     )
-    return graph.finish(_graph_name(model), doc, _metadata(model, INVERSE, sha256))
+    return graph.finish(f"pisigma {model.name}", doc, _metadata(model, INVERSE, sha256))
 
 
 def _forward(model: CalibratedModel, arm: HybridArm, sha256: str) -> bytes:
@@ -226,7 +226,7 @@ def _forward(model: CalibratedModel, arm: HybridArm, sha256: str) -> bytes:
         "the pose is that of the hybrid geometry at q + full_correction, at share 0 that of the geometric calibration "
         "at q; between, the model goes along the straight line from one pose to the other."
     )
-    return graph.finish(_graph_name(model), doc, _metadata(model, FORWARD, sha256))
+    return graph.finish(f"pisigma {model.name}", doc, _metadata(model, FORWARD, sha256))
 
 
 def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, str]:
@@ -262,17 +262,12 @@ def _domain(model: CalibratedModel) -> dict[str, Any]:
     if model.network is None and model.hybrid is not None:
         coverage = model.hybrid.coverage
         stretches: list[list[list[float]]] = [[] for _ in range(model.robot.dof)]
-        for j, middle, half in zip(
-            coverage.joint.tolist(), coverage.middle.tolist(), coverage.half.tolist(), strict=True
-        ):
+        columns = (coverage.joint.tolist(), coverage.middle.tolist(), coverage.half.tolist())
+        for j, middle, half in zip(*columns, strict=True):
             rate = float(coverage.rate[j])
             stretches[j].append([(middle - half) / rate, (middle + half) / rate])
         domain |= {"measured": stretches, "fade_rad": coverage.fade}
     return domain
-
-
-def _graph_name(model: CalibratedModel) -> str:
-    return f"pisigma {model.name}"
 
 
 def _joints(model: CalibratedModel) -> str:
@@ -280,8 +275,7 @@ def _joints(model: CalibratedModel) -> str:
 
 
 def _units(model: CalibratedModel) -> str:
-    kinds = dict.fromkeys("rad" if turns else "m" for turns in model.robot.revolute)
-    return " or ".join(kinds)
+    return " or ".join(dict.fromkeys("rad" if turns else "m" for turns in model.robot.revolute))
 
 
 def _write(request: ExportRequest) -> Exported:

@@ -41,40 +41,31 @@ class Robot:
 
     def __post_init__(self) -> None:
         """Check that the parts fit together and make the arrays read-only."""
+        robot = f"robot '{self.name}'"
         for name, shape in (("dh", (len(self.rows), 5)), ("base", (6,)), ("tool", (6,))):
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != shape:
-                raise RobotError(
-                    f"robot '{self.name}': {name} of shape {shape} was wanted, got {values.shape}."
-                )
+                raise RobotError(f"{robot}: {name} of shape {shape} was wanted, got {values.shape}.")
             if not np.isfinite(values).all():
-                raise RobotError(f"robot '{self.name}': {name} has an entry that is not finite; correct it.")
+                raise RobotError(f"{robot}: {name} has an entry that is not finite; correct it.")
             values.setflags(write=False)
             object.__setattr__(self, name, values)
         if self.dof == 0:
-            raise RobotError(
-                f"robot '{self.name}': it has no joint that moves; add a revolute or prismatic one."
-            )
+            raise RobotError(f"{robot}: it has no joint that moves; add a revolute or prismatic one.")
         names = [row.name for row in self.rows]
-        twice = sorted({name for name in names if names.count(name) > 1})
-        if twice:
-            raise RobotError(
-                f"robot '{self.name}': the row name '{twice[0]}' stands twice; names must differ."
-            )
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise RobotError(f"{robot}: the row name '{twice[0]}' stands twice; names must differ.")
         for row in self.rows:
+            place = f"{robot}, row '{row.name}'"
             if row.type not in get_args(JointType):
-                raise RobotError(
-                    f"robot '{self.name}', row '{row.name}': the type cannot be '{row.type}'; "
-                    f"{nearest_choice(row.type, get_args(JointType))}"
-                )
+                hint = nearest_choice(row.type, get_args(JointType))
+                raise RobotError(f"{place}: the type cannot be '{row.type}'; {hint}")
             if row.direction not in (1, -1):
-                raise RobotError(
-                    f"robot '{self.name}', row '{row.name}': direction is +1 or -1, got {row.direction}."
-                )
+                raise RobotError(f"{place}: direction is +1 or -1, got {row.direction}.")
             if not row.lower < row.upper:
                 raise RobotError(
-                    f"robot '{self.name}', row '{row.name}': the lower limit {row.lower:g} is not below "
-                    f"the upper limit {row.upper:g}; swap or correct them."
+                    f"{place}: the lower limit {row.lower:g} is not below the upper limit {row.upper:g}; "
+                    "swap or correct them."
                 )
 
     @staticmethod

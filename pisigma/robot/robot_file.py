@@ -119,9 +119,8 @@ class RobotDocument(Section):
 def catalogue() -> tuple[str, ...]:
     """Names of the robots that come with pisigma, sorted."""
     folder = resources.files("pisigma.robot") / "catalogue"
-    return tuple(
-        sorted(entry.name.removesuffix(".yaml") for entry in folder.iterdir() if entry.name.endswith(".yaml"))
-    )
+    names = (entry.name for entry in folder.iterdir())
+    return tuple(sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml")))
 
 
 def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None) -> Drawing:
@@ -129,9 +128,10 @@ def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None)
     name = os.fspath(robot)
     suffix = Path(name).suffix.lower()
     if suffix == ".urdf" and name not in catalogue():
-        from pisigma.robot.urdf_rows import read_urdf_drawing
+        from pisigma.robot.urdf_chain import read_chain
+        from pisigma.robot.urdf_rows import rows_of_chain
 
-        return read_urdf_drawing(name, base, tip)
+        return rows_of_chain(read_chain(name, base, tip)).drawing
     for option, link in (("base", base), ("tip", tip)):
         if link is not None:
             raise RobotError(

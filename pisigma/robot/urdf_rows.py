@@ -7,7 +7,6 @@ is 0 (Denavit and Hartenberg 1955), unless the axes are nearly parallel; then d 
 """
 
 import math
-import os
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from pisigma.robot.row import Drawing, Row
-from pisigma.robot.urdf_chain import Chain, ChainJoint, read_chain
+from pisigma.robot.urdf_chain import Chain, ChainJoint
 from pisigma.robot.urdf_frames import (
     ROUNDING,
     Frame,
@@ -33,20 +32,6 @@ times as far away as the joints."""
 
 Vector = Float64[np.ndarray, " 3"]
 Parameters = tuple[float, float, float, float, float]
-
-
-def read_urdf_drawing(path: str | os.PathLike[str], base: str | None, tip: str | None) -> Drawing:
-    """Read the robot between two links of a URDF file.
-
-    Args:
-        path: the file.
-        base: name of the link that poses are given in; the root where none is given.
-        tip: name of the link that is the tool; may be left out where the chain has one end.
-
-    Raises:
-        RobotError: the file does not describe a serial robot; see `read_chain`.
-    """
-    return rows_of_chain(read_chain(path, base, tip)).drawing
 
 
 @dataclass(frozen=True, eq=False)

@@ -32,8 +32,7 @@ def robot_to_yaml(robot: Robot) -> str:
         "source": robot.source,
         "rows": rows,
     }
-    for frame in ("base", "tool"):
-        document[frame] = in_file_units(FRAME_COLUMNS, getattr(robot, frame))
+    document |= {part: in_file_units(FRAME_COLUMNS, getattr(robot, part)) for part in ("base", "tool")}
     return yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
 
 
@@ -71,15 +70,13 @@ def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
         root.append(ElementTree.Comment(comment_text(sentence)))
     names = {row.name for row in robot.rows}
     link = "link_0"
-    _link(root, BASE_LINK)
-    _link(root, link)
+    ElementTree.SubElement(root, "link", name=BASE_LINK)
     _joint(root, unused_name("base_joint", names), "fixed", (BASE_LINK, link), frame_of(robot.base))
     behind = np.eye(4)
     for number, (row, (theta, d, a, alpha, beta)) in enumerate(
         zip(robot.rows, robot.dh.tolist(), strict=True), 1
     ):
         following = f"link_{number}"
-        _link(root, following)
         origin = behind @ turn(2, theta) @ shift(0.0, 0.0, d)
         element = _joint(root, row.name, _type(row, robot.name), (link, following), origin)
         if row.type != "fixed":
@@ -89,20 +86,17 @@ def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
                 element, "limit", lower=repr(row.lower), upper=repr(row.upper), effort="0", velocity="0"
             )
         link, behind = following, row_frame(0.0, 0.0, a, alpha, beta)
-    _link(root, TOOL_LINK)
     tool = behind @ frame_of(robot.tool)
     _joint(root, unused_name("tool_joint", names), "fixed", (link, TOOL_LINK), tool)
     ElementTree.indent(root)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
 
 
-def _link(root: ElementTree.Element, name: str) -> None:
-    ElementTree.SubElement(root, "link", name=name)
-
-
 def _joint(
     root: ElementTree.Element, name: str, kind: str, links: tuple[str, str], origin: Frame
 ) -> ElementTree.Element:
+    """Add a joint behind its child link, which is the second of its links."""
+    ElementTree.SubElement(root, "link", name=links[1])
     element = ElementTree.SubElement(root, "joint", name=name, type=kind)
     ElementTree.SubElement(element, "origin", origin_attributes(origin))
     ElementTree.SubElement(element, "parent", link=links[0])
