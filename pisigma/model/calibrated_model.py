@@ -1,6 +1,8 @@
 """A calibrated robot: geometry, learned joint corrections and where both hold."""
 
+import platform
 from dataclasses import dataclass, field
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,6 +49,11 @@ class Provenance:
     rule: str = ""
     seed: int = 0
     versions: dict[str, str] = field(default_factory=dict)
+
+    @staticmethod
+    def present_versions() -> dict[str, str]:
+        """Give the versions of pisigma, torch and python that are running."""
+        return {"pisigma": version("pisigma"), "torch": version("torch"), "python": platform.python_version()}
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,8 +1,6 @@
 """A geometric or hybrid calibration as a model that corrected inverse kinematics can be made from."""
 
-import platform
 from dataclasses import replace
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
@@ -60,8 +58,7 @@ def model_of_calibration(
             data_sha256=measurements.content_hash(),
             rows=measurements.rows,
             rows_left_out=len(measurements.left_out),
-            versions={name: version(name) for name in ("pisigma", "torch")}
-            | {"python": platform.python_version()},
+            versions=Provenance.present_versions(),
         ),
     )
 

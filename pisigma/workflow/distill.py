@@ -7,10 +7,8 @@ role of θ_measured, for poses of a region.
 import hashlib
 import math
 import os
-import platform
 import time
 from dataclasses import dataclass, replace
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
@@ -201,8 +199,7 @@ def _provenance(parent: CalibratedModel, sha256: str, settings: DistillationSett
         data_sha256=sha256,
         rows=settings.poses,
         seed=settings.seed,
-        versions={name: version(name) for name in ("pisigma", "torch")}
-        | {"python": platform.python_version()},
+        versions=Provenance.present_versions(),
     )
 
 

@@ -1,8 +1,6 @@
 """Train and cross-validate the networks of a recipe of inverse calibration."""
 
-import platform
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 
 import torch
@@ -190,6 +188,5 @@ def _provenance(
         rows_left_out=int((~pairs.used).sum()),
         rule=pairs.left_out,
         seed=recipe.fit.seed,
-        versions={name: version(name) for name in ("pisigma", "torch")}
-        | {"python": platform.python_version()},
+        versions=Provenance.present_versions(),
     )
