@@ -30,8 +30,7 @@ Folds = Annotated[
 ]
 HoldOut = Annotated[float | None, typer.Option(help="Share of the rows to hold out once, instead of folds.")]
 Split = Annotated[
-    str,
-    typer.Option(help="How rows are split: joints (at random), interleaved, time, space or placement."),
+    str, typer.Option(help="How rows are split: joints (at random), interleaved, time, space or placement.")
 ]
 Repeats = Annotated[
     int | None,
@@ -48,8 +47,7 @@ TrainRows = Annotated[
     ),
 ]
 Free = Annotated[
-    str,
-    typer.Option(help="Free parameters: identifiable, joint_offsets, or names such as a_2,theta_3."),
+    str, typer.Option(help="Free parameters: identifiable, joint_offsets, or names such as a_2,theta_3.")
 ]
 PriorMm = Annotated[
     float, typer.Option(help="Prior standard deviation of length errors [mm]; 0 for no prior.")

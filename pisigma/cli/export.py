@@ -46,7 +46,7 @@ TargetKind = Annotated[
     str | None,
     typer.Option(
         help="What a program of targets tells the controller: joints (default), or cartesian, for a controller "
-        "that computes with the robot as drawn. A .csv file holds both.",
+        "that computes with the robot as drawn. A .csv file holds both."
     ),
 ]
 Branch = Annotated[str | None, typer.Option(help="With targets: branch to take instead of the trained one.")]

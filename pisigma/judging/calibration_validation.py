@@ -338,18 +338,16 @@ def _distance_errors(
     pairs = {pair: distance for pair, distance in stated.items() if set(pair) <= held_out}
     if not pairs:
         return torch.zeros(0, dtype=torch.float64)
-    ball = _poses(result, rows)[:, :3, 3].detach().cpu()
+    if isinstance(result, HybridResult):
+        T = result.predicted_poses(rows)
+    else:
+        T = predicted_poses(result.robot, result.bases, result.tools, rows)
+    ball = T[:, :3, 3].detach().cpu()
     centre = {
         name: ball[torch.tensor([other == name for other in names])].mean(0)
         for name in {name for pair in pairs for name in pair}
     }
     return torch.stack([(centre[a] - centre[b]).norm() - distance for (a, b), distance in pairs.items()])
-
-
-def _poses(result: Result, rows: Measurements) -> Float64[Tensor, "rows 4 4"]:
-    if isinstance(result, HybridResult):
-        return result.predicted_poses(rows)
-    return predicted_poses(result.robot, result.bases, result.tools, rows)
 
 
 def _sockets(rows: Measurements) -> set[str]:

@@ -21,14 +21,7 @@ from pisigma.judging.held_out_rows import HELD_OUT_CSV, HeldOutRows
 from pisigma.judging.progress import Progress, stage
 from pisigma.judging.trained_calibrations import Calibrator, Result, fit
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.splits import (
-    SplitBy,
-    TrainTest,
-    draw_rows,
-    holdout,
-    repeats,
-    with_fewer,
-)
+from pisigma.measurement.splits import SplitBy, TrainTest, draw_rows, holdout, repeats, with_fewer
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.reporting.calibration_card import CardTexts, write_calibration_card

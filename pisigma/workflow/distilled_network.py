@@ -136,12 +136,7 @@ def _pairs(poses: SolvedPoses, rows: slice) -> TrainingPairs:
 
 
 def _fit_size(
-    robot: Robot,
-    size: Size,
-    pairs: TrainingPairs,
-    seed: int,
-    epochs: int,
-    progress: Progress,
+    robot: Robot, size: Size, pairs: TrainingPairs, seed: int, epochs: int, progress: Progress
 ) -> CorrectionNetwork:
     """Fit a network of a size to corrections by Levenberg-Marquardt.
 

@@ -8,12 +8,7 @@ from pathlib import Path
 from pisigma.errors import RecipeError
 from pisigma.hybrid.mini_batches import MANY_ROWS
 from pisigma.judging.calibration_summary import summarise
-from pisigma.judging.calibration_validation import (
-    errors_under,
-    judge,
-    learning_curve,
-    validate,
-)
+from pisigma.judging.calibration_validation import errors_under, judge, learning_curve, validate
 from pisigma.judging.cross_validation import CrossValidation
 from pisigma.judging.pose_statistics import Comparison, compare_on
 from pisigma.judging.progress import Progress, stage
@@ -24,13 +19,7 @@ from pisigma.measurement.splits import k_folds
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.recipes.data import load_measurements, simulate_held_out, simulate_repeats, simulate_training
 from pisigma.recipes.reader import read_recipe, recipe_hash
-from pisigma.recipes.recipe import (
-    GeometricRecipe,
-    HybridRecipe,
-    InverseRecipe,
-    MeasuredData,
-    Recipe,
-)
+from pisigma.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe, MeasuredData, Recipe
 from pisigma.reporting.calibration_card import CardTexts
 from pisigma.reporting.training_card import write_training_card
 from pisigma.robot.description import Robot

@@ -17,11 +17,7 @@ from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.domain import Domain
 from pisigma.model.stored_starts import spread_rows
 from pisigma.recipes.data import simulate_held_out
-from pisigma.recipes.recipe import (
-    InverseRecipe,
-    MeasuredData,
-    SimulatedData,
-)
+from pisigma.recipes.recipe import InverseRecipe, MeasuredData, SimulatedData
 from pisigma.robot.description import Robot
 from pisigma.training.pairs import TrainingPairs, build_pairs
 from pisigma.training.patterns import build_network, build_patterns
