@@ -46,8 +46,8 @@ def simulate_training(recipe: Recipe) -> Measurements:
     Raises:
         RecipeError: the recipe is for measured data.
     """
-    section = recipe.measurements if isinstance(recipe, GeometricRecipe) else simulated_data(recipe).training
-    return section.measure(_true_robot(recipe))
+    data = simulated_data(recipe)
+    return data.training.measure(TrueRobot(Robot.load(recipe.robot), data.errors))
 
 
 def simulate_held_out(recipe: Recipe) -> Measurements:
@@ -56,8 +56,8 @@ def simulate_held_out(recipe: Recipe) -> Measurements:
     Raises:
         RecipeError: the recipe is for measured data.
     """
-    section = recipe.held_out if isinstance(recipe, GeometricRecipe) else simulated_data(recipe).held_out
-    return section.measure(_true_robot(recipe))
+    data = simulated_data(recipe)
+    return data.held_out.measure(TrueRobot(Robot.load(recipe.robot), data.errors))
 
 
 def simulate_repeats(recipe: HybridRecipe) -> tuple[Measurements, tuple[TrainTest, ...]]:
@@ -81,20 +81,18 @@ def simulate_repeats(recipe: HybridRecipe) -> tuple[Measurements, tuple[TrainTes
     return join(rows), tuple(splits)
 
 
-def simulated_data(recipe: InverseRecipe | HybridRecipe) -> SimulatedData:
-    """The section of a recipe that simulates its data.
+def simulated_data(recipe: Recipe) -> SimulatedData:
+    """What a recipe simulates; a geometric one states it beside its other settings.
 
     Raises:
         RecipeError: the recipe is for measured data.
     """
+    if isinstance(recipe, GeometricRecipe):
+        errors, training, held_out = recipe.errors, recipe.measurements, recipe.held_out
+        return SimulatedData(kind="simulated", errors=errors, training=training, held_out=held_out)
     if not isinstance(recipe.data, SimulatedData):
         raise RecipeError(f"recipe '{recipe.name}' is for measured data and simulates nothing; use another.")
     return recipe.data
-
-
-def _true_robot(recipe: Recipe) -> TrueRobot:
-    errors = recipe.errors if isinstance(recipe, GeometricRecipe) else simulated_data(recipe).errors
-    return TrueRobot(Robot.load(recipe.robot), errors)
 
 
 def repeated(data: SimulatedData, repeat: int) -> SimulatedData:

@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -24,6 +24,7 @@ from pisigma.yaml_file import Section, line_of, read_yaml
 
 Key = tuple[str | int, ...]
 Check = tuple[Key, Callable[[], object]]
+"""The keys that lead to what is checked, and the check."""
 
 
 class _KindOnly(Section):
@@ -41,40 +42,28 @@ def read_recipe(path: str | os.PathLike[str]) -> Recipe:
         RobotError: its robot cannot be used; the message names file, line and key too.
     """
     kinds: dict[str, tuple[type[Recipe], Callable[[Any, Robot], Iterator[Check]]]] = {
-        "inverse_calibration": (InverseRecipe, _inverse_checks),
+        "inverse_calibration": (InverseRecipe, _network_checks),
         "geometric_calibration": (GeometricRecipe, _geometric_checks),
         "hybrid_calibration": (HybridRecipe, _hybrid_checks),
     }
     kind, checks = kinds[read_yaml(path, _KindOnly, RecipeError).kind]
     recipe = read_yaml(path, kind, RecipeError)
-    _check_fit(path, recipe.robot, partial(checks, recipe))
+    try:
+        robot = Robot.load(recipe.robot)
+    except RobotError as problem:
+        raise type(problem)(f"{path}, line {line_of(path, ('robot',))}: 'robot': {problem}") from None
+    for keys, check in checks(recipe, robot):
+        try:
+            check()
+        except (RecipeError, IdentificationError) as problem:
+            name = ".".join(str(key) for key in keys)
+            raise RecipeError(f"{path}, line {line_of(path, keys)}: '{name}': {problem}") from None
     return recipe
 
 
 def recipe_hash(path: str | os.PathLike[str]) -> str:
     """SHA-256 (hexadecimal) of the recipe file, for provenance."""
     return hashlib.sha256(Path(path).read_bytes()).hexdigest()
-
-
-def _check_fit(
-    path: str | os.PathLike[str], robot: str, checks_of: Callable[[Robot], Iterable[Check]]
-) -> None:
-    """Try, for its robot, every check of a recipe, which comes with the keys that lead to what it checks."""
-    try:
-        loaded = Robot.load(robot)
-    except RobotError as problem:
-        raise type(problem)(f"{path}, line {line_of(path, ('robot',))}: 'robot': {problem}") from None
-    for keys, check in checks_of(loaded):
-        try:
-            check()
-        except (RecipeError, IdentificationError) as problem:
-            name = ".".join(str(key) for key in keys)
-            raise RecipeError(f"{path}, line {line_of(path, keys)}: '{name}': {problem}") from None
-
-
-def _inverse_checks(recipe: InverseRecipe, robot: Robot) -> Iterator[Check]:
-    yield from _network_checks(recipe, robot)
-    yield from _simulation_checks(recipe, robot)
 
 
 def _hybrid_checks(recipe: HybridRecipe, robot: Robot) -> Iterator[Check]:
@@ -120,6 +109,7 @@ def _network_checks(recipe: InverseRecipe, robot: Robot) -> Iterator[Check]:
         for name in recipe.fit.learning_rate:
             yield ("fit", "learning_rate", name), partial(_check_joints, (name,), corrected, ())
         yield ("fit", "learning_rate"), partial(recipe.fit.rates, corrected)
+    yield from _simulation_checks(recipe, robot)
 
 
 def _where_checks(keys: Key, section: SimulatedMeasurements, robot: Robot) -> Iterator[Check]:
