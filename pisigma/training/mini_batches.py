@@ -93,11 +93,7 @@ class _BatchTraining(lightning.LightningModule):
     misfit: Tensor
 
     def __init__(
-        self,
-        cost: BatchCost,
-        unknowns: int,
-        schedule: BatchSchedule,
-        progress: Callable[[str], None],
+        self, cost: BatchCost, unknowns: int, schedule: BatchSchedule, progress: Callable[[str], None]
     ) -> None:
         super().__init__()
         self.cost, self.schedule, self.progress = cost, schedule, progress

@@ -72,10 +72,10 @@ def _batches(patterns: Sequence[Patterns], fit: FitSection) -> tuple[Any, int]:
     Where every step takes all patterns, an epoch of Lightning's is a twentieth of the training: its hooks cost more
     than a step. The module ends the last one early where the number of steps is no multiple of twenty.
     """
+    tensors = [values for group in patterns for values in (group.x, group.d, group.validation)]
     if not isinstance(fit, MiniBatchSection):
         share = math.ceil(fit.epochs / SAVED)
-        return WholeBatches(patterns, share), math.ceil(fit.epochs / share)
-    tensors = [values for group in patterns for values in (group.x, group.d, group.validation)]
+        return WholeBatches(tensors, share), math.ceil(fit.epochs / share)
     order = ShuffledBatches(len(patterns[0].d), fit.batch_rows, fit.seed)
     return DataLoader(TensorDataset(*tensors), batch_size=None, sampler=order), fit.epochs
 
@@ -83,10 +83,9 @@ def _batches(patterns: Sequence[Patterns], fit: FitSection) -> tuple[Any, int]:
 class WholeBatches:
     """A loader that gives all patterns again and again: a DataLoader would double the time of a step."""
 
-    def __init__(self, patterns: Sequence[Patterns], count: int) -> None:
-        """Keep the patterns; an epoch has `count` batches."""
-        self._batch = [values for group in patterns for values in (group.x, group.d, group.validation)]
-        self._count = count
+    def __init__(self, batch: list[Tensor], count: int) -> None:
+        """Keep the batch of all patterns; an epoch has `count` of it."""
+        self._batch, self._count = batch, count
 
     def __iter__(self) -> Iterator[list[Tensor]]:
         """Give the batch as often as an epoch wants it."""
@@ -167,12 +166,7 @@ class NetworkTraining(lightning.LightningModule):
     energies: Tensor
     epochs_done: Tensor
 
-    def __init__(
-        self,
-        networks: Sequence[PiSigma],
-        fit: FitSection,
-        labels: Sequence[Sequence[str]],
-    ) -> None:
+    def __init__(self, networks: Sequence[PiSigma], fit: FitSection, labels: Sequence[Sequence[str]]) -> None:
         """Prepare the training.
 
         Args:
@@ -193,11 +187,10 @@ class NetworkTraining(lightning.LightningModule):
             else:
                 self.solvers.append(LevenbergMarquardt(network, fit.starts, fit.spread, fit.ridge, generator))
         self._rates = (
-            [fit.rates(names) for names in labels] if isinstance(fit, GradientDescentSection) else []
+            [fit.rates(group) for group in labels] if isinstance(fit, GradientDescentSection) else []
         )
-        self.register_buffer(
-            "energies", torch.full((fit.epochs, len(self.labels)), torch.nan, dtype=torch.float64)
-        )
+        energies = torch.full((fit.epochs, len(self.labels)), torch.nan, dtype=torch.float64)
+        self.register_buffer("energies", energies)
         self.register_buffer("epochs_done", torch.zeros((), dtype=torch.int64))
 
     def configure_optimizers(self) -> Any:
@@ -207,10 +200,8 @@ class NetworkTraining(lightning.LightningModule):
             return GradientDescent(networks, self._rates)
         if not isinstance(self.fit, MiniBatchSection):
             return SolverSteps(networks)
-        optimiser = self.fit.build(self.networks.parameters())
-        falling = torch.optim.lr_scheduler.CosineAnnealingLR(
-            optimiser, int(self.trainer.estimated_stepping_batches)
-        )
+        optimiser, steps = self.fit.build(self.networks.parameters()), self.trainer.estimated_stepping_batches
+        falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, int(steps))
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": falling, "interval": "step"}}
 
     def training_step(self, batch: list[Tensor], batch_idx: int) -> Tensor | None:
@@ -274,13 +265,12 @@ class NetworkTraining(lightning.LightningModule):
 
     def _descend_by_batch(self, patterns: list[Patterns], batch_idx: int) -> Tensor:
         """Cost of a batch, with the weight of all rows; the epoch's energies are the mean over its batches."""
-        count = self.trainer.num_training_batches
         energies = torch.cat(
             [energy(net.products(p.x), p.d) for net, p in zip(self.networks, patterns, strict=True)]  # type: ignore[operator]
         )
         epoch = self.energies[int(self.epochs_done)]
         epoch.copy_(energies.detach() + (epoch if batch_idx else 0.0))
-        return energies.sum() * count
+        return energies.sum() * self.trainer.num_training_batches
 
     def _count(self, energies: Tensor) -> None:
         """Keep the energies of an epoch that is done."""

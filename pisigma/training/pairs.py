@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
-from pisigma.kinematics.closed_form import closed_form_solver
+from pisigma.kinematics.closed_form import AbstractClosedForm, closed_form_solver
 from pisigma.kinematics.numeric import solve_numeric
 from pisigma.kinematics.singularity import singularity_measure
 from pisigma.kinematics.status import Status
@@ -66,13 +66,15 @@ def build_pairs(robot: Robot, measurements: Measurements, singular_below: float 
         IdentificationError: no row is left to train on.
     """
     T, q = measurements.T, measurements.q
-    if closed_form_solver(robot) is None:
+    solver = closed_form_solver(robot)
+    if solver is None:
         solution = solve_numeric(robot, T, q)
         q_nominal, index = solution.q, torch.zeros(len(q), dtype=torch.int64)
         unreachable = solution.status == Status.NOT_CONVERGED
         names: tuple[str, ...] = ()
     else:
-        q_nominal, index, names = _nearest_branch(robot, T, q)
+        q_nominal, index = _nearest_branch(robot, solver, T, q)
+        names = solver.branches
         unreachable = ~torch.isfinite(q_nominal).all(-1)
     target = joint_difference(robot, q, q_nominal)
     target = torch.where(unreachable[:, None], 0.0, target)
@@ -97,19 +99,15 @@ def joint_difference(
     return torch.where(torch.tensor(robot.revolute), wrap_to_pi(difference), difference)
 
 
-def _nearest_branch(robot: Robot, T: Tensor, q: Tensor) -> tuple[Tensor, Tensor, tuple[str, ...]]:
-    """Joint values of the closed-form branch nearest to q, its index, and the names of the branches."""
-    solver = closed_form_solver(robot)
-    assert solver is not None
+def _nearest_branch(robot: Robot, solver: AbstractClosedForm, T: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
+    """Joint values of the closed-form branch nearest to q, and its index."""
     every = solver.solve(T).q
     distance = joint_difference(robot, q[:, None, :].expand_as(every), every).square().sum(-1)
     index = torch.where(torch.isfinite(distance), distance, torch.inf).argmin(-1)
-    return every[torch.arange(len(q)), index], index, solver.branches
+    return every[torch.arange(len(q)), index], index
 
 
 def _frequent(index: Tensor, names: tuple[str, ...]) -> tuple[str, ...]:
-    if not names:
-        return ()
     counts = torch.bincount(index, minlength=len(names))
     order = counts.argsort(descending=True, stable=True).tolist()
     return tuple(names[i] for i in order if counts[i] > 0)

@@ -122,7 +122,7 @@ def train(
 
     Args:
         module: to train.
-        data: a `LightningDataModule`, or what gives the batches of an epoch.
+        data: what gives the batches of an epoch.
         epochs: to train at most; about `SAVED` times, and at the end, a checkpoint is written.
         checkpoints: where they are kept; None keeps none.
         show_progress: draw Lightning's bar on stderr, if that is a terminal.
@@ -154,10 +154,7 @@ def train(
             use_distributed_sampler=False,
         )
         resumed = checkpoints.file if checkpoints is not None and checkpoints.resume else None
-        if isinstance(data, lightning.LightningDataModule):
-            trainer.fit(module, datamodule=data, ckpt_path=resumed)
-        else:
-            trainer.fit(module, data, ckpt_path=resumed)
+        trainer.fit(module, data, ckpt_path=resumed)
         if trainer.interrupted:
             raise KeyboardInterrupt
 
