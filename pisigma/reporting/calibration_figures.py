@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float64
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.image import AxesImage
 from matplotlib.ticker import LogLocator, NullFormatter
 from torch import Tensor
 
@@ -117,10 +118,7 @@ def draw_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:
     figure = Figure(figsize=(side * len(tables) + 0.9, side + 0.3), layout="constrained")
     grid = figure.subplots(1, len(tables), squeeze=False)[0]
     for axes, table, title in zip(grid, tables, ("lengths", "angles"), strict=True):
-        shown = axes.imshow(table.values, cmap="RdBu", vmin=-1, vmax=1, interpolation="nearest")
-        axes.set_facecolor("0.85")
-        axes.set_xticks(range(len(table.names)), table.names, rotation=90, fontsize=8)
-        axes.set_yticks(range(len(table.names)), table.names, fontsize=8)
+        shown = show_correlations(axes, table.names, table.values)
         axes.set_title(title, fontsize=11)
         apart = ~np.eye(len(table.names), dtype=bool)
         for sign, mark in ((1, "$+$"), (-1, "$-$")):
@@ -132,6 +130,16 @@ def draw_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:
         "white + or -: redundant (|r| = 1);  grey: without effect on what was measured", fontsize=10
     )
     save_figure(figure, path)
+
+
+def show_correlations(
+    axes: Axes, names: Sequence[str], values: Float64[np.ndarray, "_names _names"]
+) -> AxesImage:
+    """Show a table of correlations as colours with the names along both axes; undefined ones are grey."""
+    axes.set_facecolor("0.85")
+    axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
+    axes.set_yticks(range(len(names)), names, fontsize=8)
+    return axes.imshow(values, cmap="RdBu", vmin=-1, vmax=1, interpolation="nearest")
 
 
 def draw_corrections(correction: JointCorrection, measurements: Measurements, path: Path) -> None:

@@ -20,6 +20,7 @@ from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocato
 
 from pisigma.errors import OutputError
 from pisigma.judging.validation_figures import LearningPoint
+from pisigma.reporting.calibration_figures import STYLES, show_correlations
 from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.corrections import CorrectionCurve, Correlations
 from pisigma.reporting.page.dependence import Dependence, binned
@@ -49,7 +50,7 @@ _STYLE: dict[Any, Any] = {
 }
 MOST_MAP_DOTS = 1_500
 """Of the flat map: the largest errors all, of the others every fourth and as many at most."""
-_MODELS = {"nominal": (BEFORE, "s", ":"), "geometric": (OTHER, "o", "--"), "hybrid": (AFTER, "^", "-")}
+_COLORS = {"nominal": BEFORE, "geometric": OTHER, "hybrid": AFTER}
 
 
 @dataclass(frozen=True, eq=False)
@@ -213,10 +214,7 @@ def _correlations(title: str, table: Correlations) -> Drawing:
         figure = Figure(figsize=(side + 0.9, side), layout="constrained")
         axes = figure.add_subplot()
         axes.grid(False)
-        axes.set_facecolor("0.85")
-        shown = axes.imshow(values, cmap="RdBu", vmin=-1, vmax=1, interpolation="nearest")
-        axes.set_xticks(range(len(names)), names, rotation=90, fontsize=8)
-        axes.set_yticks(range(len(names)), names, fontsize=8)
+        shown = show_correlations(axes, names, values)
         for (i, k), value in np.ndenumerate(np.nan_to_num(values)):
             if i != k and abs(value) >= 0.5:
                 sign = "+" if value > 0 else "−"
@@ -234,9 +232,9 @@ def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
         figure, axes = _panel()
         rows = [point.rows for point in points]
         for name in points[0].models:
-            color, mark, line = _MODELS[name]
+            line, mark = STYLES[name]
             errors = [point.models[name].rms_mm for point in points]
-            axes.plot(rows, errors, line, marker=mark, label=name, color=color)  # type: ignore[arg-type]
+            axes.plot(rows, errors, line, marker=mark, label=name, color=_COLORS[name])  # type: ignore[arg-type]
         axes.set(xscale="log", yscale="log", xlabel="rows to calibrate with", ylabel="RMS error [mm]")
         axes.set_xticks(rows, [str(count) for count in rows])
         axes.xaxis.set_minor_formatter(NullFormatter())
