@@ -21,11 +21,6 @@ class CrossValidation:
     folds: int
     comparison: Comparison
 
-    def in_file_units(self) -> dict[str, object]:
-        """The figures in mm and deg."""
-        rows = {"folds": self.folds, "rows_not_predicted": self.comparison.not_predicted}
-        return {**rows, **self.comparison.in_file_units()}
-
     @property
     def verdict(self) -> str:
         """Whether the correction helps, in a sentence."""

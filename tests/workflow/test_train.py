@@ -90,8 +90,8 @@ def test_the_correction_helps_on_rows_that_it_never_saw():
     with no_type_checker():
         result = cross_validate(measured, run.measurements, steps.append)
     assert steps == [f"cross-validation: fold {fold} of 3" for fold in (1, 2, 3)]
-    figures = result.in_file_units()
-    assert (figures["folds"], figures["rows_not_predicted"]) == (3, 0)
+    figures = result.comparison.in_file_units()
+    assert (result.folds, result.comparison.not_predicted) == (3, 0)
     assert figures["corrected"]["rms_mm"] < figures["nominal"]["rms_mm"] / 3
     assert not result.comparison.corrected.position.isnan().any()
     assert not result.comparison.nominal.rotation.isnan().any()
