@@ -214,20 +214,19 @@ def _complaint(problem: ValidationError, node: yaml.Node, document: type[BaseMod
     path: _Path = first["loc"]
     line, keys = _locate(node, path)
     key = ".".join(str(part) for part in keys) or "the file"
+    where = f"{source}, line {line}"
     more = f" ({len(errors) - 1} more findings)" if len(errors) > 1 else ""
     context = first.get("ctx", {})
     if first["type"] == "extra_forbidden":
         section = ".".join(str(part) for part in keys[:-1]) or "the file"
         hint = nearest_choice(str(keys[-1]), valid_keys(document, path[:-1]))
-        return f"{source}, line {line}: unknown key '{keys[-1]}' in '{section}'; {hint}{more}"
+        return f"{where}: unknown key '{keys[-1]}' in '{section}'; {hint}{more}"
     if first["type"] == "missing":
-        return f"{source}, line {line}: the key '{path[-1]}' is missing in '{key}'; add it.{more}"
+        return f"{where}: the key '{path[-1]}' is missing in '{key}'; add it.{more}"
     if first["type"] == "union_tag_not_found":
         tag = str(context["discriminator"]).strip("'")
         choices = ", ".join(allowed_texts(document, (*path, tag)))
-        return (
-            f"{source}, line {line}: the key '{tag}' is missing in '{key}'; add it. Valid: {choices}.{more}"
-        )
+        return f"{where}: the key '{tag}' is missing in '{key}'; add it. Valid: {choices}.{more}"
     if first["type"] == "union_tag_invalid":
         path = (*path, str(context["discriminator"]).strip("'"))
         line, keys = _locate(node, path)
@@ -237,7 +236,7 @@ def _complaint(problem: ValidationError, node: yaml.Node, document: type[BaseMod
     message = first["msg"].removeprefix("Value error, ").rstrip(".")
     value = first["input"]
     came = f", but got {value!r}" if isinstance(value, str | int | float) else ""
-    return f"{source}, line {line}: '{key}': {message[:1].lower()}{message[1:]}{came}.{more}"
+    return f"{where}: '{key}': {message[:1].lower()}{message[1:]}{came}.{more}"
 
 
 def _wrong_choice(source: str, line: int, keys: list[str | int], stated: str, choices: list[str]) -> str:
@@ -294,10 +293,10 @@ def _follow(document: type[BaseModel], path: _Path) -> list[_Schema]:
         for candidate in nodes:
             if part in candidate.get("properties", {}):
                 following.append(candidate["properties"][part])
-            elif isinstance(part, int) and ("items" in candidate or "prefixItems" in candidate):
-                following.append(
-                    candidate["prefixItems"][part] if "prefixItems" in candidate else candidate["items"]
-                )
+            elif isinstance(part, int) and "prefixItems" in candidate:
+                following.append(candidate["prefixItems"][part])
+            elif isinstance(part, int) and "items" in candidate:
+                following.append(candidate["items"])
             elif isinstance(candidate.get("additionalProperties"), dict):
                 following.append(candidate["additionalProperties"])
         if following:

@@ -39,6 +39,27 @@ FRAME = ("X", "Y", "Z", "W", "P", "R")
 CONFIGURATION = re.compile(r"[NF] ([LR] )?[UD] [TB], -?\d, -?\d, -?\d")
 WORLD = "UFRAME counts from the world frame, which on FANUC robots lies at the height of J2."
 
+ATTRIBUTES = """\
+/PROG  {name}
+/ATTR
+OWNER = MNEDITOR;
+COMMENT = "pisigma targets";
+PROG_SIZE = 0;
+FILE_NAME = ;
+VERSION = 0;
+LINE_COUNT = {lines};
+MEMORY_SIZE = 0;
+PROTECT = READ_WRITE;
+TCD:  STACK_SIZE = 0,
+      TASK_PRIORITY = 50,
+      TIME_SLICE = 0,
+      BUSY_LAMP_OFF = 0,
+      ABORT_REQUEST = 0,
+      PAUSE_REQUEST = 0;
+DEFAULT_GROUP = 1,*,*,*,*;
+CONTROL_CODE = 00000000 00000000;"""
+"""What stands before the moves."""
+
 
 def fanuc_ls(program: Program) -> str:
     """The targets as one program of joint moves that stop at every target.
@@ -67,37 +88,8 @@ def fanuc_ls(program: Program) -> str:
             "split the file of poses."
         )
     numbered = [f"{index:4d}:{line} ;" for index, line in enumerate(lines, 1)]
-    return "\r\n".join(
-        (
-            *_attributes(name, len(lines)),
-            *("/MN", *numbered),
-            *("/POS", *_positions(program)),
-            *("/END", ""),
-        )
-    )
-
-
-def _attributes(name: str, lines: int) -> list[str]:
-    return [
-        f"/PROG  {name}",
-        "/ATTR",
-        "OWNER = MNEDITOR;",
-        'COMMENT = "pisigma targets";',
-        "PROG_SIZE = 0;",
-        "FILE_NAME = ;",
-        "VERSION = 0;",
-        f"LINE_COUNT = {lines};",
-        "MEMORY_SIZE = 0;",
-        "PROTECT = READ_WRITE;",
-        "TCD:  STACK_SIZE = 0,",
-        "      TASK_PRIORITY = 50,",
-        "      TIME_SLICE = 0,",
-        "      BUSY_LAMP_OFF = 0,",
-        "      ABORT_REQUEST = 0,",
-        "      PAUSE_REQUEST = 0;",
-        "DEFAULT_GROUP = 1,*,*,*,*;",
-        "CONTROL_CODE = 00000000 00000000;",
-    ]
+    attributes = ATTRIBUTES.format(name=name, lines=len(lines)).splitlines()
+    return "\r\n".join((*attributes, "/MN", *numbered, "/POS", *_positions(program), "/END", ""))
 
 
 def _positions(program: Program) -> list[str]:
@@ -116,8 +108,8 @@ def _positions(program: Program) -> list[str]:
             f"{label} {number(value, DIGITS)} {unit}"
             for label, value, unit in zip(labels, values, units, strict=True)
         ]
-        lines += [f"P[{row}]{{", "   GP1:", head, f"\t{', '.join(parts[:3])},", f"\t{', '.join(parts[3:])}"]
-        lines.append("};")
+        halves = (f"\t{', '.join(parts[:3])},", f"\t{', '.join(parts[3:])}")
+        lines += [f"P[{row}]{{", "   GP1:", head, *halves, "};"]
     return lines
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from pisigma.errors import OutputError
 from pisigma.export.programs.fanuc_ls import FANUC
 from pisigma.export.programs.krl import KRL
-from pisigma.export.programs.language import Language, Program
+from pisigma.export.programs.language import Program
 from pisigma.export.programs.rapid import RAPID
 from pisigma.export.programs.targets import Targets
 from pisigma.export.programs.urscript import URSCRIPT
@@ -15,18 +15,13 @@ LANGUAGES = {".script": URSCRIPT, ".src": KRL, ".mod": RAPID, ".ls": FANUC}
 """By the suffix of the file."""
 
 
-def language_of(path: Path) -> Language:
-    """The language of a file, whose suffix is one of `LANGUAGES`."""
-    return LANGUAGES[path.suffix.lower()]
-
-
 def check_program(path: Path, robot: Robot, cartesian: bool, config: str | None) -> None:
     """Make sure that a program can be written, before the targets are computed.
 
     Raises:
         OutputError: the name of the file, the robot or the options do not do.
     """
-    language = language_of(path)
+    language = LANGUAGES[path.suffix.lower()]
     language.program_name(path)
     if robot.dof != 6 or not all(robot.revolute):
         turning = sum(robot.revolute)
@@ -50,7 +45,7 @@ def check_program(path: Path, robot: Robot, cartesian: bool, config: str | None)
 
 def cautions(path: Path, cartesian: bool) -> tuple[str, ...]:
     """What has to be known before a program is used, besides what is true of all of them."""
-    language = language_of(path)
+    language = LANGUAGES[path.suffix.lower()]
     return (*language.cautions, *(language.cartesian_cautions if cartesian else ()))
 
 
@@ -69,7 +64,7 @@ def program_text(targets: Targets, path: Path, cartesian: bool, config: str | No
     """
     check_program(path, targets.robot, cartesian, config)
     targets.check_complete()
-    language = language_of(path)
+    language = LANGUAGES[path.suffix.lower()]
     if cartesian and not language.keeps_branch and len(set(targets.branch)) > 1:
         other = next(row for row, name in enumerate(targets.branch) if name != targets.branch[0])
         raise OutputError(

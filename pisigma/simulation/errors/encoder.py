@@ -49,8 +49,6 @@ class EncoderQuantisation(AbstractJointSource):
 
         def error(q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
             steps = step.to(q)
-            return torch.where(
-                quantised.to(q.device), steps * torch.round(q / steps) - q, torch.zeros_like(q)
-            )
+            return torch.where(quantised.to(q.device), steps * torch.round(q / steps) - q, 0.0)
 
         return error

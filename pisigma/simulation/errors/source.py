@@ -150,10 +150,8 @@ def stated_joints(
         RecipeError: an unknown joint, or one in the mapping of the other type.
     """
     values: dict[int, Value] = {}
-    for mapping, field, other, kind in (
-        (for_revolute, fields[0], fields[1], "revolute"),
-        (for_prismatic, fields[1], fields[0], "prismatic"),
-    ):
+    kinds = ((for_revolute, *fields, "revolute"), (for_prismatic, *fields[::-1], "prismatic"))
+    for mapping, field, other, kind in kinds:
         for name, value in mapping.items():
             index = joint_index(robot, name, place)
             actual = robot.joints[index].type
