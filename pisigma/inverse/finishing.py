@@ -102,8 +102,7 @@ class Finishing:
         status = status.clone()
         limited = status == Status.OUTSIDE_JOINT_LIMITS
         if limited.any():
-            robot = self._model.calibrated or self._model.robot
-            singular = singularity_measure(robot, q[limited]) < SINGULAR_TOLERANCE
+            singular = singularity_measure(self._geometric, q[limited]) < SINGULAR_TOLERANCE
             status[limited] = torch.where(singular, int(Status.SINGULAR), int(Status.REACHED))
         return status
 

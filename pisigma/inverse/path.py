@@ -168,7 +168,8 @@ def _switches(
     reached = np.isfinite(q).all(-1)
     rows = np.flatnonzero(reached)
     status, lies = np.asarray(solution.status), np.asarray(solution.branch)
-    result = [_gap(index, status, reached) for index in _starts_of_gaps(reached)]
+    gaps = np.flatnonzero(np.diff(reached.astype(int), prepend=1) < 0)
+    result = [_gap(int(index), status, reached) for index in gaps]
     before, after = rows[:-1], rows[1:]
     step = q[after] - q[before]
     far = np.flatnonzero((np.abs(step).max(-1) > 0.1) | (lies[after] != lies[before]))
@@ -207,11 +208,6 @@ def _at(
 
 def _amount(ik: "pisigma.inverse.corrected_ik.CorrectedIK", joint: int, step: float) -> str:
     return f"{math.degrees(step):.1f} deg" if ik.revolute[joint] else f"{step * 1e3:.1f} mm"
-
-
-def _starts_of_gaps(reached: Array) -> list[int]:
-    lost = np.concatenate([[False], ~reached])
-    return [int(index) for index in np.flatnonzero(lost[1:] & ~lost[:-1])]
 
 
 def _gap(index: int, status: Array, reached: Array) -> PathSwitch:
@@ -271,8 +267,7 @@ def _within(values: Array, lower: float, upper: float, meant: float) -> tuple[Ar
 
 def wrapped(step: Array, revolute: Array) -> Array:
     """Joint motions `(..., dof)` [rad or m], those of revolute joints by less than half a turn."""
-    turns = np.round(step / (2 * math.pi))
-    return step - np.where(revolute, 2 * math.pi * turns, 0.0)
+    return step - np.where(revolute, _TURN * np.round(step / _TURN), 0.0)
 
 
 def is_jump(before: Array, middle: Array, after: Array, revolute: Array) -> Array:

@@ -57,11 +57,9 @@ class Domain(nn.Module):
 
     def measure(self, scaled: Float[Tensor, "*batch inputs"]) -> Float[Tensor, "*batch"]:
         """Distance to the nearest training row over the radius; NaN where an input is NaN."""
-        flat = scaled.reshape(-1, scaled.shape[-1])
-        nearest = [flat[:0, 0]]
-        for first in range(0, len(flat), _CHUNK):
-            nearest.append(_distances(flat[first : first + _CHUNK], self.samples).amin(-1))
-        return (torch.cat(nearest) / self.radius).reshape(scaled.shape[:-1])
+        chunks = torch.split(scaled.reshape(-1, scaled.shape[-1]), _CHUNK)
+        nearest = torch.cat([_distances(chunk, self.samples).amin(-1) for chunk in chunks])
+        return (nearest / self.radius).reshape(scaled.shape[:-1])
 
     def contains(self, scaled: Float[Tensor, "*batch inputs"]) -> Bool[Tensor, "*batch"]:
         """Whether poses are inside; a NaN never is."""

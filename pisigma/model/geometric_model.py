@@ -81,15 +81,14 @@ def model_of_hybrid(
     if learned is None:
         kept = _kept(result.uncertainty, known.robot, model.bases, model.tools)
         return replace(model, uncertainty=kept)
-    found = learned.geometry
-    bases, tools = dict(found.bases), dict(found.tools)
+    bases, tools = dict(learned.geometry.bases), dict(learned.geometry.tools)
     return replace(
         model,
         kind="hybrid_calibration",
         hybrid=result.arm(),
         hybrid_bases=bases,
         hybrid_tools=tools,
-        uncertainty=_kept(result.uncertainty, found.robot, bases, tools),
+        uncertainty=_kept(result.uncertainty, learned.geometry.robot, bases, tools),
     )
 
 
