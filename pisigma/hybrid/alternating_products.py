@@ -1,6 +1,7 @@
 """Product units with all factors fixed but one: linear in that one."""
 
 from collections.abc import Sequence
+from itertools import combinations
 
 import torch
 from jaxtyping import Float, Float64
@@ -19,6 +20,7 @@ class AlternatingProducts(AbstractFeature):
         factors: weights of all of them, the bias first.
         turn: whose turn it is.
         free: per unit, number of its free factor among all.
+        fixed: per unit, numbers of its other factors.
     """
 
     name = "products"
@@ -31,8 +33,9 @@ class AlternatingProducts(AbstractFeature):
         self.orders = tuple(orders)
         self.factors = factors
         self.turn = turn
-        starts = [sum(orders[:u]) for u in range(len(orders))]
-        self.free = tuple(start + turn % order for start, order in zip(starts, orders, strict=True))
+        units = [range(sum(orders[:u]), sum(orders[: u + 1])) for u in range(len(orders))]
+        self.free = tuple(unit[turn % len(unit)] for unit in units)
+        self.fixed = tuple([factor for factor in unit if factor not in self.free] for unit in units)
         dof, inputs = factors.shape[0], factors.shape[2]
         self.used = torch.ones(dof, len(orders) * inputs, dtype=torch.bool)
         self.group = torch.arange(dof)[:, None].expand(self.used.shape)
@@ -43,14 +46,11 @@ class AlternatingProducts(AbstractFeature):
         x = with_bias(self.robot, state.q)
         values = torch.einsum("...i,jsi->...js", x, self.factors.to(x))
         parts = []
-        start = 0
-        for order, free in zip(self.orders, self.free, strict=True):
+        for fixed in self.fixed:
             product = torch.ones_like(values[..., 0])
-            for factor in range(start, start + order):
-                if factor != free:
-                    product = product * values[..., factor]
+            for factor in fixed:
+                product = product * values[..., factor]
             parts.append(product[..., None] * x[..., None, :])
-            start += order
         return torch.cat(parts, -1)
 
     def solved(self, weights: Float64[Tensor, " weights"]) -> Float64[Tensor, "dof factors inputs"]:
@@ -72,9 +72,7 @@ class InputPairs(AbstractFeature):
         turning = [j for j, turns in enumerate(robot.revolute) if turns]
         sliding = [j for j, turns in enumerate(robot.revolute) if not turns]
         joint = [*turning, *turning, *sliding]
-        self.pairs = tuple(
-            (a, b) for a in range(len(joint)) for b in range(a + 1, len(joint)) if joint[a] != joint[b]
-        )
+        self.pairs = tuple((a, b) for a, b in combinations(range(len(joint)), 2) if joint[a] != joint[b])
         self.inputs = len(joint)
         self.used = torch.ones(robot.dof, len(self.pairs), dtype=torch.bool)
         self.group = torch.arange(robot.dof)[:, None].expand(self.used.shape)

@@ -190,11 +190,7 @@ def misfits(sums: Sums, x: Float64[Tensor, " unknowns"]) -> tuple[float, ...]:
 
 
 def maximise_evidence(
-    sums: Sums,
-    prior: GaussianPrior,
-    noise: tuple[float, ...],
-    iterations: int = 40,
-    tolerance: float = 5e-2,
+    sums: Sums, prior: GaussianPrior, noise: tuple[float, ...], iterations: int = 40, tolerance: float = 5e-2
 ) -> Posterior:
     """Estimate prior sizes and noise together with the unknowns.
 
@@ -226,8 +222,6 @@ def renewed_noise(sums: Sums, posterior: Posterior) -> tuple[float, ...]:
     noise = []
     for k, misfit in enumerate(misfits(sums, posterior.x)):
         left = max(sums.count[k] - used[k] / posterior.noise[k] ** 2, 1.0)
-        sigma = math.sqrt(misfit / left)
-        if sums.exact[k]:
-            sigma = 1.0
+        sigma = 1.0 if sums.exact[k] else math.sqrt(misfit / left)
         noise.append(max(sigma, 1.0 if sums.stated[k] else SMALLEST_NOISE))
     return tuple(noise)

@@ -83,14 +83,12 @@ def _configurations(
 ) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
     """Configurations with equally many values together: configuration, sensor, columns and residuals."""
     change = rows.start(design) - posterior.x
-    kinds, configurations, offsets = [], [], []
+    collected = []
     for number, sensor in enumerate(rows.values):
         if not sensor.certain:
             index = torch.arange(len(sensor.row), device=sensor.row.device)
-            configurations.append(rows.configuration[sensor.row])
-            kinds.append(torch.full_like(index, number))
-            offsets.append(index)
-    configuration, kind, offset = torch.cat(configurations), torch.cat(kinds), torch.cat(offsets)
+            collected.append((rows.configuration[sensor.row], torch.full_like(index, number), index))
+    configuration, kind, offset = (torch.cat(column) for column in zip(*collected, strict=True))
     order = torch.argsort(configuration * len(rows.values) + kind, stable=True)
     configuration, kind, offset = configuration[order], kind[order], offset[order]
     sizes = torch.tensor([sensor.components for sensor in rows.values], device=kind.device)[kind]
@@ -110,9 +108,8 @@ def _configurations(
                 _whitened(rows, design, posterior, change, kind[firsts[part] + k], offset[firsts[part] + k])
                 for k in range(count)
             ]
-            X, r = torch.cat([block[0] for block in blocks], 1), torch.cat([block[1] for block in blocks], 1)
-            kinds_here = torch.cat([block[2] for block in blocks], 1)
-            yield owner[part][:, None].expand(r.shape), kinds_here, X, r
+            X, r, kinds = (torch.cat(column, 1) for column in zip(*blocks, strict=True))
+            yield owner[part][:, None].expand(r.shape), kinds, X, r
 
 
 def _whitened(

@@ -170,7 +170,7 @@ class WhitenedUnknowns:
             design=few.design,
             posterior=few.posterior,
             products=tuple(
-                chosen for chosen in whole.design.features if isinstance(chosen, AlternatingProducts)
+                units for units in whole.design.features if isinstance(units, AlternatingProducts)
             ),
             start=torch.cat([few.posterior.x, few.posterior.x.new_zeros(extra)]),
             root=covariance_root(covariance, change),
@@ -214,11 +214,10 @@ class WhitenedUnknowns:
             return self.design, replace(self.posterior, x=x)
         first, factors = self.products[0], self.factors(x)
         length, unit = factors.norm(dim=-1), normalised(factors)
-        free, start = [], 0
-        for order, place in zip(first.orders, first.free, strict=True):
-            others = [s for s in range(start, start + order) if s != place]
-            free.append(factors[:, place] * length[:, others].prod(1)[:, None])
-            start += order
+        free = [
+            factors[:, place] * length[:, others].prod(1)[:, None]
+            for place, others in zip(first.free, first.fixed, strict=True)
+        ]
         units = AlternatingProducts(self.design.problem.space.robot, first.orders, unit, first.turn)
         weights = x[: self.design.stretch(len(self._additive)).start]
         x = torch.cat([weights, torch.stack(free, 1).flatten()])
