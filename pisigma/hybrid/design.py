@@ -186,7 +186,7 @@ class Rows:
         """Numbers of all configurations in a random order that is always the same."""
         return torch.randperm(self.configurations, generator=torch.Generator().manual_seed(0))
 
-    def weighted(self, weights: Sequence[Float64[Tensor, " values"]]) -> "Rows":
+    def weighted(self, weights: Sequence[Float64[Tensor, " _values"]]) -> "Rows":
         """The same with the values of every sensor weighted; then repeats of a pose are one row."""
         kept = [sensor.weighted(weight) for sensor, weight in zip(self.values, weights, strict=True)]
         if self.problem.pose is not None:
