@@ -110,20 +110,9 @@ def build_planning_problem(
     tool = space.arm_size + 6
     columns = [*arm, tool, tool + 1, tool + 2]
     usual = torch.from_numpy(space.usual_errors)[columns]
-    usual_base = torch.tensor([USUAL_LENGTH] * 3 + [USUAL_ANGLE] * 3, dtype=torch.float64)
-    size = len(columns) + 6 * len(Ts_jig_base)
-    rows = torch.zeros(candidates.count, size, dtype=torch.float64)
     free_of_base = robot.with_geometry(base=np.zeros(6))
-    for number, T_jig_base in enumerate(Ts_jig_base):
-        chosen = (candidates.placement == number).nonzero()[:, 0]
-        T, J = identification_jacobian(free_of_base, candidates.q[chosen])
-        along = T_jig_base[candidates.axis[chosen], :3]
-        start = len(columns) + 6 * number
-        rows[chosen, : len(columns)] = torch.einsum("ni,nip->np", along, J[:, :3, columns]) * usual
-        # By a small shift and turn of the base in its own frame: they span what x, y, z, roll, pitch and yaw span, so
-        # the predicted error is the same.
-        by_base = torch.cat([along, torch.linalg.cross(T[:, :3, 3], along)], -1)
-        rows[chosen, start : start + 6] = by_base * usual_base
+    rows = _rows_of_touches(free_of_base, candidates, Ts_jig_base, columns, usual)
+    size = rows.shape[1]
     _, J = identification_jacobian(free_of_base, workspace)
     J = J[:, :3, columns] * usual * 1e3
     weight = torch.zeros(size, size, dtype=torch.float64)
@@ -132,6 +121,37 @@ def build_planning_problem(
     precision = torch.full((size,), VAGUE**-2, dtype=torch.float64)
     precision[: len(columns)] = torch.where(known > 0, known, VAGUE**-2)
     return PlanningProblem(rows / sigma, weight, precision)
+
+
+def _rows_of_touches(
+    robot: Robot,
+    candidates: TouchCandidates,
+    Ts_jig_base: Float64[Tensor, "placements 4 4"],
+    columns: list[int],
+    usual: Float64[Tensor, " columns"],
+) -> Float64[Tensor, "candidates parameters"]:
+    """Give the derivatives of touches by arm and tool, then by the base of every placement, in units of usual errors.
+
+    Args:
+        robot: with its base at the origin.
+        candidates: what could be touched.
+        Ts_jig_base: where the jigs are believed to stand [m].
+        columns: of the identification Jacobian, of arm and tool.
+        usual: usual errors of their parameters [m or rad].
+    """
+    usual_base = torch.tensor([USUAL_LENGTH] * 3 + [USUAL_ANGLE] * 3, dtype=torch.float64)
+    rows = torch.zeros(candidates.count, len(columns) + 6 * len(Ts_jig_base), dtype=torch.float64)
+    for number, T_jig_base in enumerate(Ts_jig_base):
+        chosen = (candidates.placement == number).nonzero()[:, 0]
+        T, J = identification_jacobian(robot, candidates.q[chosen])
+        along = T_jig_base[candidates.axis[chosen], :3]
+        start = len(columns) + 6 * number
+        rows[chosen, : len(columns)] = torch.einsum("ni,nip->np", along, J[:, :3, columns]) * usual
+        # By a small shift and turn of the base in its own frame: they span what x, y, z, roll, pitch and yaw span, so
+        # the predicted error is the same.
+        by_base = torch.cat([along, torch.linalg.cross(T[:, :3, 3], along)], -1)
+        rows[chosen, start : start + 6] = by_base * usual_base
+    return rows
 
 
 def plan_measurements(problem: PlanningProblem, count: int) -> MeasurementPlan:
