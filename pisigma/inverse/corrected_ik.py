@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pisigma.errors import ModelError
-from pisigma.inverse.joint_input import Postures, as_array, pose_array
+from pisigma.errors import ModelError, PoseError
+from pisigma.inverse.joint_input import Postures, as_array, checked_approach, pose_array
 from pisigma.kernels.array_kinematics import by_torch, is_tensor
 from pisigma.model.folder.folder_files import COMPILED, folder_hash
 
@@ -135,6 +135,7 @@ class CorrectedIK:
         """
         if near is not None:
             near = self.postures.checked(near, throw)
+        approach = checked_approach(approach)
         kernels = self.compiled
         if isinstance(T_base_tool, np.ndarray) and T_base_tool.shape == (4, 4) and kernels is not None:
             return kernels.solve(T_base_tool, near, branch, throw, approach, self)  # the way of control loops
@@ -145,19 +146,20 @@ class CorrectedIK:
             )
             return self._like(T_base_tool, solution)
         if T.ndim == 2 and not single:
-            solution = kernels.solve(T, near, branch, throw, as_array(approach), self)
+            solution = kernels.solve(T, near, branch, throw, approach, self)
         else:
             solution = kernels.solve_batch(
-                T, near, branch, throw=throw, approach=as_array(approach), single=single, owner=self
+                T, near, branch, throw=throw, approach=approach, single=single, owner=self
             )
         return self._like(T_base_tool, solution)
 
     def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> "pisigma.inverse.solution.Solution":
         """Solutions on every branch, as `(*batch, branches)`; one for a robot without closed-form inverse."""
         T, single = pose_array(T_base_tool)
+        approach = checked_approach(approach)
         if self.compiled is None:
             return self._like(T_base_tool, self.reference.all_branches(T, approach=approach, single=single))
-        every = self.compiled.all_branches(T, approach=as_array(approach), single=single, owner=self)
+        every = self.compiled.all_branches(T, approach=approach, single=single, owner=self)
         return self._like(T_base_tool, every)
 
     def path(
@@ -187,9 +189,13 @@ class CorrectedIK:
             approach: see `__call__`; for arrays.
 
         Raises:
-            PoseError: q has another number of columns than the robot has joints.
+            PoseError: q has another number of columns than the robot has joints, or approach does not fit or is given
+                where torch evaluates the arm.
         """
+        approach = checked_approach(approach)
         kernels = self._kernels_of(q)
+        if kernels is None and approach is not None:
+            raise PoseError("approach is read with arrays of models that have kernels; give q as an array.")
         if kernels is None:
             return by_torch(self.model.forward, q)
         values = np.asarray(q, dtype=np.float64)

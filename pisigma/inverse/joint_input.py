@@ -34,6 +34,30 @@ def pose_array(values: Any) -> tuple[Any, bool]:
     return T, given.dtype == np.float32
 
 
+def checked_approach(approach: Any) -> Any:
+    """Give back from which sides joints come, if that is what the values say; what is no numbers is left as it came.
+
+    Args:
+        approach: +1 or -1 for the side from which a joint comes, 0 where that is not stated; or None.
+
+    Raises:
+        PoseError: another number stands there, which a learned backlash would be multiplied by.
+    """
+    if approach is None:
+        return None
+    try:
+        values = np.asarray(as_array(approach), dtype=np.float64)
+    except (TypeError, ValueError):
+        return approach
+    wrong = values[~np.isin(values, (-1.0, 0.0, 1.0))]
+    if wrong.size:
+        raise PoseError(
+            f"approach holds {wrong[0]:g}; give +1 (the joint's value grows before it stops), -1 (it falls) or 0 (not "
+            "stated) for every joint."
+        )
+    return values
+
+
 class Postures:
     """What joint values a robot may be at: a full turn beyond the joint limits at most, or the stroke and 1 m at least.
 

@@ -110,7 +110,7 @@ def _approaches(q: Array, near: Array | None) -> Array:
     A joint that does not move keeps the side that it came from; 0 before it has moved at all.
     """
     first = q[:1] if near is None else near[None]
-    step = np.diff(np.concatenate([first, q]), axis=0)
+    step = np.nan_to_num(np.diff(np.concatenate([first, q]), axis=0))  # poses without solution say nothing
     sides = np.where(np.abs(step) < _STILL, 0.0, np.sign(step))
     moved = np.where(sides != 0, np.arange(len(q))[:, None], -1)
     last = np.maximum.accumulate(moved, axis=0)

@@ -14,7 +14,7 @@ from torch import Tensor
 from pisigma.errors import ModelError, PoseError, nearest_choice
 from pisigma.inverse.finishing import Finishing
 from pisigma.inverse.identified_arm import IdentifiedArm, search
-from pisigma.inverse.joint_input import as_array, pose_array
+from pisigma.inverse.joint_input import as_array, checked_approach, pose_array
 from pisigma.inverse.solution import Solution
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.status import Status
@@ -110,7 +110,7 @@ class ReferenceIK:
         hybrid = self.model.hybrid
         if approach is None or hybrid is None:
             return solve(self)
-        sides, _ = self._joint_rows(approach, "approach", batch, True)
+        sides, _ = self._joint_rows(checked_approach(approach), "approach", batch, True)
         kinds, index = torch.unique(sides.reshape(-1, sides.shape[-1]), dim=0, return_inverse=True)
         result = solve(self) if not len(kinds) else None
         for kind, side in enumerate(kinds):

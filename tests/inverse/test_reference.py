@@ -164,6 +164,12 @@ def test_both_routes_know_from_which_side_joints_come():
     assert_close((picked - tensors.q)[fine].sin(), 0.0, atol=1e-9)
     with pytest.raises(PoseError, match="approach"):
         ik(T, approach=sides[:5])
+    for wrong in (5.0, 0.5, float("nan")):
+        for call in (ik, reference, ik.all_branches):
+            with pytest.raises(PoseError, match=f"approach holds {wrong:g}; give"):
+                call(T, approach=[wrong, 0, 0, 0, 0, 0])
+    with pytest.raises(PoseError, match="approach is read with arrays"):
+        ik.forward(q, approach=sides)
 
 
 def test_along_a_path_joints_come_from_where_they_move():
