@@ -8,7 +8,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions
-from pisigma.kernels.features import CompiledForm
+from pisigma.kernels.forms import CompiledForm
 from pisigma.measurement.conditions import APPROACH, JointState
 from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot

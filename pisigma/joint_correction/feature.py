@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
-from pisigma.kernels.features import CompiledForm
+from pisigma.kernels.forms import CompiledForm
 from pisigma.measurement.conditions import JointState
 from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot

@@ -9,7 +9,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, FeatureSection, turning_rate
-from pisigma.kernels.features import MOST_JOINTS, CompiledForm
+from pisigma.kernels.forms import MOST_JOINTS, CompiledForm
 from pisigma.measurement.conditions import JointState
 from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot

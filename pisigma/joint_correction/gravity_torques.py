@@ -8,7 +8,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, FeatureSection
-from pisigma.kernels.features import CompiledForm
+from pisigma.kernels.forms import CompiledForm
 from pisigma.kinematics.forward import Geometry, iterate_rows
 from pisigma.measurement.conditions import JointState
 from pisigma.onnx.chain import add_joint_frames

@@ -9,7 +9,7 @@ from pisigma.joint_correction.feature import AbstractFeature, FeatureSection
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.shared_features import NominalPose, ScaledJoints, SinesCosines
-from pisigma.kernels.features import register_compiled
+from pisigma.kernels.forms import register_compiled
 from pisigma.robot.description import Robot
 
 FEATURES: dict[str, type[AbstractFeature]] = {}

@@ -9,7 +9,7 @@ from jaxtyping import Float, Float64
 from torch import Tensor
 
 from pisigma.joint_correction.feature import AbstractFeature, scaled_joints, unit_inputs
-from pisigma.kernels.features import CompiledForm
+from pisigma.kernels.forms import CompiledForm
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.conditions import JointState
 from pisigma.network.inputs import Inputs

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pisigma.kernels.features import FORMS
+from pisigma.kernels.forms import FORMS
 
 FILE = Path(__file__).parent / "kernels.ll.zlib"
 """A line of JSON and the code as compressed text; `python -m pisigma.joint_correction.registry` writes it."""
@@ -105,7 +105,7 @@ _MANGLED = re.compile(r"(?<=[@\"])_ZN[\w.$]+")
 
 
 def intermediate_code() -> str:
-    """What numba makes of the kernels with all features of `kernels.features.FORMS`.
+    """What numba makes of the kernels with all features of `kernels.forms.FORMS`.
 
     Returns:
         Text of LLVM with the entry `ENTRY`.

@@ -7,7 +7,7 @@ from typing import Any, no_type_check
 from numba import njit
 
 from pisigma.kernels.arrays import DRAWN, FIXED, REVOLUTE
-from pisigma.kernels.features import FORMS
+from pisigma.kernels.forms import FORMS
 from pisigma.kernels.rows import Array, Record
 
 

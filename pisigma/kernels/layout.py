@@ -10,7 +10,7 @@ import numpy as np
 
 from pisigma.errors import ModelError
 from pisigma.kernels.arrays import PARTS, Description
-from pisigma.kernels.features import MOST_JOINTS, MOST_KINDS, MOST_VALUES
+from pisigma.kernels.forms import MOST_JOINTS, MOST_KINDS, MOST_VALUES
 
 DOF = MOST_JOINTS
 ROWS, FACTORS, UNITS, STRETCHES, STARTS = 24, 24, 12, 96, 512

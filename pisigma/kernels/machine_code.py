@@ -20,7 +20,7 @@ import llvmlite.binding as llvm  # type: ignore[import-untyped]
 
 from pisigma.errors import ModelError
 from pisigma.kernels.build import ARGUMENTS, ENTRY, intermediate_code, read_ready, ready_features, source_hash
-from pisigma.kernels.features import FORMS
+from pisigma.kernels.forms import FORMS
 
 _ALLOWED = frozenset(
     (

@@ -15,7 +15,7 @@ from pisigma.export.onnx_model import export_onnx
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.registry import FEATURES, register_feature
-from pisigma.kernels.features import FORMS, CompiledForm
+from pisigma.kernels.forms import FORMS, CompiledForm
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
