@@ -14,8 +14,9 @@ from pisigma.errors import PoseError, nearest_choice
 from pisigma.inverse.solution import Solution
 from pisigma.kernels import arrays
 from pisigma.kernels.description_file import read_description
+from pisigma.kernels.forms import KernelForms
 from pisigma.kernels.layout import make_memory, pack
-from pisigma.kernels.machine_code import address_of, kernel_features, load_kernels
+from pisigma.kernels.machine_code import address_of, kernel_forms, load_kernels
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import pisigma.inverse.corrected_ik
@@ -43,14 +44,14 @@ _COMPILING = (
 )
 
 
-def _kernels(features: tuple[str, ...]) -> Callable[..., int]:
+def _kernels(forms: KernelForms) -> Callable[..., int]:
     """The kernels; where machine code has to be made first, somebody at a terminal reads why it takes so long."""
     notice = threading.Timer(_PATIENCE, sys.stderr.write, (_COMPILING,))
     notice.daemon = True
     if sys.stderr.isatty():
         notice.start()
     try:
-        return load_kernels(features)
+        return load_kernels(forms)
     finally:
         notice.cancel()
 
@@ -80,14 +81,14 @@ class CompiledIK:
             ModelError: the arm is larger than the compiled kernels allow, or there are no kernels for this machine.
         """
         self.description = description
-        self._packed = pack(description, name, kernel_features(description.features))
+        self._packed = pack(description, name, kernel_forms(description.forms))
         self._address = address_of(self._packed)
         self.branches = tuple(branches)
         self.joints = tuple(joints)
         self.name = name
         self.belongs_to = belongs_to
         self._none = np.zeros((0, len(self.joints)))
-        self._kernels = _kernels(description.features)
+        self._kernels = _kernels(description.forms)
         self._threads = threading.local()
 
     @staticmethod

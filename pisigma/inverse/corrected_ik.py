@@ -71,7 +71,7 @@ class CorrectedIK:
         ik.name, ik.branches, ik.joints = kernels.name, kernels.branches, kernels.joints
         ik.order = tuple(int(index) for index in form.order)
         ik.limits, ik.revolute = arms.limits, np.asarray(arms.revolute, dtype=bool)
-        ik.closed_form = form.kind != 0
+        ik.closed_form = bool(kernels.description.forms.closed_forms)
         ik._read, ik.compiled = read, kernels
         return ik
 

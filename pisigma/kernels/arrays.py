@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+from pisigma.kernels.forms import KernelForms
 from pisigma.kinematics.status import Status
 
 NOMINAL, GEOMETRIC, HYBRID, DRAWN = 0, 1, 2, 3
@@ -13,9 +14,8 @@ BLENDED = 4
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
 """What moves in a row."""
 
-NO_CLOSED_FORM, SCARA, SPHERICAL_WRIST, THREE_PARALLEL = 0, 1, 2, 3
-"""Which closed form the nominal arm has."""
-
+NO_CLOSED_FORM = 0
+"""Of a nominal arm that has none; else the kind is 1 + the index of its name in `KernelForms.closed_forms`."""
 
 REACHED = int(Status.REACHED)
 SINGULAR = int(Status.SINGULAR)
@@ -69,7 +69,7 @@ class Correction(NamedTuple):
         middle: of every joint's values [rad or m].
         half: of every joint's travel [rad or m].
         values: the numbers of all features one after the other, as their `pack` gives them.
-        starts: where those of every feature begin, in the order of `Description.features`.
+        starts: where those of every feature begin, in the order of `Description.forms`.
         weight: `(factors, inputs, dof)` of the product units.
         bias: `(factors, dof)` of the product units.
         orders: number of factors of every product unit.
@@ -159,7 +159,6 @@ class ClosedForm(NamedTuple):
     """The nominal arm with canonical twists; see `pisigma.kinematics.closed_form`.
 
     Attributes:
-        kind: NO_CLOSED_FORM, SCARA, SPHERICAL_WRIST or THREE_PARALLEL.
         branches: how many it has; 1 without closed form.
         order: indices of the branches in the order in which they are tried where none is asked for.
         trained: how many of these, the first ones, training rows lie on.
@@ -173,7 +172,6 @@ class ClosedForm(NamedTuple):
         a: of every joint's row [m].
     """
 
-    kind: int
     branches: int
     order: Any
     trained: int
@@ -205,7 +203,7 @@ class Description(NamedTuple):
     """All of a calibrated arm.
 
     Attributes:
-        features: names of the features that its correction has.
+        forms: names of the features that its correction has, and of its closed form, if it has one.
     """
 
     arms: Arms
@@ -214,10 +212,8 @@ class Description(NamedTuple):
     network: Network
     closed_form: ClosedForm
     starts: Starts
-    features: tuple[str, ...] = ()
+    forms: KernelForms = KernelForms()
 
 
-PARTS: dict[str, Any] = {
-    part: kind for part, kind in Description.__annotations__.items() if part != "features"
-}
+PARTS: dict[str, Any] = {part: kind for part, kind in Description.__annotations__.items() if part != "forms"}
 """The parts of a description by name."""

@@ -1,20 +1,20 @@
 """The kernels' intermediate code, which comes with the package: made by numba, and tied to the sources by a hash.
 
-`python -m pisigma.joint_correction.registry` makes it, with all features. The code is that of no processor in
-particular, and without vectors: 64-bit machines lay out the kernels' structs alike, and the machine that loads it says
-which processor it has and makes the vectors.
+`python -m pisigma.joint_correction.registry` makes it, with all features and closed forms. The code is that of no
+processor in particular, and without vectors: 64-bit machines lay out the kernels' structs alike, and the machine that
+loads it says which processor it has and makes the vectors.
 """
 
+import dataclasses
 import hashlib
 import json
 import re
 import sys
 import zlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pisigma.kernels.forms import FORMS
+from pisigma.kernels.forms import KernelForms
 
 FILE = Path(__file__).parent / "kernels.ll.zlib"
 """A line of JSON and the code as compressed text; `python -m pisigma.joint_correction.registry` writes it."""
@@ -29,21 +29,22 @@ _NO_CODE = re.compile(rb'"""[\s\S]*?"""|#[^\n]*|^[ \t]*\n', re.MULTILINE)
 
 
 _FORMS = re.compile(rb"^@no_type_check\ndef [\s\S]*?(?=^(?:@|class |def |[A-Z_a-z])|\Z)", re.MULTILINE)
-"""Compiled forms among the files of features."""
+"""Compiled forms among the files of features and closed forms."""
 
 
 def source_files() -> list[Path]:
-    """The files that the kernels are made from, without those of features."""
+    """The files that the kernels are made from, without those of features and closed forms."""
     package = Path(__file__).parent.parent
     kernels = sorted(path for path in (package / "kernels").glob("*.py") if path.name not in _PYTHON)
     return [*kernels, *(package / name for name in _SHARED)]
 
 
 def source_hash() -> str:
-    """SHA-256 of the sources without docstrings, comments and empty lines; of features only the compiled forms."""
-    features = sorted((Path(__file__).parent.parent / "joint_correction").glob("*.py"))
+    """SHA-256 of the sources without docstrings, comments and empty lines; of features and closed forms these only."""
+    package = Path(__file__).parent.parent
+    forms = sorted([*package.glob("joint_correction/*.py"), *package.glob("kinematics/closed_form/*.py")])
     contents = [path.read_bytes() for path in source_files()]
-    contents += [form for path in features for form in _FORMS.findall(path.read_bytes())]
+    contents += [form for path in forms for form in _FORMS.findall(path.read_bytes())]
     digest = hashlib.sha256()
     for content in contents:
         lines = _NO_CODE.sub(b"", content).split(b"\n")
@@ -51,22 +52,23 @@ def source_hash() -> str:
     return digest.hexdigest()
 
 
-def write_ready(code: str, features: Sequence[str], **made_with: str) -> None:
+def write_ready(code: str, forms: KernelForms, **made_with: str) -> None:
     """Write the intermediate code of the present sources.
 
     Args:
         code: text of LLVM.
-        features: names of those that it evaluates, in order.
+        forms: what it evaluates.
         made_with: versions of the compilers that made it.
     """
-    header = json.dumps({"sources": source_hash(), "features": list(features), **made_with}, sort_keys=True)
+    stated = {"sources": source_hash(), "forms": dataclasses.asdict(forms), **made_with}
+    header = json.dumps(stated, sort_keys=True)
     FILE.write_bytes(header.encode() + b"\n" + zlib.compress(code.encode(), 9))
 
 
-def ready_features() -> tuple[str, ...] | None:
-    """Names of the features that the code evaluates; None where `read_ready` gives None, but for damaged code."""
+def ready_forms() -> KernelForms | None:
+    """What the code evaluates; None where `read_ready` gives None, but for damaged code."""
     header, _ = _content()
-    return None if header is None else tuple(header["features"])
+    return None if header is None else KernelForms(**{kind: tuple(n) for kind, n in header["forms"].items()})
 
 
 def read_ready() -> str | None:
@@ -105,7 +107,7 @@ _MANGLED = re.compile(r"(?<=[@\"])_ZN[\w.$]+")
 
 
 def intermediate_code() -> str:
-    """What numba makes of the kernels with all features of `kernels.forms.FORMS`.
+    """What numba makes of the kernels with all registered features and closed forms.
 
     Returns:
         Text of LLVM with the entry `ENTRY`.
@@ -120,7 +122,7 @@ def intermediate_code() -> str:
 
     for name, module in list(sys.modules.items()):
         if name.startswith("pisigma.kernels.") and hasattr(module, "njit"):
-            del sys.modules[name]  # its kernels may have been made for other features
+            del sys.modules[name]  # its kernels may have been made for other forms
     from pisigma.kernels.kernels import run
     from pisigma.kernels.layout import DESCRIPTION, MEMORY
 
@@ -144,5 +146,5 @@ def build() -> None:
     from importlib.metadata import version
 
     code = intermediate_code()
-    write_ready(code, tuple(FORMS), numba=version("numba"), llvmlite=version("llvmlite"))
+    write_ready(code, KernelForms.registered(), numba=version("numba"), llvmlite=version("llvmlite"))
     print(f"{FILE}: {FILE.stat().st_size / 1e3:.0f} kB ({len(code) / 1e6:.1f} MB of text)")

@@ -1,5 +1,6 @@
 """A calibrated arm as one file of plain arrays, which is read without torch."""
 
+import dataclasses
 import json
 import math
 import os
@@ -11,8 +12,9 @@ import numpy as np
 
 from pisigma.errors import ModelError
 from pisigma.kernels.arrays import PARTS, Description
+from pisigma.kernels.forms import KernelForms
 
-FORMAT = 4
+FORMAT = 5
 _NAMES = ("branches", "joints", "name", "belongs_to")
 _FIELDS = [(part, field) for part, kind in PARTS.items() for field in kind._fields]
 
@@ -42,7 +44,7 @@ def write_description(
         "joints": joints,
         "name": name,
         "belongs_to": belongs_to,
-        "features": description.features,
+        "forms": dataclasses.asdict(description.forms),
         "shapes": shapes,
     }
     values = {
@@ -84,8 +86,8 @@ def read_description(file: str | os.PathLike[str]) -> tuple[Description, dict[st
         raise ModelError(f"{file}: was changed or is no whole compiled model; export the model again.")
     header = json.loads(str(values["header"]))
     description = _description(header["shapes"], values)
-    description = description._replace(features=tuple(header["features"]))
-    return description, {name: header[name] for name in _NAMES}
+    forms = KernelForms(**{kind: tuple(names) for kind, names in header["forms"].items()})
+    return description._replace(forms=forms), {name: header[name] for name in _NAMES}
 
 
 def _description(shapes: dict[str, Any], values: dict[str, Any]) -> Description:

@@ -1,7 +1,9 @@
-"""Compiled forms of the features of a joint correction, which the registry of features hands in."""
+"""Compiled forms that are handed to the kernels as plain functions: of features, and of closed forms of the inverse."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from types import FunctionType
+from typing import Any
 
 MOST_JOINTS = 8
 """The largest number of joints; weights that are worked on side by side stand in rows of so many."""
@@ -28,20 +30,82 @@ class CompiledForm:
     add_slope: Callable[..., None] | None = None
     frames: bool = False
 
-    @property
-    def fingerprint(self) -> str:
-        """What the functions do, as a text that is another one where they change."""
-        codes = [function.__code__ for function in (self.add, self.add_slope) if function is not None]
-        return repr([(code.co_code, code.co_consts, code.co_names) for code in codes])
-
 
 MOST_KINDS, MOST_VALUES = 16, 4_096
 """The largest numbers of kinds of features, and of the values of all features of a correction."""
 
 FORMS: dict[str, CompiledForm] = {}
-"""By the feature's name, in the order in which they were registered."""
+"""Those of features by name, in the order in which they were registered."""
 
 
 def register_compiled(name: str, form: CompiledForm) -> None:
     """Have the kernels evaluate a feature, from when they are next compiled."""
     FORMS[name] = form
+
+
+def compiled_closed_forms() -> dict[str, Callable[..., None]]:
+    """The plain functions of registered closed forms by name, see `AbstractClosedForm.compiled`; imports torch."""
+    from pisigma.kinematics.closed_form.registry import CLOSED_FORMS
+
+    return {name: form.compiled for name, form in CLOSED_FORMS.items() if form.compiled is not None}
+
+
+@dataclass(frozen=True)
+class KernelForms:
+    """Names of what kernels evaluate, or of what an arm needs of them, in the order of their indices.
+
+    Attributes:
+        features: of the joint correction.
+        closed_forms: of the inverse of the nominal arm.
+    """
+
+    features: tuple[str, ...] = ()
+    closed_forms: tuple[str, ...] = ()
+
+    @staticmethod
+    def registered() -> "KernelForms":
+        """What kernels evaluate that are compiled now."""
+        return KernelForms(tuple(FORMS), tuple(compiled_closed_forms()))
+
+    def cover(self, wanted: "KernelForms") -> bool:
+        """Whether all that is wanted is among them."""
+        return {*wanted.features} <= {*self.features} and {*wanted.closed_forms} <= {*self.closed_forms}
+
+    def fingerprints(self, ready: "KernelForms") -> list[str]:
+        """Their names; of those that are not ready texts that are other ones where the plain functions change."""
+        names, known = (*self.features, *self.closed_forms), {*ready.features, *ready.closed_forms}
+        return [name if name in known else _fingerprint(*_functions(name)) for name in names]
+
+
+def _functions(name: str) -> tuple[Callable[..., Any] | None, ...]:
+    """The plain functions of a feature or of a closed form."""
+    return (FORMS[name].add, FORMS[name].add_slope) if name in FORMS else (compiled_closed_forms()[name],)
+
+
+def compiled_plain(function: Callable[..., Any], **options: Any) -> Any:
+    """What numba compiles of a plain function and of the plain functions that it calls, with its options."""
+    from numba import njit
+
+    assert isinstance(function, FunctionType)
+    calls = {name: compiled_plain(called, **options) for name, called in _called(function)}
+    names = {**function.__globals__, **calls}
+    return njit(**options)(FunctionType(function.__code__, names, function.__name__))
+
+
+def _called(function: Callable[..., Any]) -> Iterator[tuple[str, FunctionType]]:
+    """The plain functions that a plain function calls, and under which names."""
+    assert isinstance(function, FunctionType)
+    for name in function.__code__.co_names:
+        if isinstance(called := function.__globals__.get(name), FunctionType):
+            yield name, called
+
+
+def _fingerprint(*functions: Callable[..., Any] | None) -> str:
+    """What plain functions and those that they call do."""
+    words = []
+    for function in functions:
+        if isinstance(function, FunctionType):
+            code = function.__code__
+            words.append(repr((code.co_code, code.co_consts, code.co_names)))
+            words += [_fingerprint(called) for _, called in _called(function)]
+    return "".join(words)

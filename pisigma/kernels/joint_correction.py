@@ -7,7 +7,7 @@ from typing import Any, no_type_check
 from numba import njit
 
 from pisigma.kernels.arrays import DRAWN, FIXED, REVOLUTE
-from pisigma.kernels.forms import FORMS
+from pisigma.kernels.forms import FORMS, compiled_plain
 from pisigma.kernels.rows import Array, Record
 
 
@@ -21,7 +21,7 @@ def _chained(functions: Iterable[Callable[..., None] | None]) -> Any:
 
     for index, function in enumerate(functions):
         if function is not None:
-            compiled = njit(error_model="numpy", fastmath={"contract"})(function)
+            compiled = compiled_plain(function, error_model="numpy", fastmath={"contract"})
             chain = _then(chain, compiled, index)
     return chain
 

@@ -3,14 +3,13 @@
 Arrays are as long as the largest robot needs, with counts beside them, so that one compiled function serves all.
 """
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from pisigma.errors import ModelError
 from pisigma.kernels.arrays import PARTS, Description
-from pisigma.kernels.forms import MOST_JOINTS, MOST_KINDS, MOST_VALUES
+from pisigma.kernels.forms import MOST_JOINTS, MOST_KINDS, MOST_VALUES, KernelForms
 
 DOF = MOST_JOINTS
 ROWS, FACTORS, UNITS, STRETCHES, STARTS = 24, 24, 12, 96, 512
@@ -136,16 +135,16 @@ MEMORY = np.dtype(
 """What kernels work in: overwritten all the time, and nothing in it outlives a pose."""
 
 
-def pack(description: Description, name: str, features: Sequence[str] = ()) -> np.ndarray:
+def pack(description: Description, name: str, forms: KernelForms) -> np.ndarray:
     """A description as one struct, `(1,)` of `DESCRIPTION`.
 
     Args:
         description: the arm as arrays.
         name: of the model, for complaints.
-        features: names of those that the kernels evaluate, in their order.
+        forms: what the kernels evaluate.
 
     Raises:
-        ModelError: the arm is larger than the compiled kernels allow, or its correction has features that they lack.
+        ModelError: the arm is larger than the compiled kernels allow, or needs what they do not evaluate.
     """
     packed = np.zeros(1, DESCRIPTION)
     for part, kind in PARTS.items():
@@ -166,13 +165,17 @@ def pack(description: Description, name: str, features: Sequence[str] = ()) -> n
     packed["correction"]["inputs"] = correction.weight.shape[1]
     packed["correction"]["products"] = len(correction.orders)
     packed["correction"]["first"] = -1
-    for feature, start in zip(description.features, correction.starts, strict=True):
-        if feature not in features:
-            raise ModelError(
-                f"model '{name}': its correction uses the feature '{feature}', which these kernels do not evaluate; "
-                "import what registers it, and install pisigma[compile]."
-            )
-        packed["correction"]["first"][0, features.index(feature)] = start
+    wanted = description.forms
+    if not forms.cover(wanted):
+        lacking = {*wanted.features, *wanted.closed_forms} - {*forms.features, *forms.closed_forms}
+        raise ModelError(
+            f"model '{name}': it uses {', '.join(map(repr, sorted(lacking)))}, which these kernels do not evaluate; "
+            "import what registers it, and install pisigma[compile]."
+        )
+    for feature, start in zip(wanted.features, correction.starts, strict=True):
+        packed["correction"]["first"][0, forms.features.index(feature)] = start
+    for form in wanted.closed_forms:
+        packed["closed_form"]["kind"] = 1 + forms.closed_forms.index(form)
     network = description.network
     if network.samples > SAMPLES:
         raise ModelError(

@@ -11,7 +11,7 @@ import os
 import stat
 import tempfile
 import threading
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,8 @@ import llvmlite  # type: ignore[import-untyped]
 import llvmlite.binding as llvm  # type: ignore[import-untyped]
 
 from pisigma.errors import ModelError
-from pisigma.kernels.build import ARGUMENTS, ENTRY, intermediate_code, read_ready, ready_features, source_hash
-from pisigma.kernels.forms import FORMS
+from pisigma.kernels.build import ARGUMENTS, ENTRY, intermediate_code, read_ready, ready_forms, source_hash
+from pisigma.kernels.forms import KernelForms
 
 _ALLOWED = frozenset(
     (
@@ -47,43 +47,46 @@ _kept: list[Any] = []
 
 
 @functools.cache
-def _ready_features() -> tuple[str, ...] | None:
-    return ready_features()
+def _ready_forms() -> KernelForms | None:
+    return ready_forms()
 
 
-def kernel_features(wanted: Collection[str] = ()) -> tuple[str, ...]:
-    """Names of the features that the kernels evaluate that `load_kernels` gives, in their order.
+_NOTHING = KernelForms()
 
-    They are those of the code that comes with the package where that has all that are wanted; else those that are
+
+def kernel_forms(wanted: KernelForms = _NOTHING) -> KernelForms:
+    """What the kernels evaluate that `load_kernels` gives.
+
+    That is what the code that comes with the package evaluates where this is all that is wanted; else what is
     registered.
     """
-    ready = _ready_features()
-    return ready if ready is not None and set(wanted) <= set(ready) else tuple(FORMS)
+    ready = _ready_forms()
+    return ready if ready is not None and ready.cover(wanted) else KernelForms.registered()
 
 
-def load_kernels(wanted: Collection[str] = ()) -> Callable[..., int]:
+def load_kernels(wanted: KernelForms = _NOTHING) -> Callable[..., int]:
     """The function `kernels.run`, on addresses and numbers; -1, or what `kernels.solve_poses` says.
 
     Machine code is made when it is first wanted on a machine, in some seconds, and read from a file afterwards.
 
     Args:
-        wanted: names of features that they have to evaluate.
+        wanted: what they have to evaluate.
 
     Raises:
         ModelError: there is no intermediate code of the present sources, and numba, which makes it, is not installed.
     """
     with _lock:
-        return _load(kernel_features(wanted))
+        return _load(kernel_forms(wanted))
 
 
 @functools.cache
-def _load(features: tuple[str, ...]) -> Callable[..., int]:
+def _load(forms: KernelForms) -> Callable[..., int]:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    name = f"kernels-{_key(features)}.o"
+    name = f"kernels-{_key(forms)}.o"
     code = next((kept for folder in cache_folders() if (kept := read_code(folder / name)) is not None), None)
     if code is None:
-        code = optimised_object(_intermediate_code(features), _native_machine())
+        code = optimised_object(_intermediate_code(forms), _native_machine())
         any(write_code(folder / name, code) for folder in cache_folders())
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _native_machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
@@ -102,12 +105,12 @@ def _call(native: Any, *arguments: int) -> int:
     return result[0]
 
 
-def _key(features: tuple[str, ...]) -> str:
+def _key(forms: KernelForms) -> str:
     """What the machine code depends on: sources, options, the versions of the compiler, and the processor."""
-    digest, ready = hashlib.sha256(), _ready_features() or ()
+    digest = hashlib.sha256()
     for word in (
         source_hash(),
-        *(name if name in ready else FORMS[name].fingerprint for name in features),
+        *forms.fingerprints(_ready_forms() or _NOTHING),
         _OPTIONS,
         llvmlite.__version__,
         str(llvm.llvm_version_info),
@@ -119,9 +122,9 @@ def _key(features: tuple[str, ...]) -> str:
     return digest.hexdigest()[:16]
 
 
-def _intermediate_code(features: tuple[str, ...]) -> str:
-    """What comes with the package, where it is of the present sources and features; else what numba makes."""
-    ready = read_ready() if _ready_features() == features else None
+def _intermediate_code(forms: KernelForms) -> str:
+    """What comes with the package, where it is of the present sources and forms; else what numba makes."""
+    ready = read_ready() if _ready_forms() == forms else None
     if ready is not None:
         return ready
     try:

@@ -14,6 +14,7 @@ from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kernels import arrays
 from pisigma.kernels.array_kinematics import KINDS, arm_ends, arm_rows
 from pisigma.kernels.description_file import write_description
+from pisigma.kernels.forms import KernelForms
 from pisigma.kinematics.closed_form import AbstractClosedForm, closed_form_solver
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stored_starts import StoredStarts, middle_of_starts
@@ -23,11 +24,6 @@ from pisigma.network.pi_sigma import PiSigma
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert
 
-_FORMS = {
-    "scara": arrays.SCARA,
-    "spherical_wrist": arrays.SPHERICAL_WRIST,
-    "three_parallel": arrays.THREE_PARALLEL,
-}
 _NUMERIC = ("numeric",)
 _Input = tuple[int, list[float]]
 _Member = tuple[JointGroup, PiSigma]
@@ -78,7 +74,7 @@ def describe(model: CalibratedModel) -> tuple[arrays.Description, tuple[str, ...
     description = arrays.Description(
         arms=_arms(model.robot, geometric, model.hybrid),
         correction=correction,
-        features=features,
+        forms=KernelForms(features, (solver.name,) if solver else ()),
         coverage=_coverage(geometric, model.hybrid),
         network=_network(model),
         closed_form=_closed_form(model, solver),
@@ -155,8 +151,8 @@ def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> a
     if solver is None:
         none, zeros = np.zeros((3, 4)), np.zeros(model.robot.dof)
         first = np.zeros(1, dtype=np.int64)
-        return arrays.ClosedForm(arrays.NO_CLOSED_FORM, 1, first, 1, none, none, *[zeros] * 6)
-    if solver.compiled not in _FORMS:
+        return arrays.ClosedForm(1, first, 1, none, none, *[zeros] * 6)
+    if solver.compiled is None:
         raise ModelError(
             f"model '{model.name}': the closed form {type(solver).__name__} of its robot has no compiled form; use "
             "pisigma.load, which solves without kernels."
@@ -164,7 +160,6 @@ def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> a
     rows, names = solver.rows, solver.branches
     trained = [names.index(name) for name in model.branches] or list(range(len(names)))
     return arrays.ClosedForm(
-        kind=_FORMS[solver.compiled],
         branches=len(names),
         order=np.array([*trained, *(index for index in range(len(names)) if index not in trained)]),
         trained=len(trained),

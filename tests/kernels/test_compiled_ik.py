@@ -275,7 +275,7 @@ def test_files_that_are_no_models_are_refused(arms, tmp_path):
         tmp_path / "other.npz" if (tmp_path / "other.npz").exists() else _foreign(tmp_path)
     ) as foreign:
         assert foreign.files
-    with pytest.raises(ModelError, match="no compiled model of format 4"):
+    with pytest.raises(ModelError, match="no compiled model of format 5"):
         CompiledIK.load(tmp_path / "other.npz")
 
 

@@ -10,6 +10,7 @@ import pytest
 
 from pisigma.errors import ModelError
 from pisigma.kernels import build, machine_code
+from pisigma.kernels.forms import KernelForms
 
 TRIPLES = ["x86_64-unknown-linux-gnu", "aarch64-unknown-linux-gnu", "arm64-apple-macosx14.0.0"]
 
@@ -41,8 +42,8 @@ def test_the_hash_covers_every_kernel_and_no_comment(tmp_path, monkeypatch):
 def test_code_of_other_sources_or_damaged_code_is_not_used(tmp_path, monkeypatch):
     monkeypatch.setattr(build, "FILE", tmp_path / "kernels.ll.zlib")
     assert build.read_ready() is None
-    build.write_ready("define", ("series",), numba="1")
-    assert (build.read_ready(), build.ready_features()) == ("define", ("series",))
+    build.write_ready("define", KernelForms(("series",), ("scara",)), numba="1")
+    assert (build.read_ready(), build.ready_forms()) == ("define", KernelForms(("series",), ("scara",)))
     whole = build.FILE.read_bytes()
     for wrong in (whole[:-3], b"", b"[1]\nx", whole.replace(b'"sources": "', b'"sources": "0')):
         build.FILE.write_bytes(wrong)
@@ -53,12 +54,12 @@ def test_without_code_and_without_numba_one_sentence_says_what_to_install(monkey
     def missing() -> str:
         raise ImportError
 
-    monkeypatch.setattr(machine_code, "_ready_features", lambda: None)
+    monkeypatch.setattr(machine_code, "_ready_forms", lambda: None)
     monkeypatch.setattr(machine_code, "intermediate_code", missing)
     with pytest.raises(ModelError, match=r"install pisigma\[compile\]"):
-        machine_code._intermediate_code(())
+        machine_code._intermediate_code(KernelForms())
     monkeypatch.setattr(machine_code, "intermediate_code", lambda: "made now")
-    assert machine_code._intermediate_code(()) == "made now"
+    assert machine_code._intermediate_code(KernelForms()) == "made now"
 
 
 def test_objects_for_other_processors_can_be_made():
@@ -123,8 +124,8 @@ def test_a_relative_cache_is_ignored_and_a_missing_home_survived(stated, tmp_pat
 
 
 def test_the_key_holds_what_the_code_depends_on(monkeypatch):
-    key = machine_code._key(())
-    assert key == machine_code._key(())
+    key = machine_code._key(KernelForms())
+    assert key == machine_code._key(KernelForms())
     for owner, name, other in (
         (machine_code.llvm, "get_host_cpu_name", lambda: "another"),
         (machine_code.llvm, "get_process_triple", lambda: "another"),
@@ -135,7 +136,7 @@ def test_the_key_holds_what_the_code_depends_on(monkeypatch):
     ):
         with monkeypatch.context() as patch:
             patch.setattr(owner, name, other)
-            assert machine_code._key(()) != key, name
+            assert machine_code._key(KernelForms()) != key, name
 
 
 def test_loading_kernels_on_a_fresh_cache_needs_no_compiler(tmp_path):

@@ -1,7 +1,7 @@
 """What every closed form gives: all branches of a pose, each with its status."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import ClassVar, TypeVar
 
@@ -44,11 +44,19 @@ class AbstractClosedForm(ABC):
             solutions (forks), through which they count, the last one fastest.
         robot: the robot it belongs to.
         rows: its rows with canonical twists.
-        compiled: name of the compiled form of the same formulas, see `model.compiled_model`; None where there is none.
+        name: of the form, which model files say.
+        compiled: the same formulas as a plain function that the kernels compile; None where there is none. It is called
+            as `compiled(form, P, only, rounding, q)` with `kernels.arrays.ClosedForm`, the pose `(4, 4)` of which
+            `_solve_components` gets the first three rows, the index of the only branch that is wanted or -1 for all,
+            and the relative size of what counts as rounding. It writes the canonical joint variables of branches that
+            reach the pose into `q`, `(branches, dof)`, whose first column is NaN before. It and the plain functions
+            that it calls work on numbers and entries of arrays, and call functions of `math`; each is decorated by
+            `typing.no_type_check`.
     """
 
+    name: ClassVar[str]
     branches: ClassVar[tuple[str, ...]]
-    compiled: ClassVar[str | None] = None
+    compiled: ClassVar[Callable[..., None] | None] = None
     robot: Robot
     rows: CanonicalRows
 

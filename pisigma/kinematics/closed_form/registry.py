@@ -6,14 +6,21 @@ from pisigma.kinematics.closed_form.spherical_wrist import SphericalWristArm
 from pisigma.kinematics.closed_form.three_parallel import ThreeParallelArm
 from pisigma.robot.description import Robot
 
-CLOSED_FORMS: list[type[AbstractClosedForm]] = [Scara, SphericalWristArm, ThreeParallelArm]
-"""The registry: the first form whose `of` takes a robot is its closed form."""
+CLOSED_FORMS: dict[str, type[AbstractClosedForm]] = {}
+"""The registry, by name: the first form whose `of` takes a robot is its closed form."""
 
 
 def register_closed_form(form: type[AbstractClosedForm]) -> type[AbstractClosedForm]:
-    """Add a closed form behind those that are registered; may be used as a decorator."""
-    if form not in CLOSED_FORMS:
-        CLOSED_FORMS.append(form)
+    """Add a closed form behind those that are registered; may be used as a decorator.
+
+    A form with compiled functions has the kernels made again where it is first used, which needs numba
+    (`pip install 'pisigma[compile]'`).
+
+    Raises:
+        ValueError: another form has the name.
+    """
+    if CLOSED_FORMS.setdefault(form.name, form) is not form:
+        raise ValueError(f"there is a closed form '{form.name}' already; give yours another name.")
     return form
 
 
@@ -24,4 +31,12 @@ def closed_form_solver(robot: Robot) -> AbstractClosedForm | None:
     Signs of twists, offsets, directions, base, tool, fixed rows before the first and behind the last joint do
     not matter, nor do twist and beta of the last row.
     """
-    return next((solver for form in CLOSED_FORMS if (solver := form.of(robot)) is not None), None)
+    return next((solver for form in CLOSED_FORMS.values() if (solver := form.of(robot)) is not None), None)
+
+
+for _form in (
+    Scara,
+    SphericalWristArm,
+    ThreeParallelArm,
+):
+    register_closed_form(_form)

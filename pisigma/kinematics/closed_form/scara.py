@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, no_type_check
 
 import torch
 from jaxtyping import Bool
@@ -10,10 +11,31 @@ from torch import Tensor
 
 from pisigma.kinematics.closed_form.canonical import canonical_rows
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
-from pisigma.kinematics.closed_form.two_link import rounding, solve_two_link
+from pisigma.kinematics.closed_form.two_link import rounding, solve_two_link, two_link
 from pisigma.kinematics.components import Frame, Scalar, as_tensors
 from pisigma.kinematics.tolerances import TILT_TOLERANCE
 from pisigma.robot.description import Robot
+
+
+@no_type_check
+def scara_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> None:
+    """Both branches; see `AbstractClosedForm.compiled`."""
+    if math.hypot(P[0, 2], P[1, 2]) > max(TILT_TOLERANCE, rounding) or P[2, 2] <= 0:
+        return
+    x, y = form.a[1] + form.a[2] * math.cos(form.theta[2]), form.a[2] * math.sin(form.theta[2])
+    length, angle = math.hypot(x, y), math.atan2(y, x)
+    zero = form.sign[0] * form.offset[0]
+    for branch in range(2):
+        if only >= 0 and branch != only:
+            continue
+        first, elbow, reached = two_link(
+            P[0, 3], P[1, 3], form.a[0], length, 1.0 - 2 * branch, zero, rounding
+        )
+        if reached:
+            t_2 = elbow - angle
+            q[branch, 0], q[branch, 1] = first, t_2
+            q[branch, 2] = P[2, 3] - form.d[0] - form.d[1]
+            q[branch, 3] = math.atan2(P[1, 0], P[0, 0]) - first - t_2 - form.theta[2]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +51,9 @@ class Scara(AbstractClosedForm):
     0.
     """
 
+    name = "scara"
     branches = ("elbow_positive", "elbow_negative")
-    compiled = "scara"
+    compiled = staticmethod(scara_branches)
 
     @classmethod
     def of(cls, robot: Robot) -> "Scara | None":

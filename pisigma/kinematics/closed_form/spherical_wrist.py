@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, no_type_check
 
 import torch
 from jaxtyping import Bool
@@ -10,12 +11,78 @@ from torch import Tensor
 
 from pisigma.kinematics.closed_form.canonical import canonical_rows
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
-from pisigma.kinematics.closed_form.two_link import ARM_BRANCHES, rounding, singular_tolerance, solve_two_link
+from pisigma.kinematics.closed_form.two_link import (
+    ARM_BRANCHES,
+    first_joint,
+    rounding,
+    singular_tolerance,
+    solve_two_link,
+    two_link,
+)
 from pisigma.kinematics.components import Columns, Frame, Scalar, as_tensors
 from pisigma.robot.description import Robot
 
 _RIGHT = math.pi / 2
 _TWISTS = (-_RIGHT, 0.0, -_RIGHT, _RIGHT, -_RIGHT)
+
+
+@no_type_check
+def _spherical_joints(
+    form: Any,
+    P: Any,
+    t_1: float,
+    t_2: float,
+    t_3: float,
+    only: int,
+    branch: int,
+    rounding: float,
+    q: Any,
+) -> None:
+    """Joints 4 to 6, both flips, from `M = R_03^T · R = RotZ(t_4) RotY(-t_5) RotZ(t_6)`."""
+    c_1, s_1 = math.cos(t_1), math.sin(t_1)
+    c, s = math.cos(t_2 + t_3), math.sin(t_2 + t_3)
+    xx, xy, xz = c_1 * c, s_1 * c, -s
+    zx, zy, zz = -c_1 * s, -s_1 * s, -c
+    m_02 = xx * P[0, 2] + xy * P[1, 2] + xz * P[2, 2]
+    m_12 = s_1 * P[0, 2] - c_1 * P[1, 2]
+    m_22 = zx * P[0, 2] + zy * P[1, 2] + zz * P[2, 2]
+    m_00 = xx * P[0, 0] + xy * P[1, 0] + xz * P[2, 0]
+    m_01 = xx * P[0, 1] + xy * P[1, 1] + xz * P[2, 1]
+    m_10, m_11 = s_1 * P[0, 0] - c_1 * P[1, 0], s_1 * P[0, 1] - c_1 * P[1, 1]
+    sine = math.hypot(m_02, m_12)
+    t_4 = form.sign[3] * form.offset[3] if sine <= rounding else math.atan2(-m_12, -m_02)
+    t_5 = math.atan2(sine, m_22)
+    cos, sin = math.cos(t_4), math.sin(t_4)
+    t_6 = math.atan2(cos * m_10 - sin * m_00, cos * m_11 - sin * m_01)
+    for flip in range(2):
+        if only < 0 or only == branch + flip:
+            out, turn = q[branch + flip], math.pi * flip
+            out[0], out[1], out[2] = t_1, t_2, t_3
+            out[3], out[4], out[5] = t_4 + turn, t_5 * (1.0 - 2 * flip), t_6 + turn
+
+
+@no_type_check
+def spherical_wrist_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> None:
+    """All eight branches; see `AbstractClosedForm.compiled`."""
+    a, d = form.a, form.d
+    forearm, side = math.hypot(a[2], d[3]), d[1] + d[2]
+    scale = abs(a[0]) + abs(a[1]) + forearm + abs(side)
+    far, azimuth, beside, on_axis = first_joint(P, side, scale, form.sign[0] * form.offset[0], rounding)
+    if not beside:
+        return
+    for pair in range(4):
+        if only >= 0 and only // 2 != pair:
+            continue
+        shoulder, elbow = 1.0 - 2 * (pair // 2), 1.0 - 2 * (pair % 2)
+        ahead = shoulder * far
+        t_1 = azimuth - math.atan2(side, ahead)
+        if shoulder < 0 and on_axis:
+            t_1 = azimuth - math.pi
+        upwards = shoulder * elbow * math.copysign(1.0, a[1])
+        zero = form.sign[1] * form.offset[1]
+        t_2, bend, reached = two_link(ahead - a[0], d[0] - P[2, 3], a[1], forearm, upwards, zero, rounding)
+        if reached:
+            _spherical_joints(form, P, t_1, t_2, bend - math.atan2(d[3], a[2]), only, 2 * pair, rounding, q)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +107,9 @@ class SphericalWristArm(AbstractClosedForm):
     values are given.
     """
 
+    name = "spherical_wrist"
     branches = ARM_BRANCHES
-    compiled = "spherical_wrist"
+    compiled = staticmethod(spherical_wrist_branches)
 
     @classmethod
     def of(cls, robot: Robot) -> "SphericalWristArm | None":

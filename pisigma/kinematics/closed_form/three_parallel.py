@@ -3,6 +3,7 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any, no_type_check
 
 import torch
 from jaxtyping import Bool
@@ -13,9 +14,11 @@ from pisigma.kinematics.closed_form.interface import AbstractClosedForm
 from pisigma.kinematics.closed_form.two_link import (
     ARM_BRANCHES,
     TwoLink,
+    first_joint,
     rounding,
     singular_tolerance,
     solve_two_link,
+    two_link,
 )
 from pisigma.kinematics.components import Columns, Frame, Scalar, as_tensors
 from pisigma.kinematics.tolerances import TRIANGLE_MARGIN
@@ -23,6 +26,83 @@ from pisigma.robot.description import Robot
 
 _RIGHT = math.pi / 2
 _TWISTS = (_RIGHT, 0.0, 0.0, _RIGHT, -_RIGHT)
+
+
+@no_type_check
+def _plane_joints(
+    form: Any,
+    P: Any,
+    t_1: float,
+    t_5: float,
+    t_6: float,
+    x: float,
+    upwards: float,
+    free: bool,
+    rounding: float,
+    q: Any,
+) -> None:
+    """Joints 2 to 4: the two links that carry axis 4; joint 6 of a straight wrist may turn for them."""
+    a, y, zero = form.a, P[2, 3] - form.d[0], form.sign[1] * form.offset[1]
+    along, across, b = a[3], -form.d[4], abs(a[2])
+    for attempt in range(2):
+        s_6, c_6 = math.sin(t_6), math.cos(t_6)
+        u, v = -s_6 * P[0, 0] - c_6 * P[0, 1], -s_6 * P[1, 0] - c_6 * P[1, 1]
+        t_234 = math.atan2(math.cos(t_1) * u + math.sin(t_1) * v, s_6 * P[2, 0] + c_6 * P[2, 1])
+        c, s = math.cos(t_234), math.sin(t_234)
+        first, bend, reached = two_link(
+            x - (c * along - s * across), y - (s * along + c * across), a[1], b, upwards, zero, rounding
+        )
+        if reached:
+            t_3 = bend - (math.pi if a[2] < 0 else 0.0)
+            q[0], q[1], q[2] = t_1, first, t_3
+            q[3], q[4], q[5] = t_234 - first - t_3, t_5, t_6
+            return
+        hand, far = math.hypot(along, across), math.hypot(x, y)
+        if attempt == 1 or not free or hand == 0.0:
+            return
+        turn = t_234 + math.atan2(across, along) - math.atan2(y, x)
+        nearest, farthest = (
+            abs(abs(a[1]) - b) + TRIANGLE_MARGIN * (abs(a[1]) + b),
+            (abs(a[1]) + b) * (1 - TRIANGLE_MARGIN),
+        )
+        square = far * far + hand * hand - 2 * far * hand * math.cos(turn)
+        square = min(max(square, nearest * nearest), farthest * farthest)
+        cosine = (far * far + hand * hand - square) / (2 * (far if far > 0 else 1.0) * hand)
+        change = math.copysign(math.acos(min(max(cosine, -1.0), 1.0)), math.sin(turn)) - turn
+        t_6 -= math.copysign(1.0, math.cos(t_5)) * change
+
+
+@no_type_check
+def three_parallel_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> None:
+    """All eight branches; see `AbstractClosedForm.compiled`."""
+    a, d = form.a, form.d
+    side = d[1] + d[2] + d[3]
+    scale = abs(a[0]) + abs(a[1]) + abs(a[2]) + math.hypot(a[3], d[4]) + abs(side)
+    far, azimuth, beside, on_axis = first_joint(P, side, scale, form.sign[0] * form.offset[0], rounding)
+    if not beside:
+        return
+    for shoulder in range(2):
+        if only >= 0 and only // 4 != shoulder:
+            continue
+        ahead = far * (1.0 - 2 * shoulder)
+        t_1 = azimuth + math.atan2(side, ahead)
+        if shoulder == 1 and on_axis:
+            t_1 = azimuth + math.pi
+        s_1, c_1 = math.sin(t_1), math.cos(t_1)
+        u, v, w = s_1 * P[0, 0] - c_1 * P[1, 0], s_1 * P[0, 1] - c_1 * P[1, 1], s_1 * P[0, 2] - c_1 * P[1, 2]
+        sine = math.hypot(u, v)
+        for wrist in range(2):
+            if only >= 0 and only % 2 != wrist:
+                continue
+            flip = 1.0 - 2 * wrist
+            free = sine <= rounding
+            t_6 = form.sign[5] * form.offset[5] if free else math.atan2(-flip * v, flip * u)
+            t_5 = flip * math.atan2(sine, w)
+            for elbow in range(2):
+                branch = 4 * shoulder + 2 * elbow + wrist
+                if only < 0 or only == branch:
+                    upwards = -(1.0 - 2 * shoulder) * (1.0 - 2 * elbow) * math.copysign(1.0, a[1])
+                    _plane_joints(form, P, t_1, t_5, t_6, ahead - a[0], upwards, free, rounding, q[branch])
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +129,9 @@ class ThreeParallelArm(AbstractClosedForm):
     Near, but not at, such a place the exact values are given.
     """
 
+    name = "three_parallel"
     branches = ARM_BRANCHES
-    compiled = "three_parallel"
+    compiled = staticmethod(three_parallel_branches)
 
     @classmethod
     def of(cls, robot: Robot) -> "ThreeParallelArm | None":

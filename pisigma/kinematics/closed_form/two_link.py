@@ -1,7 +1,9 @@
 """Two links in a plane, which all closed forms here share, and from what size on they take a number for 0."""
 
 import itertools
+import math
 from dataclasses import dataclass
+from typing import Any, no_type_check
 
 import torch
 from jaxtyping import Bool, Float
@@ -73,3 +75,35 @@ def solve_two_link(
     free = torch.atan2(b * sine, a + b * cosine)
     first = torch.where(on_axis, first_when_free, torch.atan2(y, x) - free)
     return TwoLink(first, torch.atan2(sine, cosine), reached, sine.abs() < singular_tolerance(x.dtype))
+
+
+@no_type_check
+def two_link(
+    x: float, y: float, a: float, b: float, elbow_sign: float, free: float, rounding: float
+) -> tuple[float, float, bool]:
+    """The same as `solve_two_link` on plain numbers: the angles [rad], and whether the point is within reach."""
+    cosine = (x * x + y * y - (a * a + b * b)) / (2 * a * b)
+    reached = abs(cosine) <= 1 + rounding
+    cosine = min(max(cosine, -1.0), 1.0)
+    sine = elbow_sign * math.sqrt((1 - cosine) * (1 + cosine))
+    first = free
+    if math.sqrt(x * x + y * y) > rounding * (abs(a) + b):
+        first = math.atan2(y, x) - math.atan2(b * sine, a + b * cosine)
+    return first, math.atan2(sine, cosine), reached
+
+
+@no_type_check
+def first_joint(
+    P: Any, side: float, scale: float, zero: float, rounding: float
+) -> tuple[float, float, bool, bool]:
+    """What joint 1 of an arm brings a point to, whose distance from the plane of the arm is `side` [m].
+
+    Returns:
+        The distance [m] ahead of axis 1, the azimuth [rad], whether there is such a joint value, and whether the point
+        lies on the axis, so that any would do.
+    """
+    x, y = P[0, 3], P[1, 3]
+    square = x * x + y * y - side * side
+    on_axis = math.hypot(x, y) <= rounding * scale
+    azimuth = zero if on_axis else math.atan2(y, x)
+    return math.sqrt(max(square, 0.0)), azimuth, square >= -rounding * scale * scale, on_axis
