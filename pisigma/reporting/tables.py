@@ -25,15 +25,6 @@ def markdown_table(columns: Sequence[str], rows: Sequence[Sequence[str]]) -> str
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
-def use_text(name: str) -> str:
-    """How a model is used, as a piece of Python."""
-    return (
-        f'```python\nimport pisigma\n\nik = pisigma.load("models/{name}")\n'
-        "solution = ik(T_base_tool)  # (*batch, 4, 4) [m]\n"
-        "solution.q, solution.status  # joint values to command [rad or m], and whether to trust them\n```"
-    )
-
-
 def figure_text(value: float) -> str:
     """A figure with four decimals, or two digits and an exponent where these would say little."""
     return f"{value:.4f}" if value == 0 or abs(value) >= 1e-3 else f"{value:.1e}"

@@ -1,0 +1,42 @@
+"""Cards and pages from templates: Python computes, a template of the folder `templates` holds layout and wording."""
+
+import functools
+from pathlib import Path
+
+import jinja2
+
+from pisigma.reporting.tables import CARD, figure_text, joint_table, markdown_table, pose_table
+
+
+def render(template: str, **content: object) -> str:
+    """Fill in a template.
+
+    Args:
+        template: a file of the folder `templates`; what is filled into one of HTML shows as text, whatever it holds.
+        content: what the template names.
+    """
+    return _environment().get_template(template).render(content)
+
+
+def write_card(folder: Path, template: str, **content: object) -> None:
+    """Write the card of a model folder; see `render`."""
+    (folder / CARD).write_text(render(template, **content) + "\n", encoding="utf-8")
+
+
+@functools.cache
+def _environment() -> jinja2.Environment:
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("pisigma.reporting"),
+        autoescape=lambda name: name is not None and name.endswith(".html.j2"),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {
+        "figure": figure_text,
+        "digits": "{:.4g}".format,
+        "pose_table": pose_table,
+        "joint_table": joint_table,
+        "table": lambda table: markdown_table(*table),
+    }
+    return environment
