@@ -11,7 +11,7 @@ from testing.models import no_type_checker
 import pisigma
 from pisigma.judging.training_summary import JointErrorFigures, TrainingSummary
 from pisigma.model.folder.model_folder import load_model
-from pisigma.recipes.data import simulate_held_out, simulate_training
+from pisigma.recipes.data import simulate
 from pisigma.recipes.reader import read_recipe, recipe_hash
 from pisigma.recipes.recipe import SimulatedData
 from pisigma.reporting.tables import joint_table
@@ -78,9 +78,10 @@ def test_figures_are_found_again(folder, repository):
     names = [joint.name for joint in model.robot.joints]
     bound = recipe.singular_rows.below if recipe.singular_rows.rule == "leave_out" else None
     with no_type_checker():
+        data = simulate(recipe)
         parts = {
-            "training": build_pairs(model.robot, simulate_training(recipe), bound),
-            "held_out": build_pairs(model.robot, simulate_held_out(recipe), None),
+            "training": build_pairs(model.robot, data.training, bound),
+            "held_out": build_pairs(model.robot, data.held_out, None),
         }
     for part, pairs in parts.items():
         T, q, before = pairs.T[pairs.used], pairs.q_nominal[pairs.used], pairs.target[pairs.used]

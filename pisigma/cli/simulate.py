@@ -18,13 +18,12 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Write the simulated measurements of a recipe as a CSV file."""
-    from pisigma.recipes.data import simulate_held_out, simulate_training
+    from pisigma.recipes.data import simulate as simulate_recipe
     from pisigma.recipes.reader import read_recipe
-    from pisigma.robot import Robot
 
-    stated = read_recipe(recipe)
-    rows = simulate_held_out(stated) if held_out else simulate_training(stated)
-    rows.write_csv(out, Robot.load(stated.robot))
+    data = simulate_recipe(read_recipe(recipe))
+    rows = data.simulations[0][1 if held_out else 0]
+    rows.write_csv(out, data.robot)
     if as_json:
         print_json({"file": str(out), "rows": rows.rows, "sha256": rows.content_hash()})
     else:

@@ -1,14 +1,15 @@
-"""The rows of a recipe: simulated, or read from a file."""
+"""The robot of a recipe and its rows: simulated, or read from a file."""
 
 import os
+from dataclasses import dataclass
 from typing import TypeVar
 
 import torch
 
 from pisigma.errors import RecipeError
 from pisigma.measurement.dataset import Measurements, join
-from pisigma.measurement.splits import TrainTest
-from pisigma.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe, Recipe, SimulatedData
+from pisigma.measurement.splits import TrainTest, k_folds
+from pisigma.recipes.recipe import GeometricRecipe, HybridRecipe, MeasuredData, Recipe, SimulatedData
 from pisigma.robot.description import Robot
 from pisigma.simulation.measure import SimulatedMeasurements
 from pisigma.simulation.true_robot import TrueRobot
@@ -17,10 +18,46 @@ from pisigma.yaml_file import Section
 Seeded = TypeVar("Seeded", bound=Section)
 
 
-def load_measurements(
-    recipe: InverseRecipe | HybridRecipe, data: Measurements | str | os.PathLike[str] | None
-) -> Measurements:
-    """Give the rows of a recipe: the simulated training rows, or all measured rows, the set "test" among them.
+@dataclass(frozen=True, eq=False)
+class RecipeData:
+    """What a recipe is trained and judged on.
+
+    Attributes:
+        robot: as drawn.
+        training: rows to train on.
+        test: rows that a file of measurements marks as test; None without such rows.
+        simulations: training and held-out rows of every repeat of a simulation, those of the model first; none for
+            measured data.
+        folds: how measured rows are split for a cross-validation; None for simulated ones.
+    """
+
+    robot: Robot
+    training: Measurements
+    test: Measurements | None = None
+    simulations: tuple[tuple[Measurements, Measurements], ...] = ()
+    folds: MeasuredData | None = None
+
+    @property
+    def held_out(self) -> Measurements | None:
+        """Rows of the simulation that the training never sees; None for measured data."""
+        return self.simulations[0][1] if self.simulations else None
+
+    def splits(self) -> tuple[Measurements, tuple[TrainTest, ...]]:
+        """Rows to judge on, and which of them are training and held-out rows of every fold, or of every simulation.
+
+        Raises:
+            MeasurementError: there are fewer different joint vectors than folds.
+        """
+        if self.folds is not None:
+            return self.training, k_folds(self.training, self.folds.folds, self.folds.seed)
+        every = [rows for pair in self.simulations for rows in pair]
+        joined = join(every)
+        numbers = iter(torch.split(torch.arange(joined.rows), [rows.rows for rows in every]))
+        return joined, tuple(zip(numbers, numbers, strict=True))
+
+
+def load_data(recipe: Recipe, data: Measurements | str | os.PathLike[str] | None = None) -> RecipeData:
+    """Simulate the rows of a recipe, or take the measured ones.
 
     Args:
         recipe: the recipe.
@@ -28,57 +65,39 @@ def load_measurements(
 
     Raises:
         RecipeError: a simulated recipe got data, or a measured one none.
+        RobotError: the robot of the recipe cannot be used.
         MeasurementError: the file cannot be used.
     """
-    robot = Robot.load(recipe.robot)
-    if isinstance(recipe.data, SimulatedData):
+    if isinstance(recipe, GeometricRecipe) or isinstance(recipe.data, SimulatedData):
         if data is not None:
-            raise RecipeError(f"recipe '{recipe.name}' simulates its data and takes no --data; leave it out.")
-        return simulate_training(recipe)
+            raise RecipeError(
+                f"recipe '{recipe.name}' simulates its data and has no use for --data; leave it out."
+            )
+        return simulate(recipe, recipe.repeats if isinstance(recipe, HybridRecipe) else 1)
     if data is None:
         raise RecipeError(f"recipe '{recipe.name}' is for measured data; give the file with --data FILE.csv.")
-    return data if isinstance(data, Measurements) else Measurements.read_csv(data, robot)
+    robot = Robot.load(recipe.robot)
+    rows = data if isinstance(data, Measurements) else Measurements.read_csv(data, robot)
+    return RecipeData(robot, *rows.split_sets(), folds=recipe.data)
 
 
-def simulate_training(recipe: Recipe) -> Measurements:
-    """Measure the training rows of a recipe on its true robot.
+def simulate(recipe: Recipe, repeats: int = 1) -> RecipeData:
+    """Measure training and held-out rows of a recipe on its true robot.
 
-    Raises:
-        RecipeError: the recipe is for measured data.
-    """
-    data = simulated_data(recipe)
-    return data.training.measure(TrueRobot(Robot.load(recipe.robot), data.errors))
-
-
-def simulate_held_out(recipe: Recipe) -> Measurements:
-    """Measure the held-out rows of a recipe on its true robot.
+    Args:
+        recipe: for simulated data.
+        repeats: how often, with other seeds each time.
 
     Raises:
         RecipeError: the recipe is for measured data.
+        RobotError: the robot of the recipe cannot be used.
     """
-    data = simulated_data(recipe)
-    return data.held_out.measure(TrueRobot(Robot.load(recipe.robot), data.errors))
-
-
-def simulate_repeats(recipe: HybridRecipe) -> tuple[Measurements, tuple[TrainTest, ...]]:
-    """Measure training and held-out rows of every repeat of a simulation.
-
-    Returns:
-        All rows together, and per repeat which of them are its training and its held-out rows.
-
-    Raises:
-        RecipeError: the recipe is for measured data.
-    """
-    robot, rows, splits, start = Robot.load(recipe.robot), [], [], 0
-    for repeat in range(recipe.repeats):
-        data = repeated(simulated_data(recipe), repeat)
+    robot, stated, simulations = Robot.load(recipe.robot), simulated_data(recipe), []
+    for repeat in range(repeats):
+        data = repeated(stated, repeat)
         true = TrueRobot(robot, data.errors)
-        train, test = data.training.measure(true), data.held_out.measure(true)
-        middle, end = start + train.rows, start + train.rows + test.rows
-        splits.append((torch.arange(start, middle), torch.arange(middle, end)))
-        rows += [train, test]
-        start = end
-    return join(rows), tuple(splits)
+        simulations.append((data.training.measure(true), data.held_out.measure(true)))
+    return RecipeData(robot, simulations[0][0], simulations=tuple(simulations))
 
 
 def simulated_data(recipe: Recipe) -> SimulatedData:

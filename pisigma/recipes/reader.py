@@ -67,7 +67,7 @@ def recipe_hash(path: str | os.PathLike[str]) -> str:
 
 
 def _hybrid_checks(recipe: HybridRecipe, robot: Robot) -> Iterator[Check]:
-    yield ("hybrid",), partial(recipe.hybrid.calibrator, recipe.calibration.calibrator(robot))
+    yield ("hybrid",), partial(recipe.calibrator, robot)
     yield from _simulation_checks(recipe, robot)
 
 

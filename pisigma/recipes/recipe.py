@@ -237,13 +237,13 @@ class HybridRecipe(AbstractRecipe):
     hybrid: HybridSection = HybridSection()
     learning_curve: LearningCurveSection | None = None
 
-    def calibrator(self) -> HybridCalibrator:
-        """The calibrator for the nominal robot.
+    def calibrator(self, robot: Robot) -> HybridCalibrator:
+        """The calibrator for a robot.
 
         Raises:
             IdentificationError: a choice of the section `hybrid` does not exist.
         """
-        return self.hybrid.calibrator(self.calibration.calibrator(Robot.load(self.robot)))
+        return self.hybrid.calibrator(self.calibration.calibrator(robot))
 
 
 Recipe = InverseRecipe | GeometricRecipe | HybridRecipe

@@ -15,14 +15,12 @@ from pisigma.judging.progress import Progress, stage
 from pisigma.judging.training_summary import TrainingRun, TrainingSummary, summarise_training
 from pisigma.judging.validation_figures import ErrorFigures, ValidationFigures
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.splits import k_folds
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.recipes.data import load_measurements, simulate_held_out, simulate_repeats, simulate_training
+from pisigma.recipes.data import RecipeData, load_data
 from pisigma.recipes.reader import read_recipe, recipe_hash
-from pisigma.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe, MeasuredData, Recipe
+from pisigma.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe, Recipe
 from pisigma.reporting.calibration_card import CardTexts
 from pisigma.reporting.training_card import write_training_card
-from pisigma.robot.description import Robot
 from pisigma.workflow.calibrate import Calibration, compose
 from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.train_networks import DEFAULTS, TrainSettings, cross_validate, train_networks
@@ -94,15 +92,14 @@ def train(
     if isinstance(recipe, str | os.PathLike):
         path = recipe
         recipe, sha256 = read_recipe(path), recipe_hash(path)
+    loaded = load_data(recipe, data)
     result: Training
     if isinstance(recipe, GeometricRecipe):
-        if data is not None or settings.resume:
-            _refuse(recipe, "--resume" if settings.resume else "--data")
-        result = _train_geometric(recipe, sha256)
+        result = _train_geometric(recipe, sha256, loaded, settings)
     elif isinstance(recipe, HybridRecipe):
-        result = _train_hybrid(recipe, sha256, data, settings, progress)
+        result = _train_hybrid(recipe, sha256, loaded, settings, progress)
     else:
-        result = _train_inverse(recipe, sha256, data, settings, progress)
+        result = _train_inverse(recipe, sha256, loaded, settings, progress)
     return replace(result, seconds=time.perf_counter() - started)
 
 
@@ -111,16 +108,19 @@ def _call(recipe: Recipe) -> str:
     return f"pisigma.train({recipe.name!r})"
 
 
-def _refuse(recipe: Recipe, option: str) -> None:
+def _refuse_resume(recipe: Recipe, reason: str = "") -> None:
     raise RecipeError(
-        f"recipe '{recipe.name}': a recipe of kind {recipe.kind} has no use for {option}; leave it out."
+        f"recipe '{recipe.name}': a recipe of kind {recipe.kind} has no use for --resume{reason}; leave it out."
     )
 
 
-def _train_geometric(recipe: GeometricRecipe, sha256: str) -> Calibration:
-    robot = Robot.load(recipe.robot)
-    rows, held_out = simulate_training(recipe), simulate_held_out(recipe)
-    result = recipe.calibration.calibrator(robot).fit(rows)
+def _train_geometric(
+    recipe: GeometricRecipe, sha256: str, data: RecipeData, settings: TrainSettings
+) -> Calibration:
+    if settings.resume:
+        _refuse_resume(recipe)
+    rows, held_out = data.simulations[0]
+    result = recipe.calibration.calibrator(data.robot).fit(rows)
     errors = ErrorFigures.model_validate(errors_under(result, held_out).in_file_units())
     summary = summarise(result).having(
         command=_call(recipe),
@@ -131,31 +131,27 @@ def _train_geometric(recipe: GeometricRecipe, sha256: str) -> Calibration:
         paper=recipe.model_dump(mode="json")["paper"] or None,
     )
     texts = CardTexts(recipe.description, recipe.not_validated)
-    return compose(robot, result, rows, summary, texts, recipe=(recipe.name, sha256))
+    return compose(data.robot, result, rows, summary, texts, recipe=(recipe.name, sha256))
 
 
 def _train_hybrid(
     recipe: HybridRecipe,
     sha256: str,
-    data: Measurements | str | os.PathLike[str] | None,
+    data: RecipeData,
     settings: TrainSettings,
     progress: Progress,
 ) -> Calibration:
-    rows, test_rows = load_measurements(recipe, data).split_sets()
-    batches = recipe.hybrid.mini_batches
+    rows, batches = data.training, recipe.hybrid.mini_batches
     if settings.resume and (batches is False or (batches == "auto" and rows.rows < MANY_ROWS)):
-        _refuse(recipe, "--resume: it does not train on mini-batches")
-    measured = isinstance(recipe.data, MeasuredData)
-    if isinstance(recipe.data, MeasuredData):
-        judged, splits = rows, k_folds(rows, recipe.data.folds, recipe.data.seed)
-    else:
-        judged, splits = simulate_repeats(recipe)
-    calibrator = recipe.calibrator()
+        _refuse_resume(recipe, ": it does not train on mini-batches")
+    measured = data.folds is not None
+    judged, splits = data.splits()
+    calibrator = recipe.calibrator(data.robot)
     started = time.perf_counter()
     result = calibrator.fit(rows, stage(progress, "calibration"), settings.checkpoints, settings.resume)
     seconds = time.perf_counter() - started
     validation = validate(calibrator, judged, splits, stage(progress, "held-out rows"))
-    test = None if test_rows is None else judge(calibrator, result, rows, test_rows)
+    test = None if data.test is None else judge(calibrator, result, rows, data.test)
     curve = None
     if (stated := recipe.learning_curve) is not None:
         of_curve = stage(progress, "learning curve")
@@ -172,7 +168,7 @@ def _train_hybrid(
     )
     texts = CardTexts(recipe.description, recipe.not_validated)
     return compose(
-        Robot.load(recipe.robot),
+        data.robot,
         result,
         rows,
         summary,
@@ -187,18 +183,14 @@ def _train_hybrid(
 def _train_inverse(
     recipe: InverseRecipe,
     sha256: str,
-    data: Measurements | str | os.PathLike[str] | None,
+    data: RecipeData,
     settings: TrainSettings,
     progress: Progress,
 ) -> InverseTraining:
-    measurements, test_rows = load_measurements(recipe, data).split_sets()
-    run = train_networks(recipe, measurements, settings, sha256)
-    validation = test = None
-    if isinstance(recipe.data, MeasuredData):
-        validation = cross_validate(recipe, measurements, progress)
-    if test_rows is not None:
-        test = compare_on(run.model, test_rows)
-    count = 0 if test_rows is None else test_rows.rows
+    run = train_networks(recipe, data, settings, sha256)
+    validation = None if data.folds is None else cross_validate(recipe, data, progress)
+    test = None if data.test is None else compare_on(run.model, data.test)
+    count = 0 if data.test is None else data.test.rows
     summary = summarise_training(run, recipe.paper, validation, test, count)
     summary = summary.having(command=_call(recipe))
     model = replace(run.model, metrics=summary.to_json())

@@ -1,6 +1,6 @@
 """Train and cross-validate the networks of a recipe of inverse calibration."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -12,12 +12,12 @@ from pisigma.judging.pose_statistics import Comparison, PoseErrors, compare_on
 from pisigma.judging.progress import Progress
 from pisigma.judging.training_summary import JointErrors, TrainingRun
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.splits import groups_of_equal_joints, k_folds
+from pisigma.measurement.splits import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.domain import Domain
 from pisigma.model.stored_starts import spread_rows
-from pisigma.recipes.data import simulate_held_out
-from pisigma.recipes.recipe import InverseRecipe, MeasuredData, SimulatedData
+from pisigma.recipes.data import RecipeData
+from pisigma.recipes.recipe import InverseRecipe, SimulatedData
 from pisigma.robot.description import Robot
 from pisigma.training.pairs import TrainingPairs, build_pairs
 from pisigma.training.patterns import build_network, build_patterns
@@ -48,7 +48,7 @@ DEFAULTS = TrainSettings()
 
 def train_networks(
     recipe: InverseRecipe,
-    measurements: Measurements,
+    data: RecipeData,
     settings: TrainSettings = DEFAULTS,
     recipe_sha256: str = "",
 ) -> TrainingRun:
@@ -56,7 +56,7 @@ def train_networks(
 
     Args:
         recipe: the recipe.
-        measurements: its rows; those of the set "test" are not trained on.
+        data: its robot and rows.
         settings: checkpoints, progress and logs.
         recipe_sha256: of the recipe file, for provenance.
 
@@ -66,14 +66,13 @@ def train_networks(
     from pisigma.training.networks import fit_networks  # imports lightning, which takes seconds
     from pisigma.training.trainer import Checkpoints
 
-    measurements, _ = measurements.split_sets()
-    robot = Robot.load(recipe.robot)
-    if isinstance(recipe.data, MeasuredData):
+    robot, measurements = data.robot, data.training
+    if data.folds is not None:
         _check_one_pose(measurements)
         robot = fit_base_and_tool(robot, measurements).robot
     bound = recipe.singular_rows.below if recipe.singular_rows.rule == "leave_out" else None
     pairs = build_pairs(robot, measurements, bound)
-    held_out = _held_out_pairs(recipe, robot)
+    held_out = None if data.held_out is None else _held_out_pairs(recipe.name, robot, data.held_out)
     network = build_network(robot, recipe.network, pairs)
     generator = torch.Generator().manual_seed(recipe.fit.seed)
     share = recipe.fit.validation_share if isinstance(recipe.fit, LevenbergMarquardtSection) else 0.0
@@ -108,28 +107,28 @@ def train_networks(
 
 
 def cross_validate(
-    recipe: InverseRecipe, measurements: Measurements, progress: Progress = lambda what: None
+    recipe: InverseRecipe, data: RecipeData, progress: Progress = lambda what: None
 ) -> CrossValidation:
     """Train the recipe once per fold, on the other folds, and judge it on the fold.
 
     Args:
         recipe: for measured data.
-        measurements: its rows to train on; every one is held out once.
+        data: its robot and rows; every row to train on is held out once.
         progress: called before every fold.
 
     Raises:
         RecipeError: the recipe simulates its data.
         MeasurementError: there are fewer different joint vectors than folds.
     """
-    if not isinstance(recipe.data, MeasuredData):
+    if data.folds is None:
         raise RecipeError(f"recipe '{recipe.name}' simulates its data; it has held-out rows of its own.")
+    measurements, folds = data.splits()
     not_predicted = 0
     nominal = torch.full((2, measurements.rows), torch.nan, dtype=torch.float64)
     corrected = nominal.clone()
-    folds = k_folds(measurements, recipe.data.folds, recipe.data.seed)
     for number, (training, test) in enumerate(folds, start=1):
         progress(f"cross-validation: fold {number} of {len(folds)}")
-        model = train_networks(recipe, measurements.select(training)).model
+        model = train_networks(recipe, replace(data, training=measurements.select(training))).model
         comparison = compare_on(model, measurements.select(test))
         not_predicted += comparison.not_predicted
         for store, errors in ((nominal, comparison.nominal), (corrected, comparison.corrected)):
@@ -157,14 +156,12 @@ def _check_one_pose(measurements: Measurements) -> None:
             )
 
 
-def _held_out_pairs(recipe: InverseRecipe, robot: Robot) -> TrainingPairs | None:
+def _held_out_pairs(name: str, robot: Robot, held_out: Measurements) -> TrainingPairs:
     """Fresh simulated poses, all of which must have a joint error to judge by."""
-    if not isinstance(recipe.data, SimulatedData):
-        return None
-    pairs = build_pairs(robot, simulate_held_out(recipe), None)
+    pairs = build_pairs(robot, held_out, None)
     if not pairs.used.all():
         raise RecipeError(
-            f"recipe '{recipe.name}': {int((~pairs.used).sum())} of {len(pairs.used)} poses of data.held_out "
+            f"recipe '{name}': {int((~pairs.used).sum())} of {len(pairs.used)} poses of data.held_out "
             "cannot be reached by the nominal robot and have no joint error; change their region."
         )
     return pairs

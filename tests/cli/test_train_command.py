@@ -95,7 +95,7 @@ def test_recipes_at_fault(refuses, tmp_path, old, new, complaint):
 def test_data_where_none_is_wanted_and_none_where_it_is(refuses, trained, tmp_path):
     folder, _, _ = trained
     sentence = refuses("train", folder / "kiro3.yaml", "--data", "x.csv", "--out", tmp_path / "model")
-    assert "takes no --data; leave it out." in sentence
+    assert "has no use for --data; leave it out." in sentence
     text = small_recipe_text("kiro3")
     start, end = text.index("data:\n"), text.index("singular_rows:")
     (tmp_path / "measured.yaml").write_text(f"{text[:start]}data: {{kind: measured}}\n{text[end:]}")

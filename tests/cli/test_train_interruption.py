@@ -10,7 +10,7 @@ from pathlib import Path
 
 from testing.closeness import assert_close
 
-from pisigma.recipes.data import load_measurements
+from pisigma.recipes.data import load_data
 from pisigma.recipes.reader import read_recipe
 from pisigma.workflow.train_networks import TrainSettings, train_networks
 
@@ -103,8 +103,8 @@ def test_killed_and_resumed_levenberg_marquardt_gives_the_same_weights(write_rec
     recipe = read_recipe(path)
     kill_after_a_checkpoint(tmp_path / "broken", path)
     options = TrainSettings(tmp_path / "broken" / ".model.training", resume=True)
-    resumed = train_networks(recipe, load_measurements(recipe, None), options)
-    whole = train_networks(recipe, load_measurements(recipe, None))
+    resumed = train_networks(recipe, load_data(recipe), options)
+    whole = train_networks(recipe, load_data(recipe))
     assert 0 < resumed.history.resumed_from < EPOCHS
     assert_close(resumed.history.energies, whole.history.energies, atol=0)
     for name, value in whole.model.network.state_dict().items():

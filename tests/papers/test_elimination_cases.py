@@ -8,7 +8,7 @@ from testing.models import shipped_training
 
 from elimination_cases import report_correlations, report_eliminations
 from pisigma.errors import RecipeError
-from pisigma.recipes.data import simulate_held_out
+from pisigma.recipes.data import simulate
 from pisigma.recipes.reader import read_recipe
 from published import read_published
 
@@ -27,7 +27,7 @@ def calibrated():
 def test_every_case_predicts_the_same_and_keeps_the_sums(repository, recipe, calibrated):
     result, rows = calibrated
     two = read_published(repository / "training").redundant_sums["rb5"].cases[:2]
-    report = report_eliminations(recipe, two, result, rows, simulate_held_out(recipe))
+    report = report_eliminations(recipe, two, result, rows, simulate(recipe).held_out)
     json.dumps(report, allow_nan=False)
     first, second, none = report["elimination_cases"]
     assert [case["parameters"] for case in (first, second, none)] == [28, 28, 35]

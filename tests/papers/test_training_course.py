@@ -3,7 +3,7 @@
 import pytest
 from testing.closeness import assert_close
 
-from pisigma.recipes.data import load_measurements
+from pisigma.recipes.data import load_data
 from pisigma.recipes.reader import read_recipe
 from pisigma.workflow.train_networks import train_networks
 from training_course import EPOCHS_SHOWN, epochs_shown, report_course
@@ -21,7 +21,7 @@ def test_first_and_last_epoch_are_shown_and_none_twice(epochs):
 def test_energies_and_points_are_those_of_the_training(repository):
     recipe = read_recipe(repository / "training" / "kiro3_paper.yaml")
     recipe = recipe.model_copy(update={"fit": recipe.fit.model_copy(update={"epochs": 100})})
-    run = train_networks(recipe, load_measurements(recipe, None))
+    run = train_networks(recipe, load_data(recipe))
     course = report_course(run)
     epochs = course["energies"].pop("epoch")
     assert list(course["energies"]) == ["theta_1", "theta_2"]

@@ -7,15 +7,10 @@ from testing.closeness import assert_close
 from pisigma.errors import RecipeError
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.mini_batches import MiniBatches
-from pisigma.recipes.data import (
-    load_measurements,
-    repeated,
-    simulate_held_out,
-    simulate_repeats,
-    simulate_training,
-)
+from pisigma.recipes.data import load_data, repeated, simulate
 from pisigma.recipes.reader import read_recipe
 from pisigma.recipes.recipe import HybridRecipe, MeasuredData, SimulatedData
+from pisigma.robot import Robot
 
 RB5 = "rb5_hybrid"
 SMALL = (("count: 5000", "count: 40"), ("repeats: 5", "repeats: 2"))
@@ -30,7 +25,7 @@ def test_shipped_recipes_parse_and_say_what_they_are(repository, name):
     assert recipe.description
     assert recipe.not_validated
     assert recipe.learning_curve is not None
-    calibrator = recipe.calibrator()
+    calibrator = recipe.calibrator(Robot.load(recipe.robot))
     assert calibrator == HybridCalibrator(calibrator.geometric)  # the defaults
 
 
@@ -73,11 +68,13 @@ def test_mistakes_are_refused_with_place(write_recipe, old, new, complaint):
 
 def test_repeats_are_other_robots_other_poses_and_other_noise(write_recipe):
     recipe = read_recipe(write_recipe(RB5, *SMALL))
-    rows, parts = simulate_repeats(recipe)
+    rows, parts = load_data(recipe).splits()
     assert rows.rows == 2 * (150 + 40)
     assert [(len(train), len(test)) for train, test in parts] == [(150, 40)] * 2
     assert sorted(torch.cat([part for both in parts for part in both]).tolist()) == list(range(rows.rows))
-    first, held_out = simulate_training(recipe), simulate_held_out(recipe)
+    data = simulate(recipe)
+    assert len(data.simulations) == 1
+    first, held_out = data.training, data.held_out
     (train, test), (other, _) = parts
     assert_close(rows.q[train], first.q, atol=0.0)
     assert_close(rows.position[train], first.position, atol=0.0)
@@ -93,11 +90,11 @@ def test_measured_recipes_want_a_file_and_simulated_ones_none(write_recipe, tmp_
     recipe = read_recipe(write_recipe("ur5_hybrid"))
     assert isinstance(recipe.data, MeasuredData)
     with pytest.raises(RecipeError, match="is for measured data; give the file with --data"):
-        load_measurements(recipe, None)
+        load_data(recipe)
     with pytest.raises(RecipeError, match="is for measured data and simulates nothing"):
-        simulate_repeats(recipe)
-    with pytest.raises(RecipeError, match="simulates its data and takes no --data"):
-        load_measurements(read_recipe(write_recipe(RB5)), tmp_path / "rows.csv")
+        simulate(recipe)
+    with pytest.raises(RecipeError, match="simulates its data and has no use for --data"):
+        load_data(read_recipe(write_recipe(RB5)), tmp_path / "rows.csv")
 
 
 @pytest.mark.parametrize(
@@ -105,9 +102,10 @@ def test_measured_recipes_want_a_file_and_simulated_ones_none(write_recipe, tmp_
     [("true", True), ("auto", "auto"), ("{epochs: 3, seed: 1}", MiniBatches(epochs=3, seed=1))],
 )
 def test_a_recipe_may_choose_mini_batches(repository, tmp_path, stated, wanted):
-    recipe = (repository / "training" / f"{RB5}.yaml").read_text(encoding="utf-8")
+    text = (repository / "training" / f"{RB5}.yaml").read_text(encoding="utf-8")
     file = tmp_path / "recipe.yaml"
     file.write_text(
-        recipe.replace(HYBRID, f"repeats: 5\nhybrid: {{mini_batches: {stated}}}\n"), encoding="utf-8"
+        text.replace(HYBRID, f"repeats: 5\nhybrid: {{mini_batches: {stated}}}\n"), encoding="utf-8"
     )
-    assert read_recipe(file).calibrator().mini_batches == wanted
+    recipe = read_recipe(file)
+    assert recipe.calibrator(Robot.load(recipe.robot)).mini_batches == wanted

@@ -3,7 +3,7 @@
 import pytest
 
 from pisigma.errors import RecipeError, RobotError, UnknownRobotError
-from pisigma.recipes.data import load_measurements, simulate_held_out, simulate_training
+from pisigma.recipes.data import load_data, simulate
 from pisigma.recipes.reader import read_recipe, recipe_hash
 from pisigma.training.sections import GradientDescentSection
 
@@ -67,14 +67,13 @@ def test_unknown_and_broken_robots_are_refused_with_place(write_recipe, tmp_path
 
 def test_data_and_recipe_must_go_together(repository, small_recipe, tmp_path):
     simulated = small_recipe(PAPER)
-    with pytest.raises(RecipeError, match="takes no --data"):
-        load_measurements(simulated, tmp_path / "data.csv")
+    with pytest.raises(RecipeError, match="has no use for --data"):
+        load_data(simulated, tmp_path / "data.csv")
     measured = read_recipe(repository / "training" / "ur10_inverse.yaml")
     with pytest.raises(RecipeError, match="give the file with --data"):
-        load_measurements(measured, None)
-    for simulate in (simulate_training, simulate_held_out):
-        with pytest.raises(RecipeError, match="is for measured data and simulates nothing"):
-            simulate(measured)
+        load_data(measured)
+    with pytest.raises(RecipeError, match="is for measured data and simulates nothing"):
+        simulate(measured)
 
 
 def test_the_hash_is_of_the_bytes(write_recipe):

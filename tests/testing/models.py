@@ -118,14 +118,14 @@ def shipped_training(name: str, seed: int | None = None):
 def trained_run(name: str):
     """What a short training of the shipped recipe gives: the recipe and the run."""
     from pisigma.errors import RecipeError
-    from pisigma.recipes.data import load_measurements
+    from pisigma.recipes.data import load_data
     from pisigma.recipes.recipe import InverseRecipe
     from pisigma.workflow.train_networks import train_networks
     from pisigma.yaml_file import parse_yaml
 
     recipe = parse_yaml(small_recipe_text(name), InverseRecipe, RecipeError, name)
     with no_type_checker():
-        return recipe, train_networks(recipe, load_measurements(recipe, None))
+        return recipe, train_networks(recipe, load_data(recipe))
 
 
 @contextmanager

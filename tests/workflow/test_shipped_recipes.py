@@ -11,7 +11,7 @@ from testing.models import no_type_checker, shipped_training
 
 import pisigma
 from pisigma.judging.training_summary import TrainingRun
-from pisigma.recipes.data import load_measurements
+from pisigma.recipes.data import load_data
 from pisigma.recipes.reader import read_recipe
 from pisigma.recipes.recipe import GeometricRecipe, InverseRecipe, SimulatedData
 from pisigma.workflow.train_networks import train_networks
@@ -113,7 +113,7 @@ def test_the_physical_robot_is_corrected_too():
 def test_a_seed_gives_the_same_model_bit_for_bit_and_another_does_not():
     recipe = read("kiro3")
     recipe = recipe.model_copy(update={"fit": recipe.fit.model_copy(update={"epochs": 10})})
-    rows, states = load_measurements(recipe, None), []
+    rows, states = load_data(recipe), []
     for seed in (3, 3, 4):
         seeded = recipe.model_copy(update={"fit": recipe.fit.model_copy(update={"seed": seed})})
         with no_type_checker():

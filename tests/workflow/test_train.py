@@ -11,6 +11,7 @@ import pisigma
 from pisigma.errors import MeasurementError, RecipeError
 from pisigma.judging.pose_statistics import compare_on
 from pisigma.judging.training_summary import summarise_training
+from pisigma.recipes.data import load_data, simulate
 from pisigma.recipes.reader import recipe_hash
 from pisigma.recipes.recipe import MeasuredData, SingularRows
 from pisigma.workflow.train import InverseTraining
@@ -80,7 +81,7 @@ def test_rows_of_two_frames_are_refused():
     measured = recipe.model_copy(update={"data": MeasuredData(kind="measured")})
     rows = replace(run.measurements, frame=("left",) * 50 + ("right",) * 50)
     with pytest.raises(MeasurementError, match="frame 'right' stands there"):
-        train_networks(measured, rows)
+        train_networks(measured, load_data(measured, rows))
 
 
 def test_the_correction_helps_on_rows_that_it_never_saw():
@@ -88,7 +89,7 @@ def test_the_correction_helps_on_rows_that_it_never_saw():
     measured = recipe.model_copy(update={"data": MeasuredData(kind="measured", folds=3, seed=1)})
     steps: list[str] = []
     with no_type_checker():
-        result = cross_validate(measured, run.measurements, steps.append)
+        result = cross_validate(measured, load_data(measured, run.measurements), steps.append)
     assert steps == [f"cross-validation: fold {fold} of 3" for fold in (1, 2, 3)]
     figures = result.comparison.in_file_units()
     assert (result.folds, result.comparison.not_predicted) == (3, 0)
@@ -99,9 +100,9 @@ def test_the_correction_helps_on_rows_that_it_never_saw():
 
 
 def test_a_simulated_recipe_has_held_out_rows_of_its_own():
-    recipe, run = trained_run("kiro3")
+    recipe, _ = trained_run("kiro3")
     with pytest.raises(RecipeError, match="simulates its data"):
-        cross_validate(recipe, run.measurements)
+        cross_validate(recipe, simulate(recipe))
 
 
 def test_rows_of_the_test_set_change_nothing_that_is_learned():
@@ -115,10 +116,10 @@ def test_rows_of_the_test_set_change_nothing_that_is_learned():
     training, test = marked.split_sets()
     with no_type_checker():
         models = [
-            train_networks(measured, data).model
+            train_networks(measured, load_data(measured, data)).model
             for data in (marked, replace(marked, position=position), training)
         ]
-        run = train_networks(measured, marked)
+        run = train_networks(measured, load_data(measured, marked))
         summary = summarise_training(run, {}, None, compare_on(run.model, test), test.rows)
     states = [model.network.state_dict() for model in models]
     for name, values in states[0].items():

@@ -10,7 +10,7 @@ from markdown_text import command_of
 from pisigma.export.output_file import write_whole
 from pisigma.identification.result import CalibrationResult
 from pisigma.model.folder.staging import check_replaceable
-from pisigma.recipes.data import simulate_held_out
+from pisigma.recipes.data import simulate
 from pisigma.recipes.reader import read_recipe
 from pisigma.recipes.recipe import GeometricRecipe
 from pisigma.workflow.train import InverseTraining, Training, train
@@ -69,7 +69,7 @@ def extra_figures(folder: Path, name: str, training: Training) -> dict[str, Any]
     if not isinstance(recipe, GeometricRecipe) or not isinstance(training.result, CalibrationResult):
         return {}
     cases = read_published(folder).redundant_sums[name.split("_")[0]].cases
-    held_out = simulate_held_out(recipe)
+    (_, held_out), *_ = simulate(recipe).simulations
     return {
         **report_eliminations(recipe, cases, training.result, training.rows, held_out),
         **report_correlations(training.result),
