@@ -241,7 +241,8 @@ class GeometricCalibrator:
         few = problem
         if problem.q.shape[0] > ROUGH_ROWS:
             few = problem.select(chosen_rows(problem.q.shape[0], ROUGH_ROWS).to(problem.q.device))
-        rough = levenberg_marquardt(few.without_prior(), start, min(ROUGH_STEPS, self.maximum_iterations))
+        steps = min(ROUGH_STEPS, self.maximum_iterations)
+        rough = levenberg_marquardt(few.without_prior(), start, steps, close_enough=1.0)
         here = rough.linearisation
         extended: list[int] = []
         kept = [candidates.index(i) for i in problem.active.tolist()]

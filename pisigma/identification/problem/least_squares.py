@@ -1,5 +1,6 @@
 """Levenberg-Marquardt on normal equations; problem, solver and solution are apart."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import Enum
@@ -102,6 +103,7 @@ def levenberg_marquardt(
     problem: AbstractLeastSquares[Point],
     start: Point | Linearisation[Point],
     maximum_iterations: int = 50,
+    close_enough: float = 0.0,
 ) -> Solution[Point]:
     """Minimise by Levenberg-Marquardt steps `(normal + damping / step_scale²) step = descent`.
 
@@ -116,6 +118,8 @@ def levenberg_marquardt(
         problem: what to minimise.
         start: where to begin, or the problem as already seen from there.
         maximum_iterations: steps tried at most.
+        close_enough: length [standard errors] of a step, as a vector of all unknowns, that is not worth taking; the
+            search then ends without it.
 
     Returns:
         The best point, with the reason for stopping (see `SolutionStatus`).
@@ -126,9 +130,12 @@ def levenberg_marquardt(
     damping, uphill, iterations = START_DAMPING, 0, 0
     status = SolutionStatus.ITERATION_LIMIT
     while iterations < maximum_iterations:
-        iterations += 1
         step = solve_damped(here, problem.step_scale, damping)
-        decrement = float(step @ here.normal @ step)
+        decrement = float((here.normal @ step).dot(step))
+        if here is best and decrement < close_enough**2:
+            status = SolutionStatus.CONVERGED
+            break
+        iterations += 1
         there = problem.linearise(problem.moved(here.point, step), best)
         if there.cost <= best.cost:
             best, settled = problem.renewed(there)
@@ -168,17 +175,16 @@ def solve_damped(
         IdentificationError: they are not finite.
     """
     normal = linearisation.normal
-    if not (bool(torch.isfinite(normal).all()) and bool(torch.isfinite(linearisation.descent).all())):
+    if not math.isfinite(float(normal.sum() + linearisation.descent.sum())):
         raise IdentificationError(
             "the normal equations are not finite; look for huge values, or standard deviations of next to nothing, in "
             "the measurements."
         )
     while True:
-        damped = normal.clone()
-        damped.diagonal().add_(damping / step_scale.square())
-        scale = damped.diagonal().rsqrt()
-        scaled = damped * (scale * scale[:, None])
-        scaled.diagonal().add_(1e-14)
+        damped = normal.diagonal() + damping / step_scale.square()
+        scale = damped.rsqrt()
+        scaled = normal * (scale * scale[:, None])
+        scaled.diagonal().copy_(damped * scale.square() + 1e-14)
         factor, failed = torch.linalg.cholesky_ex(scaled)
         if not failed:
             return scale * torch.cholesky_solve((scale * linearisation.descent)[:, None], factor)[:, 0]

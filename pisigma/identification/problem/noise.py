@@ -94,7 +94,7 @@ class SensorView:
 
     def scaled(self, precision: Float64[Tensor, " active"], group: Tensor) -> Float64[Tensor, " active"]:
         """1 / variance of parameters by the prior at its present scale."""
-        return precision / precision.new_tensor(self.prior_scale).square()[group]
+        return precision / precision.new_tensor([scale**2 for scale in self.prior_scale])[group]
 
 
 def view_of(linearisation: Linearisation[Tensor]) -> SensorView:

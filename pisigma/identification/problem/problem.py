@@ -29,6 +29,10 @@ from pisigma.measurement.conditions import JointState
 from pisigma.sensors.sensor import AbstractSensor, Unknowns
 
 CERTAIN_LOSS = SquaredLoss()
+SETTLED = 1e-2
+"""Estimates of noise and of the prior's sizes have settled that change by a smaller share from point to point."""
+PRIOR_ROUNDS, PRIOR_SETTLED = 8, 1e-3
+"""At one point the prior's sizes are estimated anew so often at most, or until they change by a smaller share."""
 
 
 class MotionMemory:
@@ -181,16 +185,42 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             repetition = group_variance_ratio(
                 self.sensors, self.loss, renewed_noise, used, self.pose, self.configuration
             )
-        off = (linearisation.point - self.nominal)[self.active]
-        prior_scale = view.prior_scale
-        if self.prior_sizes != "stated":
-            floor = 1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR
-            prior_scale = prior_scales(off, self._prior, self.prior_group, view, covariance, floor)
-        old, new = (*view.noise, *view.repetition, *view.prior_scale), (*noise, *repetition, *prior_scale)
-        settled = all(abs(b / a - 1) < 1e-2 for a, b in zip(old, new, strict=True))
-        return self.combined(
-            linearisation.point, SensorView(view.sums, noise, repetition, prior_scale)
-        ), settled
+        renewed = SensorView(view.sums, noise, repetition, view.prior_scale)
+        if self._sized:
+            off = self._off(linearisation.point)
+            sized = replace(renewed, prior_scale=self._prior_scales(off, view, covariance))
+            renewed = sized if refine else self._with_settled_prior(sized, off)
+        return self.combined(linearisation.point, renewed), _alike(view, renewed)
+
+    def _with_settled_prior(self, view: SensorView, off: Tensor) -> SensorView:
+        """Estimate the prior's sizes together with the step that they lead to.
+
+        Residuals being linear in the step, that takes no further linearisation.
+        """
+        normal, descent = self._data_sums(view)
+        pull = descent + normal @ off
+        for _ in range(PRIOR_ROUNDS):
+            held = normal.clone()
+            held.diagonal().add_(view.scaled(self._prior, self.prior_group))
+            covariance = covariance_of(held)
+            before = view
+            view = replace(view, prior_scale=self._prior_scales(covariance @ pull, view, covariance))
+            if _alike(before, view, PRIOR_SETTLED):
+                break
+        return view
+
+    def _prior_scales(self, off: Tensor, view: SensorView, covariance: Tensor) -> tuple[float, ...]:
+        floor = 1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR
+        return prior_scales(off, self._prior, self.prior_group, view, covariance, floor)
+
+    @cached_property
+    def _sized(self) -> bool:
+        """Whether there is a prior whose sizes are estimated."""
+        return self.prior_sizes != "stated" and bool((self._prior > 0).any())
+
+    def _off(self, point: Tensor) -> Float64[Tensor, " active"]:
+        """Distance of the free parameters from where the prior has them."""
+        return (point - self.nominal)[self.active]
 
     def row_weights(self, view: SensorView, sensor: int, rows: slice) -> Float64[Tensor, " poses"]:
         """1 / standard deviation of each row for a sensor, 0 where it saw nothing [1/m or 1/rad]."""
@@ -252,19 +282,33 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def combined(self, point: Tensor, view: SensorView) -> Linearisation[Tensor]:
         """Divide the sums by their variances and add the prior."""
-        off = (point - self.nominal)[self.active]
+        off = self._off(point)
         precision = view.scaled(self._prior, self.prior_group)
         pull = off * precision
-        normal, descent, misfit, rounding = torch.diag(precision), -pull, 0.0, 0.0
+        normal, descent = self._data_sums(view)
+        normal.diagonal().add_(precision)
+        descent.sub_(pull)
+        misfit, rounding = 0.0, 0.0
         for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True)):
             scale, variance = view.scale(k), view.variance(k)
             cost = self.loss_of(sensor).cost(sums.distance / scale, sensor.components)
             misfit += float(cost.sum()) * scale**2 / variance
-            normal.add_(sums.normal, alpha=1 / variance)
-            descent.add_(sums.descent, alpha=1 / variance)
             size = self._reach if sensor.unit == "m" else 1.0
             rounding += self.values_measured[k] * (torch.finfo(point.dtype).eps * size) ** 2 / variance
         return Linearisation(point, misfit + float(off.dot(pull)), descent, normal, misfit, rounding, view)
+
+    def _data_sums(
+        self, view: SensorView
+    ) -> tuple[Float64[Tensor, "active active"], Float64[Tensor, " active"]]:
+        """Divide the sums by their variances; the prior is not in it."""
+        first, *others = range(len(view.sums))
+        normal, descent = (
+            sums / view.variance(first) for sums in (view.sums[first].normal, view.sums[first].descent)
+        )
+        for k in others:
+            normal.add_(view.sums[k].normal, alpha=1 / view.variance(k))
+            descent.add_(view.sums[k].descent, alpha=1 / view.variance(k))
+        return normal, descent
 
     @cached_property
     def _reach(self) -> float:
@@ -319,3 +363,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         sums.descent.addmv_(A, (residual * root).flatten())
         sums.residual[:, rows] = residual
         sums.distance[rows] = distance
+
+
+def _alike(before: SensorView, after: SensorView, share: float = SETTLED) -> bool:
+    """Whether two estimates of noise and of the prior's sizes differ by less than a share."""
+    old, new = ((*view.noise, *view.repetition, *view.prior_scale) for view in (before, after))
+    return all(abs(b / a - 1) < share for a, b in zip(old, new, strict=True))
