@@ -20,7 +20,7 @@ from pisigma.identification.initial_guess.initial_guess import chosen_rows
 from pisigma.identification.problem.noise import view_of
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.setup import identified_geometry
-from pisigma.identification.result_assembly import SolvedCalibration
+from pisigma.identification.result import SolvedCalibration
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions
 from pisigma.joint_correction.registry import FEATURES, feature_named
 from pisigma.measurement.conditions import stated_conditions

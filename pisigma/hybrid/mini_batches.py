@@ -22,7 +22,7 @@ from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.hybrid.uncertainty import covariance_root
 from pisigma.identification.problem.loss import AbstractLoss
 from pisigma.identification.problem.problem import CalibrationProblem
-from pisigma.identification.result_assembly import SolvedCalibration
+from pisigma.identification.result import SolvedCalibration
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.conditions import JointState

@@ -17,7 +17,7 @@ from pisigma.identification.identifiability.sufficiency import floating_frames
 from pisigma.identification.prediction import predicted_poses
 from pisigma.identification.problem.loss import AbstractLoss
 from pisigma.identification.problem.setup import IdentifiedGeometry, identified_geometry
-from pisigma.identification.result_assembly import SolvedCalibration
+from pisigma.identification.result import SolvedCalibration
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_of_equal_joints

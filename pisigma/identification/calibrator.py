@@ -12,7 +12,12 @@ from torch import Tensor
 from pisigma.errors import IdentificationError
 from pisigma.identification.identifiability.pairwise import find_pairwise_redundancy
 from pisigma.identification.identifiability.plausibility import refuse_implausible
-from pisigma.identification.identifiability.redundancy import Redundancy, find_redundancy, rank_extension
+from pisigma.identification.identifiability.redundancy import (
+    Findings,
+    Redundancy,
+    find_redundancy,
+    rank_extension,
+)
 from pisigma.identification.identifiability.sufficiency import (
     check_sufficiency,
     determines_scale,
@@ -26,8 +31,7 @@ from pisigma.identification.problem.noise import view_of
 from pisigma.identification.problem.parameters import ParameterSpace, Prior
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.setup import CalibrationSetup, SetupOptions, build_setup
-from pisigma.identification.result import CalibrationResult
-from pisigma.identification.result_assembly import Findings, SolvedCalibration
+from pisigma.identification.result import CalibrationResult, SolvedCalibration
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS
@@ -146,7 +150,7 @@ class GeometricCalibrator:
         problem = setup.problem.with_active(active)
         solution, problem, extended = self._solved(problem, setup.start, unknowns + candidates)
         refuse_implausible(problem, solution.linearisation, measurements.source)
-        findings = Findings(at_start, sizes, redundancy, extended, warnings)
+        findings = Findings(sizes, redundancy, extended, warnings)
         return SolvedCalibration(measurements, setup, problem, solution, findings)
 
     def build(self, measurements: Measurements) -> CalibrationSetup:

@@ -1,50 +1,42 @@
 """What a calibration comes to: the robot, its parameters with their errors, and what the data cannot determine."""
 
-from dataclasses import dataclass, field
+import math
+from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
+import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.identification.identifiability.observability import Observability
-from pisigma.identification.identifiability.pairwise import PairwiseRedundancy
-from pisigma.identification.identifiability.redundancy import Redundancy
+from pisigma.identification.identifiability.observability import (
+    Observability,
+    find_weak_directions,
+    observability_of,
+)
+from pisigma.identification.identifiability.pairwise import PairwiseRedundancy, find_pairwise_redundancy
+from pisigma.identification.identifiability.plausibility import misfitting_frames
+from pisigma.identification.identifiability.redundancy import Findings, Redundancy
+from pisigma.identification.parameter_table import ParameterEstimate, parameter_table
 from pisigma.identification.prediction import predicted_poses
-from pisigma.identification.problem.least_squares import SolutionStatus
+from pisigma.identification.problem.least_squares import (
+    Linearisation,
+    Solution,
+    SolutionStatus,
+    covariance_of,
+)
+from pisigma.identification.problem.noise import effective_parameters, values_used, view_of
+from pisigma.identification.problem.problem import CalibrationProblem
+from pisigma.identification.problem.setup import CalibrationSetup, IdentifiedGeometry, identified_geometry
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.sensors.registry import measured_errors
 
-
-@dataclass(frozen=True)
-class ParameterEstimate:
-    """One row of the parameter table, in SI units.
-
-    Attributes:
-        name: such as "theta_1".
-        unit: "m" or "rad".
-        nominal: as drawn.
-        estimated: as identified.
-        change: estimated - nominal.
-        standard_error: of the estimate; NaN where it was not estimated.
-        remark: "identified", what it is only identified together with, or why it was not estimated.
-        label: the remark in a few words, for tables.
-    """
-
-    name: str
-    unit: str
-    nominal: float
-    estimated: float
-    change: float
-    standard_error: float
-    remark: str
-    label: str
-
-    @property
-    def free(self) -> bool:
-        """Whether it was estimated."""
-        return not np.isnan(self.standard_error)
+UNUSUAL = 4.0
+"""Errors that are surely more than so many times as large as the prior says are worth a warning. Healthy
+robots have up to 4.6 times the default prior of 1 mrad. The estimate from n parameters has a relative standard
+deviation of about `1 / sqrt(2 n)`, so `exp(-sqrt(2 / n))` times the estimate is two of these below it."""
 
 
 @dataclass(frozen=True)
@@ -95,51 +87,156 @@ class Outlier:
 
 
 @dataclass(frozen=True, eq=False)
+class SolvedCalibration:
+    """A calibration problem with its solution.
+
+    Attributes:
+        measurements: all rows, also those that could not be used.
+        setup: start, and what base and tool are relative to.
+        problem: with its free parameters.
+        solution: of it.
+        findings: on the parameters.
+    """
+
+    measurements: Measurements
+    setup: CalibrationSetup
+    problem: CalibrationProblem
+    solution: Solution[Tensor]
+    findings: Findings
+
+    def result(self) -> "CalibrationResult":
+        """Return the calibration in the user's coordinates."""
+        geometry = self.geometry
+        return CalibrationResult(geometry.robot, geometry.bases, geometry.tools, geometry.unknowns, self)
+
+    @cached_property
+    def geometry(self) -> IdentifiedGeometry:
+        """The solution in the user's coordinates."""
+        return identified_geometry(self.setup, self.solution.linearisation.point)
+
+    @cached_property
+    def refined(self) -> Linearisation[Tensor]:
+        """The problem at its solution, the noise estimated from all good rows."""
+        return self.problem.refined(self.solution.linearisation)
+
+    @cached_property
+    def covariance(self) -> Float64[np.ndarray, "parameters parameters"]:
+        """Covariance of all parameters in the user's coordinates (SI), zero where they were not free."""
+        size = len(self.problem.space.parameters)
+        full = torch.zeros(size, size, dtype=torch.float64)
+        active = self.problem.active.cpu()
+        full[active[:, None], active] = covariance_of(self.refined.normal).cpu()
+        covariance: np.ndarray = (self.geometry.change @ full @ self.geometry.change.mT).numpy()
+        return covariance
+
+
+@dataclass(frozen=True, eq=False)
 class CalibrationResult:
-    """A geometric calibration.
+    """A geometric calibration. Whatever predictions do not need is worked out when it is asked for.
 
     Attributes:
         robot: the calibrated robot, with the base of the first frame and the tool of the first target.
         bases: per frame x, y, z [m], roll, pitch, yaw [rad].
         tools: the same per target.
-        parameters: all parameters, free or not.
-        covariance: of all parameters in their order (SI), zero where they were not free.
-        residuals: per sensor, measured - predicted of every row [m or rad], NaN where it measured nothing.
-        outliers: rows that counted for less than half, the worst first.
-        noise: per sensor.
-        redundancy: rank, chosen parameters and dependencies at the start.
-        pairwise: redundancy the paper's way, by Pearson correlation.
-        extended: parameters that were added because at the solution the data do determine them.
-        weak_directions: directions that the data hardly determine, in words; there the nominal value stands.
-        observability: indices O1 to O5 of the free parameters at the solution.
-        iterations: steps tried.
-        cost: sum of squared residuals over variances, with loss and prior.
-        status: why the search ended.
-        rms_path: RMS of the first sensor's residuals' lengths at every point passed [m], the start first.
-        warnings: what to measure next, in sentences.
         unknowns: by group and owner, what the sensors found out about themselves, in the owner's frame: of a
             "socket" x, y, z [m], of an "anchor" x, y, z and what its sensor shows at no distance [m].
+        solved: the problem with its solution.
     """
 
     robot: Robot
     bases: dict[str, Float64[np.ndarray, " 6"]]
     tools: dict[str, Float64[np.ndarray, " 6"]]
-    parameters: tuple[ParameterEstimate, ...]
-    covariance: Float64[np.ndarray, "parameters parameters"]
-    residuals: dict[str, Float64[np.ndarray, "rows components"]]
-    outliers: tuple[Outlier, ...]
-    noise: tuple[SensorNoise, ...]
-    redundancy: Redundancy
-    pairwise: PairwiseRedundancy
-    extended: tuple[str, ...]
-    weak_directions: tuple[str, ...]
-    observability: Observability
-    iterations: int
-    cost: float
-    status: SolutionStatus
-    rms_path: tuple[float, ...]
-    warnings: tuple[str, ...]
-    unknowns: dict[str, dict[str, Float64[np.ndarray, " columns"]]] = field(default_factory=dict)
+    unknowns: dict[str, dict[str, Float64[np.ndarray, " columns"]]]
+    solved: SolvedCalibration
+
+    @cached_property
+    def parameters(self) -> tuple[ParameterEstimate, ...]:
+        """All parameters, free or not."""
+        solved = self.solved
+        return parameter_table(
+            solved.setup,
+            solved.problem,
+            solved.findings,
+            solved.refined,
+            solved.geometry,
+            solved.covariance,
+        )
+
+    @property
+    def covariance(self) -> Float64[np.ndarray, "parameters parameters"]:
+        """Covariance of all parameters in their order (SI), zero where they were not free."""
+        return self.solved.covariance
+
+    @cached_property
+    def residuals(self) -> dict[str, Float64[np.ndarray, "rows components"]]:
+        """Per sensor, measured - predicted of every row [m or rad], NaN where it measured nothing."""
+        return _residuals(self.solved)
+
+    @cached_property
+    def outliers(self) -> tuple[Outlier, ...]:
+        """Rows that counted for less than half, the worst first."""
+        return _outliers(self.solved)
+
+    @cached_property
+    def noise(self) -> tuple[SensorNoise, ...]:
+        """Noise of every sensor."""
+        return _noise(self.solved)
+
+    @property
+    def redundancy(self) -> Redundancy:
+        """Rank, chosen parameters and dependencies at the start."""
+        return self.solved.findings.redundancy
+
+    @cached_property
+    def pairwise(self) -> PairwiseRedundancy:
+        """Redundancy the paper's way, by Pearson correlation."""
+        findings = self.solved.findings
+        return find_pairwise_redundancy(findings.information, findings.sizes)
+
+    @property
+    def extended(self) -> tuple[str, ...]:
+        """Names of parameters that were added because at the solution the data do determine them."""
+        names = self.solved.problem.space.names
+        return tuple(names[i] for i in self.solved.findings.extended)
+
+    @cached_property
+    def weak_directions(self) -> tuple[str, ...]:
+        """Directions that the data hardly determine, in words; there the nominal value stands."""
+        return find_weak_directions(self.solved.problem, self.solved.refined)
+
+    @cached_property
+    def observability(self) -> Observability:
+        """Indices O1 to O5 of the free parameters at the solution."""
+        problem, here = self.solved.problem, self.solved.refined
+        gram = sum((sums.normal for sums in view_of(here).sums), torch.zeros_like(here.normal))
+        usual = problem.step_scale * 1e3  # to rows in mm and mrad, columns per 1 mm and 1 mrad
+        poses = int(torch.stack([sensor.present for sensor in problem.sensors]).any(0).sum())
+        return observability_of(gram * usual * usual[:, None], poses)
+
+    @property
+    def iterations(self) -> int:
+        """Steps tried."""
+        return self.solved.solution.iterations
+
+    @property
+    def cost(self) -> float:
+        """Sum of squared residuals over variances, with loss and prior."""
+        return self.solved.refined.cost
+
+    @property
+    def status(self) -> SolutionStatus:
+        """Why the search ended."""
+        return self.solved.solution.status
+
+    @cached_property
+    def rms_path(self) -> tuple[float, ...]:
+        """RMS of the first sensor's residuals' lengths at every point passed [m or rad], the start first."""
+        return tuple(view_of(passed).sums[0].rms for passed in self.solved.solution.path)
+
+    @cached_property
+    def warnings(self) -> tuple[str, ...]:
+        """What to measure next, and what does not fit, in sentences."""
+        return (*self.solved.findings.warnings, *_warnings(self.solved))
 
     @property
     def rank(self) -> int:
@@ -182,3 +279,82 @@ class CalibrationResult:
         """
         T = predicted_poses(self.robot, self.bases, self.tools, measurements)
         return measured_errors(T, measurements, self.unknowns)
+
+
+def _warnings(solved: SolvedCalibration) -> tuple[str, ...]:
+    """Sentences on the search, on errors far larger than the prior, and on frames that do not fit."""
+    problem, here, status = solved.problem, solved.refined, solved.solution.status
+    sentences = [] if status.good else [f"the search {status.value}."]
+    view, group = view_of(here), problem.prior_group
+    precision = problem.precision[problem.active]
+    effective = effective_parameters(precision, group, view, covariance_of(here.normal))
+    units = [problem.space.parameters[i].unit for i in problem.active[precision > 0].tolist()]
+    groups = set(zip(group[precision > 0].tolist(), units, strict=True))
+    for kind, unit in (("length", "m"), ("angle", "rad")):
+        factors = [
+            view.prior_scale[number]
+            for number, of in groups
+            if of == unit and effective[number] > 0
+            if view.prior_scale[number] * math.exp(-((2 / effective[number]) ** 0.5)) > UNUSUAL
+        ]
+        if factors:
+            sentences.append(
+                f"the {kind} errors are about {max(factors):.2g} times as large as the prior says, so their size was "
+                "taken from the data; check the nominal geometry and the robot, or give a wider prior."
+            )
+    return (*sentences, *misfitting_frames(problem, here))
+
+
+def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows components"]]:
+    """Residuals turned back into the measuring frames."""
+    measurements, setup, problem = solved.measurements, solved.setup, solved.problem
+    R = setup.anchors.bases[:, :3, :3].to(problem.frame.device)[problem.frame]
+    residuals = {}
+    for sensor, sums in zip(problem.sensors, view_of(solved.refined).sums, strict=True):
+        own = sums.residual.t()
+        if sensor.components == 3:
+            own = (R @ own[..., None])[..., 0]
+        values = torch.full((measurements.q.shape[0], sensor.components), torch.nan, dtype=own.dtype)
+        values[setup.rows.cpu()] = torch.where(sensor.present[:, None], own, torch.nan).cpu()
+        residuals[sensor.name] = values.numpy()
+    return residuals
+
+
+def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
+    measurements, setup, problem = solved.measurements, solved.setup, solved.problem
+    outliers = []
+    view = view_of(solved.refined)
+    for number, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
+        deviations = sums.distance / view.scale(number)
+        for k in (
+            (problem.loss_of(sensor).weight(deviations, sensor.components) < 0.5).nonzero()[:, 0].tolist()
+        ):
+            row = int(setup.rows[k])
+            length = float(sums.residual[:, k].norm())
+            outliers.append(
+                Outlier(row, measurements.place(row), sensor.name, length, float(deviations[k]), sensor.unit)
+            )
+    return tuple(sorted(outliers, key=lambda outlier: -outlier.deviations))
+
+
+def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
+    noise = []
+    problem, here = solved.problem, solved.refined
+    view = view_of(here)
+    used = values_used(view, covariance_of(here.normal))
+    for k, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
+        sigma = view.noise[k]
+        unit = sensor.unit if sensor.sigma is None else "stated"
+        noise.append(
+            SensorNoise(
+                sensor=sensor.name,
+                sigma=sigma,
+                unit=unit,
+                values=problem.values_measured[k],
+                used=used[k],
+                rms=sums.rms,
+                quantity=sensor.unit,
+                components=sensor.components,
+            )
+        )
+    return tuple(noise)

@@ -1,6 +1,7 @@
 """Which parameters the data can tell apart: rank, choice, dependencies in words, additions."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -46,29 +47,59 @@ class Redundancy:
     Turns of base and tool are meant as small turns about their own axes.
 
     Attributes:
-        names: the parameters that were looked at.
+        information: the condensed Jacobian.
         rank: how many independent combinations of them the data determine.
         tolerance: of the rank, as a share of the largest singular value.
         singular_values: of the column-scaled Jacobian.
         kept: the parameters that were chosen, `rank` of them.
         removed: those that act like combinations of kept ones.
         no_effect: those that change no measured value at all.
-        dependencies: the combinations that are identified where single values are not.
     """
 
-    names: tuple[str, ...]
+    information: Information
     rank: int
     tolerance: float
     singular_values: Float64[np.ndarray, " singular"]
     kept: tuple[str, ...]
     removed: tuple[str, ...]
     no_effect: tuple[str, ...]
-    dependencies: tuple[Dependency, ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters that were looked at."""
+        return self.information.names
+
+    @cached_property
+    def dependencies(self) -> tuple[Dependency, ...]:
+        """The combinations that are identified where single values are not, one for every kept parameter with any."""
+        return _dependencies(self.information, self.kept, self.removed)
 
     def group(self, name: str) -> str | None:
         """The sentence of a dependency that a parameter is part of, the shortest if several."""
         having = [dependency for dependency in self.dependencies if name in dependency.names]
         return min(having, key=lambda dependency: len(dependency.names)).sentence if having else None
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What the rank analysis says about the parameters.
+
+    Attributes:
+        sizes: values of the candidates at the start.
+        redundancy: what the Jacobian there says of them.
+        extended: indices of parameters that were added later.
+        warnings: sentences so far.
+    """
+
+    sizes: Float64[np.ndarray, " candidates"]
+    redundancy: Redundancy
+    extended: list[int]
+    warnings: tuple[str, ...]
+
+    @property
+    def information(self) -> Information:
+        """The condensed Jacobian of the candidates at the start."""
+        return self.redundancy.information
 
 
 def find_redundancy(
@@ -99,14 +130,13 @@ def find_redundancy(
     kept, removed = acting[np.sort(pivots)], np.delete(acting, pivots)
     names = information.names
     return Redundancy(
-        names=names,
+        information=information,
         rank=rank,
         tolerance=tolerance,
         singular_values=singular,
         kept=tuple(names[i] for i in kept),
         removed=tuple(names[i] for i in removed),
         no_effect=tuple(names[i] for i in range(len(names)) if i not in acting),
-        dependencies=_dependencies(information, lengths, kept, removed),
     )
 
 
@@ -130,12 +160,14 @@ def pivoted_columns(A: Float64[np.ndarray, "rows columns"], count: int) -> Int64
 
 
 def _dependencies(
-    information: Information, lengths: np.ndarray, kept: np.ndarray, removed: np.ndarray
+    information: Information, kept_names: tuple[str, ...], removed_names: tuple[str, ...]
 ) -> tuple[Dependency, ...]:
-    """One for every kept parameter that removed ones act like."""
-    if len(removed) == 0 or len(kept) == 0:
+    if not removed_names or not kept_names:
         return ()
+    number = {name: index for index, name in enumerate(information.names)}
+    kept, removed = ([number[name] for name in names] for names in (kept_names, removed_names))
     J = information.jacobian
+    lengths = np.linalg.norm(J, axis=0)
     scaled, *_ = np.linalg.lstsq(J[:, kept] / lengths[kept], J[:, removed] / lengths[removed], rcond=None)
     usual = np.array([parameter.usual_error for parameter in information.parameters])
     dependencies = []
