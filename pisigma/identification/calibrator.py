@@ -19,9 +19,9 @@ from pisigma.identification.identifiability.redundancy import (
     rank_extension,
 )
 from pisigma.identification.identifiability.sufficiency import (
-    check_sufficiency,
     determines_scale,
-    undetermined,
+    free_parameters,
+    refuse_too_few,
 )
 from pisigma.identification.initial_guess.initial_guess import chosen_rows
 from pisigma.identification.problem.information import Information, information
@@ -137,20 +137,14 @@ class GeometricCalibrator:
         candidates, at_start = self._at_start(setup, self.candidates(setup.problem.space))
         sizes = setup.start.cpu().numpy()[candidates]
         redundancy = find_redundancy(at_start, sizes)
-        warnings = check_sufficiency(
-            self.robot,
-            setup.problem,
-            redundancy,
-            not isinstance(self.free, str),
-            measurements.source,
-            len(unknowns),
-        )
-        warnings = (*warnings, *undetermined(setup))
+        explicit = not isinstance(self.free, str)
+        refuse_too_few(setup.problem, redundancy, explicit, len(unknowns), measurements.source)
         active = [*self._chosen(setup.problem.space, at_start, sizes, redundancy), *unknowns]
         problem = setup.problem.with_active(active)
         solution, problem, extended = self._solved(problem, setup.start, unknowns + candidates)
         refuse_implausible(problem, solution.linearisation, measurements.source)
-        findings = Findings(sizes, redundancy, extended, warnings)
+        wanted = free_parameters(redundancy, explicit, len(unknowns))
+        findings = Findings(sizes, redundancy, extended, wanted)
         return SolvedCalibration(measurements, setup, problem, solution, findings)
 
     def build(self, measurements: Measurements) -> CalibrationSetup:

@@ -18,6 +18,7 @@ from pisigma.identification.identifiability.observability import (
 from pisigma.identification.identifiability.pairwise import PairwiseRedundancy, find_pairwise_redundancy
 from pisigma.identification.identifiability.plausibility import misfitting_frames
 from pisigma.identification.identifiability.redundancy import Findings, Redundancy
+from pisigma.identification.identifiability.sufficiency import what_to_measure
 from pisigma.identification.parameter_table import ParameterEstimate, parameter_table
 from pisigma.identification.prediction import predicted_poses
 from pisigma.identification.problem.least_squares import (
@@ -236,7 +237,10 @@ class CalibrationResult:
     @cached_property
     def warnings(self) -> tuple[str, ...]:
         """What to measure next, and what does not fit, in sentences."""
-        return (*self.solved.findings.warnings, *_warnings(self.solved))
+        return (
+            *what_to_measure(self.solved.setup, self.solved.findings.wanted),
+            *_warnings(self.solved),
+        )
 
     @property
     def rank(self) -> int:

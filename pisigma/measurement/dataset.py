@@ -5,6 +5,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -111,6 +112,10 @@ class Measurements:
 
     def as_fields(self) -> MeasuredFields:
         """Return the rows field by field, without the fields that no row has."""
+        return self._fields
+
+    @cached_property
+    def _fields(self) -> MeasuredFields:
         present = {
             item.name: value
             for item in fields(self)

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -105,17 +106,28 @@ class MeasuredFields:
         if kind in ("touch", "distance"):
             return self._filled(kind)
         position, rotation = self._filled("position"), self._filled("rotation")
-        return {
-            "pose": position & rotation,
-            "position": position & ~rotation,
-            "rotation": rotation & ~position,
-        }[kind]
+        if kind == "pose":
+            return position & rotation
+        if kind == "position":
+            return position & ~rotation
+        if kind == "rotation":
+            return rotation & ~position
+        raise KeyError(kind)
 
     def _filled(self, name: str) -> Bool[Tensor, " rows"]:
-        values = self.numbers.get(name)
-        if values is None:
-            return torch.zeros(self.rows, dtype=torch.bool, device=self.numbers["q"].device)
-        return torch.isfinite(values.reshape(self.rows, math.prod(values.shape[1:]))).all(-1)
+        if name not in self._filled_rows:
+            values = self.numbers.get(name)
+            if values is None:
+                filled = torch.zeros(self.rows, dtype=torch.bool, device=self.numbers["q"].device)
+            else:
+                filled = torch.isfinite(values.reshape(self.rows, math.prod(values.shape[1:]))).all(-1)
+            self._filled_rows[name] = filled
+        return self._filled_rows[name]
+
+    @cached_property
+    def _filled_rows(self) -> dict[str, Bool[Tensor, " rows"]]:
+        """By field of numbers, the rows in which it is filled, once that was asked for."""
+        return {}
 
     def select(self, rows: Tensor) -> "MeasuredFields":
         """Return the rows of an int64 index, in its order."""

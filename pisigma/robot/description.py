@@ -2,6 +2,7 @@
 
 import os
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, get_args
 
 import numpy as np
@@ -83,7 +84,7 @@ class Robot:
         """
         return Robot(*read_robot(robot, base, tip))
 
-    @property
+    @cached_property
     def joints(self) -> tuple[Row, ...]:
         """The rows that move, in order."""
         return tuple(row for row in self.rows if row.type != "fixed")
@@ -93,7 +94,7 @@ class Robot:
         """Number of joints that move."""
         return len(self.joints)
 
-    @property
+    @cached_property
     def joint_rows(self) -> tuple[int, ...]:
         """Index of the row of every joint."""
         return tuple(i for i, row in enumerate(self.rows) if row.type != "fixed")
@@ -108,12 +109,12 @@ class Robot:
         """+1 or -1 for every joint."""
         return np.array([float(joint.direction) for joint in self.joints])
 
-    @property
+    @cached_property
     def revolute(self) -> tuple[bool, ...]:
         """For every joint, whether it turns."""
         return tuple(joint.type == "revolute" for joint in self.joints)
 
-    @property
+    @cached_property
     def reach(self) -> float:
         """A length [m] that no tool position can be farther than from the first row's origin.
 

@@ -88,13 +88,13 @@ class Findings:
         sizes: values of the candidates at the start.
         redundancy: what the Jacobian there says of them.
         extended: indices of parameters that were added later.
-        warnings: sentences so far.
+        wanted: how many numbers have to be estimated; see `sufficiency.free_parameters`.
     """
 
     sizes: Float64[np.ndarray, " candidates"]
     redundancy: Redundancy
     extended: list[int]
-    warnings: tuple[str, ...]
+    wanted: int
 
     @property
     def information(self) -> Information:

@@ -28,51 +28,67 @@ SOCKETS_WITHOUT_SCALE = (
 )
 
 
-def check_sufficiency(
-    robot: Robot,
-    problem: CalibrationProblem,
-    redundancy: Redundancy,
-    explicit: bool,
-    source: str,
-    unknowns: int = 0,
-) -> tuple[str, ...]:
-    """Refuse data that cannot determine the free parameters; warn of data that hardly do.
+def free_parameters(redundancy: Redundancy, explicit: bool, unknowns: int) -> int:
+    """Return how many numbers have to be estimated.
 
     Args:
-        robot: with the tool of the fit.
-        problem: rows and sensors.
         redundancy: of the candidates at the start.
         explicit: whether the candidates were named one by one.
-        source: what complaints call the data.
         unknowns: number of the sensors' unknowns, such as where sockets are.
+    """
+    acting = len(redundancy.names) - len(redundancy.no_effect)
+    return (acting if explicit else redundancy.rank) + unknowns
 
-    Returns:
-        Sentences that say what to measure next.
+
+def refuse_too_few(
+    problem: CalibrationProblem, redundancy: Redundancy, explicit: bool, unknowns: int, source: str
+) -> None:
+    """Refuse data that cannot determine the free parameters.
+
+    Args:
+        problem: rows and sensors.
+        redundancy: see `free_parameters`, as for the next two.
+        explicit: see there.
+        unknowns: see there.
+        source: what complaints call the data.
 
     Raises:
         IdentificationError: there are not more values than parameters.
     """
-    wanted = len(redundancy.names) - len(redundancy.no_effect) if explicit else redundancy.rank
-    wanted += unknowns
     values = distinct_values(problem)
-    per_row = values / max(distinct_rows(problem), 1)
-    if values <= wanted:
-        # not the rank, which is at most that of the few values
-        most = len(redundancy.names) - len(redundancy.no_effect) + unknowns
-        missing = int(np.ceil((GOOD_RATIO * most - values) / per_row))
-        raise IdentificationError(
-            f"{source}: {distinct_rows(problem)} different poses give {values} values for {most} free "
-            "parameters, which leaves nothing to distinguish noise from error; measure about "
-            f"{missing} more poses, or free fewer parameters."
-        )
-    warnings = [*_still_joints(robot, problem), *_targets_on_axis(robot, problem)]
+    if values > free_parameters(redundancy, explicit, unknowns):
+        return
+    # not the rank, which is at most that of the few values
+    most = free_parameters(redundancy, True, unknowns)
+    raise IdentificationError(
+        f"{source}: {distinct_rows(problem)} different poses give {values} values for {most} free "
+        "parameters, which leaves nothing to distinguish noise from error; measure about "
+        f"{_missing_poses(problem, most)} more poses, or free fewer parameters."
+    )
+
+
+def what_to_measure(setup: CalibrationSetup, wanted: int) -> tuple[str, ...]:
+    """Say what to measure next, in sentences, where the data hardly determine what is free.
+
+    Args:
+        setup: the problem at its start.
+        wanted: how many numbers have to be estimated.
+    """
+    problem = setup.problem
+    values = distinct_values(problem)
+    few = []
     if values < GOOD_RATIO * wanted:
-        missing = int(np.ceil((GOOD_RATIO * wanted - values) / per_row))
-        warnings.insert(
-            0,
-            f"{values} values are few for {wanted} free parameters; measure about {missing} more poses.",
+        few.append(
+            f"{values} values are few for {wanted} free parameters; measure about "
+            f"{_missing_poses(problem, wanted)} more poses."
         )
-    return tuple(warnings)
+    robot = problem.space.robot
+    return (*few, *_still_joints(robot, problem), *_targets_on_axis(robot, problem), *_undetermined(setup))
+
+
+def _missing_poses(problem: CalibrationProblem, wanted: int) -> int:
+    values = distinct_values(problem)
+    return int(np.ceil((GOOD_RATIO * wanted - values) / (values / max(distinct_rows(problem), 1))))
 
 
 def distinct_rows(problem: CalibrationProblem) -> int:
@@ -123,7 +139,7 @@ def _targets_on_axis(robot: Robot, problem: CalibrationProblem) -> list[str]:
     ]
 
 
-def undetermined(setup: CalibrationSetup) -> tuple[str, ...]:
+def _undetermined(setup: CalibrationSetup) -> tuple[str, ...]:
     """Say what a set-up cannot determine whatever its poses are, and what to measure for it."""
     return (*_scale(setup), *_touched_frames(setup), *_floating_frames(setup))
 

@@ -47,6 +47,7 @@ def fit_base_and_tool(
     free_base: bool = True,
     free_tool: bool = True,
     maximum_iterations: int = 50,
+    close_enough: float = 0.0,
 ) -> BaseToolFit:
     """Fit base and tool of a robot to measured poses or positions; no initial guess is needed.
 
@@ -61,12 +62,14 @@ def fit_base_and_tool(
         free_base: whether to fit the base; else the robot's is taken as it is.
         free_tool: whether to fit the tool; else the robot's is taken as it is.
         maximum_iterations: steps of the least squares.
+        close_enough: length of a step [standard errors] that is not worth taking.
 
     Raises:
         IdentificationError: no positions, several frames, or too few rows for what has to be fitted.
         PoseError: the joint values do not fit the robot.
     """
-    problem, solution = _solved(robot, measurements, free_base, free_tool, maximum_iterations)
+    problem = build_base_and_tool_problem(robot, measurements, free_base, free_tool)
+    solution = _solved(robot, problem, maximum_iterations, close_enough)
     state = solution.linearisation.point
     rpy_tool = rpy_from_rotation(state.R_tool).cpu().numpy() if problem.turned else robot.tool[3:]
     tools = {
@@ -86,20 +89,19 @@ def fit_base_and_tool(
 
 
 def _solved(
-    robot: Robot, measurements: Measurements, free_base: bool, free_tool: bool, maximum_iterations: int
-) -> tuple[BaseToolProblem, Solution[BaseToolState]]:
-    """The problem, and the best end of a search from any start."""
-    problem = build_base_and_tool_problem(robot, measurements, free_base, free_tool)
+    robot: Robot, problem: BaseToolProblem, maximum_iterations: int, close_enough: float
+) -> Solution[BaseToolState]:
+    """The best end of a search from any start."""
     best: tuple[float, Solution[BaseToolState]] | None = None
     for start in base_and_tool_starts(robot, problem):
-        solution = levenberg_marquardt(problem, start, maximum_iterations)
+        solution = levenberg_marquardt(problem, start, maximum_iterations, close_enough)
         off = _off(robot, problem, solution)  # not the cost, which every search divides by its own noise
         if best is None or off < best[0] * (1 - 1e-6):
             best = off, solution
         if _rms_position(problem, best[1]) < CLEAR_FIT * robot.reach:
             break
     assert best is not None
-    return problem, best[1]
+    return best[1]
 
 
 def _off(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolState]) -> float:

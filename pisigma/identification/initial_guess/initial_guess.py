@@ -155,7 +155,7 @@ def _from_positions(
         if find_base and 3 <= len(rows) < FEW and not turned and set(part.target) <= set(tools):
             bases[name] = _base_by_tools(robot, part, tools)
             continue
-        fit = fit_base_and_tool(robot, part, find_base, free_tool, GUESS_STEPS)
+        fit = fit_base_and_tool(robot, part, find_base, free_tool, GUESS_STEPS, close_enough=1.0)
         if free_base:
             bases[name] = fit.robot.base
         if free_tool:
