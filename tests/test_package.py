@@ -26,6 +26,7 @@ from pisigma.model.folder.model_folder import save_model
 LAYERS = (
     "errors",
     "yaml_file",
+    "templates",
     "se3",
     "robot",
     "kinematics",

@@ -6,6 +6,7 @@ from pathlib import Path
 import jinja2
 
 from pisigma.reporting.tables import CARD, figure_text, joint_table, markdown_table, pose_table
+from pisigma.templates import template_environment
 
 
 def render(template: str, **content: object) -> str:
@@ -25,18 +26,13 @@ def write_card(folder: Path, template: str, **content: object) -> None:
 
 @functools.cache
 def _environment() -> jinja2.Environment:
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("pisigma.reporting"),
-        autoescape=lambda name: name is not None and name.endswith(".html.j2"),
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
+    return template_environment(
+        "pisigma.reporting",
+        {
+            "figure": figure_text,
+            "digits": "{:.4g}".format,
+            "pose_table": pose_table,
+            "joint_table": joint_table,
+            "table": lambda table: markdown_table(*table),
+        },
     )
-    environment.filters |= {
-        "figure": figure_text,
-        "digits": "{:.4g}".format,
-        "pose_table": pose_table,
-        "joint_table": joint_table,
-        "table": lambda table: markdown_table(*table),
-    }
-    return environment

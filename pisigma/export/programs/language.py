@@ -1,12 +1,38 @@
 """What a controller's language is: how its programs are named and written, and what they cannot hold."""
 
+import functools
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import jinja2
+import torch
+
 from pisigma.errors import OutputError
 from pisigma.export.programs.targets import Targets
+from pisigma.export.programs.text import (
+    comments,
+    labelled,
+    metres_and_rotation_vector,
+    millimetres,
+    millimetres_and_euler,
+    numbers,
+    quaternion,
+)
+from pisigma.kinematics.status import Status
+from pisigma.templates import template_environment
+
+TEST = "TEST IT AT LOW SPEED FIRST: nothing was checked for collisions, neither the targets nor the ways between them."
+COUNTING = (
+    "Joint values count from the zeros and in the directions of the robot description '{robot}'; the controller has to "
+    "count the same."
+)
+CARTESIAN = (
+    "Poses are those that the robot as drawn takes at the corrected joint values: the controller has to compute with "
+    "the robot as drawn, and any accuracy option of its own has to be off.",
+    "Frame and tool are those of the model, as seen from the origin and from the last row of the robot description, "
+    "which have to be the controller's origin and flange.",
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,6 +51,26 @@ class Program:
     cartesian: bool
     config: str = ""
 
+    @property
+    def heading(self) -> list[str]:
+        """Sentences on what the program does and on what it relies."""
+        targets = self.targets
+        said = [targets.title, TEST, COUNTING.format(robot=targets.robot.name)]
+        if self.cartesian:
+            said += [*CARTESIAN, *targets.remarks]
+        return [*said, targets.doubt] if targets.doubt else said
+
+    @property
+    def degrees(self) -> list[list[float]]:
+        """Joint values of every target [deg]."""
+        degrees: list[list[float]] = torch.rad2deg(self.targets.q).tolist()
+        return degrees
+
+    def place(self, row: int) -> str:
+        """What is said before a move: where its pose stands, and whether its correction is a guess."""
+        guess = " OUTSIDE DOMAIN" if self.targets.status[row] == Status.OUTSIDE_DOMAIN else ""
+        return f"line {self.targets.line[row]}{guess}"
+
 
 @dataclass(frozen=True)
 class Language:
@@ -32,9 +78,11 @@ class Language:
 
     Attributes:
         name: of the language.
+        template: the file of the folder `templates` that lays its programs out.
         longest: characters that a program's name may have.
         reserved: words of the language that may be no name, in capitals.
-        write: makes the text of a program.
+        line_end: what its lines end with.
+        most_lines: numbered lines that a program may have; None for any number.
         keeps_branch: whether Cartesian targets may lie on several branches.
         capitals: whether names are written in capitals.
         configuration: what the arm's configuration looks like, where Cartesian targets need one.
@@ -43,9 +91,11 @@ class Language:
     """
 
     name: str
+    template: str
     longest: int
     reserved: frozenset[str]
-    write: Callable[[Program], str]
+    line_end: str = "\r\n"
+    most_lines: int | None = None
     keeps_branch: bool = False
     capitals: bool = False
     configuration: re.Pattern[str] | None = None
@@ -71,11 +121,36 @@ class Language:
             f"choose another --out, such as {other[: self.longest].rstrip('_')}{path.suffix}."
         )
 
+    def write(self, program: Program) -> str:
+        """The text of a program.
 
-def words(text: str) -> frozenset[str]:
-    """Words of a language in capitals, for `Language.reserved`."""
-    return frozenset(text.upper().split())
+        Raises:
+            OutputError: it has more lines than the language takes.
+        """
+        said = [*self.cautions, *(self.cartesian_cautions if program.cartesian else ())]
+        content = {"program": program, "targets": program.targets, "cautions": said}
+        text = _templates().get_template(self.template).render(content) + "\n"
+        lines = len(_NUMBERED_LINE.findall(text))
+        if self.most_lines is not None and lines > self.most_lines:
+            raise OutputError(
+                f"the program {program.name} would have {lines} lines, of which a {self.name} controller takes "
+                f"{self.most_lines}; split the file of poses."
+            )
+        return text.replace("\n", self.line_end)
 
 
-FILES_OF_SYSTEMS = words("con prn aux nul") | {f"{p}{i}" for p in ("COM", "LPT") for i in range(1, 10)}
-"""Names that some controllers' file systems keep for devices."""
+_NUMBERED_LINE = re.compile(r"(?m)^ *\d+:")
+
+
+@functools.cache
+def _templates() -> jinja2.Environment:
+    filters = (
+        numbers,
+        labelled,
+        comments,
+        millimetres,
+        millimetres_and_euler,
+        metres_and_rotation_vector,
+        quaternion,
+    )
+    return template_environment("pisigma.export.programs", {filter.__name__: filter for filter in filters})

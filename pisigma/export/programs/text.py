@@ -1,4 +1,4 @@
-"""Numbers, comments and the head of a program, as every controller reads them."""
+"""Numbers, frames and comments of a program, as templates write them."""
 
 import math
 import textwrap
@@ -8,47 +8,16 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.export.programs.targets import Targets
-from pisigma.kinematics.status import Status
-from pisigma.se3 import rpy_from_rotation
-
-TEST = (
-    "TEST IT AT LOW SPEED FIRST: nothing was checked for collisions, neither the targets nor the ways between "
-    "them."
-)
-
-
-def heading(targets: Targets, cartesian: bool) -> tuple[str, ...]:
-    """Sentences on what the program does and on what it relies.
-
-    Args:
-        targets: the targets.
-        cartesian: whether they are poses and not joint values.
-    """
-    said = [
-        targets.title,
-        TEST,
-        f"Joint values count from the zeros and in the directions of the robot description "
-        f"'{targets.robot.name}'; the controller has to count the same.",
-    ]
-    if cartesian:
-        said += [
-            "Poses are those that the robot as drawn takes at the corrected joint values: the controller has to "
-            "compute with the robot as drawn, and any accuracy option of its own has to be off.",
-            "Frame and tool are those of the model, as seen from the origin and from the last row of the robot "
-            "description, which have to be the controller's origin and flange.",
-            *targets.remarks,
-        ]
-    if targets.doubt:
-        said.append(targets.doubt)
-    return tuple(said)
-
+from pisigma.se3 import rotation_vector, rpy_from_rotation
 
 DIGITS = 6
-"""Decimals of degrees and millimetres: joints are rounded by 1e-8 rad, which moves no tool by a micrometre."""
+"""Decimals of degrees and millimetres: joints are rounded by 1e-8 rad, which moves no tool by a micrometre. Radians,
+metres and quaternions have 9."""
 
-FINE_DIGITS = 9
-"""Decimals of radians, metres and quaternions."""
+
+def numbers(values: Iterable[float], digits: int = DIGITS) -> str:
+    """Numbers with a comma and a blank between them; see `number`."""
+    return ", ".join(number(value, digits) for value in values)
 
 
 def number(value: float, digits: int) -> str:
@@ -58,30 +27,39 @@ def number(value: float, digits: int) -> str:
     return written.removeprefix("-") if not float(written) else written
 
 
-def numbers(values: Iterable[float], digits: int) -> str:
-    """Numbers with a comma and a blank between them."""
-    return ", ".join(number(value, digits) for value in values)
+def labelled(values: Iterable[float], labels: Iterable[str], unit: str = "") -> str:
+    """Numbers, each behind its label and before its unit, such as `X 1.000000, Y 2.000000`."""
+    return ", ".join(f"{label} {number(v, DIGITS)}{unit}" for label, v in zip(labels, values, strict=True))
 
 
-def labelled(labels: Iterable[str], values: Iterable[float]) -> str:
-    """Numbers, each behind its label, such as `X 1.000000, Y 2.000000`."""
-    return ", ".join(f"{label} {number(v, DIGITS)}" for label, v in zip(labels, values, strict=True))
-
-
-def comments(sentences: Iterable[str], mark: str, width: int = 100) -> list[str]:
+def comments(sentences: Iterable[str], mark: str, width: int = 100) -> str:
     """Sentences as lines of printable ASCII, each behind a mark; other characters are written as `?`."""
     lines = []
     for sentence in sentences:
         plain = " ".join(sentence.split()).encode("ascii", "replace").decode()
         plain = "".join(letter if letter.isprintable() else "?" for letter in plain)
         lines += [f"{mark}{line}" for line in textwrap.wrap(plain, width, break_on_hyphens=False)]
-    return lines
+    return "\n".join(lines)
 
 
-def place(targets: Targets, row: int) -> str:
-    """What is said before a move: where its pose stands, and whether its correction is a guess."""
-    guess = " OUTSIDE DOMAIN" if targets.status[row] == Status.OUTSIDE_DOMAIN else ""
-    return f"line {targets.line[row]}{guess}"
+def millimetres(T: Float64[Tensor, "*batch 4 4"]) -> list[float]:
+    """x, y, z [mm]."""
+    position: list[float] = (T[..., :3, 3] * 1e3).tolist()
+    return position
+
+
+def metres_and_rotation_vector(T: Float64[Tensor, "4 4"]) -> list[float]:
+    """x, y, z [m] and rotation vector [rad]."""
+    values: list[float] = torch.cat([T[:3, 3], rotation_vector(T[:3, :3])]).tolist()
+    return values
+
+
+def quaternion(T: Float64[Tensor, "4 4"]) -> list[float]:
+    """Unit quaternion (w, x, y, z) with w >= 0 of a rotation: `cos(t/2), n sin(t/2)` of axis n and angle t."""
+    vector = rotation_vector(T[:3, :3])
+    half = torch.linalg.vector_norm(vector, dim=-1, keepdim=True) / 2
+    values: list[float] = torch.cat([torch.cos(half), vector / 2 * torch.sinc(half / torch.pi)], -1).tolist()
+    return values
 
 
 def millimetres_and_euler(T: Float64[Tensor, "*batch 4 4"]) -> Float64[Tensor, "*batch 6"]:
