@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
-from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.arm import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
 from pisigma.inverse.compiled_ik import CompiledIK
 from pisigma.inverse.corrected_ik import CorrectedIK

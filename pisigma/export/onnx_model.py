@@ -10,7 +10,7 @@ import numpy as np
 
 from pisigma.errors import ModelError
 from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
-from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.arm import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
 from pisigma.joint_correction.conditions import learned_conditions
 from pisigma.joint_correction.joint_correction import JointCorrection

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.hybrid.arms import HybridArm, blend
+from pisigma.hybrid.arm import HybridArm, blend
 from pisigma.hybrid.coverage import JointCoverage
 from pisigma.hybrid.search import Trial
 from pisigma.hybrid.uncertainty import PositionUncertainty

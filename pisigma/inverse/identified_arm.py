@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
-from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.arm import HybridArm
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
 from pisigma.kinematics.numeric import NumericSolution, solve_numeric
 from pisigma.kinematics.status import Status

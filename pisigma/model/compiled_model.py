@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from pisigma.errors import ModelError
-from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.arm import HybridArm
 from pisigma.joint_correction.feature import scaled_joints, turning_rate
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kernels import arrays

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from pisigma.hybrid.arms import HybridArm, blend
+from pisigma.hybrid.arm import HybridArm, blend
 from pisigma.kinematics.jacobian import joint_jacobian
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements

@@ -6,7 +6,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
-from pisigma.hybrid.arms import blend
+from pisigma.hybrid.arm import blend
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel

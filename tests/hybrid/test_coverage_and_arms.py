@@ -11,7 +11,7 @@ from testing.closeness import assert_close
 from testing.linearised import drawn_joints
 from torch import Tensor
 
-from pisigma.hybrid.arms import HybridArm, blend
+from pisigma.hybrid.arm import HybridArm, blend
 from pisigma.hybrid.coverage import FADE, JointCoverage, share_beyond
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.joint_correction import JointCorrection

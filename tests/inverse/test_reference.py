@@ -10,7 +10,7 @@ from testing.closeness import assert_close
 from testing.models import with_limits
 
 from pisigma.errors import PoseError
-from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.arm import HybridArm
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.inverse.reference import ReferenceIK
 from pisigma.joint_correction.backlash import Backlash

@@ -9,7 +9,7 @@ import pytest
 import torch
 from testing.models import no_type_checker
 
-from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.arm import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
 from pisigma.inverse.compiled_ik import CompiledIK
 from pisigma.joint_correction.fourier_series import FourierSeries

@@ -11,7 +11,7 @@ from testing.closeness import assert_close
 from testing.models import hand_made_model, no_type_checker, with_limits
 
 from pisigma.errors import ModelError, PoseError
-from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.arm import HybridArm
 from pisigma.inverse.compiled_ik import CompiledIK
 from pisigma.inverse.reference import ReferenceIK
 from pisigma.joint_correction.joint_correction import JointCorrection

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import torch
 
-from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.arm import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from pisigma.hybrid.alternating_products import AlternatingProducts
-from pisigma.hybrid.arms import HybridArm
+from pisigma.hybrid.arm import HybridArm
 from pisigma.hybrid.coverage import JointCoverage
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.problem.parameters import ParameterSpace
