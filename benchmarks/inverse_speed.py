@@ -3,7 +3,7 @@
 Run `OMP_NUM_THREADS=1 python benchmarks/inverse_speed.py` (scipy comes with `pip install -e ".[bench]"`). The arm has
 errors of 0.5 mm and 1 mrad in every row, base and tool, and a correction of a Fourier series, gravity torques and
 product units; every joint value counts as measured. With a model folder instead of a robot it is that model, between
-its measured joint values. scipy solves the same poses of the geometric part alone, from the
+its measured joint values. scipy solves the same poses of the arm without its correction, from the
 joint values themselves with 0.05 rad added. Poses are those of uniformly drawn joint values; they are checked before
 solving and the residual is computed after it. The kernels are compiled before anything is timed.
 """
@@ -21,8 +21,7 @@ import numpy as np
 import torch
 from scipy.optimize import least_squares
 
-from pisigma.hybrid.arm import HybridArm
-from pisigma.hybrid.coverage import JointCoverage
+from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.inverse.compiled_ik import CompiledIK
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -73,16 +72,16 @@ def make_model(name: str, harmonics: int, rng: np.random.Generator) -> Calibrate
             weight.copy_(5e-4 / math.sqrt(chosen.count) * torch.from_numpy(rng.normal(size=weight.shape)))
         correction.weight.copy_(0.01 * torch.from_numpy(rng.normal(size=correction.weight.shape)))
     starts = draw_joints(robot, 400, rng)
-    arm = HybridArm(geometric, geometric, correction.requires_grad_(False), JointCoverage.of(robot, starts))
+    arm = HybridArm(geometric, correction.requires_grad_(False), JointCoverage.of(robot, starts))
     return CalibratedModel(name, "benchmark", robot, None, None, (), starts, calibrated=geometric, hybrid=arm)
 
 
 def time_scipy(kernels: object, T: np.ndarray, q: np.ndarray) -> float:
-    """Seconds a pose by least squares on the geometric arm."""
-    from pisigma.kernels.arrays import GEOMETRIC
+    """Seconds a pose by least squares on the arm without its correction."""
+    from pisigma.kernels.arrays import IDENTIFIED
 
     def residual(joints: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-        return (kernels.forward(joints[None], GEOMETRIC)[0][0, :3] - wanted[:3]).ravel()  # type: ignore[attr-defined]
+        return (kernels.forward(joints[None], IDENTIFIED)[0][0, :3] - wanted[:3]).ravel()  # type: ignore[attr-defined]
 
     start = time.perf_counter()
     for wanted, joints in zip(T, q, strict=True):

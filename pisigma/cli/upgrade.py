@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, complete_model
-from pisigma.cli.output import print_json
+from pisigma.cli.output import print_json, print_lines
 
 Model = Annotated[
     Path,
@@ -27,4 +27,4 @@ def upgrade(model: Model, as_json: AsJson = False) -> None:
     elif done.before == done.after:
         typer.echo(f"{model} has the newest format ({done.after}) already.")
     else:
-        typer.echo(f"{model}: format {done.before} was upgraded to {done.after}.")
+        print_lines([f"{model}: format {done.before} was upgraded to {done.after}.", *done.changes])

@@ -10,8 +10,7 @@ import numpy as np
 
 from pisigma.errors import ModelError
 from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
-from pisigma.hybrid.arm import HybridArm
-from pisigma.hybrid.coverage import JointCoverage
+from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.joint_correction.conditions import learned_conditions
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.shared_features import add_unit_inputs
@@ -120,8 +119,8 @@ def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) 
     return total
 
 
-def add_share(graph: OnnxGraph, coverage: JointCoverage, q: str) -> str:
-    """Add how much of a correction is in force, `(batch, 1)`; see `JointCoverage.share`."""
+def add_beyond(graph: OnnxGraph, coverage: JointCoverage, q: str) -> str:
+    """Add the angle of the joint farthest beyond its measured values, `(batch, 1)` [rad]; see `JointCoverage`."""
     node, joint = graph.node, coverage.joint.numpy()
     angle = node("Mul", graph.columns(q, joint.tolist()), coverage.rate.numpy()[joint])
     off = node("Sub", angle, coverage.middle.numpy())
@@ -133,10 +132,7 @@ def add_share(graph: OnnxGraph, coverage: JointCoverage, q: str) -> str:
         node("ReduceMin", graph.columns(beyond, np.flatnonzero(joint == j).tolist()), axes=[1], keepdims=1)
         for j in range(len(coverage.turning))
     ]
-    farthest = node("ReduceMax", node("Concat", *per_joint, axis=1), axes=[1], keepdims=1)
-    faded = node("Min", node("Div", farthest, coverage.fade), 1.0)
-    left = node("Mul", node("Mul", faded, faded), node("Sub", 3.0, node("Mul", faded, 2.0)))
-    return node("Sub", 1.0, left)
+    return node("ReduceMax", node("Concat", *per_joint, axis=1), axes=[1], keepdims=1)
 
 
 FORWARD = "forward_joint_correction"
@@ -152,7 +148,7 @@ def export_onnx(model: CalibratedModel, model_sha256: str = "") -> bytes:
 
     With a network on nominal joint values (inverse calibration, distilled): `q_nominal`, and `T_base_tool` where the
     network looks at the pose, to `q_corrected` and `correction`. With a hybrid's joint correction: `q` to `correction`
-    in force, `full_correction` and `share`.
+    and `beyond_measured`.
 
     Args:
         model: the model.
@@ -211,20 +207,17 @@ def _forward(model: CalibratedModel, arm: HybridArm, sha256: str) -> bytes:
     q = graph.add_input(
         "q", [dof], f"commanded joint values {_joints(model)} [{units}], as the controller counts"
     )
-    full = add_joint_correction(graph, arm.correction, q)
-    share = add_share(graph, arm.coverage, q)
-    in_force = graph.node("Mul", full, share)
+    correction = add_joint_correction(graph, arm.correction, q)
+    graph.add_output(correction, "correction", [dof], f"what is added to the joint values [{units}]")
     graph.add_output(
-        in_force, "correction", [dof], f"correction in force, share times the full one [{units}]"
+        add_beyond(graph, arm.coverage, q),
+        "beyond_measured",
+        [1],
+        "0 where every joint value was measured, else how far the farthest joint lies beyond [rad]",
     )
-    graph.add_output(
-        full, "full_correction", [dof], f"correction as if all joint values had been measured [{units}]"
-    )
-    graph.add_output(share, "share", [1], "1 where every joint value was measured, 0 from the fade beyond on")
     doc = (
-        f"Joint corrections of robot {model.robot.name}, model {model.name}, under the usual conditions. At share 1 "
-        "the pose is that of the hybrid geometry at q + full_correction, at share 0 that of the geometric calibration "
-        "at q; between, the model goes along the straight line from one pose to the other."
+        f"Joint corrections of robot {model.robot.name}, model {model.name}, under the usual conditions. The pose is "
+        "that of the hybrid geometry at q + correction."
     )
     return graph.finish(f"pisigma {model.name}", doc, _metadata(model, FORWARD, sha256))
 
@@ -266,7 +259,7 @@ def _domain(model: CalibratedModel) -> dict[str, Any]:
         for j, middle, half in zip(*columns, strict=True):
             rate = float(coverage.rate[j])
             stretches[j].append([(middle - half) / rate, (middle + half) / rate])
-        domain |= {"measured": stretches, "fade_rad": coverage.fade}
+        domain["measured"] = stretches
     return domain
 
 

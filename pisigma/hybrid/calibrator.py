@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Literal
 
 from pisigma.errors import IdentificationError, nearest_choice
-from pisigma.hybrid.coverage import JointCoverage, fade_angle
+from pisigma.hybrid.arm import JointCoverage
 from pisigma.hybrid.design import Rows
 from pisigma.hybrid.evidence import effective_share
 from pisigma.hybrid.mini_batches import MANY_ROWS, MiniBatches, batch_checkpoints, refine_in_batches
@@ -127,7 +127,6 @@ class HybridCalibrator:
                 "stands; measure more poses."
             )
             return _geometric_alone(solved, search, verdict)
-        progress("looking beyond the measured joint values")
         learned = self._learned(solved, refined)
         verdict = _kept_sentence(search, additive, orders, trained)
         whole = with_all_factors(refined)
@@ -137,13 +136,12 @@ class HybridCalibrator:
         return HybridResult(solved.result(), learned, uncertainty, tuple(search.trials), verdict)
 
     def _learned(self, solved: SolvedCalibration, refined: Refined) -> LearnedPart:
-        """The correction with the geometry that belongs to it, and how far it holds."""
-        fade = fade_angle(refined.rows, refined.design, refined.posterior, refined.sums)
+        """The correction with the geometry that belongs to it, and where it was measured."""
         noise = zip(solved.result().noise, refined.posterior.noise, strict=True)
         return LearnedPart(
             geometry=with_frames_of(solved, refined, identified_geometry(solved.setup, refined.point)),
             correction=refined.correction,
-            coverage=JointCoverage.of(self.geometric.robot, solved.problem.q, fade),
+            coverage=JointCoverage.of(self.geometric.robot, solved.problem.q),
             noise={geometric.sensor: sigma for geometric, sigma in noise},
             unknowns=refined.design.unknowns,
             effective=refined.effective,

@@ -1,14 +1,12 @@
 """What a hybrid calibration comes to."""
 
-import math
 from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.hybrid.arm import HybridArm, blend
-from pisigma.hybrid.coverage import JointCoverage
+from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.hybrid.search import Trial
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.prediction import predicted_poses
@@ -26,7 +24,7 @@ class LearnedPart:
     Attributes:
         geometry: differs from that of the geometric calibration, which has to make up for the correction.
         correction: Δ.
-        coverage: joint values that were measured; beyond them the geometric calibration holds.
+        coverage: joint values that were measured; beyond them the correction is an extrapolation.
         noise: per sensor, its standard deviation [m or rad], or a factor where the rows state it.
         unknowns: number of parameters and weights.
         effective: how many of them the data determine (the rest the prior holds).
@@ -49,7 +47,7 @@ class HybridResult:
     Attributes:
         geometric: the calibration without a correction.
         learned: the correction; None where there is nothing to learn, and then the geometric calibration holds.
-        uncertainty: of predicted positions where joint values were measured.
+        uncertainty: of predicted positions.
         trials: what was tried, in order.
         verdict: what was kept and why, in a sentence.
     """
@@ -65,7 +63,7 @@ class HybridResult:
         if self.learned is None:
             return None
         learned = self.learned
-        return HybridArm(self.geometric.robot, learned.geometry.robot, learned.correction, learned.coverage)
+        return HybridArm(learned.geometry.robot, learned.correction, learned.coverage)
 
     def predicted_poses(self, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
         """Where the targets were, each in the frame of its row.
@@ -74,15 +72,12 @@ class HybridResult:
             IdentificationError: a row has a frame or a target that was not calibrated.
             PoseError: the joint values do not fit the robot.
         """
-        geometric = self.geometric
-        T = predicted_poses(geometric.robot, geometric.bases, geometric.tools, measurements)
         if self.learned is None:
-            return T
-        geometry, q = self.learned.geometry, measurements.q
-        with torch.no_grad():
-            moved = replace(measurements, q=q + self.learned.correction.of_rows(measurements))
-        T_learned = predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)
-        return blend(T, T_learned, self.learned.coverage.share(q))
+            result = self.geometric
+            return predicted_poses(result.robot, result.bases, result.tools, measurements)
+        geometry = self.learned.geometry
+        moved = replace(measurements, q=self._moved_joints(measurements))
+        return predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
         """Measured - predicted of any measurements; see `CalibrationResult.errors_of`."""
@@ -94,32 +89,16 @@ class HybridResult:
     def deviation(self, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
         """Standard deviation of the predicted positions along the axes of the row's frame [m], without noise.
 
-        Outside the measured joint values it goes over into what the geometric calibration does not explain.
+        It is that of the posterior, at measured joint values and beyond them.
 
         Raises:
             IdentificationError: nothing was measured in metres.
         """
-        q = measurements.q
+        return self.uncertainty.deviation(measurements, self._moved_joints(measurements))
+
+    def _moved_joints(self, measurements: Measurements) -> Float64[Tensor, "rows dof"]:
+        """Joint values of measured rows with their corrections [rad or m]."""
         if self.learned is None:
-            return self.uncertainty.deviation(measurements, q)
+            return measurements.q
         with torch.no_grad():
-            inside = self.uncertainty.deviation(
-                measurements, q + self.learned.correction.of_rows(measurements)
-            )
-        outside = unexplained_length(self.geometric)
-        share = self.learned.coverage.share(q)[:, None]
-        return ((share * inside).square() + ((1 - share) * outside) ** 2).sqrt()
-
-
-def unexplained_length(result: CalibrationResult) -> float:
-    """What a geometric calibration does not explain of one coordinate of the measured lengths [m]; 0 without any.
-
-    The estimated noise; where the rows state their own, the RMS of the residuals.
-    """
-    lengths = []
-    for noise in result.noise:
-        if noise.unit == "m":
-            lengths.append(noise.sigma)
-        elif noise.quantity == "m" and noise.unit == "stated":
-            lengths.append(noise.rms / math.sqrt(noise.components))
-    return max(lengths, default=0.0)
+            return measurements.q + self.learned.correction.of_rows(measurements)

@@ -215,13 +215,14 @@ class CompiledIK:
 
         Returns:
             T_base_tool `(poses, 4, 4)` [m], Jacobian `(poses, 6, dof)` without the slope of the correction, the
-            correction `(poses, dof)` [rad or m], and how much of it is in force `(poses,)`.
+            correction `(poses, dof)` [rad or m], and the angle [rad] by which a joint lies beyond its measured values
+            `(poses,)`.
         """
         dof = len(self.joints)
         rows = self._rows(q, (len(q),), "q", True)
         sides = self._rows(approach, (len(rows),), "approach", True)
         T, out = np.empty((len(rows), 4, 4)), np.empty((len(rows), 7 * dof + 1))
-        default = arrays.BLENDED if self.description.arms.hybrid else arrays.GEOMETRIC
+        default = arrays.CORRECTED if self.description.arms.corrected else arrays.IDENTIFIED
         self._run(arrays.EVALUATE, T, 0, len(rows), rows, sides, default if arm is None else arm, False, out)
         J = out[:, : 6 * dof].reshape(-1, 6, dof)
         return T, J, out[:, 6 * dof : 7 * dof], out[:, 7 * dof]

@@ -30,7 +30,6 @@ class Finishing:
         """
         self._model, self._branches = model, branches
         self._trained = torch.tensor(trained)
-        self._geometric = model.calibrated or model.robot
 
     def of_nominal(
         self, T: Tensor, q: Tensor, status: Tensor, branch: Tensor, near: Tensor | None
@@ -63,9 +62,10 @@ class Finishing:
         measure = torch.full(status.shape, torch.nan, dtype=torch.float64)
         if self._model.hybrid is not None:
             commanded, inside = self._on_turn(T, commanded, inside)
-            share = self._model.hybrid.coverage.share(commanded)
-            measure = 2 - share
-            status[(status == Status.REACHED) & (share < 1)] = int(Status.OUTSIDE_DOMAIN)
+            coverage = self._model.hybrid.coverage
+            measure = 1 + coverage.beyond(commanded).amax(-1)
+            outside = known & ~coverage.contains(commanded)
+            status[(status == Status.REACHED) & outside] = int(Status.OUTSIDE_DOMAIN)
         status[~inside & known] = int(Status.OUTSIDE_JOINT_LIMITS)
         q_nominal = torch.where(known[..., None], q_nominal, torch.nan)
         q_nominal = nearest_turn(self._model.robot, q_nominal, commanded, within_limits=False)
@@ -85,7 +85,7 @@ class Finishing:
         if hybrid.correction.is_periodic:
             return q, inside
         flat = q.reshape(-1, 1, q.shape[-1])
-        solved, status = search(self._geometric, T.reshape(-1, 4, 4), flat, hybrid)
+        solved, status = search(self._model.identified, T.reshape(-1, 4, 4), flat, hybrid)
         settled = torch.where((status == Status.UNREACHABLE)[:, None], flat[:, 0], solved).reshape(q.shape)
         turned, within = wrap_into_limits(self._model.robot, settled)
         return settled, within & (turned == settled).all(-1)
@@ -102,7 +102,7 @@ class Finishing:
         status = status.clone()
         limited = status == Status.OUTSIDE_JOINT_LIMITS
         if limited.any():
-            singular = singularity_measure(self._geometric, q[limited]) < SINGULAR_TOLERANCE
+            singular = singularity_measure(self._model.identified, q[limited]) < SINGULAR_TOLERANCE
             status[limited] = torch.where(singular, int(Status.SINGULAR), int(Status.REACHED))
         return status
 

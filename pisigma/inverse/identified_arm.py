@@ -37,7 +37,7 @@ def search(
     """Solve for poses from one start after the other, until one leads there.
 
     Args:
-        robot: the arm, or the geometric part of a hybrid one.
+        robot: the arm, or a hybrid one without its correction.
         T: wanted poses.
         starts: joint values to begin with [rad or m].
         hybrid: the hybrid arm that is to take the poses, where there is one.
@@ -68,7 +68,7 @@ def search(
 
 
 def _solve(robot: Robot, T: Tensor, start: Tensor, hybrid: HybridArm | None) -> NumericSolution:
-    """Solve for the arm, and from there for the hybrid one, which may reach a little farther.
+    """Solve for the arm, and from there for the same with its correction, which may reach a little farther.
 
     First with a Jacobian that is cheap; what it does not solve, near singular poses, with the exact one.
     """
@@ -81,7 +81,7 @@ def _solve(robot: Robot, T: Tensor, start: Tensor, hybrid: HybridArm | None) -> 
         rows = (close & (status == Status.NOT_CONVERGED)).nonzero()[:, 0]
         motion = partial(hybrid_motion, hybrid, exact=exact)
         better = solve_numeric(
-            hybrid.hybrid, T[rows], q[rows], tolerance=HYBRID_TOLERANCE, max_iterations=rounds, motion=motion
+            robot, T[rows], q[rows], tolerance=HYBRID_TOLERANCE, max_iterations=rounds, motion=motion
         )
         q[rows], status[rows] = better.q, better.status
     return replace(result, q=q, status=status)
@@ -93,14 +93,14 @@ class IdentifiedArm:
 
     Attributes:
         nominal: the arm as drawn.
-        calibrated: the arm as identified.
+        identified: the arm as identified, of a hybrid the geometry that goes with its correction.
         solver: closed form of the nominal arm.
         starts: joint values of calibration rows, with the poses of the identified arm there.
-        hybrid: the arm with its joint correction, which takes the poses instead, where there is one.
+        hybrid: the same with its joint correction, which takes the poses instead, where there is one.
     """
 
     nominal: Robot
-    calibrated: Robot
+    identified: Robot
     solver: AbstractClosedForm
     starts: StoredStarts
     hybrid: HybridArm | None = None
@@ -114,7 +114,7 @@ class IdentifiedArm:
             Joint values [rad or m] on the turns of q, and a status.
         """
         result, status = search(
-            self.calibrated, T.reshape(-1, 4, 4), q.reshape(-1, 1, q.shape[-1]), self.hybrid
+            self.identified, T.reshape(-1, 4, 4), q.reshape(-1, 1, q.shape[-1]), self.hybrid
         )
         turned = q + wrapped_difference(self.nominal, result.reshape(q.shape), q)
         return turned, status.reshape(q.shape[:-1])
@@ -140,7 +140,7 @@ class IdentifiedArm:
         """
         q = T.new_full((len(T), self.nominal.dof), torch.nan)
         status = torch.full_like(branch, Status.UNREACHABLE)
-        chosen = within_reach(self.calibrated, T).nonzero()[:, 0]
+        chosen = within_reach(self.identified, T).nonzero()[:, 0]
         if not len(chosen) or not len(self.starts.q):
             return q, status, branch
         T_near, wanted = T[chosen], branch[chosen]
@@ -149,7 +149,7 @@ class IdentifiedArm:
         first = drawn[torch.arange(len(chosen)), wanted][:, None]
         others = torch.cat([drawn, self.starts.q[index]], 1)
         others = torch.where(anywhere[chosen, None, None], others, torch.nan)
-        result, reached = search(self.calibrated, T_near, torch.cat([first, others], 1), self.hybrid)
+        result, reached = search(self.identified, T_near, torch.cat([first, others], 1), self.hybrid)
         lies = nearest_branch(self.nominal, self.solver, result)
         lost = (lies != wanted) & ~anywhere[chosen]
         result[lost], reached[lost] = torch.nan, int(Status.UNREACHABLE)

@@ -78,10 +78,10 @@ def differentiable(model: CalibratedModel, result: Solution, T: Float[Tensor, "*
     twist = _twist(T)
     q_nominal = _attached(model.robot, twist, result.q_nominal, lambda q: joint_jacobian(model.robot, q)[1])
     if model.calibrated is not None:
-        calibrated, hybrid = model.calibrated, model.hybrid
+        identified, hybrid = model.identified, model.hybrid
 
         def jacobian(q: Tensor) -> Tensor:
-            return joint_jacobian(calibrated, q)[1] if hybrid is None else hybrid_motion(hybrid, q)[1]
+            return joint_jacobian(identified, q)[1] if hybrid is None else hybrid_motion(hybrid, q)[1]
 
         q = _attached(model.robot, twist, result.q, jacobian)
         return replace(result, q=q, q_nominal=q_nominal)

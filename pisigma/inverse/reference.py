@@ -57,10 +57,10 @@ class ReferenceIK:
             )
         trained = [self.branches.index(name) for name in model.branches] or list(range(len(self.branches)))
         self.order = (*trained, *(index for index in range(len(self.branches)) if index not in trained))
-        self._starts = StoredStarts(model.calibrated or model.robot, model.starts)
+        self._starts = StoredStarts(model.identified, model.starts)
         self.arm: IdentifiedArm | None = None
         if model.calibrated is not None and self._solver is not None:
-            self.arm = IdentifiedArm(model.robot, model.calibrated, self._solver, self._starts, model.hybrid)
+            self.arm = IdentifiedArm(model.robot, model.identified, self._solver, self._starts, model.hybrid)
         self._finishing = Finishing(model, self.branches, trained)
 
     def __call__(
@@ -254,7 +254,7 @@ class ReferenceIK:
         off = (q_found - q_near).norm(dim=-1).nan_to_num(torch.inf)
         away = (off > AWAY).nonzero()[:, 0]
         T_away, start = T.reshape(-1, 4, 4)[away], q_near[away]
-        q, status = search(self.arm.calibrated, T_away, start[:, None], self.model.hybrid)
+        q, status = search(self.arm.identified, T_away, start[:, None], self.model.hybrid)
         lies = nearest_branch(self.model.robot, self.arm.solver, q)
         nominal, _ = search(self.model.robot, T_away, q[:, None])
         other = self._finishing.of_identified(T_away, q, nominal, status, lies, start)

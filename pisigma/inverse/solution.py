@@ -34,8 +34,8 @@ class Solution:
             before joint values are rounded to float32; NaN without solution.
         rotation_residual: `(*batch,)`: the same of the angle to the wanted orientation [rad].
         domain_measure: `(*batch,)`: distance to the training rows over their spacing; above 1 the correction is
-            extrapolated, whatever the status says. For a hybrid 1 where all joint values were measured, rising to 2
-            where only the geometric calibration holds. NaN where nothing is learned or there is no solution.
+            extrapolated, whatever the status says. For a hybrid 1 plus the angle [rad] of the joint that is farthest
+            beyond its measured values. NaN where nothing is learned or there is no solution.
         owner: whose solution it is, which knows how accurate that is.
     """
 

@@ -146,7 +146,6 @@ class LearnedFigures(Section):
         linearisations: iterations of the fit.
         noise: per sensor.
         prior_scale: factor on predicted variances, by which left-out rows were met.
-        fades_over_deg: angle beyond the measured joint values over which the correction fades [deg].
     """
 
     features: tuple[dict[str, JsonValue], ...]
@@ -156,7 +155,6 @@ class LearnedFigures(Section):
     linearisations: int
     noise: tuple[NoiseFigures, ...]
     prior_scale: float
-    fades_over_deg: float
 
 
 class HybridFigures(Section):
@@ -328,7 +326,6 @@ def _learned(result: HybridResult, learned: LearnedPart) -> LearnedFigures:
         linearisations=learned.rounds,
         noise=tuple(_noise(sensor, sigma, units[sensor]) for sensor, sigma in learned.noise.items()),
         prior_scale=result.uncertainty.prior_scale,
-        fades_over_deg=math.degrees(learned.coverage.fade),
     )
 
 

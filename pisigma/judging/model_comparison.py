@@ -222,13 +222,13 @@ def compare_models(
 
 
 def inside_domain(model: CalibratedModel, measurements: Measurements) -> Bool[Tensor, " rows"] | None:
-    """Say which rows are inside a model's domain: where its correction was learned and is in force in full.
+    """Say which rows are inside a model's domain: where its correction was learned.
 
     Returns:
         None where the model knows no domain, as geometric calibrations do not.
     """
     if model.hybrid is not None:
-        return model.hybrid.coverage.share(measurements.q) == 1
+        return model.hybrid.coverage.contains(measurements.q)
     if model.network is None or model.domain is None:
         return None
     with torch.no_grad():

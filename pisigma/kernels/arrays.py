@@ -5,11 +5,11 @@ from typing import Any, NamedTuple
 from pisigma.kernels.forms import KernelForms
 from pisigma.kinematics.status import Status
 
-NOMINAL, GEOMETRIC, HYBRID, DRAWN = 0, 1, 2, 3
-"""Which arm: as modelled, with the identified geometry, with the geometry that goes with the correction, and as
+NOMINAL, IDENTIFIED, DRAWN = 0, 1, 2
+"""Which arm: as modelled, with the identified geometry (of a hybrid the one that goes with its correction), and as
 drawn without base, on which gravity acts."""
-BLENDED = 4
-"""The hybrid arm where joints were measured, going over into the geometric one beyond."""
+CORRECTED = 3
+"""The identified arm at `q + Δ(q)`."""
 
 FIXED, REVOLUTE, PRISMATIC = 0, 1, 2
 """What moves in a row."""
@@ -38,17 +38,17 @@ ANGLE, SINE, COSINE = 6, 7, 8
 
 
 class Arms(NamedTuple):
-    """The rows of the four arms, which have the same joints.
+    """The rows of the three arms, which have the same joints.
 
     Attributes:
         kind: per row FIXED, REVOLUTE or PRISMATIC.
-        rows: `(4, rows, 9)`: theta [rad], d, a [m], cosine and sine of alpha, of beta and of theta.
-        ends: `(4, 2, 3, 4)`: transforms of base and tool without their last rows.
+        rows: `(3, rows, 9)`: theta [rad], d, a [m], cosine and sine of alpha, of beta and of theta.
+        ends: `(3, 2, 3, 4)`: transforms of base and tool without their last rows.
         reach: of every arm [m].
         direction: per joint +1 or -1, how the controller counts.
         revolute: per joint 1 where it turns, else 0.
         limits: `(dof, 2)` [rad or m].
-        hybrid: 1 where there is a hybrid arm, else 0.
+        corrected: 1 where a correction goes with the identified arm, else 0.
     """
 
     kind: Any
@@ -58,7 +58,7 @@ class Arms(NamedTuple):
     direction: Any
     revolute: Any
     limits: Any
-    hybrid: int
+    corrected: int
 
 
 class Correction(NamedTuple):
@@ -90,21 +90,19 @@ class Correction(NamedTuple):
 
 
 class Coverage(NamedTuple):
-    """Measured joint values; see `pisigma.hybrid.coverage.JointCoverage`.
+    """Measured joint values; see `pisigma.hybrid.arm.JointCoverage`.
 
     Attributes:
         joint: of every stretch.
         middle: of every stretch [rad].
         half: half its length [rad].
         rate: per joint, angle per joint value.
-        fade: angle over which a correction fades [rad].
     """
 
     joint: Any
     middle: Any
     half: Any
     rate: Any
-    fade: float
 
 
 class Network(NamedTuple):

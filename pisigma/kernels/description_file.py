@@ -14,7 +14,7 @@ from pisigma.errors import ModelError
 from pisigma.kernels.arrays import PARTS, Description
 from pisigma.kernels.forms import KernelForms
 
-FORMAT = 5
+FORMAT = 6
 _NAMES = ("branches", "joints", "name", "belongs_to")
 _FIELDS = [(part, field) for part, kind in PARTS.items() for field in kind._fields]
 

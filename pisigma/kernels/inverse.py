@@ -8,7 +8,7 @@ from numba import njit
 from pisigma.kernels import arrays
 from pisigma.kernels.closed_form import all_branches, nearest_turn, wrap_into_limits
 from pisigma.kernels.damped_step import is_singular
-from pisigma.kernels.motion import move
+from pisigma.kernels.motion import beyond_measured, move
 from pisigma.kernels.network import add_correction, choose_corrected, finish_corrected
 from pisigma.kernels.newton import newton, search
 from pisigma.kernels.recovery import branch_of, nearest_starts, recover, within_reach
@@ -254,7 +254,7 @@ def _solve_without_branches(description: Record, memory: Record, has_near: bool)
 def finish(
     description: Record, memory: Record, has_near: bool, reached: bool, out: Array
 ) -> tuple[bool, int]:
-    """Choose the turns, write what is left of the error there and the share; whether it is reached, and the status."""
+    """Choose the turns, write the error left and how far that was measured; whether it is reached, and the status."""
     arms, q, place = description.arms, memory.solution, 2 * description.arms.dof
     inside = False
     if reached:
@@ -262,23 +262,23 @@ def finish(
     if not reached:
         out[place], out[place + 1], out[place + 2] = math.nan, math.nan, math.nan
         return False, arrays.UNREACHABLE
-    fresh, share = True, memory.share
+    fresh = True
     for j in range(arms.dof):
         fresh = fresh and memory.checked[j] == q[j]
     if not fresh:
-        share = move(description, memory, arrays.BLENDED if arms.hybrid else arrays.GEOMETRIC, q)
+        move(description, memory, arrays.CORRECTED if arms.corrected else arrays.IDENTIFIED, q)
         pose_error(memory.pose, memory.T, memory.R, memory.error)
     e = memory.error
     out[place] = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
     out[place + 1] = math.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
-    out[place + 2] = 2 - share if arms.hybrid else math.nan
+    beyond = beyond_measured(description, q) if arms.corrected else math.nan
+    out[place + 2] = 1 + beyond
     nearest_turn(arms, memory.nominal, q, False)
     if not inside:
         return True, arrays.OUTSIDE_LIMITS
-    reach = arms.reach[arrays.HYBRID if arms.hybrid else arrays.GEOMETRIC]
-    if is_singular(arms, reach, memory.J, tolerances.SINGULAR_TOLERANCE, memory):
+    if is_singular(arms, arms.reach[arrays.IDENTIFIED], memory.J, tolerances.SINGULAR_TOLERANCE, memory):
         return True, arrays.SINGULAR
-    return True, arrays.OUTSIDE_DOMAIN if share < 1.0 else arrays.REACHED
+    return True, arrays.OUTSIDE_DOMAIN if beyond > tolerances.MEASURED_ROUNDING else arrays.REACHED
 
 
 @njit(error_model="numpy")
@@ -293,7 +293,7 @@ def _choose_turns(description: Record, memory: Record, has_near: bool) -> tuple[
     turned = False
     for j in range(arms.dof):
         turned = turned or memory.q[j] != q[j]
-    if not turned or not arms.hybrid or description.correction.periodic:
+    if not turned or not arms.corrected or description.correction.periodic:
         return inside, True
     copy(q, memory.q)
     if not search(description, memory, memory.pose, memory.q):

@@ -8,7 +8,7 @@ from numba import carray, njit  # type: ignore[attr-defined]
 from pisigma.kernels import arrays
 from pisigma.kernels.chain import walk_many
 from pisigma.kernels.inverse import solve_pose
-from pisigma.kernels.motion import correct, covered, move
+from pisigma.kernels.motion import beyond_measured, move
 from pisigma.kernels.rows import Array, Record, fill
 from pisigma.kinematics.tolerances import POSE_TOLERANCE, POSE_TOLERANCE_SINGLE, ROUNDINGS
 
@@ -176,19 +176,18 @@ def _mark(description: Record, branch: int, out: Array) -> None:
 def evaluate(
     description: Record, memory: Record, arm: int, q: Array, approach: Array, T: Array, out: Array
 ) -> int:
-    """Write poses at joint values, and in a row Jacobian, and correction and share of it of BLENDED; gives -1."""
+    """Write poses at joint values, and in a row Jacobian, correction, and angle beyond measured values; gives -1."""
     dof = description.arms.dof
     for row in range(q.shape[0]):
         for j in range(dof):
             memory.q[j] = q[row, j]
         _take_approach(approach, row, memory.approach, dof)
         fill(out[row], 0.0)
-        if arm == arrays.BLENDED:
-            correct(description, memory, memory.q)
+        move(description, memory, arm, memory.q)
+        if arm == arrays.CORRECTED:
             for j in range(dof):
                 out[row, 6 * dof + j] = memory.delta[j]
-            out[row, 7 * dof] = covered(description, memory.q)[0]
-        move(description, memory, arm, memory.q)
+            out[row, 7 * dof] = beyond_measured(description, memory.q)
         for k in range(4):
             for i in range(3):
                 T[row, i, k] = memory.T[i, k]

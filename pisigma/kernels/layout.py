@@ -35,8 +35,8 @@ def _integers(**shapes: tuple[int, ...]) -> list[_Field]:
     return [(name, np.int64, shape) for name, shape in shapes.items()]
 
 
-_ARMS = _integers(dof=(), rows_used=(), hybrid=(), kind=(ROWS,), revolute=(DOF,)) + _floats(
-    rows=(4, ROWS, 9), ends=(4, 2, 3, 4), reach=(4,), direction=(DOF,), limits=(DOF, 2)
+_ARMS = _integers(dof=(), rows_used=(), corrected=(), kind=(ROWS,), revolute=(DOF,)) + _floats(
+    rows=(3, ROWS, 9), ends=(3, 2, 3, 4), reach=(3,), direction=(DOF,), limits=(DOF, 2)
 )
 _CORRECTION = _integers(
     inputs=(), products=(), frames=(), periodic=(), orders=(UNITS,), first=(MOST_KINDS,)
@@ -49,7 +49,7 @@ _CORRECTION = _integers(
     bias=(FACTORS, DOF),
 )
 _COVERAGE = _integers(stretches=(), joint=(STRETCHES,)) + _floats(
-    middle=(STRETCHES,), half=(STRETCHES,), rate=(DOF,), fade=()
+    middle=(STRETCHES,), half=(STRETCHES,), rate=(DOF,)
 )
 _NETWORK = _integers(
     used=(),
@@ -97,8 +97,6 @@ MEMORY = np.dtype(
         axes=(DOF, 6),  # of the joints: direction and origin
         T=(3, 4),  # pose and Jacobian of an arm
         J=(6, DOF),
-        T_other=(3, 4),  # the same of the geometric part of a blended arm
-        J_other=(6, DOF),
         R=(3, 3),
         error=(6,),  # of the pose at a trial
         best=(6,),  # of the pose at the best so far, and the Jacobian there
@@ -121,8 +119,7 @@ MEMORY = np.dtype(
         q=(DOF,),  # joint values of a candidate
         start=(DOF,),  # joint values to start from
         kept=(DOF,),  # joint values outside their limits, in case there are no others
-        checked=(DOF,),  # joint values that T, J, error and share belong to, NaN where they belong to none
-        share=(),  # of the correction
+        checked=(DOF,),  # joint values that T, J and error belong to, NaN where they belong to none
         lanes=(12, LANES),  # frames of many poses, entry by entry
         lane_turns=(2, LANES),  # cosines and sines of a joint
         lane_axes=(DOF, 6, LANES),  # directions and origins of the joints

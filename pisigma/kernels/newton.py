@@ -5,7 +5,7 @@ from typing import no_type_check
 
 from numba import njit
 
-from pisigma.kernels.arrays import BLENDED, GEOMETRIC, HYBRID
+from pisigma.kernels.arrays import CORRECTED, IDENTIFIED
 from pisigma.kernels.damped_step import damped_step, scaled_square
 from pisigma.kernels.joint_correction import correction_slope
 from pisigma.kernels.motion import correct, move
@@ -40,9 +40,8 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
         tolerance: residuals to come below [m and rad].
     """
     arms, dof = description.arms, description.arms.dof
-    reach = arms.reach[HYBRID if arm == BLENDED else arm]
-    share = move(description, memory, arm, q)
-    _steepen(description, memory, arm, q, share)
+    reach = arms.reach[IDENTIFIED if arm == CORRECTED else arm]
+    _move_steeply(description, memory, arm, q)
     pose_error(T, memory.T, memory.R, memory.best)
     copy_rows(memory.J, memory.J_best)
     old, damping = scaled_square(reach, memory.best), tolerances.FIRST_DAMPING
@@ -54,8 +53,7 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
         if possible:
             for j in range(dof):
                 memory.trial[j] = q[j] + memory.step[j]
-            share = move(description, memory, arm, memory.trial)
-            _steepen(description, memory, arm, memory.trial, share)
+            _move_steeply(description, memory, arm, memory.trial)
             pose_error(T, memory.T, memory.R, memory.error)
             new = scaled_square(reach, memory.error)
         if new < old:
@@ -70,15 +68,16 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
 
 @njit(error_model="numpy")
 @no_type_check
-def _steepen(description: Record, memory: Record, arm: int, q: Array, share: float) -> None:
-    """Take the slope of the correction into the Jacobian of a blended arm."""
+def _move_steeply(description: Record, memory: Record, arm: int, q: Array) -> None:
+    """Do as `move`, and take the slope of the correction into the Jacobian of a corrected arm."""
+    move(description, memory, arm, q)
     dof = description.arms.dof
-    if arm != BLENDED or share == 0.0 or dof > 6:
+    if arm != CORRECTED or dof > 6:
         return  # with joints to spare it would lead to another of the many solutions than the torch route's
     correction_slope(description.arms, description.correction, memory, q)
     for j in range(dof):
         for i in range(6):
-            memory.J[i, j] *= 1 + share * memory.slope[j]
+            memory.J[i, j] *= 1 + memory.slope[j]
 
 
 @njit(error_model="numpy")
@@ -86,8 +85,8 @@ def _steepen(description: Record, memory: Record, arm: int, q: Array, share: flo
 def search(description: Record, memory: Record, T: Array, q: Array) -> bool:
     """Bring q to a pose of the calibrated arm, and say whether that succeeded.
 
-    First the geometric arm, then from there the hybrid one, which may reach a little farther; where the start is
-    near already, a shorter way to the same place.
+    First the arm without its correction, then from there with it, which may reach a little farther; where the start
+    is near already, a shorter way to the same joint values.
     """
     arms = description.arms
     fill(memory.checked, math.nan)
@@ -96,12 +95,12 @@ def search(description: Record, memory: Record, T: Array, q: Array) -> bool:
         if _quick(description, memory, T, q):
             return True
         copy(memory.start, q)
-    newton(description, memory, GEOMETRIC, T, q, tolerances.TOLERANCE)
-    if not arms.hybrid:
+    newton(description, memory, IDENTIFIED, T, q, tolerances.TOLERANCE)
+    if not arms.corrected:
         return _within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)
-    if not _within(memory.best, tolerances.NEARLY * arms.reach[GEOMETRIC], tolerances.NEARLY):
+    if not _within(memory.best, tolerances.NEARLY * arms.reach[IDENTIFIED], tolerances.NEARLY):
         return False
-    newton(description, memory, BLENDED, T, q, tolerances.HYBRID_TOLERANCE)
+    newton(description, memory, CORRECTED, T, q, tolerances.HYBRID_TOLERANCE)
     return _within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)
 
 
@@ -110,17 +109,16 @@ def search(description: Record, memory: Record, T: Array, q: Array) -> bool:
 def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
     """Solve for `q + Δ(q)` by Newton steps, then for q by fixed-point steps; checked on the arm itself.
 
-    Only where joint values lead to the pose that are near the start and all within the measured ones: there the
-    correction need not be in the Newton steps at all.
+    Only where joint values near the start lead to the pose: there the correction need not be in the Newton steps at
+    all.
     """
     arms, dof = description.arms, description.arms.dof
-    arm = HYBRID if arms.hybrid else GEOMETRIC
-    if not _converge(description, memory, arm, T, q):
+    if not _converge(description, memory, T, q):
         return False
-    if not arms.hybrid:
-        move(description, memory, GEOMETRIC, q)
+    if not arms.corrected:
+        move(description, memory, IDENTIFIED, q)
         pose_error(T, memory.T, memory.R, memory.error)
-        return _checked(memory, q, 1.0, tolerances.TOLERANCE * 4)
+        return _checked(memory, q, tolerances.TOLERANCE * 4)
     copy(q, memory.trial)
     before = 1.0
     for attempt in range(20):
@@ -136,32 +134,29 @@ def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
         if moved * ratio < _SETTLED or ratio > 0.5:
             break
         before = moved
-    share = move(description, memory, BLENDED, q)
-    if share < 1.0:
-        return False
+    move(description, memory, CORRECTED, q)
     pose_error(T, memory.T, memory.R, memory.error)
-    return _checked(memory, q, share, tolerances.ACCEPTED)
+    return _checked(memory, q, tolerances.ACCEPTED)
 
 
 @njit(error_model="numpy")
 @no_type_check
-def _checked(memory: Record, q: Array, share: float, tolerance: float) -> bool:
+def _checked(memory: Record, q: Array, tolerance: float) -> bool:
     """Whether the pose is reached; if so, keep that the pose, Jacobian and error in memory are those of q."""
     if not _within(memory.error, tolerance, tolerance):
         return False
     copy(q, memory.checked)
-    memory.share = share
     return True
 
 
 @njit(error_model="numpy")
 @no_type_check
-def _converge(description: Record, memory: Record, arm: int, T: Array, q: Array) -> bool:
-    """Newton steps as long as each is far better than the one before."""
+def _converge(description: Record, memory: Record, T: Array, q: Array) -> bool:
+    """Newton steps of the identified arm as long as each is far better than the one before."""
     arms, dof = description.arms, description.arms.dof
-    reach, before = arms.reach[arm], _CLOSE * _CLOSE
+    reach, before = arms.reach[IDENTIFIED], _CLOSE * _CLOSE
     for _ in range(8):
-        move(description, memory, arm, q)
+        move(description, memory, IDENTIFIED, q)
         pose_error(T, memory.T, memory.R, memory.error)
         square = scaled_square(reach, memory.error)
         if not square < before:

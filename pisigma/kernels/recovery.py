@@ -5,7 +5,7 @@ from typing import no_type_check
 
 from numba import njit
 
-from pisigma.kernels.arrays import GEOMETRIC, NOMINAL
+from pisigma.kernels.arrays import IDENTIFIED, NOMINAL
 from pisigma.kernels.chain import walk
 from pisigma.kernels.closed_form import all_branches
 from pisigma.kernels.newton import search
@@ -18,7 +18,7 @@ from pisigma.kinematics.tolerances import ATTEMPTS, PULL, REACH_ROUNDING
 @no_type_check
 def within_reach(description: Record, T: Array) -> bool:
     """Whether a pose is not farther away than the robot is long, whatever its joints do."""
-    base, reach = description.arms.ends[GEOMETRIC, 0], description.arms.reach[GEOMETRIC]
+    base, reach = description.arms.ends[IDENTIFIED, 0], description.arms.reach[IDENTIFIED]
     x, y, z = T[0, 3] - base[0, 3], T[1, 3] - base[1, 3], T[2, 3] - base[2, 3]
     return math.sqrt(x * x + y * y + z * z) <= reach * (1 + REACH_ROUNDING)
 

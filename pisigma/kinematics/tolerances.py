@@ -3,6 +3,10 @@
 POSE_TOLERANCE, POSE_TOLERANCE_SINGLE = 1e-6, 1e-4
 """Largest deviation of `R^T R` from the identity and of the last row from (0, 0, 0, 1); of poses in float32."""
 
+MEASURED_ROUNDING = 1e-9
+"""How far [rad] a joint may lie beyond its measured values and still count as measured: commanded values of measured
+poses are those of the rows up to the residuals of their solution."""
+
 LIMIT_TOLERANCE = 1e-9
 """How far [rad or m] a value may lie beyond a limit and still count as on it; it is not moved."""
 
@@ -20,7 +24,7 @@ TRIANGLE_MARGIN = 1e-9
 """Relative distance that the two links of an arm keep from stretched and folded where a free joint turns for them."""
 
 TOLERANCE, HYBRID_TOLERANCE = 1e-13, 1e-12
-"""[m and rad] Residuals that the iteration of an arm comes below; blending two arms costs a few more roundings."""
+"""[m and rad] Residuals that the iteration of an arm comes below; a joint correction costs a few more roundings."""
 
 ACCEPTED = 1e-11
 """[m and rad] Residuals that will do where rounding stops the iteration earlier."""
@@ -35,7 +39,7 @@ ITERATIONS = 100
 """Damped steps after which an iteration is given up."""
 
 NEARLY = 0.01
-"""Share of the reach, and angle [rad]: a pose that the geometric arm misses by less the hybrid one may take."""
+"""Share of the reach, and angle [rad]: a pose that an arm misses by less it may take with its joint correction."""
 
 REACH_ROUNDING = 1e-9
 """Share of the reach by which a pose may lie farther away than the robot is long."""

@@ -48,7 +48,7 @@ def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) ->
 def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
     """Standard deviation of the position of every row's target along the axes of its frame [m], without noise.
 
-    Beyond the measured joint values it goes over into what the geometric calibration does not explain.
+    It is that of the posterior, at measured joint values and beyond them.
 
     Returns:
         NaN where the model holds no uncertainty.
@@ -61,12 +61,7 @@ def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Flo
     frame = known_names(model.bases, measurements.frame, "frame", measurements)
     target = known_names(model.tools, measurements.target, "target", measurements)
     at, arm = replace(measurements, frame=frame, target=target), model.hybrid
-    if arm is None:
-        return model.uncertainty.deviation(at, at.q)
-    inside = model.uncertainty.deviation(at, corrected_joints(arm, at))
-    share = arm.coverage.share(at.q)[:, None]
-    deviation: Tensor = ((share * inside).square() + ((1 - share) * model.unexplained) ** 2).sqrt()
-    return deviation
+    return model.uncertainty.deviation(at, at.q if arm is None else corrected_joints(arm, at))
 
 
 def geometry_of(robot: Robot, bases: Frames, tools: Frames) -> IdentifiedGeometry:

@@ -75,13 +75,11 @@ class CalibratedModel:
         bases: per frame of the measurements ("" where it had no name) x, y, z [m], roll, pitch, yaw [rad] of
             the base in it; the first is that of `robot`. Empty where frames were not told apart.
         tools: the same per target for the tool.
-        hybrid: the arm with a joint correction that was fitted through the kinematics, its geometric part being
-            `calibrated`; None where there is none.
+        hybrid: the arm with a joint correction that was fitted through the kinematics, with a geometry of its own
+            beside the one of `calibrated`; None where there is none.
         hybrid_bases: the bases that go with the hybrid's geometry, by the names of `bases`.
         hybrid_tools: the same for the tools.
         uncertainty: of predicted positions, or None.
-        unexplained: standard deviation of what the geometric calibration does not explain [m]: noise and all
-            that it cannot express.
         conditions: payload [kg] and temperature [deg C] that it was put under, by name; empty for the usual ones of
             the rows. See `pisigma.model.stated_conditions`.
         provenance: recipe, data, versions.
@@ -102,10 +100,14 @@ class CalibratedModel:
     hybrid_bases: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
     hybrid_tools: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
     uncertainty: PositionUncertainty | None = None
-    unexplained: float = 0.0
     conditions: dict[str, float] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)
     metrics: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def identified(self) -> Robot:
+        """The geometry that commanded joint values go through: of the hybrid, as identified, or else nominal."""
+        return self.calibrated or self.robot if self.hybrid is None else self.hybrid.robot
 
     @property
     def drawn(self) -> Robot | None:

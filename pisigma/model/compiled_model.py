@@ -8,7 +8,6 @@ import numpy as np
 import torch
 
 from pisigma.errors import ModelError
-from pisigma.hybrid.arm import HybridArm
 from pisigma.joint_correction.feature import scaled_joints, turning_rate
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kernels import arrays
@@ -21,7 +20,6 @@ from pisigma.model.stored_starts import StoredStarts, middle_of_starts
 from pisigma.network.correction_network import JointGroup
 from pisigma.network.inputs import POSE_INPUTS
 from pisigma.network.pi_sigma import PiSigma
-from pisigma.robot.description import Robot
 from pisigma.se3 import invert
 
 _NUMERIC = ("numeric",)
@@ -68,14 +66,13 @@ def describe(model: CalibratedModel) -> tuple[arrays.Description, tuple[str, ...
             f"model '{model.name}': its robot has no closed-form inverse, and the model holds no joint values to "
             "start from; calibrate it again."
         )
-    geometric = model.calibrated or model.robot
     correction, features = _correction(model)
-    stored = StoredStarts(geometric, model.starts.double().cpu())
+    stored = StoredStarts(model.identified, model.starts.double().cpu())
     description = arrays.Description(
-        arms=_arms(model.robot, geometric, model.hybrid),
+        arms=_arms(model),
         correction=correction,
         forms=KernelForms(features, (solver.name,) if solver else ()),
-        coverage=_coverage(geometric, model.hybrid),
+        coverage=_coverage(model),
         network=_network(model),
         closed_form=_closed_form(model, solver),
         starts=arrays.Starts(stored.q.numpy(), stored.points.numpy(), stored.lever),
@@ -83,10 +80,10 @@ def describe(model: CalibratedModel) -> tuple[arrays.Description, tuple[str, ...
     return description, solver.branches if solver else _NUMERIC
 
 
-def _arms(nominal: Robot, geometric: Robot, hybrid: HybridArm | None) -> arrays.Arms:
-    arms = (nominal, geometric, geometric, nominal)  # in the order NOMINAL, GEOMETRIC, HYBRID, DRAWN
-    if hybrid is not None:
-        arms = (nominal, hybrid.geometric, hybrid.hybrid, hybrid.correction.robot)
+def _arms(model: CalibratedModel) -> arrays.Arms:
+    nominal, hybrid = model.robot, model.hybrid
+    drawn = nominal if hybrid is None else hybrid.correction.robot
+    arms = (nominal, model.identified, drawn)  # in the order NOMINAL, IDENTIFIED, DRAWN
     return arrays.Arms(
         kind=np.array([KINDS[row.type] for row in nominal.rows]),
         rows=np.stack([arm_rows(arm) for arm in arms]),
@@ -95,7 +92,7 @@ def _arms(nominal: Robot, geometric: Robot, hybrid: HybridArm | None) -> arrays.
         direction=nominal.directions,
         revolute=np.array(nominal.revolute, dtype=np.int64),
         limits=nominal.limits,
-        hybrid=int(hybrid is not None),
+        corrected=int(hybrid is not None),
     )
 
 
@@ -137,14 +134,12 @@ def _correction(model: CalibratedModel) -> tuple[arrays.Correction, tuple[str, .
     return compiled, tuple(numbers)
 
 
-def _coverage(robot: Robot, hybrid: HybridArm | None) -> arrays.Coverage:
-    if hybrid is None:
+def _coverage(model: CalibratedModel) -> arrays.Coverage:
+    if model.hybrid is None:
         none = np.zeros(0)
-        return arrays.Coverage(np.zeros(0, dtype=np.int64), none, none, turning_rate(robot), 1.0)
-    own = hybrid.coverage
-    return arrays.Coverage(
-        own.joint.numpy(), own.middle.numpy(), own.half.numpy(), own.rate.numpy(), float(own.fade)
-    )
+        return arrays.Coverage(np.zeros(0, dtype=np.int64), none, none, turning_rate(model.identified))
+    own = model.hybrid.coverage
+    return arrays.Coverage(own.joint.numpy(), own.middle.numpy(), own.half.numpy(), own.rate.numpy())
 
 
 def _closed_form(model: CalibratedModel, solver: AbstractClosedForm | None) -> arrays.ClosedForm:

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.hybrid.result import HybridResult, unexplained_length
+from pisigma.hybrid.result import HybridResult
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.result import CalibrationResult
 from pisigma.kinematics.closed_form import closed_form_solver
@@ -77,7 +77,6 @@ def model_of_hybrid(
     """
     known, learned = result.geometric, result.learned
     model = model_of_calibration(name, nominal, known, measurements, recipe)
-    model = replace(model, unexplained=unexplained_length(known))
     if learned is None:
         kept = _kept(result.uncertainty, known.robot, model.bases, model.tools)
         return replace(model, uncertainty=kept)

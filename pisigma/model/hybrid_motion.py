@@ -6,11 +6,10 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from pisigma.hybrid.arm import HybridArm, blend
+from pisigma.hybrid.arm import HybridArm
 from pisigma.kinematics.jacobian import joint_jacobian
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
-from pisigma.se3 import rotation_vector
 
 CHUNK = 4_096
 """Poses whose features are in memory at a time: a few hundred columns a joint."""
@@ -25,7 +24,7 @@ def hybrid_poses(arm: HybridArm, q: Float[Tensor, "*batch dof"]) -> Float[Tensor
     Raises:
         PoseError: q has another number of columns than the robot has joints.
     """
-    arm.geometric.check_joint_count(q.shape[-1])
+    arm.robot.check_joint_count(q.shape[-1])
     flat = q.reshape(-1, q.shape[-1])
     return torch.cat([arm.forward(part) for part in torch.split(flat, CHUNK)]).reshape(*q.shape[:-1], 4, 4)
 
@@ -40,10 +39,7 @@ def corrected_joints(arm: HybridArm, measurements: Measurements) -> Float64[Tens
 def hybrid_motion(
     arm: HybridArm, q: Float[Tensor, "poses dof"], exact: bool = True
 ) -> tuple[Float[Tensor, "poses 4 4"], Float[Tensor, "poses 6 dof"]]:
-    """Poses and joint Jacobian of a hybrid arm.
-
-    With share s of the hybrid arm and e from the geometric to the hybrid pose, the Jacobian is
-    `s J_hybrid(q + Δ) (1 + dΔ/dq) + (1 - s) J_geometric(q) + e ds/dq`, up to the share of the curvature in e.
+    """Poses and joint Jacobian `J(q + Δ) (1 + dΔ/dq)` of a hybrid arm.
 
     Args:
         arm: the arm.
@@ -59,19 +55,10 @@ def hybrid_motion(
 
 
 def _motion(arm: HybridArm, q: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
-    T_hybrid, J_hybrid = joint_jacobian(arm.hybrid, q + arm.delta(q))
+    T, J = joint_jacobian(arm.robot, q + arm.delta(q))
     if exact:
-        J_hybrid = J_hybrid + J_hybrid @ _slope(arm.delta, q)
-    share = arm.coverage.share(q)
-    if bool((share == 1).all()):
-        return T_hybrid, J_hybrid
-    T_geometric, J_geometric = joint_jacobian(arm.geometric, q)
-    shift = T_hybrid[:, :3, 3] - T_geometric[:, :3, 3]
-    turn = rotation_vector(T_hybrid[:, :3, :3] @ T_geometric[:, :3, :3].mT)
-    fading = _slope(lambda moving: arm.coverage.share(moving)[..., None], q)
-    between = torch.cat([shift, turn], -1)[..., None] @ fading
-    way = share[:, None, None]
-    return blend(T_geometric, T_hybrid, share), way * J_hybrid + (1 - way) * J_geometric + between
+        J = J + J @ _slope(arm.delta, q)
+    return T, J
 
 
 def _slope(

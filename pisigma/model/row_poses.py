@@ -6,7 +6,6 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
-from pisigma.hybrid.arm import blend
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -28,16 +27,12 @@ def poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64
         MeasurementError: the model does not know a frame or target of the rows.
         PoseError: the joint values do not fit the robot.
     """
-    arm, q = model.hybrid, measurements.q
+    arm = model.hybrid
     if arm is None:
-        return _seen(model.forward(q), model.robot, model.bases, model.tools, measurements)
-    model.robot.check_joint_count(q.shape[-1])
-    T_geometric = _seen(
-        forward_kinematics(arm.geometric, q), arm.geometric, model.bases, model.tools, measurements
-    )
-    T_hybrid = forward_kinematics(arm.hybrid, corrected_joints(arm, measurements))
-    T_hybrid = _seen(T_hybrid, arm.hybrid, model.hybrid_bases, model.hybrid_tools, measurements)
-    return blend(T_geometric, T_hybrid, arm.coverage.share(q))
+        return _seen(model.forward(measurements.q), model.robot, model.bases, model.tools, measurements)
+    model.robot.check_joint_count(measurements.q.shape[-1])
+    T = forward_kinematics(arm.robot, corrected_joints(arm, measurements))
+    return _seen(T, arm.robot, model.hybrid_bases, model.hybrid_tools, measurements)
 
 
 def nominal_poses_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:

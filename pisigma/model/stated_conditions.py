@@ -49,7 +49,7 @@ def under_stated_conditions(
     assert learned is not None
     usual = dict(zip(learned.names, learned.mean, strict=True))
     correction, shift = at_conditions(arm.correction, _scaled(model.name, learned, given))
-    under = replace(arm, hybrid=_shifted(arm.hybrid, shift), correction=correction)
+    under = replace(arm, robot=_shifted(arm.robot, shift), correction=correction)
     return replace(model, hybrid=under, conditions={**usual, **given})
 
 

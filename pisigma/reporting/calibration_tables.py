@@ -69,8 +69,8 @@ def learned_lines(hybrid: HybridFigures) -> list[str]:
     if learned is not None:
         lines.append(
             f"Geometry and correction have {learned.unknowns} unknowns, of which the data determine "
-            f"{learned.effective_parameters:.0f}; beyond the measured joint values the correction fades to nothing "
-            f"over {learned.fades_over_deg:.0f} deg."
+            f"{learned.effective_parameters:.0f}; beyond the measured joint values the correction is an extrapolation, "
+            "whose predicted deviation says how good it is."
         )
     return lines
 

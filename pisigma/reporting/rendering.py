@@ -5,7 +5,8 @@ from pathlib import Path
 
 import jinja2
 
-from pisigma.reporting.tables import CARD, figure_text, joint_table, markdown_table, pose_table
+from pisigma.model.folder.folder_files import CARD
+from pisigma.reporting.tables import figure_text, joint_table, markdown_table, pose_table
 from pisigma.templates import template_environment
 
 

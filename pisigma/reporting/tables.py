@@ -6,8 +6,6 @@ from typing import NamedTuple
 from pisigma.judging.training_summary import JointFigures
 from pisigma.judging.validation_figures import ErrorFigures
 
-CARD = "README.md"
-
 _STATISTICS = ("average", "deviation", "maximum")
 _SHOWN = {"rms": "RMS", "p95": "95 %", "max": "maximum"}
 

@@ -8,10 +8,11 @@ def test_what_is_new_already_is_said(run, models):
     assert json.loads(result.stdout) == {
         "model": str(models / "kiro3"),
         "name": "hand_made_kiro3",
-        "before": 3,
-        "after": 3,
+        "before": 4,
+        "after": 4,
+        "changes": [],
     }
-    assert "has the newest format (3) already" in run("upgrade", models / "kiro3").stdout
+    assert "has the newest format (4) already" in run("upgrade", models / "kiro3").stdout
 
 
 def test_a_folder_without_a_model_is_refused(refuses, tmp_path):

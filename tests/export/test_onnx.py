@@ -121,12 +121,12 @@ def test_the_correction_of_a_hybrid_is_that_of_the_model(name, names, rows):
     q[rows // 2 :] = joints_around(name, rows - rows // 2, spread=1.0)
     if names == "pose":
         q += 0.01  # where an angle of the pose is half a turn, its sign is a matter of rounding
-    full, share = model.hybrid.correction(q), model.hybrid.coverage.share(q)[:, None]
-    found = run(export_onnx(model), q=q)
-    assert_close(found["full_correction"], full, atol=1e-12)
-    assert_close(found["share"], share, atol=1e-12)
-    assert_close(found["correction"], share * full, atol=1e-12)
-    assert rows < 2 or float(full.abs().max()) > 1e-3
+    delta, found = model.hybrid.correction(q), run(export_onnx(model), q=q)
+    assert_close(found["correction"], delta, atol=1e-12)
+    beyond = model.hybrid.coverage.beyond(q).amax(-1, keepdim=True)
+    assert_close(found["beyond_measured"], beyond, atol=1e-12)
+    assert rows < 2 or float(delta.abs().max()) > 1e-3
+    assert rows < 2 or float(beyond.max()) > 0.1
 
 
 def test_joints_that_count_the_other_way_carry_their_masses():
@@ -135,22 +135,7 @@ def test_joints_that_count_the_other_way_carry_their_masses():
     robot = replace(robot, rows=rows)
     model = hybrid_model("ur10", [GravityTorques(robot)], robot=robot)
     q = everywhere(robot, 50)
-    assert_close(run(export_onnx(model), q=q)["full_correction"], model.hybrid.correction(q), atol=1e-12)
-
-
-def test_the_share_fades_at_the_ends_of_what_was_measured():
-    model = hybrid_model("ur10", features_of(Robot.load("ur10"), "series"))
-    coverage = model.hybrid.coverage
-    end = float(coverage.middle[0] + coverage.half[0])
-    beyond = torch.tensor(
-        [-1e-9, 0.0, 1e-9, coverage.fade / 2, coverage.fade, 2 * coverage.fade, 2 * math.pi],
-        dtype=torch.float64,
-    )
-    q = joints_around("ur10", 1, spread=0.0).repeat(len(beyond), 1)
-    q[:, 0] = end + beyond
-    share = run(export_onnx(model), q=q)["share"][:, 0]
-    assert_close(share, coverage.share(q), atol=1e-12)
-    assert_close(share[3:6], [0.5, 0.0, 0.0], atol=1e-7)
+    assert_close(run(export_onnx(model), q=q)["correction"], model.hybrid.correction(q), atol=1e-12)
 
 
 @pytest.mark.parametrize("kind", [INVERSE, FORWARD])
@@ -173,7 +158,9 @@ def test_the_file_says_what_its_numbers_are(kind):
     graph = onnx.load_from_string(content).graph
     described = {value.name: value.doc_string for value in (*graph.input, *graph.output)}
     assert all(
-        "[rad or m]" in text for name, text in described.items() if name not in ("T_base_tool", "share")
+        "[rad or m]" in text
+        for name, text in described.items()
+        if name not in ("T_base_tool", "beyond_measured")
     )
     assert {value.type for value in opened.get_inputs()} == {"tensor(double)"}
     assert {value.shape[0] for value in (*opened.get_inputs(), *opened.get_outputs())} == {"batch"}

@@ -157,7 +157,7 @@ def test_the_onnx_graph_has_an_input_for_the_side():
     q = measured(ARC_MINUTE, 200, 9, 0.0).q[:4]
     approach = torch.tensor([1.0, -1.0, 0.0, 1.0, -1.0, 1.0], dtype=torch.float64).repeat(4, 1)
     session = runtime.InferenceSession(export_onnx(model()), providers=["CPUExecutionProvider"])
-    (full,) = session.run(["full_correction"], {"q": q.numpy(), "approach": approach.numpy()})
+    (delta,) = session.run(["correction"], {"q": q.numpy(), "approach": approach.numpy()})
     arm = model().hybrid
     assert arm is not None
-    assert_close(torch.from_numpy(full), arm.correction(q, approach), atol=1e-15)
+    assert_close(torch.from_numpy(delta), arm.correction(q, approach), atol=1e-15)

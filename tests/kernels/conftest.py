@@ -9,8 +9,7 @@ import pytest
 import torch
 from testing.models import no_type_checker
 
-from pisigma.hybrid.arm import HybridArm
-from pisigma.hybrid.coverage import JointCoverage
+from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.inverse.compiled_ik import CompiledIK
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
@@ -68,7 +67,7 @@ def calibrated(name: str, hybrid: bool = True, covered: float = 1.0, joints: boo
     if hybrid:
         other = geometric.with_geometry(dh=geometric.dh + 0.2 * ERRORS * rng.normal(size=robot.dh.shape))
         measured = JointCoverage.of(robot, draw_joints(robot, 400, share=covered))
-        arm = HybridArm(geometric, other, draw_correction(robot, joints), measured)
+        arm = HybridArm(other, draw_correction(robot, joints), measured)
     starts = draw_joints(robot, 400, share=covered)
     return CalibratedModel(
         f"calibrated {name}", "test", robot, None, None, (), starts, calibrated=geometric, hybrid=arm

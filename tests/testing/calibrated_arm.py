@@ -6,8 +6,7 @@ import math
 import numpy as np
 import torch
 
-from pisigma.hybrid.arm import HybridArm
-from pisigma.hybrid.coverage import JointCoverage
+from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -68,9 +67,7 @@ def calibrated_arm(
     arm, starts = None, joints_of(robot, 400, share=covered)
     if hybrid:
         other = geometric.with_geometry(dh=geometric.dh + 0.2 * ERRORS * rng.normal(size=robot.dh.shape))
-        arm = HybridArm(
-            geometric, other, random_correction(robot, shared, size=size), JointCoverage.of(robot, starts)
-        )
+        arm = HybridArm(other, random_correction(robot, shared, size=size), JointCoverage.of(robot, starts))
     return CalibratedModel(
         f"calibrated {name}", "test", robot, None, None, (), starts, calibrated=geometric, hybrid=arm
     )

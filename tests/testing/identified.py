@@ -4,8 +4,7 @@ import numpy as np
 import torch
 from testing.models import hand_made_model, joints_around
 
-from pisigma.hybrid.arm import HybridArm
-from pisigma.hybrid.coverage import JointCoverage
+from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.model.calibrated_model import CalibratedModel
@@ -63,7 +62,6 @@ def hybrid_model(
     correction.requires_grad_(False)
     assert model.calibrated is not None
     arm = HybridArm(
-        model.calibrated,
         off_by(model.calibrated, 1e-5, 1e-5, seed=1),
         correction,
         JointCoverage.of(model.robot, model.starts),

@@ -17,7 +17,7 @@ from jig_figures import (
 from jig_report import BOTH, DEFAULT, PLANNED, RANDOM, JigRun
 from jig_tables import Table, all_tables
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.tables import CARD
+from pisigma.model.folder.folder_files import CARD
 
 _SETUPS = {"nominal": "nominal", BOTH: "both", DEFAULT: "both, default"}
 

@@ -9,6 +9,8 @@ WEIGHTS = "model.safetensors"
 """All tensors."""
 COMPILED = "compiled.npz"
 """The same as arrays for the compiled kernels, made from the two others; a folder is whole without it."""
+CARD = "README.md"
+"""What people read."""
 
 
 def folder_hash(folder: Path) -> str | None:

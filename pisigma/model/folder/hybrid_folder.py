@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from pisigma.hybrid.alternating_products import AlternatingProducts
-from pisigma.hybrid.arm import HybridArm
-from pisigma.hybrid.coverage import JointCoverage
+from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.joint_correction.feature import AbstractFeature, turning_rate
@@ -48,7 +47,6 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
         result["learned"] = {
             "features": [chosen.describe().model_dump(mode="json") for chosen in arm.correction.features],
             "orders": list(arm.correction.orders),
-            "fade_rad": arm.coverage.fade,
             "bases": {name: frame.tolist() for name, frame in model.hybrid_bases.items()},
             "tools": {name: frame.tolist() for name, frame in model.hybrid_tools.items()},
         }
@@ -58,7 +56,6 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
             "free": _free_rows(known),
             "turns": [chosen.turn for chosen in known.features if isinstance(chosen, AlternatingProducts)],
             "prior_scale": known.prior_scale,
-            "unexplained_m": model.unexplained,
         }
     return result
 
@@ -72,7 +69,7 @@ def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
         assert model.calibrated is not None
         result |= _geometry("calibrated", model.calibrated)
     if (arm := model.hybrid) is not None:
-        result |= _geometry("learned", arm.hybrid)
+        result |= _geometry("learned", arm.robot)
         result |= {f"correction.{key}": value for key, value in arm.correction.state_dict().items()}
         result |= {f"coverage.{name}": getattr(arm.coverage, name) for name in ("joint", "middle", "half")}
     if (known := model.uncertainty) is not None:
@@ -134,13 +131,12 @@ def with_hybrid(
         if (list(learned.bases), list(learned.tools)) != (list(model.bases), list(model.tools)):
             raise ValueError("the learned part has other frames or targets than the geometric one")
         place = (_exact("learned", drawn, tensors, ()), _frames(learned.bases), _frames(learned.tools))
-        parts = _correction(learned, drawn, tensors), _coverage(learned, drawn, tensors)
-        arm = HybridArm(calibrated, place[0], *parts)
+        arm = HybridArm(place[0], _correction(learned, drawn, tensors), _coverage(drawn, tensors))
         model = replace(model, hybrid=arm, hybrid_bases=place[1], hybrid_tools=place[2])
     if known is None:
         return model
     uncertainty = _uncertainty(known, model.hybrid, drawn, tensors["uncertainty.root"], place)
-    return replace(model, uncertainty=uncertainty, unexplained=known.unexplained_m)
+    return replace(model, uncertainty=uncertainty)
 
 
 def _free_rows(known: PositionUncertainty) -> list[int]:
@@ -197,7 +193,7 @@ def _correction(learned: LearnedSection, robot: Robot, tensors: Mapping[str, Ten
     return correction
 
 
-def _coverage(learned: LearnedSection, robot: Robot, tensors: Mapping[str, Tensor]) -> JointCoverage:
+def _coverage(robot: Robot, tensors: Mapping[str, Tensor]) -> JointCoverage:
     joint, middle, half = (tensors[f"coverage.{name}"] for name in ("joint", "middle", "half"))
     if not len(joint) == len(middle) == len(half):
         raise ValueError("the coverage has stretches of which joint, middle or half is missing")
@@ -205,7 +201,7 @@ def _coverage(learned: LearnedSection, robot: Robot, tensors: Mapping[str, Tenso
         raise ValueError("the coverage needs a stretch of at least no length for every joint, and no other")
     rate = torch.from_numpy(turning_rate(robot))
     turning = tuple(bool(turns) for turns in robot.revolute)
-    return JointCoverage(joint, middle, half, rate, turning, learned.fade_rad)
+    return JointCoverage(joint, middle, half, rate, turning)
 
 
 def _uncertainty(

@@ -14,7 +14,7 @@ from pisigma.joint_correction.registry import feature_section
 from pisigma.robot.robot_file import RobotDocument
 from pisigma.yaml_file import Section, parse_yaml
 
-FORMAT = 3
+FORMAT = 4
 """Of this version; folders of earlier formats are upgraded by `pisigma.model.folder.upgrade`."""
 _CHECKSUM = re.compile(r"(.*^)sha256: ([0-9a-f]{64})\n", re.DOTALL | re.MULTILINE)
 
@@ -39,14 +39,12 @@ class LearnedSection(Section):
     Attributes:
         features: of the unit of order 1.
         orders: number of factors of every product unit.
-        fade_rad: angle beyond the measured joint values over which the correction fades.
         bases: per frame, of the hybrid's geometry.
         tools: per target.
     """
 
     features: tuple[_Feature, ...]
     orders: tuple[Annotated[int, Field(ge=2, le=100)], ...]
-    fade_rad: Annotated[float, Field(gt=0)]
     bases: dict[str, _Frame]
     tools: dict[str, _Frame]
 
@@ -70,7 +68,6 @@ class UncertaintySection(Section):
         turns: whose turn it is, for every stretch of weights of product units that stands behind the others: see
             `pisigma.hybrid.alternating_products.AlternatingProducts`.
         prior_scale: see `pisigma.hybrid.uncertainty.PositionUncertainty`.
-        unexplained_m: see `pisigma.model.calibrated_model.CalibratedModel`.
     """
 
     sockets: tuple[str, ...]
@@ -79,7 +76,6 @@ class UncertaintySection(Section):
     free: tuple[Annotated[int, Field(ge=0)], ...]
     turns: tuple[Annotated[int, Field(ge=0)], ...]
     prior_scale: Annotated[float, Field(gt=0)]
-    unexplained_m: Annotated[float, Field(ge=0)]
 
 
 class ProvenanceSection(Section):
@@ -101,7 +97,7 @@ class ModelDocument(Section):
 
     model_config = ConfigDict(protected_namespaces=())
 
-    format: Literal[3]
+    format: Literal[4]
     name: str
     kind: str
     branches: tuple[str, ...]

@@ -13,7 +13,7 @@ import yaml
 
 from pisigma.errors import ModelError
 from pisigma.model.compiled_model import save_compiled
-from pisigma.model.folder.folder_files import COMPILED, DESCRIPTION, folder_hash
+from pisigma.model.folder.folder_files import CARD, COMPILED, DESCRIPTION, folder_hash
 from pisigma.model.folder.model_document import FORMAT, read_signed_text, stated_format, write_document
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.folder.staging import staged_folder
@@ -42,6 +42,14 @@ _LABELS = (
 )
 """What earlier versions said of a parameter, and the few words for it that newer ones keep beside."""
 
+_FADED = re.compile(r"beyond the measured joint values the correction fades to nothing over \d+ deg")
+_EXTRAPOLATED = "beyond the measured joint values the correction is an extrapolation"
+"""What a card said of the fade, and what it says instead."""
+_NO_FADE = (
+    "The correction now holds at all joint values, and the predicted deviation says how well; up to format 3 it faded "
+    "to the geometric calibration beyond the measured ones."
+)
+
 
 @dataclass(frozen=True)
 class Upgrade:
@@ -51,17 +59,20 @@ class Upgrade:
         name: of the model.
         before: format that the folder had.
         after: format that it has now; the same where there was nothing to do.
+        changes: sentences on what the model does otherwise than before.
     """
 
     name: str
     before: int
     after: int
+    changes: tuple[str, ...] = ()
 
 
 def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
     """Rewrite a model folder of an earlier version in the form of this one, whole or not at all.
 
-    Tensors, figures, card and all other files stay as they are; the file for the compiled kernels is made again.
+    Tensors, figures and all other files stay as they are, and so does the card but for what is not true any more; the
+    file for the compiled kernels is made again.
 
     Args:
         folder: to upgrade.
@@ -80,16 +91,27 @@ def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
     document["metrics"] = _metrics(str(document.get("kind")), _renamed(document["metrics"]))
     if "uncertainty" in document:
         document["uncertainty"] = _renamed(document["uncertainty"])
+    changes = _without_fade(document)
     with staged_folder(path) as scratch:
         shutil.copytree(path, scratch, dirs_exist_ok=True)
         (scratch / COMPILED).unlink(missing_ok=True)
+        if changes and (card := scratch / CARD).is_file():
+            card.write_text(_FADED.sub(_EXTRAPOLATED, card.read_text(encoding="utf-8")), encoding="utf-8")
         write_document(
             {key: value for key, value in document.items() if key != "format"}, scratch / DESCRIPTION
         )
         model = load_model(scratch)
         with suppress(ModelError):  # the kernels do not know every kind of model
             save_compiled(model, scratch / COMPILED, folder_hash(scratch) or "")
-    return Upgrade(model.name, before, FORMAT)
+    return Upgrade(model.name, before, FORMAT, changes)
+
+
+def _without_fade(document: dict[str, Any]) -> tuple[str, ...]:
+    """Take out how a correction faded to the geometric calibration, as it did up to format 3; says so where it did."""
+    document.get("uncertainty", {}).pop("unexplained_m", None)
+    learned = (document["metrics"].get("hybrid") or {}).get("learned") or {}
+    learned.pop("fades_over_deg", None)
+    return () if document.get("learned", {}).pop("fade_rad", None) is None else (_NO_FADE,)
 
 
 def _renamed(values: Any) -> Any:

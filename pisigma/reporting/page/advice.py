@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.hybrid.coverage import JointCoverage
+from pisigma.hybrid.arm import JointCoverage
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_tables import warning_lines
@@ -118,7 +118,7 @@ def _joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> list[str]:
         gaps.append(f"{name} {ranges} {unit} ({100 * share:.0f} % of {whole})")
     if not gaps:
         return []
-    beyond = "the learned correction fades out" if model.hybrid else "nothing was measured"
+    beyond = "the learned correction is an extrapolation" if model.hybrid else "nothing was measured"
     return [
         f"Joints were measured in part only: {'; '.join(gaps)}. Beyond that {beyond}: measure there if programs "
         "go there."

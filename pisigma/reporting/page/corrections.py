@@ -10,9 +10,9 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.hybrid.coverage import share_beyond
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.tolerances import MEASURED_ROUNDING
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_figures import JOINT_UNITS
 from pisigma.reporting.calibration_tables import (
@@ -139,11 +139,11 @@ class CorrectionCurve:
         unit: of its values, "deg" or "mm".
         small_unit: of its correction, "mdeg" or "µm".
         values: over the joint's range.
-        correction: in force there.
+        correction: there.
         measured: whether the joint value was measured.
         dots: corrections at measured rows.
         dot_values: joint values there.
-        sentence: how large it is, and where it fades.
+        sentence: how large it is, and where it was measured.
     """
 
     joint: str
@@ -171,17 +171,17 @@ def correction_curves(model: CalibratedModel) -> tuple[CorrectionCurve, ...]:
     for j in range(robot.dof):
         at = middle.repeat(POINTS, 1)
         at[:, j] = torch.linspace(*_range(robot, q, j), POINTS, dtype=torch.float64)
-        share = torch.ones(POINTS, dtype=torch.float64)
-        if hybrid is not None:  # the correction fades as the joint leaves its measured values
-            share = share_beyond(hybrid.coverage.beyond(at)[:, j], hybrid.coverage.fade)
-        curve = correction_at(model, at)[:, j] * share
+        measured = torch.ones(POINTS, dtype=torch.bool)
+        if hybrid is not None:
+            measured = hybrid.coverage.beyond(at)[:, j] <= MEASURED_ROUNDING
+        curve = correction_at(model, at)[:, j]
         if bool((curve != 0).any()) or bool((at_rows[:, j] != 0).any()):
-            curves.append(_curve(robot, j, at[:, j], curve, share == 1, q[:, j], at_rows[:, j]))
+            curves.append(_curve(robot, j, at[:, j], curve, measured, q[:, j], at_rows[:, j]))
     return tuple(curves)
 
 
 def correction_at(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "rows dof"]:
-    """Compute the learned correction in full at joint values [rad or m]."""
+    """Compute the learned correction at joint values [rad or m]."""
     hybrid, chunks = model.hybrid, torch.split(q, CHUNK)
     with torch.no_grad():
         if hybrid is not None:
@@ -217,7 +217,7 @@ def _curve(
     )
     low, high = values[inside].min(initial=math.inf), values[inside].max(initial=-math.inf)
     if not inside.all() and high > low:
-        sentence += f"; measured from {low:.0f} to {high:.0f} {unit}, beyond it fades"
+        sentence += f"; measured from {low:.0f} to {high:.0f} {unit}, extrapolated beyond"
     return CorrectionCurve(
         joint=robot.joints[joint].name,
         unit=unit,

@@ -23,8 +23,6 @@ from pisigma.se3 import invert, transform_from_xyzrpy
 
 MOST_PREDICTED = 4_000
 """The accuracy is predicted at so many rows at most, evenly over them: each costs a millisecond."""
-ROUNDING = 1e-9
-"""A joint value that is beyond the measured ones by less counts as measured [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +142,7 @@ def inside(model: CalibratedModel, q: Float64[Tensor, "rows dof"]) -> Bool[Tenso
     """Say whether every joint value was measured; everywhere where the model does not keep that."""
     if model.hybrid is None:
         return torch.ones(len(q), dtype=torch.bool)
-    return model.hybrid.coverage.beyond(q).amax(-1) <= ROUNDING
+    return model.hybrid.coverage.contains(q)
 
 
 def _judged(

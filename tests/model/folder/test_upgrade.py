@@ -27,6 +27,8 @@ OLD = {
     "warnings": "warnings",
 }
 
+CARD = "Kept; beyond the measured joint values {}."
+
 
 def old(values: Any, names: dict[str, str] = OLD) -> Any:
     """The same values with the keys of the earlier version."""
@@ -44,10 +46,14 @@ def write_old(model: CalibratedModel, folder: Path) -> dict[str, bytes]:
     document["metrics"] = old(document["metrics"])
     if "uncertainty" in document:
         document["uncertainty"] = old(document["uncertainty"], {"prior_scale": "widening"})
+        document["uncertainty"]["unexplained_m"] = 1e-4
+    if "learned" in document:
+        document["learned"]["fade_rad"] = 0.17
+        document["metrics"]["hybrid"]["learned"]["fades_over_deg"] = 10.0
     text = yaml.safe_dump(document | {"format": 2 if "uncertainty" in document else 1}, sort_keys=False)
     path.write_text(f"{text}sha256: {hashlib.sha256(text.encode()).hexdigest()}\n")
     (folder / "compiled.npz").write_bytes(b"of the earlier version")
-    (folder / "README.md").write_text("the card")
+    (folder / "README.md").write_text(CARD.format("the correction fades to nothing over 10 deg"))
     return {entry.name: entry.read_bytes() for entry in folder.iterdir()}
 
 
@@ -56,17 +62,19 @@ def test_a_hybrid_calibration_comes_back_with_all_figures(tmp_path):
     files = write_old(model, tmp_path / "arm")
     with pytest.raises(ModelError, match="run `pisigma upgrade"):
         load_model(tmp_path / "arm")
-    assert upgrade_folder(tmp_path / "arm") == Upgrade("arm", 2, 3)
+    done = upgrade_folder(tmp_path / "arm")
+    assert (done.name, done.before, done.after) == ("arm", 2, 4)
+    assert [sentence for sentence in done.changes if "faded" in sentence]
     upgraded = load_model(tmp_path / "arm")
     assert upgraded.metrics == model.metrics
     assert CalibrationSummary.read(upgraded) == CalibrationSummary.read(model)
     assert upgraded.uncertainty.prior_scale == model.uncertainty.prior_scale
-    for name in ("model.safetensors", "README.md"):
-        assert (tmp_path / "arm" / name).read_bytes() == files[name]
+    assert (tmp_path / "arm" / "model.safetensors").read_bytes() == files["model.safetensors"]
+    assert (tmp_path / "arm" / "README.md").read_text() == CARD.format("the correction is an extrapolation")
     assert (tmp_path / "arm" / "compiled.npz").read_bytes() != files["compiled.npz"]
     assert [entry.name for entry in tmp_path.iterdir()] == ["arm"]
     before = (tmp_path / "arm" / "model.yaml").read_bytes()
-    assert upgrade_folder(tmp_path / "arm") == Upgrade("arm", 3, 3)
+    assert upgrade_folder(tmp_path / "arm") == Upgrade("arm", 4, 4)
     assert (tmp_path / "arm" / "model.yaml").read_bytes() == before
 
 
@@ -84,7 +92,7 @@ def test_figures_of_other_kinds_change_their_form(tmp_path):
         "joints": [{"name": "theta_1", "unit": "deg", "correction": figures, "error": figures}],
     }
     write_old(replace(network, metrics={"joints": [{"name": "theta_1"}]}), tmp_path / "net")
-    assert upgrade_folder(tmp_path / "net") == Upgrade("hand_made_kiro3", 1, 3)
+    assert upgrade_folder(tmp_path / "net") == Upgrade("hand_made_kiro3", 1, 4)
     assert load_model(tmp_path / "net").metrics == {"joints": [{"name": "theta_1"}]}
 
 
