@@ -23,7 +23,7 @@ from pisigma.judging.trained_calibrations import (
     with_frames,
     without_missing,
 )
-from pisigma.judging.validation_figures import ErrorFigures, LearningPoint, ValidationFigures
+from pisigma.judging.validation_figures import LearningPoint, ValidationFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import TrainTest, with_fewer
 from pisigma.sensors.registry import SENSORS
@@ -91,10 +91,7 @@ class CalibrationValidation:
                 name: tuple(_rms_mm(one.models[name].position) for one in self.repeats)
                 for name in self.models
             }
-        figures |= {
-            name: ErrorFigures.model_validate(errors.in_file_units())
-            for name, errors in self.all_errors.items()
-        }
+        figures |= {name: errors.figures for name, errors in self.all_errors.items()}
         if self.all_spread is not None:
             figures |= self.all_spread.in_file_units()
         count = max((len(errors) for errors in self.distances.values()), default=0)
@@ -131,13 +128,9 @@ class _Judged:
     def add(self, name: str, errors: PoseErrors, distances: Tensor, test: Tensor) -> None:
         """Errors of some rows under one model."""
         if name not in self._errors:
-            nothing = torch.full((self._rows,), torch.nan, dtype=torch.float64)
-            self._errors[name] = PoseErrors(nothing, nothing.clone() if self._turned else None)
+            self._errors[name] = PoseErrors.none(self._rows, self._turned)
             self._distances[name] = []
-        store = self._errors[name]
-        store.position[test] = errors.position
-        if errors.rotation is not None and store.rotation is not None:
-            store.rotation[test] = errors.rotation
+        self._errors[name].put(test, errors)
         self._distances[name].append(distances)
 
     def add_spread(self, spread: PredictedSpread, test: Tensor) -> None:
@@ -214,24 +207,6 @@ def validate_repeatedly(
     return replace(first, again=tuple(again))
 
 
-@dataclass(frozen=True, eq=False)
-class CurvePoint:
-    """Errors of held-out rows by calibrations with `rows` training rows.
-
-    Attributes:
-        rows: number of training rows.
-        validation: errors of the held-out rows of all splits.
-    """
-
-    rows: int
-    validation: CalibrationValidation
-
-    def figures(self) -> LearningPoint:
-        """The figures in mm and deg."""
-        figures = self.validation.figures().model_dump(exclude_unset=True)
-        return LearningPoint.model_validate({**figures, "rows": self.rows, "held_out": figures["rows"]})
-
-
 def learning_curve(
     calibrator: Calibrator,
     measurements: Measurements,
@@ -240,7 +215,7 @@ def learning_curve(
     seed: int,
     progress: Progress = lambda what: None,
     whole: CalibrationValidation | None = None,
-) -> tuple[CurvePoint, ...]:
+) -> tuple[LearningPoint, ...]:
     """Calibrate with fewer and fewer of the training rows of every split, and judge on all its test rows.
 
     Args:
@@ -253,7 +228,7 @@ def learning_curve(
         whole: what all training rows gave, as the last point of the curve; None for none.
 
     Returns:
-        The points, fewest rows first.
+        The figures of the points, fewest rows first.
 
     Raises:
         MeasurementError: a split has fewer training rows than are wanted.
@@ -263,10 +238,14 @@ def learning_curve(
     for rows in sorted(sizes):
         fewer = with_fewer(measurements, splits, rows, seed)
         of_rows = stage(progress, f"{rows} training rows")
-        points.append(CurvePoint(rows, validate(calibrator, measurements, fewer, of_rows)))
+        points.append((rows, validate(calibrator, measurements, fewer, of_rows)))
     if whole is not None:
-        points.append(CurvePoint(min(len(train) for train, _ in splits), whole))
-    return tuple(points)
+        points.append((min(len(train) for train, _ in splits), whole))
+    figures = ((rows, validation.figures().model_dump(exclude_unset=True)) for rows, validation in points)
+    return tuple(
+        LearningPoint.model_validate({**values, "rows": rows, "held_out": values["rows"]})
+        for rows, values in figures
+    )
 
 
 def judge(

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError
+from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
@@ -74,6 +75,18 @@ class PoseErrors:
         return ErrorVectors.between(measurements, expected).sizes
 
     @staticmethod
+    def none(rows: int, turned: bool) -> "PoseErrors":
+        """Errors of rows that are not judged yet, with orientations or without."""
+        nothing = torch.full((rows,), torch.nan, dtype=torch.float64)
+        return PoseErrors(nothing, nothing.clone() if turned else None)
+
+    def put(self, rows: Int64[Tensor, " some"], errors: "PoseErrors") -> None:
+        """Write the errors of some rows, as far as both have orientations."""
+        self.position[rows] = errors.position
+        if self.rotation is not None and errors.rotation is not None:
+            self.rotation[rows] = errors.rotation
+
+    @staticmethod
     def joined(several: Sequence["PoseErrors"]) -> "PoseErrors":
         """Join errors one after the other; all have orientations or none has."""
         rotations = [errors.rotation for errors in several if errors.rotation is not None]
@@ -88,13 +101,14 @@ class PoseErrors:
             position, None if self.rotation is None else torch.where(rows, self.rotation, torch.nan)
         )
 
-    def in_file_units(self) -> dict[str, float]:
+    @property
+    def figures(self) -> ErrorFigures:
         """RMS, mean, 95 % and maximum in mm and, where measured, in deg."""
         figures = {f"{name}_mm": value * 1e3 for name, value in error_statistics(self.position).items()}
         if self.rotation is not None:
             degrees = torch.rad2deg(self.rotation)
             figures |= {f"{name}_deg": value for name, value in error_statistics(degrees).items()}
-        return figures
+        return ErrorFigures(**figures)
 
 
 def error_statistics(errors: Float64[Tensor, " rows"]) -> dict[str, float]:
@@ -149,10 +163,6 @@ class Comparison:
         """Compare on the rows that both have."""
         both = ~(torch.isfinite(nominal.position) & torch.isnan(corrected.position))
         return Comparison(nominal.only(both), corrected, int((~both).sum()))
-
-    def in_file_units(self) -> dict[str, dict[str, float]]:
-        """The figures in mm and deg of "nominal" and "corrected"."""
-        return {"nominal": self.nominal.in_file_units(), "corrected": self.corrected.in_file_units()}
 
 
 def compare_on(model: CalibratedModel, measurements: Measurements) -> Comparison:

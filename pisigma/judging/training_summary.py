@@ -8,7 +8,6 @@ from typing import Any
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.judging.cross_validation import CrossValidation
 from pisigma.judging.pose_statistics import Comparison
 from pisigma.judging.summary import AbstractSummary
 from pisigma.judging.validation_figures import ErrorFigures
@@ -17,6 +16,9 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.training.history import TrainingHistory
 from pisigma.training.pairs import TrainingPairs
 from pisigma.yaml_file import Section
+
+LEVEL = 0.05
+"""Relative change of an error that is taken for none."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,14 +150,36 @@ class ComparisonFigures(Section):
     @staticmethod
     def of(comparison: Comparison, **counts: int) -> "ComparisonFigures":
         """The figures of a comparison, with numbers of folds or rows."""
-        return ComparisonFigures.model_validate(
-            {**counts, "rows_not_predicted": comparison.not_predicted, **comparison.in_file_units()}
+        return ComparisonFigures(
+            **counts,
+            rows_not_predicted=comparison.not_predicted,
+            nominal=comparison.nominal.figures,
+            corrected=comparison.corrected.figures,
         )
 
     @property
     def models(self) -> dict[str, ErrorFigures]:
         """The errors of both by name."""
         return {"nominal": self.nominal, "corrected": self.corrected}
+
+    @property
+    def verdict(self) -> str:
+        """Whether the correction helps, in a sentence."""
+        nominal, corrected = self.nominal.by_name, self.corrected.by_name
+        findings, harm, help_, larger = [], False, False, False
+        for name, quantity, unit in (("position", "rms_mm", "mm"), ("orientation", "rms_deg", "deg")):
+            if quantity in nominal:
+                before, after = nominal[quantity], corrected[quantity]
+                change = "lowers" if after < before * (1 - LEVEL) else "does not change"
+                change = "raises" if after > before * (1 + LEVEL) else change
+                harm, help_ = harm or change == "raises", help_ or change == "lowers"
+                rise = _rise(nominal[f"max_{unit}"], corrected[f"max_{unit}"], unit)
+                rise = rise and f", {'and' if change == 'raises' else 'but'} {rise}"
+                larger = larger or bool(rise)
+                findings.append(f"{change} the {name} error ({before:.3f} to {after:.3f} {unit} RMS{rise})")
+        advice = "; use it with care" if harm or larger else ""
+        advice = advice if help_ else "; do not use it"
+        return f"On held-out rows the correction {' and '.join(findings)}{advice}."
 
 
 class TrainingSummary(AbstractSummary):
@@ -181,9 +205,8 @@ class TrainingSummary(AbstractSummary):
 def summarise_training(
     run: TrainingRun,
     paper: Mapping[str, BeforeAfter],
-    validation: CrossValidation | None = None,
-    test: Comparison | None = None,
-    test_rows: int = 0,
+    validation: ComparisonFigures | None = None,
+    test: ComparisonFigures | None = None,
 ) -> TrainingSummary:
     """Gather the figures of a training.
 
@@ -192,18 +215,16 @@ def summarise_training(
         paper: published figures, by joint.
         validation: errors of rows that were held out in turn.
         test: errors of the rows of the set "test".
-        test_rows: how many these are.
     """
     provenance = run.model.provenance
     counts: dict[str, Any] = {"used": provenance.rows, "left_out": provenance.rows_left_out}
     counts |= {"rule": provenance.rule} if provenance.rule else {}
     figures: dict[str, Any] = {"joints": tuple(_joint(run, name, paper) for name in run.history.joints)}
     if validation is not None:
-        figures["cross_validation"] = ComparisonFigures.of(validation.comparison, folds=validation.folds)
-        figures["verdict"] = validation.verdict
+        figures |= {"cross_validation": validation, "verdict": validation.verdict}
     if test is not None:
-        counts["kept_aside"] = test_rows
-        figures["test"] = ComparisonFigures.of(test, rows=test_rows)
+        counts["kept_aside"] = test.rows
+        figures["test"] = test
     return TrainingSummary(rows=RowFigures(**counts), **figures)
 
 
@@ -221,3 +242,10 @@ def _joint(run: TrainingRun, name: str, paper: Mapping[str, BeforeAfter]) -> Joi
     if name in paper:
         figures["paper"] = paper[name]
     return JointFigures(name=name, **figures)
+
+
+def _rise(before: float, after: float, unit: str) -> str:
+    """Say that the largest error rises, by however little; nothing where it does not."""
+    texts = f"{before:.3f}", f"{after:.3f}"
+    rises = after > before and texts[0] != texts[1]
+    return f"the largest rises from {texts[0]} to {texts[1]} {unit}" if rises else ""

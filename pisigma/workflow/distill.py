@@ -320,8 +320,7 @@ def _tool_errors(
 ) -> ErrorFigures:
     """Errors of the tool at joint values q under the full model, from the poses T."""
     error = pose_error(T, parent.forward(q))
-    errors = PoseErrors(error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1))
-    return ErrorFigures.model_validate(errors.in_file_units())
+    return PoseErrors(error[:, :3].norm(dim=-1), error[:, 3:].norm(dim=-1)).figures
 
 
 def _joint_errors(

@@ -9,11 +9,15 @@ from pisigma.errors import RecipeError
 from pisigma.hybrid.mini_batches import MANY_ROWS
 from pisigma.judging.calibration_summary import summarise
 from pisigma.judging.calibration_validation import errors_under, judge, learning_curve, validate
-from pisigma.judging.cross_validation import CrossValidation
-from pisigma.judging.pose_statistics import Comparison, compare_on
+from pisigma.judging.pose_statistics import compare_on
 from pisigma.judging.progress import Progress, stage
-from pisigma.judging.training_summary import TrainingRun, TrainingSummary, summarise_training
-from pisigma.judging.validation_figures import ErrorFigures, ValidationFigures
+from pisigma.judging.training_summary import (
+    ComparisonFigures,
+    TrainingRun,
+    TrainingSummary,
+    summarise_training,
+)
+from pisigma.judging.validation_figures import ValidationFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.recipes.data import RecipeData, load_data
@@ -34,8 +38,6 @@ class InverseTraining(AbstractModelResult):
         model: what `pisigma.load` would read, with all figures as its metrics.
         recipe: what was trained.
         run: what training gave: history, pairs, joint errors.
-        validation: errors of rows under trainings without them, for measured data; None for simulated ones.
-        test: errors of the rows that the data mark as test; None without such rows.
         summary: all figures.
         seconds: time it took [s].
     """
@@ -43,10 +45,18 @@ class InverseTraining(AbstractModelResult):
     model: CalibratedModel
     recipe: InverseRecipe
     run: TrainingRun
-    validation: CrossValidation | None
-    test: Comparison | None
     summary: TrainingSummary
     seconds: float = 0.0
+
+    @property
+    def validation(self) -> ComparisonFigures | None:
+        """Errors of rows under trainings without them, for measured data; None for simulated ones."""
+        return self.summary.cross_validation
+
+    @property
+    def test(self) -> ComparisonFigures | None:
+        """Errors of the rows that the data mark as test; None without such rows."""
+        return self.summary.test
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -121,7 +131,7 @@ def _train_geometric(
         _refuse_resume(recipe)
     rows, held_out = data.simulations[0]
     result = recipe.calibration.calibrator(data.robot).fit(rows)
-    errors = ErrorFigures.model_validate(errors_under(result, held_out).in_file_units())
+    errors = errors_under(result, held_out).figures
     summary = summarise(result).having(
         command=_call(recipe),
         redundant_sets=tuple(tuple(members) for members in result.pairwise.sets),
@@ -155,8 +165,7 @@ def _train_hybrid(
     curve = None
     if (stated := recipe.learning_curve) is not None:
         of_curve = stage(progress, "learning curve")
-        points = learning_curve(calibrator, judged, splits, stated.rows, stated.seed, of_curve, validation)
-        curve = tuple(point.figures() for point in points)
+        curve = learning_curve(calibrator, judged, splits, stated.rows, stated.seed, of_curve, validation)
     summary = summarise(result).having(
         command=_call(recipe),
         rows=rows.rows,
@@ -189,9 +198,9 @@ def _train_inverse(
 ) -> InverseTraining:
     run = train_networks(recipe, data, settings, sha256)
     validation = None if data.folds is None else cross_validate(recipe, data, progress)
-    test = None if data.test is None else compare_on(run.model, data.test)
-    count = 0 if data.test is None else data.test.rows
-    summary = summarise_training(run, recipe.paper, validation, test, count)
-    summary = summary.having(command=_call(recipe))
+    test = None
+    if data.test is not None:
+        test = ComparisonFigures.of(compare_on(run.model, data.test), rows=data.test.rows)
+    summary = summarise_training(run, recipe.paper, validation, test).having(command=_call(recipe))
     model = replace(run.model, metrics=summary.to_json())
-    return InverseTraining(model, recipe, run, validation, test, summary)
+    return InverseTraining(model, recipe, run, summary)

@@ -7,10 +7,9 @@ import torch
 
 from pisigma.errors import MeasurementError, RecipeError
 from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
-from pisigma.judging.cross_validation import CrossValidation
 from pisigma.judging.pose_statistics import Comparison, PoseErrors, compare_on
 from pisigma.judging.progress import Progress
-from pisigma.judging.training_summary import JointErrors, TrainingRun
+from pisigma.judging.training_summary import ComparisonFigures, JointErrors, TrainingRun
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
@@ -108,7 +107,7 @@ def train_networks(
 
 def cross_validate(
     recipe: InverseRecipe, data: RecipeData, progress: Progress = lambda what: None
-) -> CrossValidation:
+) -> ComparisonFigures:
     """Train the recipe once per fold, on the other folds, and judge it on the fold.
 
     Args:
@@ -123,21 +122,16 @@ def cross_validate(
     if data.folds is None:
         raise RecipeError(f"recipe '{recipe.name}' simulates its data; it has held-out rows of its own.")
     measurements, folds = data.splits()
-    not_predicted = 0
-    nominal = torch.full((2, measurements.rows), torch.nan, dtype=torch.float64)
-    corrected = nominal.clone()
+    turned, not_predicted = measurements.rotation is not None, 0
+    nominal, corrected = (PoseErrors.none(measurements.rows, turned) for _ in range(2))
     for number, (training, test) in enumerate(folds, start=1):
         progress(f"cross-validation: fold {number} of {len(folds)}")
         model = train_networks(recipe, replace(data, training=measurements.select(training))).model
         comparison = compare_on(model, measurements.select(test))
         not_predicted += comparison.not_predicted
-        for store, errors in ((nominal, comparison.nominal), (corrected, comparison.corrected)):
-            store[0, test] = errors.position
-            if errors.rotation is not None:
-                store[1, test] = errors.rotation
-    rotated = measurements.rotation is not None
-    before, after = (PoseErrors(store[0], store[1] if rotated else None) for store in (nominal, corrected))
-    return CrossValidation(len(folds), Comparison(before, after, not_predicted))
+        nominal.put(test, comparison.nominal)
+        corrected.put(test, comparison.corrected)
+    return ComparisonFigures.of(Comparison(nominal, corrected, not_predicted), folds=len(folds))
 
 
 def _check_one_pose(measurements: Measurements) -> None:

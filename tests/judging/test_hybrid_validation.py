@@ -130,12 +130,11 @@ def test_a_learning_curve_falls_and_ends_with_all_rows(arm, found):
     whole, parts, _ = found
     points = learning_curve(small(arm.true.nominal), arm.measurements, parts, (100, 40), 0, whole=whole)
     assert [point.rows for point in points] == [40, 100, 160]
-    assert points[-1].validation is whole
-    figures = [point.figures() for point in points]
-    assert [figure.held_out for figure in figures] == [ROWS] * 3
-    errors = [figure.hybrid.rms_mm for figure in figures]
+    assert points[-1].hybrid == whole.figures().hybrid
+    assert [figure.held_out for figure in points] == [ROWS] * 3
+    errors = [figure.hybrid.rms_mm for figure in points]
     assert errors == sorted(errors, reverse=True)
-    assert all(figure.hybrid.rms_mm < 1.05 * figure.geometric.rms_mm for figure in figures)
+    assert all(figure.hybrid.rms_mm < 1.05 * figure.geometric.rms_mm for figure in points)
 
 
 def test_a_frame_that_was_held_out_is_fitted_under_both_arms(arm):

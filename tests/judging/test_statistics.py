@@ -65,7 +65,7 @@ def test_pose_errors_are_lengths_and_angles(generator):
     assert_close(errors.position, shift.norm(dim=-1), atol=1e-12)
     assert_close(errors.rotation, turn.norm(dim=-1), atol=1e-9)
     assert PoseErrors.between(measured(moved, q, orientation=False), T).rotation is None
-    assert {"rms_mm", "rms_deg"} < set(errors.in_file_units())
+    assert {"rms_mm", "rms_deg"} < set(errors.figures.by_name)
 
 
 def test_pose_errors_need_positions():
@@ -91,8 +91,8 @@ def test_comparison_is_on_the_same_rows():
     found = Comparison.of(nominal, corrected)
     assert found.not_predicted == 1  # the third row was not measured
     assert torch.equal(found.nominal.position.isnan(), corrected.position.isnan())
-    assert_close(found.in_file_units()["nominal"]["mean_mm"], 2500.0)
-    assert_close(found.in_file_units()["corrected"]["mean_mm"], 500.0)
+    assert_close(found.nominal.figures.mean_mm, 2500.0)
+    assert_close(found.corrected.figures.mean_mm, 500.0)
 
 
 def test_error_vectors_are_measured_minus_expected_along_the_axes(generator):

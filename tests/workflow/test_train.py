@@ -10,7 +10,7 @@ from testing.models import no_type_checker, shipped_training, small_recipe_text,
 import pisigma
 from pisigma.errors import MeasurementError, RecipeError
 from pisigma.judging.pose_statistics import compare_on
-from pisigma.judging.training_summary import summarise_training
+from pisigma.judging.training_summary import ComparisonFigures, summarise_training
 from pisigma.recipes.data import load_data, simulate
 from pisigma.recipes.reader import recipe_hash
 from pisigma.recipes.recipe import MeasuredData, SingularRows
@@ -91,11 +91,9 @@ def test_the_correction_helps_on_rows_that_it_never_saw():
     with no_type_checker():
         result = cross_validate(measured, load_data(measured, run.measurements), steps.append)
     assert steps == [f"cross-validation: fold {fold} of 3" for fold in (1, 2, 3)]
-    figures = result.comparison.in_file_units()
-    assert (result.folds, result.comparison.not_predicted) == (3, 0)
-    assert figures["corrected"]["rms_mm"] < figures["nominal"]["rms_mm"] / 3
-    assert not result.comparison.corrected.position.isnan().any()
-    assert not result.comparison.nominal.rotation.isnan().any()
+    assert (result.folds, result.rows_not_predicted) == (3, 0)
+    assert result.corrected.rms_mm < result.nominal.rms_mm / 3
+    assert result.nominal.rms_deg > 0
     assert result.verdict.startswith("On held-out rows the correction lowers the position error (")
 
 
@@ -120,7 +118,9 @@ def test_rows_of_the_test_set_change_nothing_that_is_learned():
             for data in (marked, replace(marked, position=position), training)
         ]
         run = train_networks(measured, load_data(measured, marked))
-        summary = summarise_training(run, {}, None, compare_on(run.model, test), test.rows)
+        summary = summarise_training(
+            run, {}, None, ComparisonFigures.of(compare_on(run.model, test), rows=test.rows)
+        )
     states = [model.network.state_dict() for model in models]
     for name, values in states[0].items():
         assert all(torch.equal(values, other[name]) for other in states[1:])

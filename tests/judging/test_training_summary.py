@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from pisigma.judging.cross_validation import CrossValidation
 from pisigma.judging.pose_statistics import Comparison, PoseErrors
+from pisigma.judging.training_summary import ComparisonFigures
 
 
 def verdict(position: float, rotation: float | None, largest: float | None = None) -> str:
@@ -14,7 +14,7 @@ def verdict(position: float, rotation: float | None, largest: float | None = Non
     if largest is not None:
         moved[0] = largest
     after = PoseErrors(moved, None if rotation is None else rotation * one)
-    return CrossValidation(2, Comparison(PoseErrors(one, turn), after, 0)).verdict
+    return ComparisonFigures.of(Comparison(PoseErrors(one, turn), after, 0), folds=2).verdict
 
 
 @pytest.mark.parametrize(
