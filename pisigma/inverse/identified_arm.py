@@ -9,11 +9,12 @@ from torch import Tensor
 
 from pisigma.hybrid.arm import HybridArm
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
+from pisigma.kinematics.joint_limits import wrapped_difference
 from pisigma.kinematics.numeric import NumericSolution, solve_numeric
 from pisigma.kinematics.status import Status
 from pisigma.kinematics.tolerances import ATTEMPTS, HYBRID_TOLERANCE, ITERATIONS, NEARLY, PULL, REACH_ROUNDING
 from pisigma.model.hybrid_motion import hybrid_motion
-from pisigma.model.stored_starts import StoredStarts, nearest_branch, wrapped_difference
+from pisigma.model.stored_starts import StoredStarts, nearest_branch
 from pisigma.robot.description import Robot
 
 CHEAP_ITERATIONS, EXACT_ITERATIONS = 10, 25
@@ -150,7 +151,7 @@ class IdentifiedArm:
         others = torch.cat([drawn, self.starts.q[index]], 1)
         others = torch.where(anywhere[chosen, None, None], others, torch.nan)
         result, reached = search(self.identified, T_near, torch.cat([first, others], 1), self.hybrid)
-        lies = nearest_branch(self.nominal, self.solver, result)
+        lies = nearest_branch(self.solver, result)
         lost = (lies != wanted) & ~anywhere[chosen]
         result[lost], reached[lost] = torch.nan, int(Status.UNREACHABLE)
         branch = branch.index_copy(0, chosen, torch.where(anywhere[chosen], lies, wanted))

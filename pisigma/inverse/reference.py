@@ -255,7 +255,7 @@ class ReferenceIK:
         away = (off > AWAY).nonzero()[:, 0]
         T_away, start = T.reshape(-1, 4, 4)[away], q_near[away]
         q, status = search(self.arm.identified, T_away, start[:, None], self.model.hybrid)
-        lies = nearest_branch(self.model.robot, self.arm.solver, q)
+        lies = nearest_branch(self.arm.solver, q)
         nominal, _ = search(self.model.robot, T_away, q[:, None])
         other = self._finishing.of_identified(T_away, q, nominal, status, lies, start)
         good = (other.status != Status.UNREACHABLE) & (other.status != Status.OUTSIDE_JOINT_LIMITS)

@@ -1,4 +1,4 @@
-"""Joint limits: bring joint values inside by full turns where that is possible, and say which are not."""
+"""Full turns of joints: differences the short way round, and joint values inside their limits where that can be."""
 
 import torch
 from jaxtyping import Bool, Float
@@ -6,6 +6,15 @@ from torch import Tensor
 
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.robot.description import Robot
+from pisigma.se3 import wrap_to_pi
+
+
+def wrapped_difference(
+    robot: Robot, q: Float[Tensor, "*#batch dof"], other: Float[Tensor, "*#batch dof"]
+) -> Float[Tensor, "*_batch dof"]:
+    """`q - other` [rad or m], wrapped to (-pi, pi] for the joints that turn; the batches broadcast."""
+    difference = q - other
+    return torch.where(torch.tensor(robot.revolute, device=q.device), wrap_to_pi(difference), difference)
 
 
 def wrap_into_limits(

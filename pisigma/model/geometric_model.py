@@ -102,9 +102,4 @@ def _kept(
 def _branches(nominal: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:
     """Branches of the nominal arm that joint values lie on, most frequent first; empty without closed form."""
     solver = closed_form_solver(nominal)
-    if solver is None:
-        return ()
-    index = nearest_branch(nominal, solver, q)
-    counts = torch.bincount(index, minlength=len(solver.branches))
-    order = counts.argsort(descending=True, stable=True).tolist()
-    return tuple(solver.branches[i] for i in order if counts[i] > 0)
+    return () if solver is None else solver.frequent(nearest_branch(solver, q))

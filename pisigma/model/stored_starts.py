@@ -7,7 +7,6 @@ from torch import Tensor
 from pisigma.kinematics.closed_form import AbstractClosedForm
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot.description import Robot
-from pisigma.se3 import wrap_to_pi
 
 MAXIMUM_STARTS = 512
 
@@ -62,21 +61,8 @@ def spread_rows(q: Float64[Tensor, "rows dof"]) -> Float64[Tensor, "starts dof"]
     return q[torch.linspace(0, len(q) - 1, min(len(q), MAXIMUM_STARTS)).round().long()].clone()
 
 
-def nearest_branch(
-    robot: Robot, solver: AbstractClosedForm, q: Float64[Tensor, "poses dof"]
-) -> Int64[Tensor, " poses"]:
-    """Index of the robot's branch whose joint values are nearest to others [rad or m]; 0 for NaN."""
+def nearest_branch(solver: AbstractClosedForm, q: Float64[Tensor, "poses dof"]) -> Int64[Tensor, " poses"]:
+    """Index of the nominal robot's branch whose joint values are nearest to others [rad or m]; 0 for NaN."""
     known = torch.isfinite(q).all(-1)
     safe = torch.where(known[:, None], q, 0.0)
-    every = solver.solve(forward_kinematics(robot, safe)).q
-    distance = wrapped_difference(robot, every, safe[:, None].expand_as(every)).square().sum(-1)
-    nearest: Tensor = torch.where(torch.isfinite(distance), distance, torch.inf).argmin(-1)
-    return torch.where(known, nearest, 0)
-
-
-def wrapped_difference(
-    robot: Robot, q: Float64[Tensor, "*batch dof"], other: Float64[Tensor, "*batch dof"]
-) -> Float64[Tensor, "*batch dof"]:
-    """`q - other` [rad or m], of revolute joints the short way round."""
-    difference = q - other
-    return torch.where(torch.tensor(robot.revolute), wrap_to_pi(difference), difference)
+    return torch.where(known, solver.nearest(forward_kinematics(solver.robot, safe), safe)[1], 0)

@@ -7,11 +7,10 @@ from torch import Tensor
 
 from pisigma.errors import RecipeError, UnreachablePoseError, nearest_choice
 from pisigma.kinematics.closed_form import AbstractClosedForm, InverseSolutions, closed_form_solver
-from pisigma.kinematics.joint_limits import wrap_into_limits
+from pisigma.kinematics.joint_limits import wrap_into_limits, wrapped_difference
 from pisigma.kinematics.numeric import solve_numeric
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
-from pisigma.se3 import wrap_to_pi
 from pisigma.simulation.errors.source import joint_values
 from pisigma.simulation.poses import JointsRandom, WhereToMeasure
 from pisigma.simulation.true_robot import TrueRobot
@@ -127,9 +126,7 @@ def _nearest(
     allowed: Bool[Tensor, "poses branches"],
 ) -> Float64[Tensor, "poses dof"]:
     """The nearest of the solutions that are allowed."""
-    difference = solutions.q - near
-    revolute = torch.tensor(robot.revolute, device=near.device)
-    difference = torch.where(revolute, wrap_to_pi(difference), difference)
+    difference = wrapped_difference(robot, solutions.q, near)
     distance = torch.where(allowed, (difference * difference).sum(-1), torch.inf)
     return torch.take_along_dim(solutions.q, distance.argmin(-1)[:, None, None], 1)[:, 0]
 

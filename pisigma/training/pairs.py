@@ -7,13 +7,13 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
-from pisigma.kinematics.closed_form import AbstractClosedForm, closed_form_solver
+from pisigma.kinematics.closed_form import closed_form_solver
+from pisigma.kinematics.joint_limits import wrapped_difference
 from pisigma.kinematics.numeric import solve_numeric
 from pisigma.kinematics.singularity import singularity_measure
 from pisigma.kinematics.status import Status
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
-from pisigma.se3 import wrap_to_pi
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,12 +71,10 @@ def build_pairs(robot: Robot, measurements: Measurements, singular_below: float 
         solution = solve_numeric(robot, T, q)
         q_nominal, index = solution.q, torch.zeros(len(q), dtype=torch.int64)
         unreachable = solution.status == Status.NOT_CONVERGED
-        names: tuple[str, ...] = ()
     else:
-        q_nominal, index = _nearest_branch(robot, solver, T, q)
-        names = solver.branches
+        q_nominal, index = solver.nearest(T, q)
         unreachable = ~torch.isfinite(q_nominal).all(-1)
-    target = joint_difference(robot, q, q_nominal)
+    target = wrapped_difference(robot, q, q_nominal)
     target = torch.where(unreachable[:, None], 0.0, target)
     q_nominal = torch.where(unreachable[:, None], q, q - target)
     singular = torch.zeros_like(unreachable)
@@ -88,26 +86,5 @@ def build_pairs(robot: Robot, measurements: Measurements, singular_below: float 
             f"{measurements.source}: none of the {len(q)} rows can be used for training; check base, "
             "tool and units, or measure away from singularities."
         )
-    return TrainingPairs(T, q_nominal, target, used, singular, unreachable, _frequent(index[used], names))
-
-
-def joint_difference(
-    robot: Robot, q: Float64[Tensor, "*batch dof"], q_nominal: Float64[Tensor, "*batch dof"]
-) -> Float64[Tensor, "*batch dof"]:
-    """`q - q_nominal`, wrapped to (-pi, pi] for the joints that turn [rad or m]."""
-    difference = q - q_nominal
-    return torch.where(torch.tensor(robot.revolute), wrap_to_pi(difference), difference)
-
-
-def _nearest_branch(robot: Robot, solver: AbstractClosedForm, T: Tensor, q: Tensor) -> tuple[Tensor, Tensor]:
-    """Joint values of the closed-form branch nearest to q, and its index."""
-    every = solver.solve(T).q
-    distance = joint_difference(robot, q[:, None, :].expand_as(every), every).square().sum(-1)
-    index = torch.where(torch.isfinite(distance), distance, torch.inf).argmin(-1)
-    return every[torch.arange(len(q)), index], index
-
-
-def _frequent(index: Tensor, names: tuple[str, ...]) -> tuple[str, ...]:
-    counts = torch.bincount(index, minlength=len(names))
-    order = counts.argsort(descending=True, stable=True).tolist()
-    return tuple(names[i] for i in order if counts[i] > 0)
+    branches = () if solver is None else solver.frequent(index[used])
+    return TrainingPairs(T, q_nominal, target, used, singular, unreachable, branches)

@@ -5,7 +5,6 @@ role of θ_measured, for poses of a region.
 """
 
 import hashlib
-import math
 import os
 import time
 from dataclasses import dataclass, replace
@@ -17,7 +16,6 @@ from torch import Tensor
 
 from pisigma.errors import IdentificationError, ModelError
 from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.inverse.reference import NUMERIC
 from pisigma.joint_correction.conditions import learned_conditions
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.judging.distillation_summary import (
@@ -34,6 +32,7 @@ from pisigma.judging.distillation_summary import (
 from pisigma.judging.pose_statistics import PoseErrors
 from pisigma.judging.progress import Progress
 from pisigma.judging.validation_figures import ErrorFigures
+from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.domain import Domain
@@ -42,6 +41,7 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.model.stored_starts import spread_rows
 from pisigma.reporting.distilled_card import write_distilled_card
 from pisigma.robot.description import Robot
+from pisigma.robot.row import Row
 from pisigma.se3 import pose_error
 from pisigma.workflow.distilled_network import Size, choose_network, sizes_for
 from pisigma.workflow.result import AbstractModelResult
@@ -150,6 +150,7 @@ def distill(
         parent, every, (fitted, chosen_by), sizes, (settings.seed, settings.epochs), progress
     )
     held_out = every.select(slice(settings.poses + choosing, None))
+    solver = closed_form_solver(parent.robot)
     with torch.no_grad():
         predicted = network(held_out.T, held_out.q_nominal)
         scaled = network.scaled_inputs(every.T[fitted], every.q_nominal[fitted])
@@ -159,7 +160,7 @@ def distill(
         robot=parent.robot,
         network=network,
         domain=Domain.around(scaled[:DOMAIN_SAMPLES], generator),
-        branches=_frequent(CorrectedIK(parent), every),
+        branches=() if solver is None else solver.frequent(every.branch),
         starts=spread_rows((every.q_nominal + every.correction)[fitted]),
         bases=parent.bases,
         tools=parent.tools,
@@ -182,15 +183,6 @@ def _check_parent(parent: CalibratedModel) -> None:
             f"model '{parent.name}' has no identified geometry with joint values it was measured at, so there is "
             "nothing to distil; give a model of `pisigma calibrate`."
         )
-
-
-def _frequent(ik: CorrectedIK, poses: SolvedPoses) -> tuple[str, ...]:
-    """Branches that the poses lie on, most frequent first; none for a robot without closed-form inverse."""
-    if ik.branches == (NUMERIC,):
-        return ()
-    counts = torch.bincount(poses.branch, minlength=len(ik.branches))
-    order = counts.argsort(descending=True, stable=True).tolist()
-    return tuple(ik.branches[i] for i in order if counts[i] > 0)
 
 
 def _provenance(parent: CalibratedModel, sha256: str, settings: DistillationSettings) -> Provenance:
@@ -309,8 +301,13 @@ def _region(region: Region, poses: SolvedPoses, robot: Robot) -> RegionFigures:
         rows=len(region.q),
         box_mm=tuple(value * 1e3 for value in region.box or bounds),
         joints=tuple(
-            JointRange(name=joint.name, unit=unit, lower=a * factor, upper=b * factor)
-            for joint, a, b, (unit, factor) in zip(robot.joints, low, high, _units(robot), strict=True)
+            JointRange(
+                name=joint.name,
+                unit=joint.file_unit,
+                lower=joint.in_file_unit(a),
+                upper=joint.in_file_unit(b),
+            )
+            for joint, a, b in zip(robot.joints, low, high, strict=True)
         ),
     )
 
@@ -328,20 +325,13 @@ def _joint_errors(
 ) -> tuple[JointErrorFigures, ...]:
     """Per joint what the full solution adds, and how far the distilled model is from it."""
     joints = []
-    for joint, (unit, factor), full, rest in zip(
-        robot.joints, _units(robot), correction.T, (correction - predicted).T, strict=True
-    ):
-        sizes = {"correction": _absolute(full * factor), "error": _absolute(rest * factor)}
-        joints.append(JointErrorFigures(name=joint.name, unit=unit, **sizes))
+    for joint, full, rest in zip(robot.joints, correction.T, (correction - predicted).T, strict=True):
+        sizes = {"correction": _absolute(full, joint), "error": _absolute(rest, joint)}
+        joints.append(JointErrorFigures(name=joint.name, unit=joint.file_unit, **sizes))
     return tuple(joints)
 
 
-def _absolute(values: Float64[Tensor, " poses"]) -> AbsoluteFigures:
+def _absolute(values: Float64[Tensor, " poses"], joint: Row) -> AbsoluteFigures:
     size = values.abs()
-    return AbsoluteFigures(
-        mean=float(size.mean()), rms=float(size.square().mean().sqrt()), max=float(size.max())
-    )
-
-
-def _units(robot: Robot) -> list[tuple[str, float]]:
-    return [("deg", math.degrees(1)) if turns else ("mm", 1e3) for turns in robot.revolute]
+    figures = {"mean": size.mean(), "rms": size.square().mean().sqrt(), "max": size.max()}
+    return AbsoluteFigures(**{name: joint.in_file_unit(float(value)) for name, value in figures.items()})

@@ -10,6 +10,7 @@ from pisigma.errors import IdentificationError
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.judging.progress import Progress
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.joint_limits import wrapped_difference
 from pisigma.kinematics.singularity import singularity_measure
 from pisigma.kinematics.status import Status
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
@@ -131,8 +132,7 @@ def draw_between(
         neighbours.append(way.norm(dim=-1).topk(nearby + 1, largest=False).indices[:, 1:])
     order = torch.rand(count, nearby, generator=generator).argsort(-1)[:, : robot.dof]
     others = torch.cat(neighbours)[first].gather(1, order)
-    way = q[others] - q[first][:, None]
-    way = torch.where(turning, wrap_to_pi(way), way)
+    way = wrapped_difference(robot, q[others], q[first][:, None])
     weight = torch.rand(count, way.shape[1] + 1, generator=generator, dtype=torch.float64).log().square()
     weight = weight / weight.sum(-1, keepdim=True)
     return q[first] + (weight[:, 1:, None] * way).sum(1)

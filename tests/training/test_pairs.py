@@ -15,7 +15,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
 from pisigma.simulation.measure import simulate
 from pisigma.simulation.true_robot import TrueRobot
-from pisigma.training.pairs import build_pairs, joint_difference
+from pisigma.training.pairs import build_pairs
 
 
 def random_joints(generator: torch.Generator, rows: int) -> torch.Tensor:
@@ -39,16 +39,6 @@ def test_the_target_is_the_joint_error_of_the_true_robot(generator):
 def measure(robot: Robot, q: torch.Tensor, error: torch.Tensor) -> Measurements:
     T = forward_kinematics(robot, q + error)
     return Measurements(q=q, position=T[:, :3, 3].clone(), rotation=T[:, :3, :3].clone(), source="made up")
-
-
-def test_differences_are_wrapped_for_joints_that_turn_only():
-    robot = Robot.load("kiro3")
-    q = torch.tensor([math.pi - 0.1, 0.5, 8.0, -3.0], dtype=torch.float64)
-    nominal = torch.tensor([-math.pi + 0.1, 0.4, 1.0, 3.2], dtype=torch.float64)
-    expected = torch.tensor([-0.2, 0.1, 7.0, 2 * math.pi - 6.2], dtype=torch.float64)
-    assert_close(joint_difference(robot, q, nominal), expected, atol=1e-14)
-    half = torch.tensor([math.pi, 0, 0, 0], dtype=torch.float64)
-    assert_close(joint_difference(robot, half, torch.zeros(4, dtype=torch.float64))[0], math.pi, atol=0)
 
 
 def test_targets_stay_small_across_a_full_turn(generator):

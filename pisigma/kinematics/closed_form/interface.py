@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pisigma.kinematics.closed_form.canonical import CanonicalRows
 from pisigma.kinematics.components import Frame, Scalar, frame_of
-from pisigma.kinematics.joint_limits import wrap_into_limits
+from pisigma.kinematics.joint_limits import wrap_into_limits, wrapped_difference
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
 from pisigma.se3 import check_transforms, invert, wrap_to_pi
@@ -93,6 +93,24 @@ class AbstractClosedForm(ABC):
         status = torch.where(inside, status, int(Status.OUTSIDE_JOINT_LIMITS))
         status = torch.where(reached, status, int(Status.UNREACHABLE))
         return InverseSolutions(torch.where(reached[..., None], q, torch.nan), status, self.branches)
+
+    def nearest(
+        self, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]
+    ) -> tuple[Float[Tensor, "poses dof"], Int64[Tensor, " poses"]]:
+        """Joint values [rad or m] on the branch whose are nearest to others, and its index.
+
+        Where no branch reaches a pose they are NaN, and the index is 0.
+        """
+        every = self.solve(T).q
+        distance = wrapped_difference(self.robot, every, q[:, None]).square().sum(-1)
+        index = torch.where(torch.isfinite(distance), distance, torch.inf).argmin(-1)
+        return every[torch.arange(len(q)), index], index
+
+    def frequent(self, index: Int64[Tensor, " poses"]) -> tuple[str, ...]:
+        """Names of the branches of these indices, the most frequent first."""
+        counts = torch.bincount(index, minlength=len(self.branches))
+        order = counts.argsort(descending=True, stable=True).tolist()
+        return tuple(self.branches[i] for i in order if counts[i] > 0)
 
     def _solve_canonical(
         self, T: Float[Tensor, "*batch 4 4"]
