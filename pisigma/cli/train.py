@@ -2,10 +2,8 @@
 
 import shlex
 import shutil
-import textwrap
 import time
 from collections.abc import Sequence
-from itertools import zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -18,9 +16,6 @@ from pisigma.cli.output import print_json, print_lines, print_table, progress_of
 if TYPE_CHECKING:
     from pisigma.judging.calibration_summary import CalibrationSummary
     from pisigma.judging.training_summary import TrainingSummary
-
-_WIDTH = 24
-"""Columns of a list of parameters."""
 
 
 def train(
@@ -102,7 +97,7 @@ def _print_redundancy(summary: "CalibrationSummary") -> None:
         return
     paper = summary.paper or {}
     rows = _sets_side_by_side(summary.redundant_sets, paper.get("redundant_sets", ()))  # type: ignore[arg-type]
-    rows += _wrapped("no effect", _in_braces(summary.no_effect or ()), _in_braces(paper.get("no_effect", ())))  # type: ignore[arg-type]
+    rows.append(("no effect", _in_braces(summary.no_effect or ()), _in_braces(paper.get("no_effect", ()))))  # type: ignore[arg-type]
     for label, value, key, form in (
         ("left by pairs", summary.pairwise_parameters, "pairwise_parameters", "{}"),
         ("rank", summary.rank, "rank", "{}"),
@@ -116,24 +111,14 @@ def _print_redundancy(summary: "CalibrationSummary") -> None:
 def _sets_side_by_side(
     ours: Sequence[Sequence[str]], papers: Sequence[Sequence[str]]
 ) -> list[tuple[str, str, str]]:
-    """A line per set, equal sets on one line."""
-    rows: list[tuple[str, str, str]] = []
-    left = list(papers)
-    for members in ours:
-        same = next((other for other in left if set(other) == set(members)), None)
-        if same is not None:
-            left.remove(same)
-        rows += _wrapped("", _in_braces(members), _in_braces(same or ()))
-    for members in left:
-        rows += _wrapped("", "", _in_braces(members))
-    return [("redundant sets", *row[1:]) if number == 0 else row for number, row in enumerate(rows)]
+    """A row per set, equal sets on one."""
+    pairs = [(members, next((one for one in papers if set(one) == set(members)), ())) for members in ours]
+    pairs += [((), one) for one in papers if set(one) not in [set(members) for members in ours]]
+    return [
+        ("" if number else "redundant sets", _in_braces(our), _in_braces(papers_set))
+        for number, (our, papers_set) in enumerate(pairs)
+    ]
 
 
 def _in_braces(names: Sequence[str]) -> str:
     return f"{{{', '.join(names)}}}" if names else ""
-
-
-def _wrapped(label: str, *cells: str) -> list[tuple[str, str, str]]:
-    """One row of a table as lines of bounded width."""
-    columns = [[label], *(textwrap.wrap(cell, _WIDTH) or [""] for cell in cells)]
-    return [(line[0], line[1], line[2]) for line in zip_longest(*columns, fillvalue="")]
