@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, complete_model
+from pisigma.cli.arguments import AsJson, ModelFolder
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
 from pisigma.errors import PoseError, RecipeError
 
@@ -17,12 +17,6 @@ if TYPE_CHECKING:
 
 Box = tuple[float, float, float, float, float, float]
 
-Model = Annotated[
-    Path,
-    typer.Argument(
-        metavar="MODEL", help="Model folder that `pisigma calibrate` wrote.", autocompletion=complete_model
-    ),
-]
 Out = Annotated[Path, typer.Option(help="Model folder to write.")]
 RegionMm = Annotated[
     Box | None,
@@ -54,7 +48,7 @@ Seed = Annotated[int, typer.Option(help="Seed of poses and starts.")]
 
 def distill(
     context: typer.Context,
-    model: Model,
+    model: ModelFolder,
     out: Out,
     region: RegionMm = None,
     joints: Joints = None,

@@ -1,23 +1,14 @@
 """`pisigma upgrade`: a model folder of an earlier version in the form of this one."""
 
 from dataclasses import asdict
-from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, complete_model
+from pisigma.cli.arguments import AsJson, ModelFolder
 from pisigma.cli.output import print_json, print_lines
 
-Model = Annotated[
-    Path,
-    typer.Argument(
-        metavar="MODEL", help="Model folder that an earlier version wrote.", autocompletion=complete_model
-    ),
-]
 
-
-def upgrade(model: Model, as_json: AsJson = False) -> None:
+def upgrade(model: ModelFolder, as_json: AsJson = False) -> None:
     """Rewrite a model folder of an earlier version so that this one reads it, whole or not at all."""
     from pisigma.model.folder.upgrade import upgrade_folder
 

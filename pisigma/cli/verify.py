@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson
+from pisigma.cli.arguments import AsJson, ModelFolder
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of, screen_width
 from pisigma.errors import AcceptanceError
 
@@ -21,7 +21,7 @@ Data = Annotated[
 
 
 def verify(
-    model: Annotated[Path, typer.Argument(help="Model folder.")],
+    model: ModelFolder,
     data: Data,
     fit_frame: FitFrame = False,
     as_json: AsJson = False,
