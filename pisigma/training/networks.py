@@ -1,7 +1,7 @@
 """Fitting Pi-Sigma networks with Lightning: the paper's gradient descent, Levenberg-Marquardt, or mini-batches."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,8 +18,6 @@ from pisigma.training.history import TrainingHistory
 from pisigma.training.levenberg_marquardt import LevenbergMarquardt, Patterns
 from pisigma.training.sections import FitSection, GradientDescentSection, MiniBatchSection
 from pisigma.training.trainer import SAVED, Checkpoints, train
-
-Closure = Callable[[], Any]
 
 
 def fit_networks(
@@ -118,42 +116,6 @@ class ShuffledBatches(Sampler[Tensor]):
         return math.ceil(self._rows / self._batch_rows)
 
 
-class GradientDescent(torch.optim.Optimizer):
-    """`Δw = -η ∂E/∂w` with a learning rate η per output (Jeong et al. 1998, eq. 4); no momentum, no state."""
-
-    def __init__(
-        self, networks: Sequence[PiSigma], learning_rates: Sequence[Float[Tensor, " outputs"]]
-    ) -> None:
-        """Take weights and biases of networks, with one rate per output; the fixed weights stay as they are."""
-        groups = [
-            {"params": [network.weight, network.bias], "rates": rates}
-            for network, rates in zip(networks, learning_rates, strict=True)
-        ]
-        super().__init__(groups, {})
-
-    @torch.no_grad()
-    def step(self, closure: Closure | None = None) -> Any:
-        """Move every parameter against its gradient, which the closure writes; gives what the closure gave."""
-        energies = closure() if closure is not None else None
-        for group in self.param_groups:
-            for parameter in group["params"]:
-                rates = group["rates"].reshape(-1, *[1] * (parameter.dim() - 1))
-                parameter.addcmul_(parameter.grad, rates, value=-1)
-        return energies
-
-
-class SolverSteps(torch.optim.Optimizer):
-    """Steps of Levenberg-Marquardt solvers, as an optimiser: Lightning counts steps, and saves, by optimisers."""
-
-    def __init__(self, networks: Sequence[PiSigma]) -> None:
-        """Take weights and biases; they change when the training has ended, see `NetworkTraining.write_networks`."""
-        super().__init__([{"params": [network.weight, network.bias]} for network in networks], {})
-
-    def step(self, closure: Closure) -> Any:  # type: ignore[override]
-        """Do what the closure does: the solvers keep the state."""
-        return closure()
-
-
 class NetworkTraining(lightning.LightningModule):
     """Trains the networks of all joint groups side by side, each output for itself.
 
@@ -195,11 +157,10 @@ class NetworkTraining(lightning.LightningModule):
 
     def configure_optimizers(self) -> Any:
         """The optimiser of the method."""
-        networks: list[PiSigma] = list(self.networks)  # type: ignore[arg-type]
-        if isinstance(self.fit, GradientDescentSection):
-            return GradientDescent(networks, self._rates)
         if not isinstance(self.fit, MiniBatchSection):
-            return SolverSteps(networks)
+            # `_descend` writes gradients times rates. Solvers write none: they keep the state, but Lightning counts
+            # steps, and saves, by an optimiser.
+            return torch.optim.SGD(self.networks.parameters(), lr=1.0)
         optimiser, steps = self.fit.build(self.networks.parameters()), self.trainer.estimated_stepping_batches
         falling = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, int(steps))
         return {"optimizer": optimiser, "lr_scheduler": {"scheduler": falling, "interval": "step"}}
@@ -253,10 +214,14 @@ class NetworkTraining(lightning.LightningModule):
         return self.energies[: int(self.epochs_done)].clone()
 
     def _descend(self, patterns: list[Patterns]) -> Tensor:
-        """Write the closed-form gradient into the parameters' `grad` and give the energy of every output."""
+        """Write `η ∂E/∂w` (Jeong et al. 1998, eq. 4) into the parameters' `grad`; give the energy of every output."""
         energies = []
-        for network, group in zip(self.networks, patterns, strict=True):
-            value, network.weight.grad, network.bias.grad = energy_gradient(network, group.x, group.d)  # type: ignore[arg-type]
+        for network, group, rates in zip(self.networks, patterns, self._rates, strict=True):
+            value, by_weight, by_bias = energy_gradient(network, group.x, group.d)  # type: ignore[arg-type]
+            network.weight.grad, network.bias.grad = (
+                by_weight * rates[:, None, None],
+                by_bias * rates[:, None],
+            )
             energies.append(value)
         return torch.cat(energies)
 
