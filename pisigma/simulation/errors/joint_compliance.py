@@ -7,16 +7,7 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from pisigma.kinematics.components import (
-    Scalar,
-    Vector,
-    add,
-    combine,
-    cross,
-    follow_xyzrpy,
-    product,
-    translate,
-)
+from pisigma.kinematics.components import Frame, as_transform, follow_xyzrpy
 from pisigma.kinematics.forward import Geometry, iterate_rows
 from pisigma.robot.description import Robot
 from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_values, row_index
@@ -99,31 +90,27 @@ def gravity_load(
     columns = q.reshape(-1, robot.dof).t().contiguous().unbind(0)
     geometry = Geometry(robot.dh.tolist(), [0.0] * 6, robot.tool.tolist())
     frames = list(iterate_rows(robot, geometry, columns))
-    total = payload.mass_kg
-    moment = _first_moment(payload, follow_xyzrpy(frames[-1].after, geometry.tool))
+    fall = q.new_tensor(gravity)
+    total, moment = payload.mass_kg, _first_moment(payload, follow_xyzrpy(frames[-1].after, geometry.tool), q)
     loads: list[Tensor] = []
     for index in reversed(range(len(frames))):
         row, frame = robot.rows[index], frames[index]
         if index in links:
             total += links[index].mass_kg
-            moment = combine(1.0, moment, 1.0, _first_moment(links[index], frame.after))
+            moment = moment + _first_moment(links[index], frame.after, q)
         if row.type == "fixed":
             continue
-        axis, origin = frame.before[2], frame.before[3]
-        arm = cross(combine(1.0, moment, -total, origin), gravity)
-        load = _dot(axis, arm) if row.type == "revolute" else product(total, _dot(axis, gravity))
-        loads.append(torch.zeros_like(columns[0]) + product(float(row.direction), load))
+        axis, origin = as_transform(frame.before, columns[0])[:, :3, 2:].unbind(-1)
+        force = (
+            fall * total
+            if row.type == "prismatic"
+            else torch.linalg.cross(moment - total * origin, fall[None])
+        )
+        loads.append(row.direction * (axis * force).sum(-1))
     return torch.stack(loads[::-1], -1).reshape(q.shape)
 
 
-def _first_moment(mass: LinkMass, frame: tuple[Vector, Vector, Vector, Vector]) -> Vector:
+def _first_moment(mass: LinkMass, frame: Frame, q: Tensor) -> Float[Tensor, "poses 3"]:
     """Mass times centre of mass [kg m] in the frame of the first row."""
-    x, y, z = (value / 1e3 for value in mass.centre_mm)
-    return combine(mass.mass_kg, translate(frame, x, y, z)[3], 0.0, (0.0, 0.0, 0.0))
-
-
-def _dot(u: Vector, v: Vector) -> Scalar:
-    total: Scalar = 0.0
-    for s, t in zip(u, v, strict=True):
-        total = add(total, product(s, t))
-    return total
+    T = as_transform(frame, q.reshape(-1, q.shape[-1])[:, 0])
+    return mass.mass_kg * (T @ q.new_tensor([*(value / 1e3 for value in mass.centre_mm), 1.0]))[:, :3]
