@@ -20,12 +20,11 @@ def rotation_from_rpy(rpy: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3
     cos, sin = torch.cos(rpy), torch.sin(rpy)
     cz, cy, cx = cos.unbind(-1)
     sz, sy, sx = sin.unbind(-1)
-    rows = [
-        torch.stack([cz * cy, cz * sy * sx - sz * cx, cz * sy * cx + sz * sx], -1),
-        torch.stack([sz * cy, sz * sy * sx + cz * cx, sz * sy * cx - cz * sx], -1),
-        torch.stack([-sy, cy * sx, cy * cx], -1),
-    ]
-    return torch.stack(rows, -2)
+    cz_sy, sz_sy = cz * sy, sz * sy
+    first = (cz * cy, cz_sy * sx - sz * cx, cz_sy * cx + sz * sx)
+    second = (sz * cy, sz_sy * sx + cz * cx, sz_sy * cx - cz * sx)
+    entries = torch.stack([*first, *second, -sy, cy * sx, cy * cx], -1)
+    return entries.view(*rpy.shape[:-1], 3, 3)
 
 
 def rpy_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3"]:

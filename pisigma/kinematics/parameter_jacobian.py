@@ -124,20 +124,18 @@ def tool_motion(
     number = 3 * count + 6
     J = q.new_empty((number + 2 * count + 6, 6 if turning else 3, poses))
     turns = J[:number, 3:] if turning else q.new_empty((number, 3, poses))
-    base_turns = base_axes[:3, :3].expand(3, 3, poses)
-    torch.cat([walked.z, walked.x, walked.y, base_turns, tool_steps[:3]], out=turns)
-    arms = q.new_empty((number, 3, poses))
-    torch.sub(position, walked.before, out=arms[:count])
-    torch.sub(position, walked.moved, out=arms[count : 2 * count])
-    arms[2 * count : 3 * count] = arms[count : 2 * count]
-    arms[-6:-3] = position - base_axes[ORIGIN, :3]
-    arms[-3:] = 0
-    u, v, shift = turns.unbind(1), arms.unbind(1), J[:number].unbind(1)
-    for k in range(3):  # the cross product turns x arms
+    base_steps = base_axes[:6, :3].expand(6, 3, poses)
+    torch.cat([walked.z, walked.x, walked.y, base_steps[:3], tool_steps[:3]], out=turns)
+    origins = q.new_empty((number, 3, poses))
+    base_origin = base_axes[None, ORIGIN, :3].expand(3, 3, poses)
+    torch.cat(
+        [walked.before, walked.moved, walked.moved, base_origin, position.expand(3, 3, poses)], out=origins
+    )
+    u, v, shift = turns.unbind(1), torch.sub(position, origins, out=origins).unbind(1), J[:number].unbind(1)
+    for k in range(3):  # the cross product of the axes and the ways from the origins to the tool
         i, j = (k + 1) % 3, (k + 2) % 3
         torch.mul(u[i], v[j], out=shift[k]).addcmul_(u[j], v[i], value=-1)
-    base_shifts = base_axes[3:6, :3].expand(3, 3, poses)
-    torch.cat([walked.z, walked.x, base_shifts, tool_steps[3:6]], out=J[number:, :3])
+    torch.cat([walked.z, walked.x, base_steps[3:], tool_steps[3:6]], out=J[number:, :3])
     if turning:
         J[number:, 3:] = 0
     return ToolMotion(position, tool_steps[AXES].transpose(0, 1), J)
@@ -172,15 +170,25 @@ def _walk_rows(robot: Robot, dh: Float64[np.ndarray, "rows 5"], q: Tensor, base_
     turning[robot.joint_rows, range(robot.dof)] = robot.directions * robot.revolute
     angles = torch.addmm(q.new_tensor(dh[:, :1]), q.new_tensor(turning), q.t())
     before, flat = frames[:-1], frames.flatten(2)
-    turns = zip(before[:, :2], before[:, 4:6], before[:, 5:], angles.cos(), angles.sin(), strict=True)
-    steps = zip(_row_matrices(dh, q), flat[:-1, :4], flat[1:, 2:], strict=True)
+    turns = zip(
+        *(block.unbind(0) for block in (before[:, :2], before[:, 4:6], before[:, 5:])),
+        angles.cos().unbind(0),
+        angles.sin().unbind(0),
+        strict=True,
+    )
+    steps = zip(
+        *(block.unbind(0) for block in (_row_matrices(dh, q), flat[:-1, :4], flat[1:, 2:])), strict=True
+    )
+    sliding = {
+        row: joint for joint, row in enumerate(robot.joint_rows) if robot.rows[row].type == "prismatic"
+    }
     for row, ((turned, xy, side, cosine, sine), (matrix, state, after)) in enumerate(
         zip(turns, steps, strict=True)
     ):
         torch.mul(xy, cosine, out=turned).addcmul_(side, sine)
         torch.mm(matrix, state, out=after)
-        if robot.rows[row].type == "prismatic":
-            joint = robot.joint_rows.index(row)
+        if row in sliding:
+            joint = sliding[row]
             frames[row + 1, 3].addcmul_(frames[row, 2], q[:, joint], value=robot.directions[joint])
     last = torch.cat([frames[-1, 4:6], frames[-1, 2:4]])
     return _Walked(before[:, 2], before[:, 0], frames[1:, 5], before[:, 3], frames[1:, 3], last)

@@ -66,4 +66,4 @@ def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Flo
 
 def geometry_of(robot: Robot, bases: Frames, tools: Frames) -> IdentifiedGeometry:
     """A geometry as an uncertainty needs it: without sockets, anchors, and how it was solved for."""
-    return IdentifiedGeometry(robot, bases, tools, {}, torch.zeros(0, 0, dtype=torch.float64))
+    return IdentifiedGeometry(robot, bases, tools, {})

@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from pisigma.kinematics.parameter_jacobian import ToolMotion
-from pisigma.se3 import invert, rotation_vector
+from pisigma.se3 import rotation_vector
 from pisigma.sensors.sensor import AbstractSensor, Derivative, SensorRows, Unknowns, Values
 
 NEARLY_OPPOSITE = -0.99
@@ -38,8 +38,8 @@ class PositionSensor(AbstractSensor):
         present = data.measured("position") | data.measured("pose")
         if data.position is None or not bool(present.any()):
             return None
-        T = invert(rows.bases)
-        position = (T[:, :3, :3] @ data.position[..., None])[..., 0] + T[:, :3, 3]
+        R, p = rows.bases[:, :3, :3], rows.bases[:, :3, 3]
+        position = ((data.position - p)[:, None] @ R)[:, 0]
         return cls(torch.where(present, position.t(), 0.0).contiguous(), present, rows.sigma(present))
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
@@ -76,7 +76,7 @@ class RotationSensor(AbstractSensor):
         present = data.measured("rotation") | data.measured("pose")
         if data.rotation is None or not bool(present.any()):
             return None
-        rotation = invert(rows.bases)[:, :3, :3] @ data.rotation @ rows.tools.mT
+        rotation = rows.bases[:, :3, :3].mT @ data.rotation @ rows.tools.mT
         eye = torch.eye(3, dtype=rotation.dtype, device=rotation.device)
         rotation = torch.where(present[:, None, None], rotation, eye).permute(1, 2, 0).contiguous()
         return cls(rotation, present, rows.sigma(present, "rad"))

@@ -1,5 +1,6 @@
 """Fits that no calibration error explains: of another robot, in other units, with swapped frame names."""
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -61,12 +62,10 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
         IdentificationError: see above.
     """
     robot = problem.space.robot
-    drawn, fitted = (
-        torch.from_numpy(robot.dh[:, 2].copy()),
-        point.cpu()[: problem.space.arm_size].view(-1, 5)[:, 2],
-    )
-    ruined = (drawn.abs() > LONG_SHARE * robot.reach) & ((fitted - drawn).abs() > RUINED_SHARE * drawn.abs())
-    for row in ruined.nonzero()[:1, 0].tolist():
+    drawn, fitted = robot.dh[:, 2], point.cpu().numpy()[: problem.space.arm_size].reshape(-1, 5)[:, 2]
+    long = np.abs(drawn) > LONG_SHARE * robot.reach
+    ruined = long & (np.abs(fitted - drawn) > RUINED_SHARE * np.abs(drawn))
+    for row in np.flatnonzero(ruined)[:1].tolist():
         raise IdentificationError(
             f"{source}: the best fit makes {problem.space.names[5 * row + 2]} of robot '{robot.name}' "
             f"{float(fitted[row]) * 1e3:.4g} mm instead of {float(drawn[row]) * 1e3:.4g} mm, which no calibration "

@@ -152,10 +152,11 @@ def pivoted_columns(A: Float64[np.ndarray, "rows columns"], count: int) -> Int64
     pivots: list[int] = []
     for _ in range(count):
         lengths = np.einsum("ij,ij->j", A, A)
-        lengths[pivots] = -1.0
-        pivots.append(int(lengths.argmax()))
-        direction = A[:, pivots[-1]] / np.sqrt(lengths[pivots[-1]])
+        pivot = int(lengths.argmax())
+        pivots.append(pivot)
+        direction = A[:, pivot] / np.sqrt(lengths[pivot])
         A -= direction[:, None] * (direction @ A)
+        A[:, pivot] = 0.0
     return np.array(pivots, dtype=np.int64)
 
 

@@ -29,16 +29,41 @@ class BaseToolFit:
     Attributes:
         robot: the robot with base and tool set; with several targets the tool of the first.
         tools: for every target x, y, z [m], roll, pitch, yaw [rad] of its tool.
-        rms_position: root mean square of the position errors' lengths [m].
-        rms_rotation: root mean square of the rotation errors' angles [rad]; NaN where none was measured.
-        status: how the least squares ended, and which freedom the data leave open.
+        problem: what was solved.
+        solution: of it.
     """
 
     robot: Robot
     tools: dict[str, Float64[np.ndarray, " 6"]]
-    rms_position: float
-    rms_rotation: float
-    status: str
+    problem: BaseToolProblem
+    solution: Solution[BaseToolState]
+
+    @property
+    def rms_position(self) -> float:
+        """Root mean square of the position errors' lengths [m]."""
+        return _rms_position(self.problem, self.solution)
+
+    @property
+    def rms_rotation(self) -> float:
+        """Root mean square of the rotation errors' angles [rad]; NaN where none was measured."""
+        state = self.solution.linearisation.point
+        return _rms_rotation(self.problem, state) if self.problem.turned else float("nan")
+
+    @property
+    def status(self) -> str:
+        """How the least squares ended, and how many unknowns the data leave open."""
+        normal = self.solution.linearisation.normal
+        if len(normal) == 0:
+            return "nothing was free"
+        scale = normal.diagonal().clamp(min=1e-300).rsqrt()
+        values = torch.linalg.eigvalsh(normal * scale * scale[:, None])
+        rank, free = int((values > 1e-10 * values[-1]).sum()), len(values)
+        if rank == free:
+            return self.solution.status.value
+        return (
+            f"{self.solution.status.value}; the data see only {rank} of the {free} unknowns of base and tool, "
+            "the others stay where they started (poses with more different wrist orientations would determine them)"
+        )
 
 
 def fit_base_and_tool(
@@ -71,20 +96,21 @@ def fit_base_and_tool(
     problem = build_base_and_tool_problem(robot, measurements, free_base, free_tool)
     solution = _solved(robot, problem, maximum_iterations, close_enough)
     state = solution.linearisation.point
-    rpy_tool = rpy_from_rotation(state.R_tool).cpu().numpy() if problem.turned else robot.tool[3:]
+    rpy_base, rpy_tool = rpy_from_rotation(torch.stack([state.R_base, state.R_tool])).cpu().numpy()
+    if not problem.turned:
+        rpy_tool = robot.tool[3:]
     tools = {
         name: np.concatenate([point.cpu().numpy(), rpy_tool])
         for name, point in zip(problem.targets, state.points, strict=True)
     }
-    base = torch.cat([state.p_base, rpy_from_rotation(state.R_base)]).cpu().numpy()
+    base = np.concatenate([state.p_base.cpu().numpy(), rpy_base])
     return BaseToolFit(
         robot=robot.with_geometry(
             base=base if free_base else None, tool=tools[problem.targets[0]] if free_tool else None
         ),
         tools=tools,
-        rms_position=_rms_position(problem, solution),
-        rms_rotation=_rms_rotation(problem, state) if problem.turned else float("nan"),
-        status=_status(solution),
+        problem=problem,
+        solution=solution,
     )
 
 
@@ -117,19 +143,3 @@ def _rms_position(problem: BaseToolProblem, solution: Solution[BaseToolState]) -
 def _rms_rotation(problem: BaseToolProblem, state: BaseToolState) -> float:
     turn = problem.rotation_residual(state)[problem.rotated]
     return float(turn.square().sum(-1).mean().sqrt())
-
-
-def _status(solution: Solution[BaseToolState]) -> str:
-    """How it ended, and how many unknowns the data do not see."""
-    normal = solution.linearisation.normal
-    if len(normal) == 0:
-        return "nothing was free"
-    scale = normal.diagonal().clamp(min=1e-300).rsqrt()
-    values = torch.linalg.eigvalsh(normal * scale * scale[:, None])
-    rank, free = int((values > 1e-10 * values[-1]).sum()), len(values)
-    if rank == free:
-        return solution.status.value
-    return (
-        f"{solution.status.value}; the data see only {rank} of the {free} unknowns of base and tool, "
-        "the others stay where they started (poses with more different wrist orientations would determine them)"
-    )

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 
+import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
@@ -230,7 +231,12 @@ def effective_parameters(
         covariance: of the parameters.
     """
     share = (1 - view.scaled(precision, group) * covariance.diagonal()) * (precision > 0)
-    totals = share.new_zeros(len(view.prior_scale)).index_add(0, group, share)
+    return _group_totals(share, group)
+
+
+def _group_totals(values: Float64[Tensor, " active"], group: Int64[Tensor, " active"]) -> tuple[float, ...]:
+    """Sum of the parameters' values per group of the prior."""
+    totals = np.bincount(group.cpu().numpy(), values.cpu().numpy(), len(PriorGroup))
     return tuple(totals.tolist())
 
 
@@ -254,10 +260,10 @@ def prior_scales(
         covariance: of the parameters.
         floor: smallest answer; 1 where smaller errors than stated do not tighten the prior.
     """
-    square = off.new_zeros(len(view.prior_scale)).index_add(0, group, off.square() * precision)
+    squares = _group_totals(off.square() * precision, group)
     least = 1.0 if floor == 1.0 else LEAST_EFFECTIVE
     effective = effective_parameters(precision, group, view, covariance)
     return tuple(
         max(off_square / count, floor**2) ** 0.5 if count > least else now
-        for count, off_square, now in zip(effective, square.tolist(), view.prior_scale, strict=True)
+        for count, off_square, now in zip(effective, squares, view.prior_scale, strict=True)
     )

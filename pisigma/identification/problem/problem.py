@@ -109,10 +109,11 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """Which size of the prior every free parameter has: of its `PriorGroup`, or for lengths and for angles."""
         drawn = (self.nominal.square() * self.precision > 1).tolist()
         groups = []
-        for parameter, is_drawn in zip(self.space.parameters, drawn, strict=True):
-            own = prior_group_of(parameter.group, is_drawn)
+        for index in self.active.tolist():
+            parameter = self.space.parameters[index]
+            own = prior_group_of(parameter.group, drawn[index])
             groups.append(own if self.prior_sizes == "estimated" else int(parameter.unit == "m"))
-        return torch.tensor(groups, dtype=torch.int64, device=self.q.device)[self.active]
+        return torch.tensor(groups, dtype=torch.int64, device=self.q.device)
 
     def with_active(self, active: Sequence[int]) -> "CalibrationProblem":
         """The same with other free parameters."""
@@ -350,7 +351,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         residual = sensor.residual(motion, unknowns, rows)
         if not self.measured_everywhere[number]:
             residual = torch.where(sensor.present[rows], residual, 0.0)
-        distance = residual.square().sum(0).sqrt()
+        distance = torch.linalg.vector_norm(residual, dim=0)
         if sensor.sigma is not None:
             distance = torch.where(sensor.present[rows], distance / sensor.sigma[rows], 0.0)
         root = self.loss_of(sensor).weight(distance / max(sigma, ALWAYS_GOOD), sensor.components).sqrt()

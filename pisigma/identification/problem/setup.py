@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -203,9 +204,10 @@ def _anchored(
     if options.free_tool:
         anchors = Anchors(anchors.bases, rotation_from_rpy(torch.from_numpy(tools[:, 3:])))
         tools[:, 3:] = 0
-    back = invert(anchors.bases)
     unknowns = {
-        own.name: _moved(back[unknown_frames[own.name]], guessed.unknowns[own.name], own.has_point).numpy()
+        own.name: _moved(
+            invert(anchors.bases)[unknown_frames[own.name]], guessed.unknowns[own.name], own.has_point
+        ).numpy()
         for own in space.unknowns
     }
     return anchors, space.values(bases, tools, unknowns)
@@ -231,14 +233,23 @@ class IdentifiedGeometry:
         tools: the same per target.
         unknowns: by group and owner, the sensors' unknowns in the owner's frame, such as
             `unknowns["socket"]["plate/0"]` [m or rad].
-        change: d(all parameters in these coordinates) / d(the problem's).
+        setup: the problem that it solves; None where that is not at hand any more.
+        point: the solution in the problem's coordinates.
     """
 
     robot: Robot
     bases: dict[str, Float64[np.ndarray, " 6"]]
     tools: dict[str, Float64[np.ndarray, " 6"]]
     unknowns: dict[str, dict[str, Float64[np.ndarray, " columns"]]]
-    change: Float64[Tensor, "parameters parameters"]
+    setup: CalibrationSetup | None = field(default=None, repr=False)
+    point: Float64[Tensor, " parameters"] | None = field(default=None, repr=False)
+
+    @cached_property
+    def change(self) -> Float64[Tensor, "parameters parameters"]:
+        """`d(all parameters in these coordinates) / d(the problem's)`; there is one with a problem only."""
+        assert self.setup is not None
+        assert self.point is not None
+        return coordinate_change(self.setup, self.point.cpu())
 
     def values(self) -> Float64[Tensor, " parameters"]:
         """Return all parameters as one vector, in the order of the `ParameterSpace` that they come from."""
@@ -249,38 +260,66 @@ class IdentifiedGeometry:
 
 def identified_geometry(setup: CalibrationSetup, point: Float64[Tensor, " parameters"]) -> IdentifiedGeometry:
     """Put the anchors back; as rotation vectors, small turns mean the same with and without them."""
-    space, anchors, point = setup.problem.space, setup.anchors, point.cpu()
-    dh, bases, tools = (block.clone() for block in space.split(point))
+    space = setup.problem.space
+    dh, bases, tools = behind_anchors(setup, point)
+    unknowns = unknowns_in_frames(setup, point).values()
+    return IdentifiedGeometry(
+        robot=space.robot.with_geometry(dh=dh, base=bases[0], tool=tools[0]),
+        bases=dict(zip(space.frames, bases, strict=True)),
+        tools=dict(zip(space.targets, tools, strict=True)),
+        unknowns={
+            own.name: dict(zip(own.owners, values, strict=True))
+            for own, values in zip(space.unknowns, unknowns, strict=True)
+        },
+        setup=setup,
+        point=point,
+    )
+
+
+def behind_anchors(
+    setup: CalibrationSetup, point: Float64[Tensor, " parameters"]
+) -> tuple[Float64[np.ndarray, "rows 5"], Float64[np.ndarray, "frames 6"], Float64[np.ndarray, "targets 6"]]:
+    """Return rows, bases and tools at a point of the problem in the user's coordinates."""
+    anchors = setup.anchors
+    dh, bases, tools = (block.clone() for block in setup.problem.space.split(point.cpu()))
+    R_anchor = anchors.bases.cpu()[:, :3, :3]
+    turned = rotation_from_rpy(torch.cat([bases, tools])[:, 3:])
+    R = torch.cat([R_anchor @ turned[: len(bases)], turned[len(bases) :] @ anchors.tools.cpu()])
+    rpy = rpy_from_rotation(R)
+    bases[:, :3] = (R_anchor @ bases[:, :3, None])[..., 0] + anchors.bases.cpu()[:, :3, 3]
+    bases[:, 3:], tools[:, 3:] = rpy[: len(bases)], rpy[len(bases) :]
+    return dh.numpy(), bases.numpy(), tools.numpy()
+
+
+def coordinate_change(
+    setup: CalibrationSetup, point: Float64[Tensor, " parameters"]
+) -> Float64[Tensor, "parameters parameters"]:
+    """Return the derivative of all parameters in the user's coordinates by those of the problem.
+
+    Args:
+        setup: with the anchors that the problem's bases and tools are relative to.
+        point: where the derivative is taken, in the problem's coordinates.
+    """
+    space, anchors = setup.problem.space, setup.anchors
+    _, bases, tools = space.split(point)
+    _, user_bases, user_tools = (torch.from_numpy(block) for block in behind_anchors(setup, point))
     change = torch.eye(len(point), dtype=point.dtype)
     for k, anchor in enumerate(anchors.bases.cpu()):
-        axes = turning_axes(bases[k, 3:])
         first = space.of("base").start + 6 * k
-        bases[k, :3] = anchor[:3, :3] @ bases[k, :3] + anchor[:3, 3]
-        bases[k, 3:] = rpy_from_rotation(anchor[:3, :3] @ rotation_from_rpy(bases[k, 3:]))
         change[first : first + 3, first : first + 3] = anchor[:3, :3]
-        back = torch.linalg.pinv(turning_axes(bases[k, 3:]), rtol=1e-9)
-        change[first + 3 : first + 6, first + 3 : first + 6] = back @ anchor[:3, :3] @ axes
-    for k, R_anchor in enumerate(anchors.tools.cpu()):
-        axes = turning_axes(tools[k, 3:])
+        back = torch.linalg.pinv(turning_axes(user_bases[k, 3:]), rtol=1e-9)
+        turns = slice(first + 3, first + 6)
+        change[turns, turns] = back @ anchor[:3, :3] @ turning_axes(bases[k, 3:])
+    for k in range(len(tools)):
         first = space.of("tool").start + 6 * k + 3
-        tools[k, 3:] = rpy_from_rotation(rotation_from_rpy(tools[k, 3:]) @ R_anchor)
-        back = torch.linalg.pinv(turning_axes(tools[k, 3:]), rtol=1e-9)
-        change[first : first + 3, first : first + 3] = back @ axes
+        back = torch.linalg.pinv(turning_axes(user_tools[k, 3:]), rtol=1e-9)
+        change[first : first + 3, first : first + 3] = back @ turning_axes(tools[k, 3:])
     for own in space.unknowns:
         if own.has_point:
             for k, number in enumerate(setup.unknown_frames[own.name].tolist()):
                 first = space.of(own.name).start + len(own.columns) * k
                 change[first : first + 3, first : first + 3] = anchors.bases[number, :3, :3].cpu()
-    return IdentifiedGeometry(
-        robot=space.robot.with_geometry(dh=dh.numpy(), base=bases[0].numpy(), tool=tools[0].numpy()),
-        bases=dict(zip(space.frames, bases.numpy(), strict=True)),
-        tools=dict(zip(space.targets, tools.numpy(), strict=True)),
-        unknowns={
-            own.name: dict(zip(own.owners, values, strict=True))
-            for own, values in zip(space.unknowns, unknowns_in_frames(setup, point).values(), strict=True)
-        },
-        change=change,
-    )
+    return change
 
 
 def unknowns_in_frames(
