@@ -25,7 +25,7 @@ from pisigma.identification.identifiability.sufficiency import (
 )
 from pisigma.identification.initial_guess.initial_guess import chosen_rows
 from pisigma.identification.problem.information import Information, information
-from pisigma.identification.problem.least_squares import Solution, levenberg_marquardt
+from pisigma.identification.problem.least_squares import SHORTEST_STEP, Solution, levenberg_marquardt
 from pisigma.identification.problem.loss import AbstractLoss, HampelLoss
 from pisigma.identification.problem.noise import view_of
 from pisigma.identification.problem.parameters import ParameterSpace, Prior
@@ -252,7 +252,8 @@ class GeometricCalibrator:
             here = problem.linearise(here.point, here)
         else:
             here = problem.combined(here.point, view_of(here))
-        fine = levenberg_marquardt(problem, here, self.maximum_iterations - rough.iterations)
+        steps = self.maximum_iterations - rough.iterations
+        fine = levenberg_marquardt(problem, here, steps, close_enough=SHORTEST_STEP)
         iterations = rough.iterations + fine.iterations
         path = rough.path + fine.path[1:]
         return Solution(fine.linearisation, iterations, fine.status, path), problem, extended

@@ -141,6 +141,14 @@ def tool_motion(
     return ToolMotion(position, tool_steps[AXES].transpose(0, 1), J)
 
 
+def flange_frames(
+    robot: Robot, q: Float[Tensor, "poses dof"]
+) -> tuple[Float[Tensor, "poses 3 3"], Float[Tensor, "poses 3"]]:
+    """Return orientation and position [m] behind the last row in the first row's frame, without base and tool."""
+    last = _walk_rows(robot, robot.dh, q, _frame_axes(q.new_zeros(6, 1), None, q)).last
+    return last[:3].permute(2, 1, 0).contiguous(), last[3].t().contiguous()
+
+
 @dataclass(frozen=True, eq=False)
 class _Walked:
     """Per row the axes z before, x turned and y twisted, and the origins before and moved.

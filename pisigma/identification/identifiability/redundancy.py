@@ -147,17 +147,10 @@ def preference_of(parameter: Parameter, size: float, index: int) -> float:
 
 
 def pivoted_columns(A: Float64[np.ndarray, "rows columns"], count: int) -> Int64[np.ndarray, " pivots"]:
-    """The first pivots of a QR factorisation with column pivoting, by modified Gram-Schmidt."""
-    A = A.copy()
-    pivots: list[int] = []
-    for _ in range(count):
-        lengths = np.einsum("ij,ij->j", A, A)
-        pivot = int(lengths.argmax())
-        pivots.append(pivot)
-        direction = A[:, pivot] / np.sqrt(lengths[pivot])
-        A -= direction[:, None] * (direction @ A)
-        A[:, pivot] = 0.0
-    return np.array(pivots, dtype=np.int64)
+    """Return the first pivots of a QR factorisation with column pivoting (LAPACK's `geqp3`)."""
+    from scipy.linalg.lapack import dgeqp3  # here, since models are loaded without scipy
+
+    return np.asarray(dgeqp3(A)[1][:count] - 1, dtype=np.int64)
 
 
 def _dependencies(

@@ -118,22 +118,27 @@ def _solved(
     robot: Robot, problem: BaseToolProblem, maximum_iterations: int, close_enough: float
 ) -> Solution[BaseToolState]:
     """The best end of a search from any start."""
-    best: tuple[float, Solution[BaseToolState]] | None = None
+    best: tuple[float, Solution[BaseToolState], bool] | None = None
     for start in base_and_tool_starts(robot, problem):
         solution = levenberg_marquardt(problem, start, maximum_iterations, close_enough)
-        off = _off(robot, problem, solution)  # not the cost, which every search divides by its own noise
+        off, clear = _off(robot, problem, solution)
         if best is None or off < best[0] * (1 - 1e-6):
-            best = off, solution
-        if _rms_position(problem, best[1]) < CLEAR_FIT * robot.reach:
+            best = off, solution, clear
+        if best[2]:
             break
     assert best is not None
     return best[1]
 
 
-def _off(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolState]) -> float:
-    """How far off the end of a search is [m]; an angle counts as what it moves at the end of the arm."""
+def _off(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolState]) -> tuple[float, bool]:
+    """How far off the end of a search is [m], and whether its positions are clearly met.
+
+    An angle counts as what it moves at the end of the arm. It is not the cost, which every search divides by its own
+    noise.
+    """
+    shift = _rms_position(problem, solution)
     turn = robot.reach * _rms_rotation(problem, solution.linearisation.point) if problem.turned else 0.0
-    return math.hypot(_rms_position(problem, solution), turn)
+    return math.hypot(shift, turn), shift < CLEAR_FIT * robot.reach
 
 
 def _rms_position(problem: BaseToolProblem, solution: Solution[BaseToolState]) -> float:

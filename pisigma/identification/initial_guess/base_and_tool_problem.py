@@ -10,7 +10,7 @@ from torch import Tensor
 from pisigma.errors import IdentificationError
 from pisigma.identification.problem.least_squares import AbstractLeastSquares, Linearisation
 from pisigma.identification.problem.noise import SMALLEST_NOISE
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.parameter_jacobian import flange_frames
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_from_vector, skew
@@ -225,12 +225,12 @@ def build_base_and_tool_problem(
     kept = [name for name, good in zip(names, keep.tolist(), strict=True) if good]
     targets = tuple(dict.fromkeys(kept))
     numbers = {name: number for number, name in enumerate(targets)}
-    still = robot.with_geometry(base=robot.base * 0, tool=robot.tool * 0)
-    T_flange = forward_kinematics(still, measurements.q[keep])
+    robot.check_joint_count(measurements.q.shape[1])
+    R_flange, p_flange = flange_frames(robot, measurements.q[keep])
     rotation, rotated = _rotations(measurements, keep)
     problem = BaseToolProblem(
-        R_flange=T_flange[:, :3, :3],
-        p_flange=T_flange[:, :3, 3],
+        R_flange=R_flange,
+        p_flange=p_flange,
         position=measurements.position[keep],
         rotation=rotation,
         rotated=rotated,
