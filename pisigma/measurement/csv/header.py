@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from pisigma.errors import MeasurementError, nearest_choice
 from pisigma.measurement.csv.table import Table
+from pisigma.measurement.fields import TEXTS
 from pisigma.measurement.readings import READINGS, Unit, reading_numbers, reading_texts
 from pisigma.robot import Robot
 
@@ -14,7 +15,6 @@ POSITION = ("x", "y", "z")
 RPY = ("roll", "pitch", "yaw")
 QUATERNION = ("qx", "qy", "qz", "qw")
 ANCHOR_PLACE = ("anchor_x", "anchor_y", "anchor_z")
-TEXTS = ("target", "frame", "set", "socket", "touch_axis", "anchor", "pair")
 
 REVOLUTE_UNITS: tuple[Unit, ...] = ("deg", "rad")
 PRISMATIC_UNITS: tuple[Unit, ...] = ("mm", "m")
@@ -55,25 +55,59 @@ class Column:
         return int(match[1]) if match else 0
 
 
-_COLUMNS: dict[str, Column] = {
-    column.name: column
-    for column in (
-        *(Column(f"{name}_mm", name, "mm") for name in POSITION),
-        *(Column(f"{name}_m", name, "m") for name in POSITION),
-        *(Column(f"{name}_deg", name, "deg") for name in RPY),
-        *(Column(name, name, "") for name in QUATERNION),
-        *(
-            Column(f"{name}_{unit}", name, unit)
-            for name in ("touch", "distance", *ANCHOR_PLACE)
-            for unit in PRISMATIC_UNITS
-        ),
-        *(Column(name, name, "") for name in TEXTS),
-        Column("sigma_mm", "sigma_position", "mm"),
-        Column("sigma_deg", "sigma_rotation", "deg"),
-        Column("payload_kg", "payload", "kg"),
-        Column("temperature_c", "temperature", "c"),
+@dataclass(frozen=True)
+class FileField:
+    """A field of measurements that are numbers, and its columns in files.
+
+    Attributes:
+        name: of the field.
+        quantities: what stands in its columns, one for every value of a row.
+        units: that the columns may be in; they are written in the first.
+        column: name of its only column without the unit, where that is not the quantity.
+    """
+
+    name: str
+    quantities: tuple[str, ...]
+    units: tuple[Unit, ...]
+    column: str = ""
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """All columns that it may have, those in the first unit first."""
+        return tuple(
+            Column("_".join(filter(None, (self.column or quantity, unit))), quantity, unit)
+            for unit in self.units
+            for quantity in self.quantities
+        )
+
+
+_FIELDS = (
+    FileField("position", POSITION, PRISMATIC_UNITS),
+    FileField("touch", ("touch",), PRISMATIC_UNITS),
+    FileField("distance", ("distance",), PRISMATIC_UNITS),
+    FileField("anchor_place", ANCHOR_PLACE, PRISMATIC_UNITS),
+    FileField("rotation", QUATERNION, ("",)),
+    FileField("sigma_position", ("sigma_position",), ("mm",), "sigma"),
+    FileField("sigma_rotation", ("sigma_rotation",), ("deg",), "sigma"),
+    FileField("payload", ("payload",), ("kg",)),
+    FileField("temperature", ("temperature",), ("c",)),
+)
+
+
+def number_fields(dof: int = 0) -> tuple[FileField, ...]:
+    """The fields behind the joint values, as they follow each other in a file; a rotation may be read as `RPY`, too.
+
+    Args:
+        dof: number of joints, whose directions of approach are among them.
+    """
+    approach = FileField("approach", tuple(f"approach{number}" for number in range(1, dof + 1)), ("",))
+    added = (
+        FileField(column.name, (column.name,), column.units)
+        for readings in READINGS.values()
+        for column in readings.columns
+        if not column.is_text
     )
-}
+    return (*_FIELDS, *([approach] if dof else []), *added)
 
 
 def find_column(name: str) -> Column | None:
@@ -86,12 +120,11 @@ def find_column(name: str) -> Column | None:
 
 
 def _columns() -> dict[str, Column]:
-    """All columns but those of joints, with those that registered sensors add."""
-    added = [column for readings in READINGS.values() for column in readings.columns]
-    names = [
-        (f"{one.name}_{unit}" if unit else one.name, one.name, unit) for one in added for unit in one.units
-    ]
-    return _COLUMNS | {name: Column(name, quantity, unit) for name, quantity, unit in names}
+    """All columns by name but those of joints."""
+    columns = [column for field in number_fields() for column in field.columns]
+    columns += [Column(f"{name}_deg", name, "deg") for name in RPY]
+    columns += [Column("set" if name == "split" else name, name, "") for name in (*TEXTS, *reading_texts())]
+    return {column.name: column for column in columns}
 
 
 def column_choices(name: str) -> str:

@@ -11,21 +11,20 @@ from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
 from pisigma.measurement.csv.header import (
-    ANCHOR_PLACE,
-    POSITION,
     PRISMATIC_UNITS,
     QUATERNION,
     REVOLUTE_UNITS,
     Column,
     Layout,
     find_column,
+    number_fields,
     quoted,
     read_header,
 )
 from pisigma.measurement.csv.rows import CheckedRows, check_cells, check_equal_rows
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.fields import TEXTS, LeftOut, MeasuredFields, OnBadRow
-from pisigma.measurement.readings import READINGS, reading_numbers, reading_texts, to_si
+from pisigma.measurement.readings import READINGS, reading_texts, to_si
 from pisigma.measurement.rules import Labels, group_faults, row_faults
 from pisigma.robot import Robot
 from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy
@@ -90,12 +89,11 @@ def _complaint(table: Table, faults: dict[int, str]) -> str:
 def _labels(layout: Layout) -> Labels:
     """Columns as complaints call them, and their units."""
     names = {quantity: f"column '{layout.column(quantity).name}'" for quantity in layout.index}
-    groups: dict[str, tuple[str, ...]] = {"position": POSITION, "anchor_place": ANCHOR_PLACE}
+    groups = {field.name: field.quantities for field in number_fields() if len(field.quantities) > 1}
     groups |= {sensor: (*readings.numbers, *readings.texts) for sensor, readings in READINGS.items()}
     for name, group in groups.items():
         if set(group) <= set(layout.index):
             names[name] = f"columns {quoted(layout.column(quantity) for quantity in group)}"
-    names["split"] = "column 'set'"
     units = {quantity: layout.column(quantity).unit for quantity in layout.index}
     return Labels("column '{}'", names, units)
 
@@ -108,9 +106,10 @@ def _fields(table: Table, layout: Layout, rows: CheckedRows) -> MeasuredFields:
         return torch.from_numpy(np.stack(columns, axis=1))
 
     fields = {"q": numbers(*layout.joints)}
-    for name, group in (("position", POSITION), ("anchor_place", ANCHOR_PLACE)):
-        if set(group) <= set(layout.index):
-            fields[name] = numbers(*group)
+    for field in number_fields():
+        if set(field.quantities) <= set(layout.index):
+            values = numbers(*field.quantities)
+            fields[field.name] = values if len(field.quantities) > 1 else values[:, 0]
     if layout.orientation:
         to_rotation = rotation_from_quaternion if layout.orientation == QUATERNION else rotation_from_rpy
         fields["rotation"] = to_rotation(numbers(*layout.orientation))
@@ -118,14 +117,8 @@ def _fields(table: Table, layout: Layout, rows: CheckedRows) -> MeasuredFields:
         fields["approach"] = torch.full_like(fields["q"], torch.nan)
         for quantity in layout.approaches:
             fields["approach"][:, layout.column(quantity).approach - 1] = numbers(quantity)[:, 0]
-    singles = ("sigma_position", "sigma_rotation", "payload", "temperature", "touch", "distance")
-    fields |= {name: numbers(name)[:, 0] for name in (*singles, *reading_numbers()) if name in layout.index}
-    quantities = {name: "set" if name == "split" else name for name in (*TEXTS, *reading_texts())}
-    texts = {
-        name: rows.texts(layout.index[quantity])
-        for name, quantity in quantities.items()
-        if quantity in layout.index
-    }
+    names = (*TEXTS, *reading_texts())
+    texts = {name: rows.texts(layout.index[name]) for name in names if name in layout.index}
     return MeasuredFields(fields, texts, table.lines, table.source)
 
 

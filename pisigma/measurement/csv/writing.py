@@ -3,8 +3,7 @@
 import csv
 import io
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +12,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, OutputError
-from pisigma.measurement.csv.header import ANCHOR_PLACE, POSITION, QUATERNION
+from pisigma.measurement.csv.header import number_fields
 from pisigma.measurement.csv.rows import first_of_equal_rows
 from pisigma.measurement.fields import KINDS, TEXTS, MeasuredFields
 from pisigma.measurement.readings import READINGS, Unit, from_si, reading_texts
@@ -33,81 +32,45 @@ def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: S
     """
     if data.rows == 0:
         raise MeasurementError(f"{data.source}: holds no row to write; give at least one measurement.")
-    columns = _columns(data, revolute)
-    _check(data, columns)
+    numbers = _numbers(data, revolute)
+    names = (*TEXTS, *reading_texts())
+    texts = {"set" if name == "split" else name: data.text(name) for name in names if any(data.text(name))}
+    _check(data, numbers, texts)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*columns.numbers, *columns.texts])
+    writer.writerow([*numbers, *texts])
     cells: list[list[object]] = [
-        ["" if number != number else number for number in values.tolist()]
-        for values in columns.numbers.values()
+        ["" if number != number else number for number in values.tolist()] for values in numbers.values()
     ]
-    writer.writerows(zip(*cells, *columns.texts.values(), strict=True))
+    writer.writerows(zip(*cells, *texts.values(), strict=True))
     _put(Path(path), text.getvalue())
 
 
-@dataclass(frozen=True)
-class _Columns:
-    """The columns by name: numbers in the file's units, and texts."""
+def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float64[np.ndarray, " rows"]]:
+    """The columns of numbers in the file's units; one that would hold nothing is left away.
 
-    numbers: dict[str, Float64[np.ndarray, " rows"]] = field(default_factory=dict)
-    texts: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    The columns of the position stand in a file without another length even so, as it could not be read without them.
+    """
+    columns: dict[str, Float64[np.ndarray, " rows"]] = {}
 
-    def add(self, name: str, values: Tensor, unit: Unit = "", *, even_if_empty: bool = False) -> None:
-        """Add a column; one that would hold nothing is left away."""
-        if even_if_empty or not bool(values.isnan().all()):
-            self.numbers[f"{name}_{unit}" if unit else name] = from_si(values.detach().cpu().numpy(), unit)
+    def add(name: str, values: Tensor, unit: Unit, needed: bool = False) -> None:
+        if needed or not bool(values.isnan().all()):
+            columns[name] = from_si(values.detach().cpu().numpy(), unit)
 
-
-def _columns(data: MeasuredFields, revolute: Sequence[bool]) -> _Columns:
-    """What stands in the file; columns that would hold nothing are left away, but for the position."""
-    columns, numbers = _Columns(), data.numbers
-    for number, (q, turns) in enumerate(zip(numbers["q"].T, revolute, strict=True), start=1):
-        columns.add(f"q{number}", q, "deg" if turns else "mm")
+    for number, (q, turns) in enumerate(zip(data.numbers["q"].T, revolute, strict=True), start=1):
+        unit: Unit = "deg" if turns else "mm"
+        add(f"q{number}_{unit}", q, unit)
     nothing = torch.full((data.rows, 3), torch.nan, dtype=torch.float64)
-    others = ("socket", "touch", "distance", *READINGS)
-    alone = not any(bool(data.measured(kind).any()) for kind in others)
-    position = numbers.get("position", nothing)
-    for name, values in zip(POSITION, position.T, strict=True):
-        columns.add(name, values, "mm", even_if_empty=alone or not bool(position.isnan().all()))
-    for name in ("touch", "distance"):
-        columns.add(name, numbers.get(name, nothing[:, 0]), "mm")
-    place = numbers.get("anchor_place", nothing)
-    for name, values in zip(ANCHOR_PLACE, place.T, strict=True):
-        columns.add(name, values, "mm", even_if_empty=not bool(place.isnan().all()))
-    if "rotation" in numbers:
-        for name, values in zip(QUATERNION, _quaternions(numbers["rotation"]).T, strict=True):
-            columns.add(name, values)
-    _add_conditions(columns, data)
-    for readings in READINGS.values():
-        for column in readings.columns:
-            if column.name in numbers:
-                columns.add(column.name, numbers[column.name], column.units[0])
-    for name in (
-        "target",
-        "frame",
-        *(text for text in TEXTS if text not in ("target", "frame")),
-        *reading_texts(),
-    ):
-        if any(data.text(name)):
-            columns.texts["set" if name == "split" else name] = data.text(name)
+    fields = {"position": nothing, **data.numbers}
+    if "rotation" in fields:
+        fields["rotation"] = _quaternions(fields["rotation"])
+    alone = not any(bool(data.measured(kind).any()) for kind in ("socket", "touch", "distance", *READINGS))
+    for field in number_fields(len(revolute)):
+        if field.name in fields:
+            values = fields[field.name].reshape(data.rows, -1).T
+            for column, of_column in zip(field.columns, values, strict=False):
+                add(column.name, of_column, column.unit, needed=alone and field.name == "position")
     return columns
-
-
-def _add_conditions(columns: _Columns, data: MeasuredFields) -> None:
-    """Standard deviations, and what was different from row to row besides the joint values."""
-    units: tuple[tuple[str, str, Unit], ...] = (
-        ("sigma_position", "sigma", "mm"),
-        ("sigma_rotation", "sigma", "deg"),
-        ("payload", "payload", "kg"),
-        ("temperature", "temperature", "c"),
-    )
-    for field_name, name, unit in units:
-        if field_name in data.numbers:
-            columns.add(name, data.numbers[field_name], unit)
-    if "approach" in data.numbers:
-        for number, approach in enumerate(data.numbers["approach"].T, start=1):
-            columns.add(f"approach{number}", approach)
 
 
 def _quaternions(R: Float64[Tensor, "rows 3 3"]) -> Float64[Tensor, "rows 4"]:
@@ -131,16 +94,18 @@ def _quaternions(R: Float64[Tensor, "rows 3 3"]) -> Float64[Tensor, "rows 4"]:
     return sign * q / length
 
 
-def _check(data: MeasuredFields, columns: _Columns) -> None:
+def _check(
+    data: MeasuredFields, columns: Mapping[str, np.ndarray], texts: Mapping[str, Sequence[str]]
+) -> None:
     """Refuse what would not read back."""
-    values = np.stack(list(columns.numbers.values()), axis=1)
+    values = np.stack(list(columns.values()), axis=1)
     nothing = ~torch.stack([data.measured(kind) for kind in (*KINDS, *READINGS)]).any(0).cpu()
     if bool(nothing.any()):
         raise MeasurementError(
             f"{data.label(int(nothing.nonzero()[0]))}: nothing was measured in this row; leave it out with select "
             "before writing."
         )
-    first = first_of_equal_rows(values, list(columns.texts.values()))
+    first = first_of_equal_rows(values, list(texts.values()))
     equal = first != np.arange(len(first))
     if equal.any():
         row = int(equal.argmax())
@@ -148,10 +113,10 @@ def _check(data: MeasuredFields, columns: _Columns) -> None:
             f"{data.label(row)}: equals row {int(first[row])} in everything; leave one of them out "
             "with select before writing."
         )
-    for name, texts in columns.texts.items():
-        for text in set(texts):
+    for name, names in texts.items():
+        for text in set(names):
             if not _fits_cell(text):
-                place = data.label(texts.index(text))
+                place = data.label(names.index(text))
                 raise MeasurementError(
                     f"{place}, column '{name}': the name {text!r} cannot stand in a CSV cell; use one of a "
                     "single line without blanks around it."
