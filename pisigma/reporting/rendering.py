@@ -6,7 +6,8 @@ from pathlib import Path
 import jinja2
 
 from pisigma.model.folder.folder_files import CARD
-from pisigma.reporting.tables import figure_text, joint_table, markdown_table, pose_table
+from pisigma.reporting.calibration_tables import parameter_table
+from pisigma.reporting.tables import figure_text, joint_table, markdown_table, percent_text, pose_table
 from pisigma.templates import template_environment
 
 
@@ -18,6 +19,12 @@ def render(template: str, **content: object) -> str:
         content: what the template names.
     """
     return _environment().get_template(template).render(content)
+
+
+def sentences(template: str, macro: str, *values: object) -> tuple[str, ...]:
+    """Fill in a macro of a template: its paragraphs, which stand between empty lines; none where it says nothing."""
+    text = getattr(_environment().get_template(template).module, macro)(*values)
+    return tuple(paragraph.strip() for paragraph in text.split("\n\n") if paragraph.strip())
 
 
 def write_card(folder: Path, template: str, **content: object) -> None:
@@ -34,6 +41,8 @@ def _environment() -> jinja2.Environment:
             "digits": "{:.4g}".format,
             "pose_table": pose_table,
             "joint_table": joint_table,
+            "parameter_table": parameter_table,
+            "percent": percent_text,
             "table": lambda table: markdown_table(*table),
         },
     )

@@ -28,6 +28,13 @@ def figure_text(value: float) -> str:
     return f"{value:.4f}" if value == 0 or abs(value) >= 1e-3 else f"{value:.1e}"
 
 
+def percent_text(share: float) -> str:
+    """Write a share as a percentage; "less than 1 %" where rounding would make it none or all."""
+    if share < 0.005:
+        return "less than 1 %"
+    return "more than 99 %" if share > 0.995 else f"{100 * share:.0f} %"
+
+
 def joint_rows(joints: Sequence[JointFigures]) -> list[tuple[str, ...]]:
     """Per joint and rows: joint, unit, rows, then average, deviation, maximum before and after."""
     lines = []

@@ -14,7 +14,7 @@ from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_tables import cross_validation_text
 from pisigma.reporting.page.judged_rows import JudgedRows, means_by_name
-from pisigma.reporting.tables import figure_text
+from pisigma.reporting.rendering import sentences
 
 LABELS = {
     "nominal": "nominal",
@@ -98,16 +98,10 @@ def figures_of(errors: PoseErrors) -> ErrorFigures:
 
 
 def _of_rows(rows: JudgedRows) -> Accuracy:
+    title = "rows of the calibration" if rows.origin == "training" else "rows of the file"
+    (how,) = sentences("report.txt.j2", "rows_of_file", rows)
     models = {name: figures_of(errors) for name, errors in rows.models.items()}
-    source, count = rows.measurements.source, rows.measurements.rows
-    if rows.origin == "training":
-        how = (
-            f"The {count} rows of {source} are the very rows that the model was made of (their hash is the one in the "
-            "model), so these figures say how well it fits, not how well it predicts."
-        )
-        return Accuracy("rows of the calibration", how, False, count, models)
-    how = f"The {count} rows of {source}, which the model was not made of (their hash is another)."
-    return Accuracy("rows of the file", how, True, count, models)
+    return Accuracy(title, how, rows.origin != "training", rows.measurements.rows, models)
 
 
 def _of_metrics(model: CalibratedModel, summary: CalibrationSummary | None) -> list[Accuracy]:
@@ -141,15 +135,9 @@ def _models(figures: object) -> dict[str, ErrorFigures]:
 
 
 def _how(key: str, rows: int, summary: CalibrationSummary | None) -> str:
-    nominal = "nominal is the robot as drawn, with base and tool fitted to those other rows."
-    if key == "test":
-        return f"{rows} rows that the file marked as test, with which nothing was calibrated."
-    if key == "held_out":
-        return f"{rows} other rows of the simulation, with which nothing was calibrated."
     figures = None if summary is None else summary.cross_validation
-    if figures is not None and (figures.folds or 1) > 1:
-        return f"{cross_validation_text(figures)}; {nominal}"
-    return f"{rows} rows that were held out once, judged by a calibration on the others; {nominal}"
+    folds = cross_validation_text(figures) if figures is not None and (figures.folds or 1) > 1 else ""
+    return sentences("report.txt.j2", "rows_of_metrics", key, rows, folds)[0]
 
 
 @dataclass(frozen=True)
@@ -214,60 +202,16 @@ def limit_of(
     noise, source = _repeated(rows), "rows that were measured more than once"
     if noise is None:
         noise, source = _identified_noise(summary), "the noise that the calibration identified"
-    if noise is None or accuracy is None or accuracy.unit != "mm" or not accuracy.figure("rms") > 0:
-        return _unknown(summary)
-    return _compared(noise, accuracy.figure("rms"), source)
-
-
-def _compared(noise: float, error: float, source: str) -> Limit:
-    """Compare the scatter of a measured position with the error [mm]."""
-    scatter = f"By {source}, a measured position scatters by {figure_text(noise)} mm RMS"
-    if noise >= error:
-        clause = "scatter of the measurements, which is as large as the error itself"
-        sentence = (
-            f"{scatter}, no less than the error itself ({figure_text(error)} mm RMS): these rows cannot show what the "
-            "model adds to it."
-        )
-        return Limit(clause, sentence, noise, None, source)
-    share = (noise / error) ** 2
-    percent = f"{percent_text(share)} of the squared error"
-    if share >= MOSTLY:
-        gain = f"{100 * (1 - math.sqrt(share)):.0f} %"
-        less = "hardly less error" if gain == "0 %" else f"{gain} less error"
-        sentence = (
-            f"{scatter}, which is {percent}: a perfect model would have {less} on the same rows, no more."
-        )
-        return Limit(f"scatter of the measurements ({percent})", sentence, noise, share, source)
-    sentence = (
-        f"{scatter}, which is {percent}; the rest, {percent_text(1 - share)}, comes of the model: too few rows, or "
-        "effects that it cannot express."
-    )
-    clause = f"the model more than the measurements, whose scatter is {percent}"
-    return Limit(clause, sentence, noise, share, source)
-
-
-def percent_text(share: float) -> str:
-    """Write a share as a percentage; "less than 1 %" where rounding would make it none or all."""
-    if share < 0.005:
-        return "less than 1 %"
-    return "more than 99 %" if share > 0.995 else f"{100 * share:.0f} %"
-
-
-def _unknown(summary: CalibrationSummary | None) -> Limit:
-    noise = () if summary is None else summary.noise
-    rest = next((one.sigma_mm for one in noise if one.sigma_mm is not None), None)
-    clause = "measurement scatter or effects that the model lacks: these rows cannot tell which"
-    if rest is None:
-        sentence = (
-            "How much the measurements scatter by themselves is not known; measure some poses several times."
-        )
-        return Limit(clause, sentence)
-    sentence = (
-        f"What the geometry leaves over, {figure_text(rest)} mm per coordinate, is scatter of the measurements and "
-        "everything that geometry cannot express; measure some poses several times, or calibrate a hybrid, to tell "
-        "them apart."
-    )
-    return Limit(clause, sentence)
+    error = accuracy.figure("rms") if accuracy is not None and accuracy.unit == "mm" else 0.0
+    if noise is None or not error > 0:
+        noise = None
+    share = None if noise is None or noise >= error else (noise / error) ** 2
+    mostly = share is not None and share >= MOSTLY
+    others = () if summary is None else summary.noise
+    rest = next((one.sigma_mm for one in others if one.sigma_mm is not None), None)
+    (clause,) = sentences("report.txt.j2", "limit_clause", noise, share, mostly)
+    (sentence,) = sentences("report.txt.j2", "limit", noise, share, mostly, error, source, rest)
+    return Limit(clause, sentence, noise, share, source if noise is not None else "")
 
 
 def _repeated(rows: JudgedRows | None) -> float | None:

@@ -1,5 +1,6 @@
 """What to measure next, as sentences with figures."""
 
+import functools
 import math
 
 import numpy as np
@@ -11,9 +12,9 @@ from pisigma.hybrid.arm import JointCoverage
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_tables import warning_lines
-from pisigma.reporting.page.accuracy import MOSTLY, Accuracy, Limit, percent_text
+from pisigma.reporting.page.accuracy import MOSTLY, Accuracy, Limit
 from pisigma.reporting.page.judged_rows import JudgedRows
-from pisigma.reporting.tables import figure_text
+from pisigma.reporting.rendering import sentences
 
 Stretch = tuple[float, float]
 """Lowest and highest joint value [rad or m]."""
@@ -48,19 +49,27 @@ def advice_for(
         accuracies: figures of the accuracy.
         limit: what limits it.
     """
-    of_rows = (*_independent(model, accuracies), *_joint_gaps(model, rows), *_outside(rows))
+    held_out = [accuracy for accuracy in accuracies if accuracy.held_out]
+    of_rows = (
+        *_say("other_rows", model, held_out),
+        *_say("joint_gaps", _joint_gaps(model, rows), model),
+        *_outside(rows),
+    )
     if summary is None:
         return (*of_rows, *_conditions(rows))
     return (
         *(line[:1].upper() + line[1:] for line in warning_lines(summary)),
         *of_rows,
-        *_weak_parameters(summary),
+        *_say("weak_parameters", summary.weak_directions, _unsure(summary), f"{SURE:.0f}"),
         *_more_rows(model, summary, limit),
         *_trust(summary),
         *_orientations(model, summary),
         *_conditions(rows),
-        *_outliers(summary),
+        *_say("outliers", summary.outliers),
     )
+
+
+_say = functools.partial(sentences, "report.txt.j2")
 
 
 def measured_stretches(
@@ -116,132 +125,61 @@ def _joint_gaps(model: CalibratedModel, rows: JudgedRows | None) -> list[str]:
         whole = f"{low * factor:.0f} to {high * factor:.0f}"
         whole = "a turn" if turns and high - low > 2 * math.pi - 1e-6 else whole
         gaps.append(f"{name} {ranges} {unit} ({100 * share:.0f} % of {whole})")
-    if not gaps:
-        return []
-    beyond = "the learned correction is an extrapolation" if model.hybrid else "nothing was measured"
-    return [
-        f"Joints were measured in part only: {'; '.join(gaps)}. Beyond that {beyond}: measure there if programs "
-        "go there."
-    ]
+    return gaps
 
 
-def _independent(model: CalibratedModel, accuracies: tuple[Accuracy, ...]) -> list[str]:
-    if model.provenance.data_source == "simulation":
-        return [
-            "The model was made of simulated rows: measure poses on a real robot and give them to this report."
-        ]
-    held_out = [accuracy for accuracy in accuracies if accuracy.held_out]
-    if not held_out:
-        return [
-            "No rows were held out: measure rows on another day and give them to this report, or calibrate with folds."
-        ]
-    if held_out[0].title == "rows of the file":
-        return []
-    return [
-        "All figures are from the measurement that the model was made of: measure some 50 other poses on another day, "
-        "with the load of the programs, and give them to this report."
-    ]
-
-
-def _outside(rows: JudgedRows | None) -> list[str]:
+def _outside(rows: JudgedRows | None) -> tuple[str, ...]:
     if rows is None or bool(rows.inside.all()):
-        return []
-    count, after = int((~rows.inside).sum()), rows.after.position.numpy() * 1e3
+        return ()
+    after = rows.after.position.numpy() * 1e3
     apart = [after[mask & np.isfinite(after)] for mask in (~rows.inside.numpy(), rows.inside.numpy())]
-    text = f"{count} of {rows.measurements.rows} rows have joint values outside those that the model was made with"
-    if all(len(errors) for errors in apart):
-        outside, inside = (figure_text(float(np.sqrt((errors**2).mean()))) for errors in apart)
-        text += f"; errors there are {outside} mm RMS, inside {inside} mm"
-    return [f"{text}: calibrate with such rows too."]
+    rms = [float(np.sqrt((errors**2).mean())) if len(errors) else None for errors in apart]
+    return _say("rows_outside", int((~rows.inside).sum()), rows.measurements.rows, *rms)
 
 
-def _weak_parameters(summary: CalibrationSummary) -> list[str]:
-    lines = [
-        f"Hardly identified: {line.rstrip('.')}. Choose poses that move more of what it depends on."
-        for line in summary.weak_directions
-    ]
-    unsure = [
+def _unsure(summary: CalibrationSummary) -> list[str]:
+    """Names of the parameters whose change from nominal may be none."""
+    return [
         row.name
         for row in summary.parameters
         if row.standard_error and row.change is not None and abs(row.change) < SURE * row.standard_error
     ]
-    if unsure:
-        named = ", ".join(unsure[:8]) + (f" and {len(unsure) - 8} others" if len(unsure) > 8 else "")
-        lines.append(
-            f"{named}: the change from nominal is less than {SURE:.0f} standard errors, so it may be none; more rows "
-            "make the standard errors smaller with the root of their number."
-        )
-    return lines
 
 
-def _more_rows(model: CalibratedModel, summary: CalibrationSummary, limit: Limit) -> list[str]:
+def _more_rows(model: CalibratedModel, summary: CalibrationSummary, limit: Limit) -> tuple[str, ...]:
     points = summary.learning_curve or ()
     if len(points) > 1:
         before, last = ((point.rows, list(point.models.values())[-1].rms_mm or 0.0) for point in points[-2:])
         gain = 1 - last[1] / before[1]
         doublings = math.log2(last[0] / before[0])
         each = 1 - (1 - gain) ** (1 / doublings) if doublings > 0 and gain < 1 else 0.0
-        change = (
-            f"from {before[0]} to {last[0]} rows the error went from {figure_text(before[1])} to "
-            f"{figure_text(last[1])} mm RMS, {100 * max(each, 0.0):.0f} % per doubling."
-        )
-        if each >= STILL_FALLING:
-            return [f"More rows help: {change}"]
-        return [f"More rows of the same kind help little: {change}"]
+        return _say("more_rows", before, last, max(each, 0.0), each >= STILL_FALLING)
     if limit.share is None or limit.share >= MOSTLY:
-        return []
-    return [
-        f"Scatter of the measurements is only {percent_text(limit.share)} of the squared error: more than the present "
-        f"{model.provenance.rows} rows would bring the rest down where it comes of too few of them."
-    ]
+        return ()
+    return _say("little_scatter", limit.share, model.provenance.rows)
 
 
-def _trust(summary: CalibrationSummary) -> list[str]:
+def _trust(summary: CalibrationSummary) -> tuple[str, ...]:
     coverage = None if summary.judged is None else summary.judged.coverage
-    if coverage is None or abs(coverage - 0.95) < COVERAGE_OFF:
-        return []
-    kind = "too good: multiply it" if coverage < 0.95 else "cautious: errors are smaller than it says"
-    return [
-        f"{100 * coverage:.1f} % of held-out coordinates are within the predicted 95 % intervals, so the predicted "
-        f"accuracy is {kind}."
-    ]
+    return () if coverage is None or abs(coverage - 0.95) < COVERAGE_OFF else _say("trust", coverage)
 
 
-def _orientations(model: CalibratedModel, summary: CalibrationSummary) -> list[str]:
+def _orientations(model: CalibratedModel, summary: CalibrationSummary) -> tuple[str, ...]:
     sensors = [noise.sensor for noise in summary.noise]
-    if not sensors or "rotation" in sensors or len(model.tools) > 2:
-        return []
-    return [
-        "Orientations were not measured: what turns the tool without moving the target stays unknown. Measure poses, "
-        "or three targets or more on the tool, where orientation counts."
-    ]
+    return () if not sensors or "rotation" in sensors or len(model.tools) > 2 else _say("no_orientations")
 
 
 def _conditions(rows: JudgedRows | None) -> list[str]:
     """Say which payload and temperature the figures hold for, where a file could have stated them."""
     if rows is None or (rows.origin == "held_out" and rows.measurements.position is None):
         return []
-    lines = []
+    lines: list[str] = []
     for values, name, unit, little in (
         (rows.measurements.payload, "payload", "kg", LITTLE_KG),
         (rows.measurements.temperature, "temperature", "°C", LITTLE_C),
     ):
         stated = torch.zeros(0) if values is None else values[torch.isfinite(values)]
-        if not len(stated):
-            lines.append(f"The file states no {name}: the figures hold for the one of the measurement.")
-            continue
-        low, high = float(stated.min()), float(stated.max())
-        if high - low < little:
-            span = f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
-            lines.append(f"The {name} was {span} {unit} throughout: the rows show nothing of others.")
+        low, high = (float(stated.min()), float(stated.max())) if len(stated) else (None, None)
+        if low is None or high is None or high - low < little:
+            lines += _say("condition", name, unit, low, high)
     return lines
-
-
-def _outliers(summary: CalibrationSummary) -> list[str]:
-    if not summary.outliers:
-        return []
-    worst = ", ".join(outlier.place for outlier in summary.outliers[:3])
-    return [
-        f"{len(summary.outliers)} rows counted for less than half as outliers: measure them again, the worst first "
-        f"({worst})."
-    ]

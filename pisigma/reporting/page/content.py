@@ -11,7 +11,13 @@ from pisigma.judging.validation_figures import LearningPoint
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_figures import CORRELATION_PNG
-from pisigma.reporting.calibration_tables import CORRELATION_CSV, coverage_line, learned_lines
+from pisigma.reporting.calibration_tables import (
+    CORRELATION_CSV,
+    coverage_line,
+    learned_lines,
+    undetermined_lines,
+    warning_lines,
+)
 from pisigma.reporting.page.accuracy import Accuracy, JudgedJoint, Limit, accuracies, judged_joints, limit_of
 from pisigma.reporting.page.advice import advice_for
 from pisigma.reporting.page.corrections import (
@@ -24,6 +30,7 @@ from pisigma.reporting.page.dependence import Dependence, NameErrors, by_name, d
 from pisigma.reporting.page.error_map import ErrorMap, map_of_rows, map_of_workspace
 from pisigma.reporting.page.judged_rows import JudgedRows, rows_of_file, rows_of_folder
 from pisigma.reporting.page.verdict import Verdict, verdict_of
+from pisigma.reporting.rendering import sentences
 
 KINDS = {
     "hybrid_calibration": "Hybrid calibration: geometry, and a learned correction of the joints",
@@ -40,6 +47,7 @@ class ReportContent:
     Attributes:
         model: the model.
         kind: what it is, in words.
+        summary: figures of its calibration; None of other models.
         verdict: what there is to say first.
         accuracies: the first one is that of the verdict.
         limit: what limits the accuracy.
@@ -51,6 +59,7 @@ class ReportContent:
         parameters: what is known of the parameters.
         curves: of the learned correction.
         learned: of the learned correction, in sentences.
+        not_identified: parameters that the data cannot determine, in sentences.
         learning_curve: points; empty where there is none.
         advice: what to measure next.
         provenance: name and value.
@@ -61,6 +70,7 @@ class ReportContent:
 
     model: CalibratedModel
     kind: str
+    summary: CalibrationSummary | None
     verdict: Verdict
     accuracies: tuple[Accuracy, ...]
     limit: Limit
@@ -72,6 +82,7 @@ class ReportContent:
     parameters: ParameterFindings
     curves: tuple[CorrectionCurve, ...]
     learned: tuple[str, ...]
+    not_identified: tuple[str, ...]
     learning_curve: tuple[LearningPoint, ...]
     advice: tuple[str, ...]
     provenance: tuple[tuple[str, str], ...]
@@ -108,8 +119,8 @@ class ReportContent:
             "residuals": [{"over": one.title, "says": one.sentence} for one in self.dependences],
             "frames": [asdict(one) for one in self.frames[0]],
             "targets": [asdict(one) for one in self.targets[0]],
-            "not_identified": list(self.parameters.not_identified),
-            "observability": {name: value for name, value, _ in self.parameters.observability},
+            "not_identified": list(self.not_identified),
+            "observability": {} if self.summary is None else self.summary.observability.model_dump(),
             "correlated": [list(pair) for pair in self.parameters.pairs],
             "advice": list(self.advice),
             "missing": list(self.missing),
@@ -144,6 +155,7 @@ def report_content(
     return ReportContent(
         model=model,
         kind=KINDS.get(model.kind, model.kind.replace("_", " ")),
+        summary=summary,
         verdict=verdict_of(model, figures, joints, rows, limit),
         accuracies=figures,
         limit=limit,
@@ -155,11 +167,12 @@ def report_content(
         parameters=parameter_findings(model, summary, folder),
         curves=correction_curves(model),
         learned=_learned(summary),
+        not_identified=() if summary is None else (*undetermined_lines(summary), *warning_lines(summary)),
         learning_curve=(summary.learning_curve or ()) if summary is not None else (),
         advice=advice_for(model, summary, rows, figures, limit),
         provenance=_provenance(model, rows),
         joints=joints,
-        missing=_missing(model, rows),
+        missing=sentences("report.txt.j2", "missing", rows, model),
         correlation_png=_correlation_png(folder),
     )
 
@@ -195,33 +208,6 @@ def _provenance(model: CalibratedModel, rows: JudgedRows | None) -> tuple[tuple[
 def _correlation_png(folder: Path) -> bytes:
     path = folder / CORRELATION_PNG
     return path.read_bytes() if path.is_file() and not (folder / CORRELATION_CSV).is_file() else b""
-
-
-def _missing(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, ...]:
-    lines = []
-    if rows is None:
-        lines.append(
-            "No measured rows: errors over the workspace, joint values, frames and time need them. Give a CSV file, or "
-            "calibrate again: the folder then keeps the errors of its held-out rows."
-        )
-    elif rows.origin == "held_out" and rows.measurements.position is None:
-        lines.append(
-            "The rows are the model's own held-out ones as its folder keeps them, without payload and temperature; "
-            "give the CSV file to see these."
-        )
-    elif rows.origin == "training":
-        lines.append(
-            "Errors of single rows are of rows that the model was made of: the folder does not keep those of held-out "
-            "rows. Calibrate again to have them."
-        )
-    if rows is not None and {"touch", "distance"} & rows.measurements.kinds:
-        lines.append(
-            "Touches and distances are not judged row by row: a model folder does not keep the anchors and zeros that "
-            "they are measured from. The figures of its held-out rows include them."
-        )
-    if model.uncertainty is None:
-        lines.append("The model holds no uncertainty, so no accuracy is predicted (hybrid calibrations do).")
-    return tuple(lines)
 
 
 def _finite(value: Any) -> Any:

@@ -15,12 +15,7 @@ from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.tolerances import MEASURED_ROUNDING
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_figures import JOINT_UNITS
-from pisigma.reporting.calibration_tables import (
-    CORRELATION_CSV,
-    parameter_table,
-    undetermined_lines,
-    warning_lines,
-)
+from pisigma.reporting.calibration_tables import CORRELATION_CSV
 from pisigma.robot.description import Robot
 
 POINTS = 1_500
@@ -29,18 +24,6 @@ CHUNK = 4_096
 STRONG = 0.9
 """Pairs of parameters with a larger correlation are named."""
 MOST_PAIRS = 12
-INDICES = (
-    ("O1", "volume of the information on all parameters together, larger is better (Borm and Menq 1991)"),
-    ("O2", "inverse of the condition number, 1 is best (Driels and Pathre 1990)"),
-    ("O3", "the direction that is observed least, larger is better (Nahvi et al. 1994)"),
-    (
-        "O4",
-        "noise amplification: the least direction weighed by O2, larger is better (Nahvi and Hollerbach 1996)",
-    ),
-    ("O5", "harmonic mean of how well directions are observed, larger is better (Sun and Hollerbach 2008)"),
-)
-
-
 Correlations = tuple[tuple[str, ...], Float64[np.ndarray, "_names _names"]]
 """Names of parameters, and the table of their correlations."""
 
@@ -53,23 +36,11 @@ class ParameterFindings:
         pairs: strongly correlated parameters and their correlation, strongest first.
         correlations: names and table of lengths and of angles; empty where they are not kept.
         missing: what the folder does not keep, in sentences.
-        table: rows of the table of parameters; empty for a model without identified geometry.
-        estimated: number of parameters with a standard error.
-        not_identified: in sentences.
-        observability: name, value and meaning of every index; empty where the model has none.
-        rank: independent combinations that the data see, or None.
-        condition: condition number, or None.
     """
 
     pairs: tuple[tuple[str, str, float], ...]
     correlations: tuple[Correlations, ...]
     missing: tuple[str, ...]
-    table: tuple[tuple[str, ...], ...] = ()
-    estimated: int = 0
-    not_identified: tuple[str, ...] = ()
-    observability: tuple[tuple[str, float, str], ...] = ()
-    rank: int | None = None
-    condition: float | None = None
 
 
 def parameter_findings(
@@ -77,25 +48,14 @@ def parameter_findings(
 ) -> ParameterFindings:
     """Gather it from the figures of a calibration, if there are some, and the files of the model's folder."""
     tables = read_correlations(folder / CORRELATION_CSV)
-    if summary is None:
-        missing = (
-            "This model has no identified parameters: its geometry is the nominal one."
-            if model.calibrated is None
-            else "The model folder does not keep the figures of its parameters; calibrate again."
-        )
-        return ParameterFindings(_pairs(tables), tables, (missing,))
-    missing = "The model folder does not keep the correlations as numbers; calibrate again to have them."
-    return ParameterFindings(
-        pairs=_pairs(tables),
-        correlations=tables,
-        missing=() if tables else (missing,),
-        table=parameter_table(summary.parameters).rows,
-        estimated=sum(row.standard_error is not None for row in summary.parameters),
-        not_identified=(*undetermined_lines(summary), *warning_lines(summary)),
-        observability=tuple((name, getattr(summary.observability, name), text) for name, text in INDICES),
-        rank=summary.rank,
-        condition=summary.condition_number,
-    )
+    if summary is not None:
+        text = "The model folder does not keep the correlations as numbers; calibrate again to have them."
+        missing = () if tables else (text,)
+    elif model.calibrated is None:
+        missing = ("This model has no identified parameters: its geometry is the nominal one.",)
+    else:
+        missing = ("The model folder does not keep the figures of its parameters; calibrate again.",)
+    return ParameterFindings(_pairs(tables), tables, missing)
 
 
 def read_correlations(path: Path) -> tuple[Correlations, ...]:

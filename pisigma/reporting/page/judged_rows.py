@@ -1,5 +1,6 @@
 """What a report holds of every row: where it is, and how far off before and after the calibration."""
 
+import functools
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -19,6 +20,7 @@ from pisigma.measurement.groups import numbers_of_names
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
+from pisigma.reporting.rendering import sentences
 from pisigma.se3 import invert, transform_from_xyzrpy
 
 MOST_PREDICTED = 4_000
@@ -76,38 +78,31 @@ def rows_of_file(
     Raises:
         MeasurementError: no row can be judged.
     """
-    rows, remarks = _test_rows(measurements)
+    rows = _test_rows(measurements)
+    left_out = measurements.rows - rows.rows
     digest = rows.content_hash()
     if held_out is not None and digest == held_out.data_sha256:
         residual, origin = held_out.residual, "held_out"
         if not bool(torch.isfinite(residual).any()):
             residual, origin = _errors(poses_of_rows(model, rows), rows)[1], "training"
-        return _judged(
-            model, rows, held_out.models, residual, ("held_out", origin), [*remarks, *_repeats(model)]
-        )
+        remarks = (*_say("rows_left_out", left_out), *_repeats(model))
+        return _judged(model, rows, held_out.models, residual, ("held_out", origin), remarks)
     origin = "training" if digest == model.provenance.data_sha256 else "other"
-    remarks += _measured_again(model, rows) if origin == "other" else []
     errors, residual = _errors(poses_of_rows(model, rows), rows)
     if not (torch.isfinite(errors.position).any() or errors.rotation is not None):
         raise MeasurementError(
             f"{rows.source}: no row holds a position, an orientation or a socket that was touched twice, so the model "
             "cannot be judged on this file; give poses or positions, or leave the file out."
         )
-    T_nominal, remark = _nominal_poses(model, rows)
+    T_nominal, own_frames = _nominal_poses(model, rows)
     models = {"nominal": _errors(T_nominal, rows)[0]}
     if model.hybrid is not None:
         models["geometric"] = _errors(poses_of_rows(replace(model, hybrid=None), rows), rows)[0]
     identified = "corrected" if model.calibrated is None else "geometric"
     models["hybrid" if model.hybrid is not None else identified] = errors
-    remarks.append(remark)
-    if rows.socket is not None:
-        remarks.append(
-            "Rows in sockets are judged from where the model puts the ball of the socket on average, so an error that "
-            "all rows of a socket share does not show."
-        )
-    missing = int((~torch.isfinite(errors.position)).sum())
-    if 0 < missing < rows.rows:
-        remarks.append(f"{missing} of {rows.rows} rows have no position error that can be known.")
+    again, kept = _measured_again(model, rows) if origin == "other" else (0, 0)
+    unknown = int((~torch.isfinite(errors.position)).sum())
+    remarks = _say("remarks_on_rows", rows, left_out, again, kept, model, own_frames, unknown)
     return _judged(model, rows, models, residual, (origin, origin), remarks)
 
 
@@ -151,7 +146,7 @@ def _judged(
     models: Mapping[str, PoseErrors],
     residual: Float64[Tensor, "rows 3"],
     origins: tuple[str, str],
-    remarks: list[str],
+    remarks: tuple[str, ...],
 ) -> JudgedRows:
     return JudgedRows(
         origin=origins[0],
@@ -162,55 +157,38 @@ def _judged(
         residual_origin=origins[1],
         predicted=predicted_at(model, rows),
         inside=inside(model, rows.q),
-        remarks=tuple(remarks),
+        remarks=remarks,
     )
 
 
-def _test_rows(measurements: Measurements) -> tuple[Measurements, list[str]]:
+_say = functools.partial(sentences, "report.txt.j2")
+
+
+def _test_rows(measurements: Measurements) -> Measurements:
     """Select the rows marked as test, or all where none is."""
     test = torch.tensor([name == "test" for name in measurements.split or ()], dtype=torch.bool)
-    if not test.any() or bool(test.all()):
-        return measurements, []
-    remark = f"The {int((~test).sum())} rows that the file marks as 'train' are left out."
-    return measurements.select(test), [remark]
+    return measurements if not test.any() or bool(test.all()) else measurements.select(test)
 
 
-def _repeats(model: CalibratedModel) -> list[str]:
+def _repeats(model: CalibratedModel) -> tuple[str, ...]:
     """Say where the errors that are kept of every row are those of one repeat among several."""
     repeats = model.metrics.get("cross_validation", {}).get("repeats", 1)
-    if repeats == 1:
-        return []
-    return [
-        f"The cross-validation was repeated {repeats} times; errors of single rows are of the first repeat."
-    ]
+    return () if repeats == 1 else _say("rows_of_folds", repeats)
 
 
-def _measured_again(model: CalibratedModel, rows: Measurements) -> list[str]:
-    """Say where joint values are among those that the model keeps of its training rows."""
+def _measured_again(model: CalibratedModel, rows: Measurements) -> tuple[int, int]:
+    """Count the rows whose joint values the model keeps of its training rows, and those that it keeps."""
     kept = {tuple(row) for row in model.starts.tolist()}
-    count = sum(tuple(row) in kept for row in rows.q.tolist())
-    if not count:
-        return []
-    return [
-        f"At least {count} of these {rows.rows} rows have joint values that the model was made with (it keeps "
-        f"{len(kept)} of {model.provenance.rows}): as far as they are the same measurements, they are no test of it."
-    ]
+    return sum(tuple(row) in kept for row in rows.q.tolist()), len(kept)
 
 
-def _nominal_poses(model: CalibratedModel, rows: Measurements) -> tuple[Float64[Tensor, "rows 4 4"], str]:
-    """Predict poses of the robot as drawn with the base and tool that suit it, and say which these are."""
+def _nominal_poses(model: CalibratedModel, rows: Measurements) -> tuple[Float64[Tensor, "rows 4 4"], bool]:
+    """Predict poses of the robot as drawn with the base and tool that suit it, and say whether these are its own."""
     try:
         nominal = nominal_model(model, rows.rotation is not None)
     except ModelError:
-        return nominal_poses_of_rows(model, rows), (
-            "Nominal is the robot as drawn with the model's base and tool, as the model keeps too few joint values to "
-            "fit its own; it looks worse than it is."
-        )
-    if model.calibrated is None:
-        remark = "Nominal is the robot as drawn with the base and tool that the model was given."
-    else:
-        remark = "Nominal is the robot as drawn, base and tool fitted to the model's own poses where it was measured."
-    return poses_of_rows(nominal, rows), remark
+        return nominal_poses_of_rows(model, rows), False
+    return poses_of_rows(nominal, rows), True
 
 
 def _errors(

@@ -6,16 +6,15 @@ from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any
 
-import jinja2
 import numpy as np
 from markupsafe import Markup
 
 from pisigma.measurement.groups import numbers_of_names
-from pisigma.reporting.calibration_tables import PARAMETER_COLUMNS
 from pisigma.reporting.page.accuracy import LABELS, Accuracy
 from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.error_map import ErrorMap
 from pisigma.reporting.page.figures import Drawing, ReportFigures
+from pisigma.reporting.rendering import render
 from pisigma.reporting.tables import figure_text
 from pisigma.robot.description import Robot
 
@@ -29,22 +28,14 @@ def render_page(content: ReportContent, figures: ReportFigures) -> str:
 
     Every text of the content is shown as it is, whatever it holds.
     """
-    environment = jinja2.Environment(
-        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    environment.filters.update(
-        image=_image,
-        png=lambda content: _address("png", content),
-        figure=figure_text,
-        error_lines=_error_lines,
-        signed="{:+.4f}".format,
-    )
-    template = environment.from_string(_resource("template.html.j2"))
-    return template.render(
+    return render(
+        "page.html.j2",
         c=content,
         figures=figures,
         labels=LABELS,
-        columns=PARAMETER_COLUMNS,
+        image=_image,
+        png=lambda png: _address("png", png),
+        error_lines=_error_lines,
         map_data=script_json(map_data(content.map, content.model.robot)),
         style=Markup(_resource("style.css")),  # ours
         script=Markup(_resource("viewer.js")),

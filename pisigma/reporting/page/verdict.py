@@ -8,7 +8,7 @@ from jaxtyping import Float64
 
 from pisigma.judging.rank_tests import SIGNIFICANT, groups_differ
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.page.accuracy import Accuracy, JudgedJoint, Limit, percent_text
+from pisigma.reporting.page.accuracy import Accuracy, JudgedJoint, Limit
 from pisigma.reporting.page.dependence import LEAST_ROWS, error_lengths, root_mean_square
 from pisigma.reporting.page.judged_rows import JudgedRows
 from pisigma.reporting.tables import figure_text
@@ -24,31 +24,22 @@ _AMONG = {
 
 
 @dataclass(frozen=True)
-class Tile:
-    """One figure of a verdict: what it is, the figure, and a remark."""
-
-    name: str
-    value: str
-    remark: str
-
-
-@dataclass(frozen=True)
 class Verdict:
     """What there is to say first.
 
     Attributes:
         sentence: how accurate, how much better than nominal, where worst, what limits it.
-        tiles: the figures of it.
         worst: where it is worst, in a sentence.
         limit: what limits it, in a sentence.
         held_out: whether the sentence rests on rows that the model was made without.
+        joint: the worst joint of a network, where no pose was judged.
     """
 
     sentence: str
-    tiles: tuple[Tile, ...]
     worst: str
     limit: str
     held_out: bool
+    joint: JudgedJoint | None = None
 
 
 @dataclass(frozen=True)
@@ -94,15 +85,7 @@ def verdict_of(
     clause, worst = _worst(model, rows)
     clauses = [_how_accurate(model, best), *([clause] if clause else [])]
     clauses += [f"what limits it is {limit.clause}"] if best.unit == "mm" else []
-    tiles = _tiles(best)
-    if limit.noise is not None:
-        noise = f"{figure_text(limit.noise)} mm"
-        if limit.share is None:
-            tiles.append(Tile("scatter of a measurement", noise, "RMS; no less than the error itself"))
-        else:
-            remark = f"of the squared error; {noise} RMS"
-            tiles.append(Tile("scatter of a measurement", percent_text(limit.share), remark))
-    return Verdict(f"{'; '.join(clauses)}.", tuple(tiles), worst, limit.sentence, best.held_out)
+    return Verdict(f"{'; '.join(clauses)}.", worst, limit.sentence, best.held_out)
 
 
 def _how_accurate(model: CalibratedModel, best: Accuracy) -> str:
@@ -124,23 +107,6 @@ def _how_accurate(model: CalibratedModel, best: Accuracy) -> str:
     )
 
 
-def _tiles(best: Accuracy) -> list[Tile]:
-    unit = best.unit
-    rms, p95, largest = (f"{figure_text(best.figure(name))} {unit}" for name in ("rms", "p95", "max"))
-    tiles = [
-        Tile(f"{'position' if unit == 'mm' else 'orientation'}, RMS", rms, f"{best.rows} rows, {best.title}"),
-        Tile("95 % within", p95, f"largest {largest}"),
-    ]
-    if best.factor is not None:
-        nominal = f"nominal {figure_text(best.figure('rms', 'nominal'))} {unit} RMS"
-        better, times = ("better", best.factor) if best.factor >= 1 else ("worse", 1 / best.factor)
-        tiles.append(Tile(f"{better} than nominal", f"{times:.1f} ×", nominal))
-    if unit == "mm" and best.last.rms_deg is not None and best.last.max_deg is not None:
-        largest = f"largest {figure_text(best.last.max_deg)} deg"
-        tiles.append(Tile("orientation, RMS", f"{figure_text(best.last.rms_deg)} deg", largest))
-    return tiles
-
-
 def _without_poses(model: CalibratedModel, joints: tuple[JudgedJoint, ...]) -> Verdict:
     """Say what joint errors say where no pose was judged."""
     if not joints:
@@ -149,7 +115,7 @@ def _without_poses(model: CalibratedModel, joints: tuple[JudgedJoint, ...]) -> V
             "how accurate it is."
         )
         advice = "Give a file with measurements that the model was not made of."
-        return Verdict(sentence, (), "", advice, held_out=False)
+        return Verdict(sentence, "", advice, held_out=False)
     held_out = joints[0].held_out
     worst = max(
         (one for one in joints if one.held_out == held_out), key=lambda one: one.errors.after.values[0]
@@ -164,11 +130,8 @@ def _without_poses(model: CalibratedModel, joints: tuple[JudgedJoint, ...]) -> V
         f"gives the joint values of poses to {after} on average at its worst joint, {worst.name}"
         f"{times}; no pose errors were judged, so nothing is known of a measured robot."
     )
-    tile = Tile(
-        f"worst joint, {worst.name}", after, f"average, {'held-out' if held_out else 'training'} rows"
-    )
     advice = "Give a file with measured positions or poses to judge them."
-    return Verdict(sentence, (tile,), "", advice, held_out)
+    return Verdict(sentence, "", advice, held_out, worst)
 
 
 def _worst(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, str]:

@@ -17,7 +17,6 @@ from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.judging.validation_figures import ErrorFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.row_poses import poses_of_rows
-from pisigma.reporting.calibration_tables import parameter_table
 from pisigma.reporting.page.accuracy import limit_of
 from pisigma.reporting.page.advice import measured_stretches
 from pisigma.reporting.page.content import report_content
@@ -162,7 +161,7 @@ def test_a_geometric_model_says_what_it_lacks(tmp_path):
     assert any("no uncertainty" in line for line in content.missing)
     assert content.limit.share is None
     assert "cannot tell which" in content.verdict.sentence
-    assert content.parameters.table == parameter_table(CalibrationSummary.read(model).parameters).rows
+    assert content.summary == CalibrationSummary.read(model)
 
 
 @pytest.mark.parametrize("name", ["kiro3", "ur10"])
@@ -170,7 +169,7 @@ def test_a_network_alone_is_reported(name, tmp_path):
     model = hand_made_model(name)
     alone = report_content(model, tmp_path)
     assert "holds no figures" in alone.verdict.sentence
-    assert alone.parameters.table == ()
+    assert alone.summary is None
     q = joints_around(name, 50, seed=4)
     T = model.forward(q)
     rows = Measurements(q=q, position=T[:, :3, 3], rotation=T[:, :3, :3])
