@@ -15,7 +15,7 @@ from typer.main import get_command
 
 from pisigma.cli.main import app
 from pisigma.kinematics.status import Status
-from pisigma.measurement.csv.header import column_choices, find_column
+from pisigma.measurement.csv.columns import column_choices, find_column
 from pisigma.robot import catalogue
 
 ROOT = Path(__file__).parent.parent

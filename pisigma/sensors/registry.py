@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.errors import MeasurementError
 from pisigma.kinematics.parameter_jacobian import ToolMotion
-from pisigma.measurement.csv.header import find_column
+from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.readings import READINGS
 from pisigma.sensors.anchor import AnchorSensor

@@ -12,15 +12,8 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
-from pisigma.measurement.csv.header import (
-    POSITION,
-    QUATERNION,
-    RPY,
-    Column,
-    check_separators,
-    find_column,
-    quoted,
-)
+from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, Column, find_column, quoted
+from pisigma.measurement.csv.header import check_separators
 from pisigma.measurement.csv.rows import QUATERNION_TOLERANCE
 from pisigma.measurement.csv.table import split_line
 from pisigma.measurement.fields import LeftOut

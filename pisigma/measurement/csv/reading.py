@@ -10,17 +10,16 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
-from pisigma.measurement.csv.header import (
+from pisigma.measurement.csv.columns import (
     PRISMATIC_UNITS,
     QUATERNION,
     REVOLUTE_UNITS,
     Column,
-    Layout,
     find_column,
     number_fields,
     quoted,
-    read_header,
 )
+from pisigma.measurement.csv.header import Layout, read_header
 from pisigma.measurement.csv.rows import CheckedRows, check_cells, check_equal_rows
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.fields import TEXTS, LeftOut, MeasuredFields, OnBadRow

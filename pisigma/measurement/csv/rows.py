@@ -7,7 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
-from pisigma.measurement.csv.header import QUATERNION, Column, Layout, quoted
+from pisigma.measurement.csv.columns import QUATERNION, Column, quoted
+from pisigma.measurement.csv.header import Layout
 from pisigma.measurement.csv.table import Faults, Table
 from pisigma.measurement.readings import READINGS, from_si, to_si
 from pisigma.robot import Robot, Row

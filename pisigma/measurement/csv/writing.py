@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, OutputError
-from pisigma.measurement.csv.header import number_fields
+from pisigma.measurement.csv.columns import number_fields
 from pisigma.measurement.csv.rows import first_of_equal_rows
 from pisigma.measurement.fields import KINDS, TEXTS, MeasuredFields
 from pisigma.measurement.readings import READINGS, Unit, from_si, reading_texts

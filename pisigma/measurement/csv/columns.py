@@ -1,0 +1,143 @@
+"""The columns of measurement files: what they are called, what stands in them, and which fields they make up."""
+
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from pisigma.errors import nearest_choice
+from pisigma.measurement.fields import TEXTS
+from pisigma.measurement.readings import READINGS, Unit, reading_texts
+
+POSITION = ("x", "y", "z")
+RPY = ("roll", "pitch", "yaw")
+QUATERNION = ("qx", "qy", "qz", "qw")
+ANCHOR_PLACE = ("anchor_x", "anchor_y", "anchor_z")
+
+REVOLUTE_UNITS: tuple[Unit, ...] = ("deg", "rad")
+PRISMATIC_UNITS: tuple[Unit, ...] = ("mm", "m")
+
+_JOINT = re.compile(r"q([1-9][0-9]{0,2})_(deg|rad|mm|m)")
+_APPROACH = re.compile(r"approach([1-9][0-9]{0,2})")
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a measurement file.
+
+    Attributes:
+        name: as in the header, such as "q1_deg".
+        quantity: what stands in it, such as "q1"; no two columns of a file have the same.
+        unit: "" where there is none.
+    """
+
+    name: str
+    quantity: str
+    unit: Unit
+
+    @property
+    def is_number(self) -> bool:
+        """Whether its cells hold numbers."""
+        return self.quantity not in (*TEXTS, *reading_texts())
+
+    @property
+    def joint(self) -> int:
+        """Number of the joint, from 1; 0 where it is no joint column."""
+        match = _JOINT.fullmatch(self.name)
+        return int(match[1]) if match else 0
+
+    @property
+    def approach(self) -> int:
+        """Number of the joint whose direction of approach it holds, from 1; 0 where it holds none."""
+        match = _APPROACH.fullmatch(self.name)
+        return int(match[1]) if match else 0
+
+
+@dataclass(frozen=True)
+class FileField:
+    """A field of measurements that are numbers, and its columns in files.
+
+    Attributes:
+        name: of the field.
+        quantities: what stands in its columns, one for every value of a row.
+        units: that the columns may be in; they are written in the first.
+        column: name of its only column without the unit, where that is not the quantity.
+    """
+
+    name: str
+    quantities: tuple[str, ...]
+    units: tuple[Unit, ...]
+    column: str = ""
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """All columns that it may have, those in the first unit first."""
+        return tuple(
+            Column("_".join(filter(None, (self.column or quantity, unit))), quantity, unit)
+            for unit in self.units
+            for quantity in self.quantities
+        )
+
+
+_FIELDS = (
+    FileField("position", POSITION, PRISMATIC_UNITS),
+    FileField("touch", ("touch",), PRISMATIC_UNITS),
+    FileField("distance", ("distance",), PRISMATIC_UNITS),
+    FileField("anchor_place", ANCHOR_PLACE, PRISMATIC_UNITS),
+    FileField("rotation", QUATERNION, ("",)),
+    FileField("sigma_position", ("sigma_position",), ("mm",), "sigma"),
+    FileField("sigma_rotation", ("sigma_rotation",), ("deg",), "sigma"),
+    FileField("payload", ("payload",), ("kg",)),
+    FileField("temperature", ("temperature",), ("c",)),
+)
+
+
+def number_fields(dof: int = 0) -> tuple[FileField, ...]:
+    """The fields behind the joint values, as they follow each other in a file; a rotation may be read as `RPY`, too.
+
+    Args:
+        dof: number of joints, whose directions of approach are among them.
+    """
+    approach = FileField("approach", tuple(f"approach{number}" for number in range(1, dof + 1)), ("",))
+    added = (
+        FileField(column.name, (column.name,), column.units)
+        for readings in READINGS.values()
+        for column in readings.columns
+        if not column.is_text
+    )
+    return (*_FIELDS, *([approach] if dof else []), *added)
+
+
+def find_column(name: str) -> Column | None:
+    """Return the column of a name, or None where there is no such column."""
+    match = _JOINT.fullmatch(name)
+    if match:
+        unit = next(unit for unit in (*REVOLUTE_UNITS, *PRISMATIC_UNITS) if unit == match[2])
+        return Column(name, f"q{match[1]}", unit)
+    return Column(name, name, "") if _APPROACH.fullmatch(name) else _columns().get(name)
+
+
+def _columns() -> dict[str, Column]:
+    """All columns by name but those of joints."""
+    columns = [column for field in number_fields() for column in field.columns]
+    columns += [Column(f"{name}_deg", name, "deg") for name in RPY]
+    columns += [Column("set" if name == "split" else name, name, "") for name in (*TEXTS, *reading_texts())]
+    return {column.name: column for column in columns}
+
+
+def column_choices(name: str) -> str:
+    """Say which columns there are and which is nearest to an unknown `name`.
+
+    Joint columns are listed for one joint: the one that `name` seems to mean, else the first.
+    """
+    number = re.search(r"[1-9][0-9]?", name)
+    joint = number[0] if number else "1"
+    joints = (f"q{joint}_{unit}" for unit in (*REVOLUTE_UNITS, *PRISMATIC_UNITS))
+    meant = name.lower()
+    if re.fullmatch(r"q[1-9][0-9]?", meant):  # most joints turn
+        meant += "_deg"
+    return nearest_choice(meant, (*joints, *_columns(), f"approach{joint}"))
+
+
+def quoted(columns: Iterable[Column]) -> str:
+    """Names of columns as complaints list them."""
+    return ", ".join(f"'{column.name}'" for column in columns)
