@@ -136,6 +136,12 @@ def follow_xyzrpy(frame: Frame, xyzrpy: Sequence[Scalar]) -> Frame:
     return rotate_x(rotate_y(rotate_z(moved, roll), pitch), yaw)
 
 
+def follow_row(frame: Frame, row: Sequence[Scalar]) -> Frame:
+    """`frame · RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)` of theta, d, a, alpha, beta."""
+    theta, d, a, alpha, beta = row
+    return rotate_y(rotate_x(translate(rotate_z(frame, theta), a, 0.0, d), alpha), beta)
+
+
 def stack_components(values: Sequence[Scalar], like: Tensor) -> Tensor:
     """The scalars side by side as `(*batch, len(values))`, a view of memory in which the batch runs fastest.
 

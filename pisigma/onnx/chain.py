@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import torch
 
-from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.components import IDENTITY, as_transform, follow_row
 from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot
 from pisigma.robot.row import Row
@@ -127,11 +127,8 @@ def _combined(graph: OnnxGraph, value: str, parts: Sequence[np.ndarray]) -> str:
 
 def _still(robot: Robot) -> list[np.ndarray]:
     """What every row does at joint value 0."""
-    found = []
-    for row, dh in zip(robot.rows, robot.dh, strict=True):
-        alone = Robot(robot.name, robot.maker, robot.source, (Row(row.name, "revolute"),), dh[None])
-        found.append(forward_kinematics(alone, torch.zeros(1, dtype=torch.float64)).numpy())
-    return found
+    like = torch.zeros((), dtype=torch.float64)
+    return [as_transform(follow_row(IDENTITY, row), like).numpy() for row in robot.dh.tolist()]
 
 
 def _matrix(frame: np.ndarray) -> np.ndarray:

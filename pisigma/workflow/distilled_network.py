@@ -1,6 +1,5 @@
 """The network that a calibrated model is distilled into: sizes, fitting one, and choosing among them."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -13,6 +12,7 @@ from pisigma.judging.distillation_summary import SizeFigures
 from pisigma.judging.progress import Progress, stage
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
+from pisigma.network.inputs import Inputs
 from pisigma.network.pi_sigma import PiSigma
 from pisigma.robot.description import Robot
 from pisigma.training.networks import fit_networks
@@ -166,7 +166,7 @@ def _fit_size(
         patterns = build_patterns(network, pairs, VALIDATION_SHARE, rows, generator)
         ((group, net),) = network.members()
         fit_networks([net], patterns, [part.joints], section)
-        _shrink_overtones(net, [_multiple(name) > 1 for name in part.inputs])
+        _shrink_overtones(net, group.inputs)
         groups.append(group)
         networks.append(net)
     return CorrectionNetwork(robot.dof, groups, networks).requires_grad_(False)
@@ -194,14 +194,10 @@ def _sections(robot: Robot, size: Size, q: Float64[Tensor, "poses dof"]) -> list
     return sections
 
 
-def _multiple(name: str) -> int:
-    """The whole number in an input that `_sections` named."""
-    return int(name.split("(")[1].split("*")[0]) if "*" in name else 1
-
-
 @torch.no_grad()
-def _shrink_overtones(network: PiSigma, overtone: Sequence[bool]) -> None:
-    """Scale inputs down and their weights up, which changes no output."""
+def _shrink_overtones(network: PiSigma, inputs: Inputs) -> None:
+    """Scale inputs of multiples of a joint's value down and their weights up, which changes no output."""
+    overtone = [max(inputs.combination(name)[1]) > 1 for name in inputs.names]
     factor = torch.where(torch.tensor(overtone), OVERTONE_SCALE, 1.0).double()
     network.input_scale.mul_(factor)
     network.weight.mul_(factor)

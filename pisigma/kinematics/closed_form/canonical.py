@@ -18,11 +18,9 @@ from pisigma.kinematics.components import (
     Frame,
     as_transform,
     cosine_sine,
+    follow_row,
     follow_xyzrpy,
     rotate_x,
-    rotate_y,
-    rotate_z,
-    translate,
 )
 from pisigma.robot.description import Robot
 from pisigma.robot.row import JointType
@@ -89,7 +87,7 @@ def canonical_rows(robot: Robot, types: Sequence[JointType], twists: Sequence[fl
         row[1] if joint.type == "prismatic" else row[0] for joint, row in zip(robot.joints, dh, strict=True)
     ]
     frame = rotate_x(IDENTITY, 0.0 if signs[-1] > 0 else math.pi)
-    frame = _follow_row(frame, (0.0, *dh[-1][1:]))
+    frame = follow_row(frame, (0.0, *dh[-1][1:]))
     like = torch.zeros((), dtype=torch.float64)
     return CanonicalRows(
         T_base_first=as_transform(
@@ -109,10 +107,5 @@ def canonical_rows(robot: Robot, types: Sequence[JointType], twists: Sequence[fl
 
 def _follow_fixed(robot: Robot, frame: Frame, start: int, stop: int) -> Frame:
     for parameters in robot.dh[start:stop].tolist():
-        frame = _follow_row(frame, parameters)
+        frame = follow_row(frame, parameters)
     return frame
-
-
-def _follow_row(frame: Frame, parameters: Sequence[float]) -> Frame:
-    theta, d, a, alpha, beta = parameters
-    return rotate_y(rotate_x(translate(rotate_z(frame, theta), a, 0.0, d), alpha), beta)
