@@ -16,6 +16,7 @@ from pisigma.kinematics.closed_form.two_link import (
     first_joint,
     rounding,
     singular_tolerance,
+    solve_first_joint,
     solve_two_link,
     two_link,
 )
@@ -142,14 +143,8 @@ class SphericalWristArm(AbstractClosedForm):
         (a_1, a_2, a_3, *_), (d_1, d_2, d_3, d_4, *_) = self.rows.a, self.rows.d
         scale = abs(a_1) + abs(a_2) + math.hypot(a_3, d_4) + abs(d_2 + d_3)
         x, y, z = p
-        side = d_2 + d_3
-        square = x * x + y * y - side * side
-        beside_axis = square >= -rounding(x.dtype) * scale * scale
-        ahead = shoulder * square.clamp(min=0).sqrt()
-        on_axis = torch.hypot(x, y) <= rounding(x.dtype) * scale
-        azimuth = torch.where(on_axis, self.rows.variable_at_zero(0), torch.atan2(y, x))
-        t_1 = azimuth - torch.atan2(torch.full_like(ahead, side), ahead)
-        t_1 = torch.where(on_axis & ahead.signbit(), azimuth - math.pi, t_1)
+        zero = self.rows.variable_at_zero(0)
+        t_1, ahead, beside_axis = solve_first_joint(x, y, d_2 + d_3, scale, shoulder, zero)
         arm = solve_two_link(
             ahead - a_1,
             d_1 - z,

@@ -17,6 +17,7 @@ from pisigma.kinematics.closed_form.two_link import (
     first_joint,
     rounding,
     singular_tolerance,
+    solve_first_joint,
     solve_two_link,
     two_link,
 )
@@ -153,7 +154,8 @@ class ThreeParallelArm(AbstractClosedForm):
         shoulder, elbow, wrist = signs
         columns = as_tensors(T)
         p = columns[3]
-        t_1, ahead, beside = self._solve_first(p[0], p[1], shoulder)
+        zero, side = self.rows.variable_at_zero(0), -sum(self.rows.d[1:4])
+        t_1, ahead, beside = solve_first_joint(p[0], p[1], side, self._scale, shoulder, zero)
         t_5, t_6, straight = self._solve_wrist(columns, t_1, wrist)
         x, y = ahead - self.rows.a[0], p[2] - self.rows.d[0]
         upwards = -math.copysign(1.0, self.rows.a[1]) * shoulder * elbow
@@ -166,17 +168,6 @@ class ThreeParallelArm(AbstractClosedForm):
         tolerance = singular_tolerance(x.dtype)
         singular = arm.singular | (ahead.abs() < tolerance * self._scale) | (straight < tolerance)
         return [t_1, arm.first, t_3, t_234 - arm.first - t_3, t_5, t_6], arm.reached & beside, singular
-
-    def _solve_first(self, x: Tensor, y: Tensor, shoulder: Scalar) -> tuple[Tensor, Tensor, Tensor]:
-        """Joint 1 from `s_1 x - c_1 y = d_2 + d_3 + d_4`; `c_1 x + s_1 y`; and whether there is such a joint."""
-        side = sum(self.rows.d[1:4])
-        square = x * x + y * y - side * side
-        beside = square >= -rounding(x.dtype) * self._scale**2
-        ahead = shoulder * square.clamp(min=0).sqrt()
-        on_axis = torch.hypot(x, y) <= rounding(x.dtype) * self._scale
-        azimuth = torch.where(on_axis, self.rows.variable_at_zero(0), torch.atan2(y, x))
-        t_1 = azimuth + torch.atan2(torch.full_like(ahead, side), ahead)
-        return torch.where(on_axis & (ahead.signbit()), azimuth + math.pi, t_1), ahead, beside
 
     def _solve_wrist(self, R: Columns, t_1: Tensor, wrist: Scalar) -> tuple[Tensor, Tensor, Tensor]:
         """Joints 5 and 6, and the size of `s_5`: axis 2 in the wanted frame is `(s_5 c_6, -s_5 s_6, c_5)`."""

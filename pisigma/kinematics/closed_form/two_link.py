@@ -1,4 +1,4 @@
-"""Two links in a plane, which all closed forms here share, and from what size on they take a number for 0."""
+"""Joint 1, and two links in a plane, which closed forms share, and from what size on they take a number for 0."""
 
 import itertools
 import math
@@ -48,6 +48,32 @@ class TwoLink:
     elbow: Float[Tensor, "*batch"]
     reached: Bool[Tensor, "..."]
     singular: Bool[Tensor, "..."]
+
+
+def solve_first_joint(
+    x: Tensor, y: Tensor, side: float, scale: float, shoulder: Scalar, free: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Joint 1, which brings a point to a distance `side` from the plane of the arm: `c_1 y - s_1 x = side`.
+
+    Args:
+        x: the point [m].
+        y: the point [m].
+        side: how far the point lies to the left of the arm's plane [m].
+        scale: length of the arm [m], which rounding is compared with.
+        shoulder: +1 where the point lies ahead of axis 1, -1 where it lies behind it; broadcasts.
+        free: azimuth [rad] of a point on axis 1, for which any would do.
+
+    Returns:
+        The angle [rad], how far ahead of axis 1 the point lies in the plane [m], and whether there is such an angle.
+    """
+    square = x * x + y * y - side * side
+    reached = square >= -rounding(x.dtype) * scale * scale
+    ahead = shoulder * square.clamp(min=0).sqrt()
+    on_axis = torch.hypot(x, y) <= rounding(x.dtype) * scale
+    azimuth = torch.where(on_axis, free, torch.atan2(y, x))
+    angle = azimuth - torch.atan2(torch.full_like(ahead, side), ahead)
+    back = azimuth - math.copysign(math.pi, side)
+    return torch.where(on_axis & ahead.signbit(), back, angle), ahead, reached
 
 
 def solve_two_link(
