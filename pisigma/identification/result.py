@@ -34,6 +34,8 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.sensors.registry import measured_errors
 
+DISAGREEING = 10.0
+"""Angles whose variance had to be enlarged by more are worth a warning."""
 UNUSUAL = 4.0
 """Errors that are surely more than so many times as large as the prior says are worth a warning. Healthy
 robots have up to 4.6 times the default prior of 1 mrad. The estimate from n parameters has a relative standard
@@ -306,6 +308,13 @@ def _warnings(solved: SolvedCalibration) -> tuple[str, ...]:
                 f"the {kind} errors are about {max(factors):.2g} times as large as the prior says, so their size was "
                 "taken from the data; check the nominal geometry and the robot, or give a wider prior."
             )
+    disagreement = max(view.disagreement)
+    if disagreement > DISAGREEING:
+        sentences.append(
+            "the measured angles disagree with the measured lengths by far more than their noise, so they count with "
+            f"1/{disagreement:.2g} of their weight; look for a wrist that wobbles, or for an orientation error of "
+            "the sensor that depends on the pose."
+        )
     return (*sentences, *misfitting_frames(problem, here))
 
 

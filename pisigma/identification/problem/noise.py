@@ -1,5 +1,6 @@
 """What the residuals say of the noise, of repeated poses and of the prior."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
@@ -37,6 +38,10 @@ class PriorGroup(IntEnum):
     """alpha and beta: how square and parallel axes are."""
 
 
+UNDETERMINED = 1e-12
+"""Share of the information of angles with which lengths are taken to determine what they do not see."""
+LARGEST_DISAGREEMENT = 1e6
+"""Angles of more than so many times their variance say nothing."""
 LEAST_EFFECTIVE = 0.1
 """The prior of a group of which the data determine less than so many parameters stays as it is."""
 SMALLEST_PRIOR = 0.03
@@ -77,12 +82,15 @@ class SensorView:
             their own.
         repetition: per sensor, 1 or more: by how much repeats of a pose, and several targets in it, say less than
             so many poses, because what the model gets wrong there is the same in all of them.
+        disagreement: per sensor, 1 or more: factor on the variance of angles with which they agree with the measured
+            lengths; see `angle_disagreement`.
         prior_scale: of the prior's standard deviations, per group of parameters.
     """
 
     sums: tuple[SensorSums, ...]
     noise: tuple[float, ...]
     repetition: tuple[float, ...]
+    disagreement: tuple[float, ...]
     prior_scale: tuple[float, ...] = (1.0,) * len(PriorGroup)
 
     def scale(self, sensor: int) -> float:
@@ -91,7 +99,7 @@ class SensorView:
 
     def variance(self, sensor: int) -> float:
         """What a sensor's sums are divided by."""
-        return self.noise[sensor] ** 2 * self.repetition[sensor]
+        return self.noise[sensor] ** 2 * self.repetition[sensor] * self.disagreement[sensor]
 
     def scaled(self, precision: Float64[Tensor, " active"], group: Tensor) -> Float64[Tensor, " active"]:
         """1 / variance of parameters by the prior at its present scale."""
@@ -183,6 +191,66 @@ def group_variance_ratio(
             ratio *= max((shared / fewer) / (square / values), 1.0)
         ratios.append(ratio)
     return tuple(ratios)
+
+
+def angle_disagreement(
+    sensors: Sequence[AbstractSensor], view: SensorView, held: Float64[Tensor, " active"], pull: Tensor
+) -> tuple[float, ...]:
+    """Estimate by which factor the variance of measured angles is to be enlarged, per sensor.
+
+    What the geometry does not explain of orientations, such as the wobble of a wrist, depends on the pose. Rows taken
+    as independent then claim to determine the geometry far better than they do, and pull the predicted positions away
+    from the measured ones. Let x be the parameters by lengths and prior alone, with the information A, and y those by
+    angles too. Taking angles in moves predicted lengths by `(x - y)^T Q (x - y)`, Q being the information of the
+    lengths alone, where `tr(Q (cov x - cov y))` is expected. The factor, 1 or more, makes both equal; it is the moment
+    estimator of random-effects meta-analysis (DerSimonian and Laird 1986, Controlled Clinical Trials 7(3), 177-188),
+    with the cost of predicted lengths as its weight.
+
+    Args:
+        sensors: the sensors.
+        view: normal equations and noise.
+        held: the prior's precision of every free parameter.
+        pull: what the prior adds to the descent.
+    """
+    angular = [sensor.unit == "rad" and not sensor.certain for sensor in sensors]
+    if not any(angular) or all(
+        sensor.certain or angle for sensor, angle in zip(sensors, angular, strict=True)
+    ):
+        return (1.0,) * len(sensors)
+    Q, R = np.zeros((2, len(held), len(held)))
+    lengths, angles = pull.cpu().numpy().copy(), np.zeros(len(held))
+    for k, (sums, angle) in enumerate(zip(view.sums, angular, strict=True)):
+        variance = view.noise[k] ** 2 * view.repetition[k]
+        normal, descent = sums.normal.cpu().numpy() / variance, sums.descent.cpu().numpy() / variance
+        if angle:
+            R += normal
+            angles += descent
+        else:
+            Q += normal
+            lengths += descent
+    A = Q + np.diag(held.cpu().numpy())
+    scale = (A + R).diagonal()
+    scale = 1 / np.sqrt(np.where(scale > 0, scale, 1.0))
+    root = np.linalg.cholesky(A * scale * scale[:, None] + UNDETERMINED * np.eye(len(scale)))
+    white = np.linalg.inv(root) * scale
+    # in these coordinates A is the identity and R diagonal
+    gain, axes = np.linalg.eigh(white @ R @ white.T)
+    white = axes.T @ white
+    Q, lengths, angles = white @ Q @ white.T, white @ lengths, white @ angles
+
+    def excess(logarithm: float) -> float:
+        """By what share angles of so much more variance move the lengths too far."""
+        share = gain.clip(0.0) / (gain.clip(0.0) + math.exp(logarithm))
+        moved = share * lengths - (1 - share) * angles * math.exp(-logarithm)
+        return float(moved @ Q @ moved) - float(Q.diagonal() @ share)
+
+    low, high = 0.0, math.log(LARGEST_DISAGREEMENT)
+    if excess(low) <= 0:
+        return (1.0,) * len(sensors)
+    while high - low > 1e-3:
+        middle = (low + high) / 2
+        low, high = (middle, high) if excess(middle) > 0 else (low, middle)
+    return tuple(math.exp(high) if angle else 1.0 for angle in angular)
 
 
 def _group_squares(

@@ -15,6 +15,7 @@ from pisigma.identification.problem.noise import (
     SMALLEST_PRIOR,
     SensorSums,
     SensorView,
+    angle_disagreement,
     group_variance_ratio,
     loss_scale,
     prior_group_of,
@@ -162,7 +163,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
                     k, total, float("inf") if before is None else before.noise[k], motion, unknowns, rows
                 )
         ones = (1.0,) * len(sums)
-        view = SensorView(tuple(sums), ones, ones) if before is None else replace(before, sums=tuple(sums))
+        view = (
+            SensorView(tuple(sums), ones, ones, ones) if before is None else replace(before, sums=tuple(sums))
+        )
         return self.combined(point, view)
 
     def renewed(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], bool]:
@@ -186,9 +189,14 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             repetition = group_variance_ratio(
                 self.sensors, self.loss, renewed_noise, used, self.pose, self.configuration
             )
-        renewed = SensorView(view.sums, noise, repetition, view.prior_scale)
+        off = self._off(linearisation.point)
+        renewed = replace(view, noise=noise, repetition=repetition)
+        if not refine:
+            held = view.scaled(self._prior, self.prior_group)
+            renewed = replace(
+                renewed, disagreement=angle_disagreement(self.sensors, renewed, held, -held * off)
+            )
         if self._sized:
-            off = self._off(linearisation.point)
             sized = replace(renewed, prior_scale=self._prior_scales(off, view, covariance))
             renewed = sized if refine else self._with_settled_prior(sized, off)
         return self.combined(linearisation.point, renewed), _alike(view, renewed)
@@ -368,5 +376,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
 def _alike(before: SensorView, after: SensorView, share: float = SETTLED) -> bool:
     """Whether two estimates of noise and of the prior's sizes differ by less than a share."""
-    old, new = ((*view.noise, *view.repetition, *view.prior_scale) for view in (before, after))
+    old, new = (
+        (*view.noise, *view.repetition, *view.disagreement, *view.prior_scale) for view in (before, after)
+    )
     return all(abs(b / a - 1) < share for a, b in zip(old, new, strict=True))
