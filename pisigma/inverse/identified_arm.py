@@ -9,13 +9,22 @@ from torch import Tensor
 
 from pisigma.hybrid.arm import HybridArm
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
+from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.joint_limits import wrapped_difference
 from pisigma.kinematics.numeric import NumericSolution, solve_numeric
 from pisigma.kinematics.status import Status
-from pisigma.kinematics.tolerances import ATTEMPTS, HYBRID_TOLERANCE, ITERATIONS, NEARLY, PULL, REACH_ROUNDING
+from pisigma.kinematics.tolerances import (
+    ATTEMPTS,
+    BESIDE,
+    HYBRID_TOLERANCE,
+    ITERATIONS,
+    NEARLY,
+    REACH_ROUNDING,
+)
 from pisigma.model.hybrid_motion import hybrid_motion
 from pisigma.model.stored_starts import StoredStarts, nearest_branch
 from pisigma.robot.description import Robot
+from pisigma.se3 import pose_error
 
 CHEAP_ITERATIONS, EXACT_ITERATIONS = 10, 25
 """Steps of a hybrid arm with the cheap Jacobian, and after these with the exact one."""
@@ -128,8 +137,9 @@ class IdentifiedArm:
     ) -> tuple[Float64[Tensor, "poses dof"], Int64[Tensor, " poses"], Int64[Tensor, " poses"]]:
         """Solve for poses that the nominal arm does not take on a branch, but the identified one may.
 
-        The starts are the nominal joint values, on the branch, of the pose drawn a little towards the nearest
-        calibration row; where any branch will do, also those on the others and the nearest rows themselves.
+        The starts are the nominal joint values on the branch, almost stretched or folded towards the pose; where any
+        branch will do, also those on the others and the calibration rows whose poses are nearest. Without a branch that
+        comes near the pose none is tried.
 
         Args:
             T: wanted poses.
@@ -142,14 +152,14 @@ class IdentifiedArm:
         q = T.new_full((len(T), self.nominal.dof), torch.nan)
         status = torch.full_like(branch, Status.UNREACHABLE)
         chosen = within_reach(self.identified, T).nonzero()[:, 0]
-        if not len(chosen) or not len(self.starts.q):
+        if not len(chosen):
             return q, status, branch
         T_near, wanted = T[chosen], branch[chosen]
-        index = self.starts.nearest(T_near, ATTEMPTS)
-        drawn = self.solver.solve(self.drawn(T_near, self.starts.T[index[:, 0], :3, 3])).q
-        first = drawn[torch.arange(len(chosen)), wanted][:, None]
-        others = torch.cat([drawn, self.starts.q[index]], 1)
-        others = torch.where(anywhere[chosen, None, None], others, torch.nan)
+        beside = self._beside(T_near)
+        first = beside[torch.arange(len(chosen)), wanted][:, None]
+        others = torch.cat([beside, self.starts.q[self.starts.nearest(T_near, ATTEMPTS)]], 1)
+        near = torch.isfinite(beside).all(-1).any(-1) & anywhere[chosen]
+        others = torch.where(near[:, None, None], others, torch.nan)
         result, reached = search(self.identified, T_near, torch.cat([first, others], 1), self.hybrid)
         lies = nearest_branch(self.solver, result)
         lost = (lies != wanted) & ~anywhere[chosen]
@@ -157,12 +167,9 @@ class IdentifiedArm:
         branch = branch.index_copy(0, chosen, torch.where(anywhere[chosen], lies, wanted))
         return q.index_copy(0, chosen, result), status.index_copy(0, chosen, reached), branch
 
-    def drawn(
-        self, T: Float64[Tensor, "poses 4 4"], towards: Float64[Tensor, "poses 3"]
-    ) -> Float64[Tensor, "poses 4 4"]:
-        """Every pose moved by `PULL`, but no farther than to the other position."""
-        way = towards - T[:, :3, 3]
-        share = (PULL * self.nominal.reach / way.norm(dim=-1).clamp(min=1e-12)).clamp(max=1.0)
-        drawn = T.clone()
-        drawn[:, :3, 3] += share[:, None] * way
-        return drawn
+    def _beside(self, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses branches dof"]:
+        """Nominal joint values on every branch; NaN on those that are not even near the pose."""
+        q = self.solver.starts(T)
+        off = pose_error(T[:, None].expand(*q.shape[:-1], 4, 4), forward_kinematics(self.identified, q))
+        off[..., :3] /= self.identified.reach
+        return torch.where((off.norm(dim=-1) <= BESIDE)[..., None], q, torch.nan)

@@ -29,6 +29,8 @@ FINE, NOT_FINITE, LAST_ROW, NOT_ORTHONORMAL, LEFT_HANDED, NEAR_NOT_FINITE = -1, 
 
 ANY_BRANCH, EVERY_BRANCH = -1, -2
 """Instead of the index of a branch."""
+NEAREST = -2
+"""The same for closed forms: all branches, as near to the pose as they come where they do not reach it."""
 
 SOLVE, EVALUATE, FORWARD = 0, 1, 2
 """What the kernels are to do: solve poses, evaluate the corrected arm, or only where an arm stands and how it moves."""

@@ -53,7 +53,8 @@ def all_branches(
         arms: the arms, for limits.
         form: the nominal arm with canonical twists.
         T: wanted T_base_tool.
-        only: the only branch that is wanted; -1 for all. Of the others the first joint value is NaN.
+        only: the only branch that is wanted, -1 for all, NEAREST for all with the nearest joint values of those that do
+            not reach the pose. Of others the first joint value is NaN.
         rounding: relative size below which a cosine beyond 1 or a length counts as rounding of T.
         P: `(4, 4)`, overwritten.
         q: `(8, dof)`, written [rad or m]: in (-pi, pi], or a full turn from there within the limits.

@@ -115,7 +115,6 @@ MEMORY = np.dtype(
         branches=(BRANCHES, DOF),  # closed-form joint values of all branches
         others=(BRANCHES, DOF),  # the same of other poses
         wanted=(4, 4),  # a pose in the frames of the closed form
-        drawn=(4, 4),  # a pose moved towards a stored one
         q=(DOF,),  # joint values of a candidate
         start=(DOF,),  # joint values to start from
         kept=(DOF,),  # joint values outside their limits, in case there are no others

@@ -44,7 +44,7 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
     _move_steeply(description, memory, arm, q)
     pose_error(T, memory.T, memory.R, memory.best)
     copy_rows(memory.J, memory.J_best)
-    old, damping = scaled_square(reach, memory.best), tolerances.FIRST_DAMPING
+    old, damping, stalled = scaled_square(reach, memory.best), tolerances.FIRST_DAMPING, 0
     for _ in range(tolerances.ITERATIONS):
         if _within(memory.best, tolerance, tolerance) or damping > tolerances.MOST_DAMPING:
             break
@@ -57,6 +57,9 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
             pose_error(T, memory.T, memory.R, memory.error)
             new = scaled_square(reach, memory.error)
         if new < old:
+            stalled = stalled + 1 if new > tolerances.STALLED * old else 0
+            if stalled == tolerances.MOST_STALLED:
+                break
             old = new
             copy(memory.trial, q)
             copy(memory.error, memory.best)

@@ -5,13 +5,15 @@ from typing import no_type_check
 
 from numba import njit
 
-from pisigma.kernels.arrays import IDENTIFIED, NOMINAL
+from pisigma.kernels.arrays import IDENTIFIED, NEAREST, NOMINAL
 from pisigma.kernels.chain import walk
 from pisigma.kernels.closed_form import all_branches
+from pisigma.kernels.damped_step import scaled_square
+from pisigma.kernels.motion import move
 from pisigma.kernels.newton import search
-from pisigma.kernels.rotations import wrap
+from pisigma.kernels.rotations import pose_error, wrap
 from pisigma.kernels.rows import Array, Record, copy, fill
-from pisigma.kinematics.tolerances import ATTEMPTS, PULL, REACH_ROUNDING
+from pisigma.kinematics.tolerances import ATTEMPTS, BESIDE, REACH_ROUNDING
 
 
 @njit(error_model="numpy")
@@ -50,7 +52,7 @@ def nearest_starts(description: Record, memory: Record, T: Array, most: int) -> 
 @njit(error_model="numpy")
 @no_type_check
 def recover(description: Record, memory: Record, branch: int, any_branch: bool) -> int:
-    """Look for joint values from other starts; see `correction.identified_arm.IdentifiedArm.recover`.
+    """Look for joint values from other starts; see `inverse.identified_arm.IdentifiedArm.recover`.
 
     Args:
         description: the calibrated arm.
@@ -61,20 +63,24 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
     Returns:
         Index of the branch on which they lie, -1 where nothing was out.
     """
-    form, starts, arms, drawn = description.closed_form, description.starts, description.arms, memory.others
-    if starts.count == 0:
+    form, starts, beside, plausible = description.closed_form, description.starts, memory.others, False
+    all_branches(description.arms, form, memory.pose, NEAREST, memory.rounding, memory.wanted, beside)
+    for index in range(form.branches):
+        if _is_near(description, memory, beside[index]):
+            plausible = True
+        else:
+            beside[index, 0] = math.nan
+    if not plausible:
         return -1
-    count = nearest_starts(description, memory, memory.pose, ATTEMPTS)
-    _draw(description, memory.pose, memory.nearest[0], memory.drawn)
-    all_branches(arms, form, memory.drawn, -1, memory.rounding, memory.wanted, drawn)
+    count = nearest_starts(description, memory, memory.pose, ATTEMPTS) if starts.count > 0 else 0
     for attempt in range(1 + form.branches + count if any_branch else 1):
         place = branch if attempt == 0 else attempt - 1
         if attempt > form.branches:
             copy(starts.q[memory.nearest[attempt - 1 - form.branches]], memory.q)
-        elif math.isnan(drawn[place, 0]):
+        elif math.isnan(beside[place, 0]) or (attempt > 0 and place == branch):
             continue
         else:
-            copy(drawn[place], memory.q)
+            copy(beside[place], memory.q)
         if search(description, memory, memory.pose, memory.q):
             copy(memory.q, memory.solution)
             lies = branch_of(description, memory, memory.q)
@@ -85,18 +91,11 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
 
 @njit(error_model="numpy")
 @no_type_check
-def _draw(description: Record, T: Array, start: int, drawn: Array) -> None:
-    """Write the pose, moved by `PULL` of the reach but no farther than to the position of a start."""
-    point = description.starts.points[start]
-    x, y, z = point[0] - T[0, 3], point[1] - T[1, 3], point[2] - T[2, 3]
-    way = max(math.sqrt(x * x + y * y + z * z), 1e-12)
-    share = min(PULL * description.arms.reach[NOMINAL] / way, 1.0)
-    for i in range(3):
-        for k in range(4):
-            drawn[i, k] = T[i, k]
-    drawn[0, 3] += share * x
-    drawn[1, 3] += share * y
-    drawn[2, 3] += share * z
+def _is_near(description: Record, memory: Record, q: Array) -> bool:
+    """Whether joint values of a nominal branch bring the identified arm near the pose; NaN do not."""
+    move(description, memory, IDENTIFIED, q)
+    pose_error(memory.pose, memory.T, memory.R, memory.error)
+    return scaled_square(description.arms.reach[IDENTIFIED], memory.error) <= BESIDE * BESIDE
 
 
 @njit(error_model="numpy")

@@ -35,6 +35,9 @@ FIRST_DAMPING, LEAST_DAMPING, MOST_DAMPING = 0.1, 1e-6, 1e12
 DAMPING_DOWN, DAMPING_UP = 0.2, 8.0
 """What the factor is multiplied by after a step that brings the tool nearer, and after one that does not."""
 
+STALLED, MOST_STALLED = 0.95, 5
+"""Share of the squared error that a step leaves which leads nowhere, and after how many in a row to give up."""
+
 ITERATIONS = 100
 """Damped steps after which an iteration is given up."""
 
@@ -44,8 +47,12 @@ NEARLY = 0.01
 REACH_ROUNDING = 1e-9
 """Share of the reach by which a pose may lie farther away than the robot is long."""
 
-PULL = 0.02
-"""Share of the reach by which a pose beyond the nominal workspace is drawn towards a measured one."""
+NEAREST_MARGIN = 2e-4
+"""Cosine of how far stretched or folded branches stay from that, 1.1 deg, where they are starts of an iteration."""
+
+BESIDE = 0.05
+"""Share of the reach, and angle [rad], by which a branch of the nominal arm may miss a pose that the calibrated one can
+reach from there, whose errors are far smaller."""
 
 ATTEMPTS, MORE_ATTEMPTS = 4, 128
 """Stored starts that are tried for a pose, nearest first; the latter on arms without closed form."""

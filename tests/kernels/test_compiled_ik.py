@@ -16,6 +16,7 @@ from pisigma.inverse.compiled_ik import CompiledIK
 from pisigma.inverse.reference import ReferenceIK
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.shared_features import NominalPose
+from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.status import Status
 from pisigma.model.compiled_model import describe, save_compiled
 
@@ -117,6 +118,31 @@ def test_poses_at_half_a_turn_and_no_orientation_error_are_no_special_case(arms)
     reached = found.status != Status.UNREACHABLE
     assert reached.any()
     assert_close(model.forward(torch.from_numpy(found.q[reached])), flipped[reached], atol=1e-10)
+
+
+@pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur5", "rb5", "fanuc_r2000"])
+def test_poses_that_only_the_calibrated_arm_reaches_are_solved(name, arms):
+    """They lie near singular poses: no nominal branch reaches them, and one of them comes near."""
+    model = arms.calibrated(name)
+    T = model.forward(arms.draw_joints(model.robot, 200 if name == "kiro3" else 10_000, seed=21))
+    nominal = torch.isfinite(closed_form_solver(model.robot).solve(T).q).all(-1).any(-1)
+    T = T[~nominal].numpy()
+    assert len(T) >= 20
+    found = arms.compiled(name).solve_batch(T)
+    reached = found.status != Status.UNREACHABLE
+    assert reached.mean() > 0.95
+    assert_close(model.forward(torch.from_numpy(found.q[reached])), T[reached], atol=1e-10)
+
+
+def test_poses_a_little_out_of_reach_are_not_solved(arms):
+    model, kernels = arms.calibrated("ur5"), arms.compiled("ur5")
+    stretched = torch.tensor([[0.3, -0.7, 0.0, 0.5, 0.6, 0.2]], dtype=torch.float64)
+    T = model.forward(stretched)[0]
+    base = torch.tensor(model.hybrid.robot.base[:3].tolist(), dtype=torch.float64)
+    out = T[:3, 3] - base
+    for share in (1.01, 1.1):
+        T[:3, 3] = share * out + base
+        assert kernels.solve(T.numpy()).status == Status.UNREACHABLE
 
 
 def test_statuses_say_what_became_of_a_pose(arms):

@@ -222,6 +222,22 @@ def test_poses_out_of_reach_are_nan_with_a_status(name, robots):
     assert torch.isnan(solutions.q).all()
 
 
+@pytest.mark.parametrize("name", ["kiro3", "kiro4", "big", "rb5"])
+def test_the_nearest_joint_values_reach_a_pose_or_nearly_so(name, robots, generator):
+    robot = robots.load(name) if name == "rb5" else _family(robots)[name]
+    solver = closed_form_solver(robot)
+    T = forward_kinematics(robot, robots.random_joints(robot, generator, 2_000))
+    solved, nearest = solver.solve(T).q, solver.starts(T)
+    assert bool(torch.isfinite(nearest).all())
+    reached = torch.isfinite(solved).all(-1)
+    off = pose_error(T[:, None].expand(*nearest.shape[:-1], 4, 4), forward_kinematics(robot, nearest))[
+        reached
+    ].norm(dim=-1)
+    assert float(off.max()) < 0.05 * robot.reach + 0.05
+    assert float(off.median()) < 1e-12
+    assert_close(nearest.nan_to_num()[reached][off < 1e-12], solved[reached][off < 1e-12], atol=1e-9)
+
+
 def test_a_wrist_centre_inside_the_dead_cylinder_is_unreachable(robots, generator):
     robot = _big_arm()
     T = transform(

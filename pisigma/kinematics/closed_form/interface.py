@@ -2,7 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, TypeVar
 
 import torch
@@ -13,6 +13,7 @@ from pisigma.kinematics.closed_form.canonical import CanonicalRows
 from pisigma.kinematics.components import Frame, Scalar, frame_of
 from pisigma.kinematics.joint_limits import wrap_into_limits, wrapped_difference
 from pisigma.kinematics.status import Status
+from pisigma.kinematics.tolerances import NEAREST_MARGIN
 from pisigma.robot.description import Robot
 from pisigma.se3 import check_transforms, invert, wrap_to_pi
 
@@ -44,12 +45,14 @@ class AbstractClosedForm(ABC):
             solutions (forks), through which they count, the last one fastest.
         robot: the robot it belongs to.
         rows: its rows with canonical twists.
+        margin: what is kept between cosines and 1: 0, but for `starts`.
         name: of the form, which model files say.
         compiled: the same formulas as a plain function that the kernels compile; None where there is none. It is called
             as `compiled(form, P, only, rounding, q)` with `kernels.arrays.ClosedForm`, the pose `(4, 4)` of which
             `_solve_components` gets the first three rows, the index of the only branch that is wanted or -1 for all,
             and the relative size of what counts as rounding. It writes the canonical joint variables of branches that
-            reach the pose into `q`, `(branches, dof)`, whose first column is NaN before. It and the plain functions
+            reach the pose into `q`, `(branches, dof)`, whose first column is NaN before; with -2 those of the branches
+            that do not reach it too, as near to it as they come (see `starts`). It and the plain functions
             that it calls work on numbers and entries of arrays, and call functions of `math`; each is decorated by
             `typing.no_type_check`.
     """
@@ -59,6 +62,7 @@ class AbstractClosedForm(ABC):
     compiled: ClassVar[Callable[..., None] | None] = None
     robot: Robot
     rows: CanonicalRows
+    margin: float = 0.0
 
     @classmethod
     @abstractmethod
@@ -86,9 +90,7 @@ class AbstractClosedForm(ABC):
             PoseError: T is no stack of rigid transforms; the message gives the index.
         """
         check_transforms(T, "T_base_tool")
-        T_first_base, T_tool_last = invert(self.rows.T_base_first.to(T)), invert(self.rows.T_last_tool.to(T))
-        variables, reached, singular = self._solve_canonical(T_first_base @ T @ T_tool_last)
-        q, inside = self._turned(self.rows.joint_values(variables))
+        q, inside, reached, singular = self._solve_branches(T)
         status = torch.where(singular, int(Status.SINGULAR), int(Status.REACHED))
         status = torch.where(inside, status, int(Status.OUTSIDE_JOINT_LIMITS))
         status = torch.where(reached, status, int(Status.UNREACHABLE))
@@ -111,6 +113,30 @@ class AbstractClosedForm(ABC):
         counts = torch.bincount(index, minlength=len(self.branches))
         order = counts.argsort(descending=True, stable=True).tolist()
         return tuple(self.branches[i] for i in order if counts[i] > 0)
+
+    def starts(self, T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch branches dof"]:
+        """Joint values of all branches, of those that do not reach a pose the nearest: almost stretched or folded.
+
+        They are starts for an arm that differs a little from this one and may reach the pose. A small margin keeps them
+        from the singular joint values themselves, which no iteration leaves.
+
+        Args:
+            T: T_base_tool [m].
+        """
+        return replace(self, margin=NEAREST_MARGIN)._solve_branches(T)[0]
+
+    def _solve_branches(
+        self, T: Tensor
+    ) -> tuple[
+        Float[Tensor, "*batch branches dof"],
+        Bool[Tensor, "*batch branches"],
+        Bool[Tensor, "*batch branches"],
+        Bool[Tensor, "*batch branches"],
+    ]:
+        """Joint values, and whether they are inside the limits, reach the pose, and are singular."""
+        T_first_base, T_tool_last = invert(self.rows.T_base_first.to(T)), invert(self.rows.T_last_tool.to(T))
+        variables, reached, singular = self._solve_canonical(T_first_base @ T @ T_tool_last)
+        return (*self._turned(self.rows.joint_values(variables)), reached, singular)
 
     def _solve_canonical(
         self, T: Float[Tensor, "*batch 4 4"]

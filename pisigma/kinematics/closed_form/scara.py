@@ -13,14 +13,16 @@ from pisigma.kinematics.closed_form.canonical import canonical_rows
 from pisigma.kinematics.closed_form.interface import AbstractClosedForm
 from pisigma.kinematics.closed_form.two_link import rounding, solve_two_link, two_link
 from pisigma.kinematics.components import Frame, Scalar, as_tensors
-from pisigma.kinematics.tolerances import TILT_TOLERANCE
+from pisigma.kinematics.tolerances import NEAREST_MARGIN, TILT_TOLERANCE
 from pisigma.robot.description import Robot
 
 
 @no_type_check
 def scara_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> None:
     """Both branches; see `AbstractClosedForm.compiled`."""
-    if math.hypot(P[0, 2], P[1, 2]) > max(TILT_TOLERANCE, rounding) or P[2, 2] <= 0:
+    nearest = only < -1
+    margin = NEAREST_MARGIN if nearest else 0.0
+    if not nearest and (math.hypot(P[0, 2], P[1, 2]) > max(TILT_TOLERANCE, rounding) or P[2, 2] <= 0):
         return
     x, y = form.a[1] + form.a[2] * math.cos(form.theta[2]), form.a[2] * math.sin(form.theta[2])
     length, angle = math.hypot(x, y), math.atan2(y, x)
@@ -29,9 +31,9 @@ def scara_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> Non
         if only >= 0 and branch != only:
             continue
         first, elbow, reached = two_link(
-            P[0, 3], P[1, 3], form.a[0], length, 1.0 - 2 * branch, zero, rounding
+            P[0, 3], P[1, 3], form.a[0], length, 1.0 - 2 * branch, zero, rounding, margin
         )
-        if reached:
+        if reached or nearest:
             t_2 = elbow - angle
             q[branch, 0], q[branch, 1] = first, t_2
             q[branch, 2] = P[2, 3] - form.d[0] - form.d[1]
@@ -75,7 +77,7 @@ class Scara(AbstractClosedForm):
         rows = self.rows
         length, angle = self._second_link
         (r_00, r_10, _), _, (r_02, r_12, r_22), (x, y, z) = as_tensors(T)
-        arm = solve_two_link(x, y, rows.a[0], length, signs[0], rows.variable_at_zero(0))
+        arm = solve_two_link(x, y, rows.a[0], length, signs[0], rows.variable_at_zero(0), self.margin)
         t_2 = arm.elbow - angle
         d_3 = z - rows.d[0] - rows.d[1]
         t_4 = torch.atan2(r_10, r_00) - arm.first - t_2 - rows.theta[2]

@@ -21,6 +21,7 @@ from pisigma.kinematics.closed_form.two_link import (
     two_link,
 )
 from pisigma.kinematics.components import Columns, Frame, Scalar, as_tensors
+from pisigma.kinematics.tolerances import NEAREST_MARGIN
 from pisigma.robot.description import Robot
 
 _RIGHT = math.pi / 2
@@ -65,11 +66,14 @@ def _spherical_joints(
 @no_type_check
 def spherical_wrist_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> None:
     """All eight branches; see `AbstractClosedForm.compiled`."""
-    a, d = form.a, form.d
+    a, d, nearest = form.a, form.d, only < -1
+    margin = NEAREST_MARGIN if nearest else 0.0
     forearm, side = math.hypot(a[2], d[3]), d[1] + d[2]
     scale = abs(a[0]) + abs(a[1]) + forearm + abs(side)
-    far, azimuth, beside, on_axis = first_joint(P, side, scale, form.sign[0] * form.offset[0], rounding)
-    if not beside:
+    far, azimuth, beside, on_axis = first_joint(
+        P, side, scale, form.sign[0] * form.offset[0], rounding, margin
+    )
+    if not beside and not nearest:
         return
     for pair in range(4):
         if only >= 0 and only // 2 != pair:
@@ -81,8 +85,10 @@ def spherical_wrist_branches(form: Any, P: Any, only: int, rounding: float, q: A
             t_1 = azimuth - math.pi
         upwards = shoulder * elbow * math.copysign(1.0, a[1])
         zero = form.sign[1] * form.offset[1]
-        t_2, bend, reached = two_link(ahead - a[0], d[0] - P[2, 3], a[1], forearm, upwards, zero, rounding)
-        if reached:
+        t_2, bend, reached = two_link(
+            ahead - a[0], d[0] - P[2, 3], a[1], forearm, upwards, zero, rounding, margin
+        )
+        if reached or nearest:
             _spherical_joints(form, P, t_1, t_2, bend - math.atan2(d[3], a[2]), only, 2 * pair, rounding, q)
 
 
@@ -144,7 +150,7 @@ class SphericalWristArm(AbstractClosedForm):
         scale = abs(a_1) + abs(a_2) + math.hypot(a_3, d_4) + abs(d_2 + d_3)
         x, y, z = p
         zero = self.rows.variable_at_zero(0)
-        t_1, ahead, beside_axis = solve_first_joint(x, y, d_2 + d_3, scale, shoulder, zero)
+        t_1, ahead, beside_axis = solve_first_joint(x, y, d_2 + d_3, scale, shoulder, zero, self.margin)
         arm = solve_two_link(
             ahead - a_1,
             d_1 - z,
@@ -152,6 +158,7 @@ class SphericalWristArm(AbstractClosedForm):
             math.hypot(a_3, d_4),
             math.copysign(1.0, a_2) * shoulder * elbow,
             self.rows.variable_at_zero(1),
+            self.margin,
         )
         singular = arm.singular | (ahead.abs() < singular_tolerance(x.dtype) * scale)
         return [t_1, arm.first, arm.elbow - math.atan2(d_4, a_3)], arm.reached & beside_axis, singular

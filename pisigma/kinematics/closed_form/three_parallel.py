@@ -22,7 +22,7 @@ from pisigma.kinematics.closed_form.two_link import (
     two_link,
 )
 from pisigma.kinematics.components import Columns, Frame, Scalar, as_tensors
-from pisigma.kinematics.tolerances import TRIANGLE_MARGIN
+from pisigma.kinematics.tolerances import NEAREST_MARGIN, TRIANGLE_MARGIN
 from pisigma.robot.description import Robot
 
 _RIGHT = math.pi / 2
@@ -39,6 +39,7 @@ def _plane_joints(
     x: float,
     upwards: float,
     free: bool,
+    margin: float,
     rounding: float,
     q: Any,
 ) -> None:
@@ -51,16 +52,24 @@ def _plane_joints(
         t_234 = math.atan2(math.cos(t_1) * u + math.sin(t_1) * v, s_6 * P[2, 0] + c_6 * P[2, 1])
         c, s = math.cos(t_234), math.sin(t_234)
         first, bend, reached = two_link(
-            x - (c * along - s * across), y - (s * along + c * across), a[1], b, upwards, zero, rounding
+            x - (c * along - s * across),
+            y - (s * along + c * across),
+            a[1],
+            b,
+            upwards,
+            zero,
+            rounding,
+            margin,
         )
-        if reached:
+        turned = attempt == 1 or not free or math.hypot(along, across) == 0.0
+        if reached or (margin > 0.0 and turned):
             t_3 = bend - (math.pi if a[2] < 0 else 0.0)
             q[0], q[1], q[2] = t_1, first, t_3
             q[3], q[4], q[5] = t_234 - first - t_3, t_5, t_6
             return
-        hand, far = math.hypot(along, across), math.hypot(x, y)
-        if attempt == 1 or not free or hand == 0.0:
+        if turned:
             return
+        hand, far = math.hypot(along, across), math.hypot(x, y)
         turn = t_234 + math.atan2(across, along) - math.atan2(y, x)
         nearest, farthest = (
             abs(abs(a[1]) - b) + TRIANGLE_MARGIN * (abs(a[1]) + b),
@@ -76,11 +85,13 @@ def _plane_joints(
 @no_type_check
 def three_parallel_branches(form: Any, P: Any, only: int, rounding: float, q: Any) -> None:
     """All eight branches; see `AbstractClosedForm.compiled`."""
-    a, d = form.a, form.d
+    a, d, margin = form.a, form.d, NEAREST_MARGIN if only < -1 else 0.0
     side = d[1] + d[2] + d[3]
     scale = abs(a[0]) + abs(a[1]) + abs(a[2]) + math.hypot(a[3], d[4]) + abs(side)
-    far, azimuth, beside, on_axis = first_joint(P, side, scale, form.sign[0] * form.offset[0], rounding)
-    if not beside:
+    far, azimuth, beside, on_axis = first_joint(
+        P, side, scale, form.sign[0] * form.offset[0], rounding, margin
+    )
+    if not beside and margin == 0.0:
         return
     for shoulder in range(2):
         if only >= 0 and only // 4 != shoulder:
@@ -103,7 +114,8 @@ def three_parallel_branches(form: Any, P: Any, only: int, rounding: float, q: An
                 branch = 4 * shoulder + 2 * elbow + wrist
                 if only < 0 or only == branch:
                     upwards = -(1.0 - 2 * shoulder) * (1.0 - 2 * elbow) * math.copysign(1.0, a[1])
-                    _plane_joints(form, P, t_1, t_5, t_6, ahead - a[0], upwards, free, rounding, q[branch])
+                    ahead_of_2, out = ahead - a[0], q[branch]
+                    _plane_joints(form, P, t_1, t_5, t_6, ahead_of_2, upwards, free, margin, rounding, out)
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,7 +167,7 @@ class ThreeParallelArm(AbstractClosedForm):
         columns = as_tensors(T)
         p = columns[3]
         zero, side = self.rows.variable_at_zero(0), -sum(self.rows.d[1:4])
-        t_1, ahead, beside = solve_first_joint(p[0], p[1], side, self._scale, shoulder, zero)
+        t_1, ahead, beside = solve_first_joint(p[0], p[1], side, self._scale, shoulder, zero, self.margin)
         t_5, t_6, straight = self._solve_wrist(columns, t_1, wrist)
         x, y = ahead - self.rows.a[0], p[2] - self.rows.d[0]
         upwards = -math.copysign(1.0, self.rows.a[1]) * shoulder * elbow
@@ -195,6 +207,7 @@ class ThreeParallelArm(AbstractClosedForm):
             abs(self.rows.a[2]),
             upwards,
             self.rows.variable_at_zero(1),
+            self.margin,
         )
         return arm, t_234
 

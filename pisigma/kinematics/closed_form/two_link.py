@@ -51,7 +51,7 @@ class TwoLink:
 
 
 def solve_first_joint(
-    x: Tensor, y: Tensor, side: float, scale: float, shoulder: Scalar, free: float
+    x: Tensor, y: Tensor, side: float, scale: float, shoulder: Scalar, free: float, margin: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Joint 1, which brings a point to a distance `side` from the plane of the arm: `c_1 y - s_1 x = side`.
 
@@ -62,13 +62,14 @@ def solve_first_joint(
         scale: length of the arm [m], which rounding is compared with.
         shoulder: +1 where the point lies ahead of axis 1, -1 where it lies behind it; broadcasts.
         free: azimuth [rad] of a point on axis 1, for which any would do.
+        margin: of the squared scale, what the square of how far ahead the point lies is not below.
 
     Returns:
         The angle [rad], how far ahead of axis 1 the point lies in the plane [m], and whether there is such an angle.
     """
     square = x * x + y * y - side * side
     reached = square >= -rounding(x.dtype) * scale * scale
-    ahead = shoulder * square.clamp(min=0).sqrt()
+    ahead = shoulder * square.clamp(min=margin * scale * scale).sqrt()
     on_axis = torch.hypot(x, y) <= rounding(x.dtype) * scale
     azimuth = torch.where(on_axis, free, torch.atan2(y, x))
     angle = azimuth - torch.atan2(torch.full_like(ahead, side), ahead)
@@ -77,7 +78,7 @@ def solve_first_joint(
 
 
 def solve_two_link(
-    x: Tensor, y: Tensor, a: float, b: float, elbow_sign: Scalar, first_when_free: float
+    x: Tensor, y: Tensor, a: float, b: float, elbow_sign: Scalar, first_when_free: float, margin: float
 ) -> TwoLink:
     """Angles of two links that end in a point: appendix A's `C_2`, `S_2`, `K_1`, `K_2` for any lengths.
 
@@ -88,6 +89,7 @@ def solve_two_link(
         b: length of the second link [m], positive.
         elbow_sign: +1 or -1, the sign of the sine of the elbow angle; broadcasts.
         first_when_free: the first angle [rad] where the point lies on its axis, so that any would do.
+        margin: what is kept between the cosine of the elbow angle and 1.
 
     Returns:
         The angles; where the point is out of reach they are those of the nearest arm and `reached` is False.
@@ -95,7 +97,7 @@ def solve_two_link(
     """
     cosine = (x * x + y * y - (a * a + b * b)) / (2 * a * b)
     reached = cosine.abs() <= 1 + rounding(x.dtype)
-    cosine = cosine.clamp(-1, 1)
+    cosine = cosine.clamp(margin - 1, 1 - margin)
     sine = elbow_sign * ((1 - cosine) * (1 + cosine)).sqrt()
     on_axis = torch.hypot(x, y) <= rounding(x.dtype) * (abs(a) + b)
     free = torch.atan2(b * sine, a + b * cosine)
@@ -105,12 +107,12 @@ def solve_two_link(
 
 @no_type_check
 def two_link(
-    x: float, y: float, a: float, b: float, elbow_sign: float, free: float, rounding: float
+    x: float, y: float, a: float, b: float, elbow_sign: float, free: float, rounding: float, margin: float
 ) -> tuple[float, float, bool]:
     """The same as `solve_two_link` on plain numbers: the angles [rad], and whether the point is within reach."""
     cosine = (x * x + y * y - (a * a + b * b)) / (2 * a * b)
     reached = abs(cosine) <= 1 + rounding
-    cosine = min(max(cosine, -1.0), 1.0)
+    cosine = min(max(cosine, margin - 1), 1 - margin)
     sine = elbow_sign * math.sqrt((1 - cosine) * (1 + cosine))
     first = free
     if math.sqrt(x * x + y * y) > rounding * (abs(a) + b):
@@ -120,7 +122,7 @@ def two_link(
 
 @no_type_check
 def first_joint(
-    P: Any, side: float, scale: float, zero: float, rounding: float
+    P: Any, side: float, scale: float, zero: float, rounding: float, margin: float
 ) -> tuple[float, float, bool, bool]:
     """What joint 1 of an arm brings a point to, whose distance from the plane of the arm is `side` [m].
 
@@ -132,4 +134,5 @@ def first_joint(
     square = x * x + y * y - side * side
     on_axis = math.hypot(x, y) <= rounding * scale
     azimuth = zero if on_axis else math.atan2(y, x)
-    return math.sqrt(max(square, 0.0)), azimuth, square >= -rounding * scale * scale, on_axis
+    ahead = math.sqrt(max(square, margin * scale * scale))
+    return ahead, azimuth, square >= -rounding * scale * scale, on_axis
