@@ -233,7 +233,7 @@ def test_the_nearest_joint_values_reach_a_pose_or_nearly_so(name, robots, genera
     off = pose_error(T[:, None].expand(*nearest.shape[:-1], 4, 4), forward_kinematics(robot, nearest))[
         reached
     ].norm(dim=-1)
-    assert float(off.max()) < 0.05 * robot.reach + 0.05
+    assert float(off.quantile(0.99)) < 0.03
     assert float(off.median()) < 1e-12
     assert_close(nearest.nan_to_num()[reached][off < 1e-12], solved[reached][off < 1e-12], atol=1e-9)
 
