@@ -1,6 +1,7 @@
 """Tables and sentences of a calibration, for its card, the screen, report pages and CSV files."""
 
 import csv
+import functools
 import math
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,6 +14,7 @@ from pisigma.judging.calibration_summary import (
     ParameterFigures,
 )
 from pisigma.judging.validation_figures import AbstractValidationFigures, LearningPoint, ValidationFigures
+from pisigma.reporting.rendering import sentences
 from pisigma.reporting.tables import Table, figure_text
 
 PARAMETERS_CSV = "parameters.csv"
@@ -20,6 +22,8 @@ CORRELATION_CSV = "correlation.csv"
 PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")
 TRIAL_COLUMNS = ("tried", "unknowns", "log evidence", "left-out error", "seconds", "kept")
 _FIGURES = ("nominal", "estimated", "change", "standard_error")
+
+_say = functools.partial(sentences, "calibration.txt.j2")
 
 
 def parameter_table(parameters: Sequence[ParameterFigures]) -> Table:
@@ -65,24 +69,12 @@ def trial_table(hybrid: HybridFigures) -> Table:
 
 def learned_lines(hybrid: HybridFigures) -> list[str]:
     """What was learned beyond the geometry, in sentences."""
-    lines, learned = [hybrid.verdict], hybrid.learned
-    if learned is not None:
-        lines.append(
-            f"Geometry and correction have {learned.unknowns} unknowns, of which the data determine "
-            f"{learned.effective_parameters:.0f}; beyond the measured joint values the correction is an extrapolation, "
-            "whose predicted deviation says how good it is."
-        )
-    return lines
+    return list(_say("learned", hybrid))
 
 
 def coverage_line(figures: AbstractValidationFigures) -> str:
     """How often held-out coordinates are within the predicted intervals, in a sentence; "" where none are predicted."""
-    if figures.coverage is None or figures.predicted_rms_mm is None:
-        return ""
-    return (
-        f"{100 * figures.coverage:.1f} % of the held-out coordinates are within the 95 % intervals that the hybrid "
-        f"predicts (RMS of a predicted position error: {figure_text(figures.predicted_rms_mm)} mm)."
-    )
+    return "".join(_say("coverage", figures))
 
 
 def curve_table(points: Sequence[LearningPoint]) -> Table:
@@ -101,85 +93,27 @@ def curve_table(points: Sequence[LearningPoint]) -> Table:
 
 def folds_text(figures: ValidationFigures) -> str:
     """How the rows of a validation were held out, such as "6 folds, 8 repeats"."""
-    return "held out once" if (figures.folds or 1) == 1 else f"{figures.folds} folds{_repeats(figures)}"
+    return _say("folds", figures)[0]
 
 
 def cross_validation_text(figures: ValidationFigures) -> str:
     """The same as a sentence without its end: "6-fold cross-validation, 8 repeats: each of 720 rows is ..."."""
-    return (
-        f"{figures.folds}-fold cross-validation{_repeats(figures)}: each of {figures.rows} rows is judged by a "
-        "calibration without it"
-    )
-
-
-def _repeats(figures: ValidationFigures) -> str:
-    return "" if figures.repeats is None else f", {figures.repeats} repeats"
+    return _say("cross_validation", figures)[0]
 
 
 def simulations_text(figures: ValidationFigures) -> str:
     """Which simulated rows were held out, in a sentence."""
-    text = f"{figures.rows} other simulated rows"
-    if figures.mean_rms_mm is None:
-        return f"{text}."
-    means = ", ".join(f"{name} {figure_text(mean)} mm" for name, mean in figures.mean_rms_mm.items())
-    return (
-        f"{text} of {figures.folds} simulations that differ in all that is random (mean of their RMS position errors: "
-        f"{means})."
-    )
+    return _say("simulations", figures)[0]
 
 
 def held_out_lines(figures: ValidationFigures) -> list[str]:
     """What else is to be said of a validation: of its repeats, of sockets and frames that were held out whole."""
-    lines = []
-    if figures.rms_mm_of_repeats is not None:
-        ranges = ", ".join(
-            f"{name} {figure_text(min(rms))} to {figure_text(max(rms))} mm"
-            for name, rms in figures.rms_mm_of_repeats.items()
-        )
-        lines.append(
-            f"The RMS position errors of the {figures.repeats} repeats by themselves are {ranges}: so much depends on "
-            "which joint values are held out together."
-        )
-    if figures.sockets_held_out:
-        lines.append(
-            f"{figures.sockets_held_out} sockets were held out whole; an error there is how far a row puts the ball "
-            "from where the socket's rows put it on average."
-        )
-    if figures.socket_distance is not None:
-        *others, (last, best) = figures.socket_distance.models.items()
-        beside = "; ".join(
-            f"{name} {figure_text(sizes.mean_mm)} and {figure_text(sizes.max_mm)} mm"
-            for name, sizes in others
-        )
-        by = f" by the {last} calibration" if last != "geometric" else ""
-        lines.append(
-            f"The known distance of held-out sockets ({figures.socket_distance.count} of them) is met to "
-            f"{figure_text(best.mean_mm)} mm on average, {figure_text(best.max_mm)} mm at worst{by} ({beside})."
-        )
-    if figures.rows_not_judged:
-        lines.append(
-            f"{figures.rows_not_judged} rows could not be judged: no row that was calibrated with had their target or "
-            "anchor."
-        )
-    if figures.frames_fitted:
-        lines.append(
-            f"{figures.frames_fitted} frames were held out whole; where the base stands in them, and nothing else, "
-            "was fitted to the held-out rows."
-        )
-    return lines
+    return list(_say("held_out", figures))
 
 
 def noise_text(noise: NoiseFigures) -> str:
     """How much a sensor scatters, in a sentence."""
-    if noise.factor_on_stated_sigma is not None:
-        size = f"{noise.factor_on_stated_sigma:.4g} times the standard deviation that the rows state"
-    else:
-        sigma, unit = (noise.sigma_deg, "deg") if noise.sigma_mm is None else (noise.sigma_mm, "mm")
-        size = f"{sigma:.4g} {unit} per value (one standard deviation)"
-    return (
-        f"Noise of {noise.sensor}, as the residuals show it: {size}, from {noise.values} values of which "
-        f"the parameters use up {noise.used_by_parameters:.3g}."
-    )
+    return _say("noise", noise)[0]
 
 
 def _sentence(line: str) -> str:

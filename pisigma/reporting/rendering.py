@@ -6,7 +6,6 @@ from pathlib import Path
 import jinja2
 
 from pisigma.model.folder.folder_files import CARD
-from pisigma.reporting.calibration_tables import parameter_table
 from pisigma.reporting.tables import figure_text, joint_table, markdown_table, percent_text, pose_table
 from pisigma.templates import template_environment
 
@@ -41,7 +40,6 @@ def _environment() -> jinja2.Environment:
             "digits": "{:.4g}".format,
             "pose_table": pose_table,
             "joint_table": joint_table,
-            "parameter_table": parameter_table,
             "percent": percent_text,
             "table": lambda table: markdown_table(*table),
         },

@@ -10,6 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from pisigma.measurement.groups import numbers_of_names
+from pisigma.reporting.calibration_tables import parameter_table
 from pisigma.reporting.page.accuracy import LABELS, Accuracy
 from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.error_map import ErrorMap
@@ -33,6 +34,7 @@ def render_page(content: ReportContent, figures: ReportFigures) -> str:
         c=content,
         figures=figures,
         labels=LABELS,
+        parameter_table=parameter_table,
         image=_image,
         png=lambda png: _address("png", png),
         error_lines=_error_lines,
