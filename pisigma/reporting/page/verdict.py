@@ -1,5 +1,6 @@
 """The verdict on a calibration: one sentence, what it rests on, and where the calibration is worst."""
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -11,16 +12,12 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.page.accuracy import Accuracy, JudgedJoint, Limit
 from pisigma.reporting.page.dependence import LEAST_ROWS, error_lengths, root_mean_square
 from pisigma.reporting.page.judged_rows import JudgedRows
-from pisigma.reporting.tables import figure_text
+from pisigma.reporting.rendering import sentences
 
 CELLS = 4
 """Cells of the measured space along every axis."""
 
-_AMONG = {
-    "held_out": "Of the held-out rows",
-    "training": "Of the rows that the model was made of",
-    "other": "Of the rows of the file",
-}
+_say = functools.partial(sentences, "report.txt.j2")
 
 
 @dataclass(frozen=True)
@@ -83,55 +80,20 @@ def verdict_of(
         return _without_poses(model, joints)
     best = accuracies[0]
     clause, worst = _worst(model, rows)
-    clauses = [_how_accurate(model, best), *([clause] if clause else [])]
+    clauses = [*_say("how_accurate", model, best), *([clause] if clause else [])]
     clauses += [f"what limits it is {limit.clause}"] if best.unit == "mm" else []
     return Verdict(f"{'; '.join(clauses)}.", worst, limit.sentence, best.held_out)
-
-
-def _how_accurate(model: CalibratedModel, best: Accuracy) -> str:
-    rms, p95, largest = (figure_text(best.figure(name)) for name in ("rms", "p95", "max"))
-    whose = "that it never saw" if best.held_out else "that it was made of"
-    within = f"{rms} {best.unit} RMS (95 % within {p95}, all within {largest})"
-    if best.reference:
-        return f"On {best.rows} poses {whose}, {model.name} keeps the tool to {within} at {best.reference}"
-    quantity = "position" if best.unit == "mm" else "orientation"
-    text = f"On {best.rows} rows {whose}, {model.name} predicts the {quantity} to {within}"
-    if best.factor is None:
-        return text
-    nominal = f"the nominal robot ({figure_text(best.figure('rms', 'nominal'))} {best.unit})"
-    if best.factor >= 1:
-        return f"{text}, {best.factor:.1f} times better than {nominal}"
-    return (
-        f"{text}, {1 / best.factor:.1f} times worse than {nominal}: check that the rows are in the frame and of the "
-        "target that the model was fitted to"
-    )
 
 
 def _without_poses(model: CalibratedModel, joints: tuple[JudgedJoint, ...]) -> Verdict:
     """Say what joint errors say where no pose was judged."""
     if not joints:
-        sentence = (
-            f"{model.name} holds no figures of its accuracy, and no measurements were given: nothing can be said of "
-            "how accurate it is."
-        )
         advice = "Give a file with measurements that the model was not made of."
-        return Verdict(sentence, "", advice, held_out=False)
-    held_out = joints[0].held_out
-    worst = max(
-        (one for one in joints if one.held_out == held_out), key=lambda one: one.errors.after.values[0]
-    )
-    averages = worst.errors.before.values[0], worst.errors.after.values[0]
-    before, after = (f"{figure_text(average)} {worst.unit}" for average in averages)
-    times = (
-        f", {averages[0] / averages[1]:.0f} times better than nominal ({before})" if averages[1] > 0 else ""
-    )
-    sentence = (
-        f"{'On rows that it never saw' if held_out else 'On the very rows that it was made of'}, {model.name} "
-        f"gives the joint values of poses to {after} on average at its worst joint, {worst.name}"
-        f"{times}; no pose errors were judged, so nothing is known of a measured robot."
-    )
+        return Verdict(_say("no_figures", model)[0], "", advice, held_out=False)
+    of_kind = [one for one in joints if one.held_out == joints[0].held_out]
+    worst = max(of_kind, key=lambda one: one.errors.after.values[0])
     advice = "Give a file with measured positions or poses to judge them."
-    return Verdict(sentence, "", advice, held_out, worst)
+    return Verdict(_say("how_accurate_joint", model, worst)[0], "", advice, worst.held_out, worst)
 
 
 def _worst(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, str]:
@@ -145,39 +107,20 @@ def _worst(model: CalibratedModel, rows: JudgedRows | None) -> tuple[str, str]:
     place, errors = rows.place.numpy()[finite], after[finite]
     region, worst = worst_region(place, errors), int(errors.argmax())
     number = int(np.flatnonzero(finite)[worst])
-    line = rows.measurements.line[number]
-    at = ", ".join(str(round(value * 1e3)) for value in place[worst].tolist())
-    joints = ", ".join(
+    joints = [
         f"{np.degrees(value):.1f} deg" if turns else f"{value * 1e3:.1f} mm"
         for value, turns in zip(rows.measurements.q.numpy()[number], model.robot.revolute, strict=True)
-    )
-    row = (
-        f"{_AMONG[rows.origin]} the worst is {f'line {line}' if line else f'row {number + 1}'} of "
-        f"{rows.measurements.source}: {figure_text(float(errors[worst]))} {unit} at x, y, z = {at} mm of the robot's "
-        f"base, joints {joints}."
-    )
-    return _region_text(region, unit, row, rows.origin)
-
-
-def _region_text(region: Region | None, unit: str, row: str, origin: str) -> tuple[str, str]:
+    ]
+    at = [round(value * 1e3) for value in place[worst].tolist()]
+    (row,) = _say("worst_row", rows, number, float(errors[worst]), unit, at, joints)
     if region is None:
         return "", row
-    as_far = " (as far as the rows that it was made of tell)" if origin == "training" else ""
-    if not region.significant:
-        return (
-            f"nowhere in the measured space is it worse than elsewhere by more than chance{as_far}",
-            f"No part of the measured space is worse than the others by more than chance. {row}",
-        )
-    ranges = ", ".join(
+    where = ", ".join(
         f"{axis} {round(low * 1e3)} to {round(high * 1e3)}"
         for axis, low, high in zip("xyz", region.low, region.high, strict=True)
     )
-    rms = f"{figure_text(region.rms)} {unit} RMS"
-    return (
-        f"it is worst around {ranges} mm of the robot's base, {rms}{as_far}",
-        f"Largest errors in {ranges} mm of the robot's base: {rms} over {region.rows} rows, {region.ratio:.1f} times "
-        f"that of all rows, more than by chance. {row}",
-    )
+    clause, sentence = _say("worst_region", region, where, unit, rows.origin)
+    return clause, f"{sentence} {row}"
 
 
 def worst_region(place: Float64[np.ndarray, "rows 3"], errors: Float64[np.ndarray, " rows"]) -> Region | None:
