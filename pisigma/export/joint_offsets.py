@@ -279,11 +279,10 @@ def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
     lost, nominal = offsets.lost.in_file_units(), offsets.nominal.in_file_units()
     said = [
         MEANING,
-        f"Offsets alone are off the whole model by {lost['mean_mm']:.4g} mm in the mean, "
-        f"{lost['p95_mm']:.4g} mm in 95 % of its poses, {lost['max_mm']:.4g} mm at most, and "
-        f"{lost['mean_mrad']:.4g} mrad in the mean (the robot as drawn, on the model's base and tool: "
-        f"{nominal['mean_mm']:.4g}, {nominal['p95_mm']:.4g}, {nominal['max_mm']:.4g} mm and "
-        f"{nominal['mean_mrad']:.4g} mrad).",
+        f"Offsets alone are off the whole model by {lost['mean_mm']:.4g} mm in the mean, {lost['p95_mm']:.4g} mm in 95 "
+        f"% of its poses, {lost['max_mm']:.4g} mm at most, and {lost['mean_mrad']:.4g} mrad in the mean (the robot as "
+        f"drawn, on the model's base and tool: {nominal['mean_mm']:.4g}, {nominal['p95_mm']:.4g}, "
+        f"{nominal['max_mm']:.4g} mm and {nominal['mean_mrad']:.4g} mrad).",
     ]
     if offsets.unobservable:
         said.append(f"Base or tool take in the offset of {', '.join(offsets.unobservable)}, which is 0 here.")
@@ -323,9 +322,5 @@ def _write(request: ExportRequest) -> Exported:
 
 
 FORMAT = ExportFormat(
-    "offsets",
-    "a table of joint offsets",
-    TABLE_SUFFIXES,
-    _write,
-    frozenset(("payload_kg", "temperature_c")),
+    "offsets", "a table of joint offsets", TABLE_SUFFIXES, _write, frozenset(("payload_kg", "temperature_c"))
 )

@@ -39,9 +39,8 @@ def sentences(targets: Targets) -> tuple[str, ...]:
     return (
         targets.title,
         "q: joint values to command, with the zeros and directions of the description of that robot.",
-        "x to yaw: where the nominal robot stands at q, FK_nominal(q): what a controller that computes with "
-        "the robot as drawn has to be commanded, on this base and with this tool. Rotation = RotZ(roll) RotY(pitch) "
-        "RotX(yaw).",
+        "x to yaw: where the nominal robot stands at q, FK_nominal(q): what a controller that computes with the robot "
+        "as drawn has to be commanded, on this base and with this tool. Rotation = RotZ(roll) RotY(pitch) RotX(yaw).",
         f"Nominal robot: {targets.robot.name} as drawn; base: {frames['base']}; tool: {frames['tool']}.",
         "sigma: predicted standard deviation of the position reached; empty where it is not known.",
         *targets.remarks,

@@ -16,14 +16,7 @@ from torch import Tensor
 from pisigma.errors import MeasurementError
 from pisigma.measurement.csv.reading import read_fields
 from pisigma.measurement.csv.writing import write_fields
-from pisigma.measurement.fields import (
-    KINDS,
-    Kind,
-    LeftOut,
-    MeasuredFields,
-    OnBadRow,
-    joined_fields,
-)
+from pisigma.measurement.fields import KINDS, Kind, LeftOut, MeasuredFields, OnBadRow, joined_fields
 from pisigma.measurement.readings import READINGS
 from pisigma.measurement.rules import check_fields
 from pisigma.robot import Robot
@@ -266,10 +259,7 @@ class Measurements:
         return Measurements.from_fields(read_fields(path, robot, on_bad_row))
 
     def write_csv(
-        self,
-        path: str | os.PathLike[str],
-        robot: Robot | None = None,
-        revolute: Sequence[bool] | None = None,
+        self, path: str | os.PathLike[str], robot: Robot | None = None, revolute: Sequence[bool] | None = None
     ) -> None:
         """Write a CSV file that `read_csv` reads back: degrees and millimetres with every digit, and quaternions.
 

@@ -133,8 +133,7 @@ class Jig:
         if Path(name).suffix.lower() in (".yaml", ".yml"):
             return read_yaml(name, JigDocument, MeasurementError).to_jig()
         raise MeasurementError(
-            f"'{name}' is no jig that comes with pisigma and no .yaml file: "
-            f"{nearest_choice(name, catalogue())}"
+            f"'{name}' is no jig that comes with pisigma and no .yaml file: {nearest_choice(name, catalogue())}"
         )
 
     @property
@@ -240,9 +239,8 @@ class Jig:
             face, block = covered.nonzero()[0].tolist()
             raise ValueError(
                 f"the face {self.face_names[face].rpartition('/')[2]} of block "
-                f"'{self.block_names[int(self.block[face])]}' is covered by block "
-                f"'{self.block_names[block]}'; "
-                "remove it from 'faces'"
+                f"'{self.block_names[int(self.block[face])]}' is covered by block '{self.block_names[block]}'; remove "
+                "it from 'faces'"
             )
 
 

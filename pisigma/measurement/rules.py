@@ -231,9 +231,7 @@ def _touch_faults(
     yield (
         touch & ~_named(data.text("frame")),
         lambda row: (
-            f"{labels('frame')}: the touch names no frame; write which placement of the "
-            "jig was touched, "
-            "such as left"
+            f"{labels('frame')}: the touch names no frame; write which placement of the jig was touched, such as left"
         ),
     )
 
@@ -303,9 +301,8 @@ def group_faults(
                 yield _fault(
                     data,
                     rows,
-                    f"{labels('frame')}: {kind} '{name}' is in the frames '{frames[0]}' and "
-                    f"'{frames[1]}', but "
-                    "its place is one point of one frame; use another name in each frame",
+                    f"{labels('frame')}: {kind} '{name}' is in the frames '{frames[0]}' and '{frames[1]}', but its "
+                    "place is one point of one frame; use another name in each frame",
                 )
     for name, rows in _groups(data.text("anchor")).items():
         places = np.where(np.isnan(anchor_place[rows]), np.inf, anchor_place[rows])  # NaN equals NaN
@@ -313,9 +310,8 @@ def group_faults(
             yield _fault(
                 data,
                 rows,
-                f"{labels('anchor_place')}: anchor '{name}' has not the same place in all "
-                "its rows; give one "
-                "place in all of them or in none, or name the anchors apart",
+                f"{labels('anchor_place')}: anchor '{name}' has not the same place in all its rows; give one place in "
+                "all of them or in none, or name the anchors apart",
             )
 
 

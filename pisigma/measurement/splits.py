@@ -68,11 +68,7 @@ def k_folds(
 
 
 def repeats(
-    measurements: Measurements,
-    folds: int | None,
-    seed: int,
-    by: SplitBy = "joints",
-    times: int | None = None,
+    measurements: Measurements, folds: int | None, seed: int, by: SplitBy = "joints", times: int | None = None
 ) -> tuple[tuple[TrainTest, ...], ...]:
     """Split the measurements into folds several times over, differently each time.
 

@@ -4,12 +4,4 @@ from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import RobotDocument, catalogue
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, JointType, Row
 
-__all__ = [
-    "DH_COLUMNS",
-    "FRAME_COLUMNS",
-    "JointType",
-    "Robot",
-    "RobotDocument",
-    "Row",
-    "catalogue",
-]
+__all__ = ["DH_COLUMNS", "FRAME_COLUMNS", "JointType", "Robot", "RobotDocument", "Row", "catalogue"]

@@ -126,11 +126,7 @@ class AnchorSensor(AbstractSensor):
 
     @classmethod
     def uncalibrated(
-        cls,
-        measurements: Measurements,
-        owner: str,
-        T: Poses,
-        calibrated: Collection[str],
+        cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
     ) -> Float64[Tensor, " columns"]:
         """Return the anchor's position that the measurements state, and no zero.
 

@@ -209,11 +209,7 @@ class AbstractSensor(ABC):
 
     @classmethod
     def uncalibrated(
-        cls,
-        measurements: Measurements,
-        owner: str,
-        T: Poses,
-        calibrated: Collection[str],
+        cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
     ) -> Float64[Tensor, " columns"]:
         """Return the unknowns of an owner that was not calibrated, for judging its rows.
 

@@ -106,11 +106,7 @@ class SocketSensor(AbstractSensor):
 
     @classmethod
     def uncalibrated(
-        cls,
-        measurements: Measurements,
-        owner: str,
-        T: Poses,
-        calibrated: Collection[str],
+        cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
     ) -> Float64[Tensor, " columns"]:
         """Return where the rows of a socket meet on average."""
         rows = numbers_of(measurements.socket, (owner,), measurements.rows).to(T.device) == 0

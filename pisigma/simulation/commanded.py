@@ -183,8 +183,7 @@ def joints_for_poses(
     if not inside.all():
         outside = (~inside).nonzero()
         raise RecipeError(
-            f"simulation: wanted pose {int(outside[0])} (counted from 0; {len(outside)} of {len(T)} poses) "
-            f"needs joint values outside the limits of robot '{robot.nominal.name}'; "
-            "change the region of the poses or the branch."
+            f"simulation: wanted pose {int(outside[0])} (counted from 0; {len(outside)} of {len(T)} poses) needs joint "
+            f"values outside the limits of robot '{robot.nominal.name}'; change the region of the poses or the branch."
         )
     return q

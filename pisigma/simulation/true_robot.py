@@ -254,8 +254,7 @@ class TrueRobot:
         if missed.any():
             index = tuple(missed.nonzero()[0].tolist())
             raise UnreachablePoseError(
-                "the true robot does not reach the wanted pose at index "
-                f"{index if len(index) != 1 else index[0]}: "
+                f"the true robot does not reach the wanted pose at index {index if len(index) != 1 else index[0]}: "
                 f"{float(solution.position_residual[index]) * 1e3:.3g} mm and "
                 f"{float(torch.rad2deg(solution.rotation_residual[index])):.3g} deg are left; "
                 f"{Status.NOT_CONVERGED.sentence}"

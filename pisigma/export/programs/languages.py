@@ -53,11 +53,10 @@ RAPID = Language(
     template="rapid.j2",
     longest=27,  # of 32, with _tool behind it
     reserved=words(
-        "alias and backward bool case connect const default div do else elseif endfor endfunc endif endmodule "
-        "endproc endrecord endtest endtrap endwhile error exit false for from func goto if inout local mod "
-        "module nostepin not noview num or pers proc raise readonly record retry return step string "
-        "sysmodule task test then to trap true trynext undo user var viewonly while with xor slow fine tool0 "
-        "wobj0 movej moveabsj confj base"
+        "alias and backward bool case connect const default div do else elseif endfor endfunc endif endmodule endproc "
+        "endrecord endtest endtrap endwhile error exit false for from func goto if inout local mod module nostepin not "
+        "noview num or pers proc raise readonly record retry return step string sysmodule task test then to trap true "
+        "trynext undo user var viewonly while with xor slow fine tool0 wobj0 movej moveabsj confj base"
     ),
 )
 FANUC = Language(

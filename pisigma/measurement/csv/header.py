@@ -139,8 +139,7 @@ def _check_joints(place: str, columns: tuple[Column, ...]) -> int:
     joints = sorted((column for column in columns if column.joint), key=lambda column: column.joint)
     if not joints:
         raise MeasurementError(
-            f"{place}: no joint column; add q1_deg or q1_rad (q1_mm or q1_m for a prismatic joint) and so on "
-            "per joint."
+            f"{place}: no joint column; add q1_deg or q1_rad (q1_mm or q1_m for a prismatic joint) and so on per joint."
         )
     for expected, column in enumerate(joints, start=1):
         if column.joint != expected:
@@ -166,9 +165,8 @@ def _check_robot(place: str, joints: list[Column], robot: Robot) -> None:
     """The joint columns fit the robot's joints."""
     if len(joints) != robot.dof:
         raise MeasurementError(
-            f"{place}, column '{joints[-1].name}': the file ends with joint {len(joints)}, but robot "
-            f"'{robot.name}' has {robot.dof} joints; choose the robot that was measured or correct the "
-            "columns."
+            f"{place}, column '{joints[-1].name}': the file ends with joint {len(joints)}, but robot '{robot.name}' "
+            f"has {robot.dof} joints; choose the robot that was measured or correct the columns."
         )
     for column, joint in zip(joints, robot.joints, strict=True):
         units = REVOLUTE_UNITS if joint.type == "revolute" else PRISMATIC_UNITS
@@ -200,8 +198,7 @@ def _check_position(place: str, columns: tuple[Column, ...]) -> None:
         if quantity not in {column.quantity for column in present}:
             raise MeasurementError(
                 f"{place}: the column '{quantity}_{unit}' is missing; add the measured position as "
-                f"{','.join(f'{name}_{unit}' for name in POSITION)} (cells may be empty where it was not "
-                "measured)."
+                f"{','.join(f'{name}_{unit}' for name in POSITION)} (cells may be empty where it was not measured)."
             )
     _check_one_unit(place, present)
 
@@ -235,8 +232,7 @@ def _check_lengths(place: str, columns: tuple[Column, ...]) -> None:
             )
     if "touch" in present and "frame" not in present:
         raise MeasurementError(
-            f"{place}, column '{present['touch'].name}': says nothing without the frame of a "
-            "jig; add the column "
+            f"{place}, column '{present['touch'].name}': says nothing without the frame of a jig; add the column "
             "frame, which placement of the jig was touched."
         )
     _check_one_unit(place, [present[name] for name in ANCHOR_PLACE if name in present])

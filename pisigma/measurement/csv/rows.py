@@ -110,16 +110,14 @@ def _numbers(cells: Sequence[str], column: Column, faults: Faults) -> Float64[np
         faults.add(
             odd,
             lambda row: (
-                f"column '{column.name}': '{cells[row].strip()}' is no finite number; write one such as "
-                f"-12.5{remedy}"
+                f"column '{column.name}': '{cells[row].strip()}' is no finite number; write one such as -12.5{remedy}"
             ),
         )
     with np.errstate(invalid="ignore"):
         faults.add(
             np.abs(values) > LARGEST,
             lambda row: (
-                f"column '{column.name}': {values[row]:.4g} {column.unit} is more than can be measured; "
-                "correct it"
+                f"column '{column.name}': {values[row]:.4g} {column.unit} is more than can be measured; correct it"
             ),
         )
     return values
@@ -160,9 +158,8 @@ def _check_limits(
     faults.add(
         outside,
         lambda row: (
-            f"column '{column.name}': {q[row]:.10g} {column.unit} is outside the limits {lower:.6g} to "
-            f"{upper:.6g} {column.unit} of joint '{joint.name}' of robot '{robot}'; "
-            f"{_UNIT_DOUBT[column.unit]}"
+            f"column '{column.name}': {q[row]:.10g} {column.unit} is outside the limits {lower:.6g} to {upper:.6g} "
+            f"{column.unit} of joint '{joint.name}' of robot '{robot}'; {_UNIT_DOUBT[column.unit]}"
         ),
     )
 

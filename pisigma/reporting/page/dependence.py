@@ -83,9 +83,7 @@ class Binned:
     number: Int64[np.ndarray, " rows"]
 
 
-def error_lengths(
-    rows: JudgedRows,
-) -> tuple[Float64[np.ndarray, " rows"], Float64[np.ndarray, " rows"], str]:
+def error_lengths(rows: JudgedRows) -> tuple[Float64[np.ndarray, " rows"], Float64[np.ndarray, " rows"], str]:
     """Give errors before and after, and their unit: of positions in mm, where there are none of orientations in deg."""
     if bool(np.isfinite(rows.after.position.numpy()).any()) or rows.after.rotation is None:
         return rows.before.position.numpy() * 1e3, rows.after.position.numpy() * 1e3, "mm"
