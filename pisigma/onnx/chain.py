@@ -65,42 +65,16 @@ def add_roll_pitch_yaw(graph: OnnxGraph, cells: str) -> list[str]:
 
 def _add_chain(graph: OnnxGraph, robot: Robot, q: str, base: np.ndarray) -> Iterator[_Step]:
     """Walk along the rows: `RotZ(q)` or `Trans(0, 0, q)` comes first, and what does not move behind it."""
-    frame, joint = _Frame(base, None), 0
+    ones = graph.node("Add", graph.node("Mul", graph.column(q, 0), 0.0), 1.0)  # one a row of q
+    frame, joint = graph.node("Mul", graph.reshape(ones, [1, 1]), base), 0
     for row, still in zip(robot.rows, _still(robot), strict=True):
         before = frame
         if row.type != "fixed":
             value = graph.reshape(graph.node("Mul", graph.column(q, joint), float(row.direction)), [1, 1])
-            frame = frame.then_moving(graph, row, value)
+            frame = graph.node("MatMul", frame, _combined(graph, value, _moving(row)))
             joint += 1
-        frame = frame.then_still(graph, still)
-        yield _Step(row, before.name(graph, q), frame.name(graph, q))
-
-
-class _Frame(NamedTuple):
-    """A frame: one that does not move, or a value of the graph `(batch, 4, 4)`."""
-
-    constant: np.ndarray
-    value: str | None
-
-    def then_moving(self, graph: OnnxGraph, row: Row, value: str) -> "_Frame":
-        """The frame behind a joint of values `(batch, 1, 1)`."""
-        parts = _moving(row)
-        if self.value is None:
-            return _Frame(self.constant, _combined(graph, value, [self.constant @ part for part in parts]))
-        return _Frame(self.constant, graph.node("MatMul", self.value, _combined(graph, value, parts)))
-
-    def then_still(self, graph: OnnxGraph, still: np.ndarray) -> "_Frame":
-        """The frame behind what does not move."""
-        if self.value is None:
-            return _Frame(self.constant @ still, None)
-        return _Frame(self.constant, graph.node("MatMul", self.value, still))
-
-    def name(self, graph: OnnxGraph, q: str) -> str:
-        """The frame as `(batch, 4, 4)`; one that does not move is repeated for every row of q."""
-        if self.value is not None:
-            return self.value
-        ones = graph.node("Add", graph.node("Mul", graph.column(q, 0), 0.0), 1.0)
-        return graph.node("Mul", graph.reshape(ones, [1, 1]), self.constant)
+        frame = graph.node("MatMul", frame, still)
+        yield _Step(row, before, frame)
 
 
 def _moving(row: Row) -> list[np.ndarray]:
