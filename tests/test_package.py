@@ -187,6 +187,12 @@ def test_public_names_are_there_and_documented(name):
     assert name in dir(pisigma)
 
 
+def test_type_checkers_know_the_public_names():
+    stub = ast.parse((PACKAGE / "__init__.pyi").read_text(encoding="utf-8"))
+    named = [alias.asname for node in stub.body if isinstance(node, ast.ImportFrom) for alias in node.names]
+    assert sorted(map(str, named)) == pisigma.__all__
+
+
 def test_unknown_names_are_no_attributes():
     assert sorted(pisigma.__all__) == list(pisigma.__all__)
     with pytest.raises(AttributeError, match="no attribute 'laod'"):

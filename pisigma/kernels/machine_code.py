@@ -22,23 +22,8 @@ from pisigma.errors import ModelError
 from pisigma.kernels.build import ARGUMENTS, ENTRY, intermediate_code, read_ready, ready_forms, source_hash
 from pisigma.kernels.forms import KernelForms
 
-_ALLOWED = frozenset(
-    (
-        "acos",
-        "atan2",
-        "ceil",
-        "cos",
-        "fabs",
-        "floor",
-        "hypot",
-        "log",
-        "memcpy",
-        "memset",
-        "pow",
-        "sin",
-        "sqrt",
-    )
-)
+_ALLOWED = {"acos", "atan2", "ceil", "cos", "fabs", "floor", "hypot", "log", "pow", "sin", "sqrt"}
+_ALLOWED |= {"memcpy", "memset"}
 """Functions of the C library that every process has."""
 _OPTIONS = "speed 3, vectors, internal linkage"
 """What `optimised_object` does, as far as the code depends on it; part of the key of kept code."""
