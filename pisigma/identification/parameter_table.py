@@ -72,7 +72,7 @@ def parameter_table(
     space, robot = problem.space, problem.space.robot
     bases, tools = np.tile(robot.base, (len(space.frames), 1)), np.tile(robot.tool, (len(space.targets), 1))
     nominal = space.values(bases, tools, unknowns_in_frames(setup, setup.start))
-    values = geometry.values()
+    values = geometry.values_of(space)
     change = values - nominal
     angle = torch.tensor([parameter.unit == "rad" for parameter in space.parameters])
     change = torch.where(angle, wrap_to_pi(change), change)

@@ -20,6 +20,7 @@ from pisigma.identification.identifiability.plausibility import misfitting_frame
 from pisigma.identification.identifiability.redundancy import Findings, Redundancy
 from pisigma.identification.identifiability.sufficiency import what_to_measure
 from pisigma.identification.parameter_table import ParameterEstimate, parameter_table
+from pisigma.identification.posterior import ParameterPosterior
 from pisigma.identification.prediction import predicted_poses
 from pisigma.identification.problem.least_squares import (
     Linearisation,
@@ -125,12 +126,20 @@ class SolvedCalibration:
     @cached_property
     def covariance(self) -> Float64[np.ndarray, "parameters parameters"]:
         """Covariance of all parameters in the user's coordinates (SI), zero where they were not free."""
-        size = len(self.problem.space.parameters)
-        full = torch.zeros(size, size, dtype=torch.float64)
-        active = self.problem.active.cpu()
-        full[active[:, None], active] = covariance_of(self.refined.normal).cpu()
-        covariance: np.ndarray = (self.geometry.change @ full @ self.geometry.change.mT).numpy()
+        change = self.geometry.change[:, self.problem.active.cpu()]
+        covariance: np.ndarray = (change @ covariance_of(self.refined.normal).cpu() @ change.mT).numpy()
         return covariance
+
+    @cached_property
+    def root(self) -> Float64[Tensor, "parameters directions"]:
+        """`R` with the covariance `R R^T` of all parameters in the user's coordinates."""
+        covariance = covariance_of(self.refined.normal).cpu()
+        scale = covariance.diagonal().clamp(min=0.0).sqrt()
+        inverse = torch.where(scale > 0, 1 / scale, 0.0)
+        values, axes = torch.linalg.eigh(covariance * inverse * inverse[:, None])
+        half = scale[:, None] * axes * values.clamp(min=0.0).sqrt()
+        root: Tensor = self.geometry.change[:, self.problem.active.cpu()] @ half
+        return root
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,6 +178,12 @@ class CalibrationResult:
     def covariance(self) -> Float64[np.ndarray, "parameters parameters"]:
         """Covariance of all parameters in their order (SI), zero where they were not free."""
         return self.solved.covariance
+
+    @cached_property
+    def posterior(self) -> ParameterPosterior:
+        """What is known of all parameters together, in the user's coordinates; see `ParameterPosterior`."""
+        solved = self.solved
+        return ParameterPosterior.of(solved.problem.space, solved.geometry, solved.root)
 
     @cached_property
     def residuals(self) -> dict[str, Float64[np.ndarray, "rows components"]]:

@@ -6,13 +6,12 @@ import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
 
-from pisigma.identification.problem.setup import IdentifiedGeometry
+from pisigma.identification.posterior import ParameterPosterior
 from pisigma.measurement.conditions import CONDITIONS
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.hybrid_motion import corrected_joints
-from pisigma.model.row_poses import Frames, known_names
-from pisigma.robot.description import Robot
+from pisigma.model.row_poses import known_names
 
 
 def position_accuracy(model: CalibratedModel, q: Float[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch"]:
@@ -64,6 +63,12 @@ def deviation_of_rows(model: CalibratedModel, measurements: Measurements) -> Flo
     return model.uncertainty.deviation(at, at.q if arm is None else corrected_joints(arm, at))
 
 
-def geometry_of(robot: Robot, bases: Frames, tools: Frames) -> IdentifiedGeometry:
-    """A geometry as an uncertainty needs it: without sockets, anchors, and how it was solved for."""
-    return IdentifiedGeometry(robot, bases, tools, {})
+def parameter_posterior(model: CalibratedModel) -> ParameterPosterior | None:
+    """Return what the calibration says of all parameters together, in the user's coordinates.
+
+    Returns:
+        Geometry, bases, tools and sensors' unknowns with all their correlations, also with the weights of the joint
+        correction; None where the model holds no uncertainty.
+    """
+    known = model.uncertainty
+    return None if known is None else ParameterPosterior.of(known.space, known.geometry, known.root)

@@ -9,12 +9,11 @@ from torch import Tensor
 
 from pisigma.hybrid.result import HybridResult
 from pisigma.hybrid.uncertainty import PositionUncertainty
+from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.identification.result import CalibrationResult
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.accuracy import geometry_of
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
-from pisigma.model.row_poses import Frames
 from pisigma.model.stored_starts import nearest_branch, spread_rows
 from pisigma.robot.description import Robot
 
@@ -78,7 +77,8 @@ def model_of_hybrid(
     known, learned = result.geometric, result.learned
     model = model_of_calibration(name, nominal, known, measurements, recipe)
     if learned is None:
-        kept = _kept(result.uncertainty, known.robot, model.bases, model.tools)
+        geometry = IdentifiedGeometry(known.robot, model.bases, model.tools, known.unknowns)
+        kept = _kept(result.uncertainty, geometry)
         return replace(model, uncertainty=kept)
     bases, tools = dict(learned.geometry.bases), dict(learned.geometry.tools)
     return replace(
@@ -87,15 +87,15 @@ def model_of_hybrid(
         hybrid=result.arm(),
         hybrid_bases=bases,
         hybrid_tools=tools,
-        uncertainty=_kept(result.uncertainty, learned.geometry.robot, bases, tools),
+        uncertainty=_kept(
+            result.uncertainty,
+            IdentifiedGeometry(learned.geometry.robot, bases, tools, learned.geometry.unknowns),
+        ),
     )
 
 
-def _kept(
-    uncertainty: PositionUncertainty, robot: Robot, bases: Frames, tools: Frames
-) -> PositionUncertainty:
+def _kept(uncertainty: PositionUncertainty, geometry: IdentifiedGeometry) -> PositionUncertainty:
     """An uncertainty at the geometry of a model, with a root that float32 holds."""
-    geometry = geometry_of(robot, bases, tools)
     return replace(uncertainty, geometry=geometry, root=uncertainty.root.float().double())
 
 

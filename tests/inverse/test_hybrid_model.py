@@ -16,7 +16,7 @@ from pisigma.errors import MeasurementError, ModelError, PoseError
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.jacobian import joint_jacobian
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.accuracy import deviation_of_rows, position_accuracy
+from pisigma.model.accuracy import deviation_of_rows, parameter_posterior, position_accuracy
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.hybrid_motion import hybrid_motion, hybrid_poses
@@ -132,6 +132,10 @@ def test_a_folder_gives_the_same_predictions_to_the_last_bit(hybrid, tmp_path):
     assert torch.equal(
         deviation_of_rows(loaded, arm.measurements), deviation_of_rows(model, arm.measurements)
     )
+    posterior, kept = parameter_posterior(model), parameter_posterior(loaded)
+    assert (kept.names, kept.weights) == (posterior.names, posterior.weights)
+    assert torch.equal(kept.mean, posterior.mean)
+    assert torch.equal(kept.root, posterior.root)
     assert np.array_equal(loaded.robot.dh, model.robot.dh)
     assert np.array_equal(loaded.robot.limits, model.robot.limits)
     assert loaded.branches == model.branches
@@ -273,6 +277,7 @@ def _known(**values):
         (_known(turns=[0]), "of shape"),
         (_known(sockets=["A", 3]), "sockets"),
         (_known(prior_scale=-1.0), "prior_scale"),
+        (_known(values={"socket": {"A": [0.0, "far"]}}), "values"),
         (
             lambda document: document["robot"]["rows"][0].update(d_mm=1.0),
             "not the geometry in the description",

@@ -7,19 +7,24 @@ import pytest
 import torch
 from testing.closeness import assert_close
 from testing.models import no_type_checker
+from testing.sensors import true_robot, wire_data
 from testing.simulated_arm import draw_joints, simulate
 
 import pisigma
 from pisigma.errors import ModelError
+from pisigma.hybrid.result import HybridResult
+from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.inverse.identified_arm import within_reach
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.numeric import solve_numeric
 from pisigma.kinematics.status import Status
+from pisigma.model.accuracy import parameter_posterior
 from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.model.geometric_model import model_of_calibration
+from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.model.stored_starts import MAXIMUM_STARTS
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")  # iterations are slow with one
@@ -226,3 +231,24 @@ def test_a_model_without_starts_still_follows_the_closed_form():
     ik = CorrectedIK(replace(model, starts=model.starts[:0]))
     T = forward_kinematics(model.calibrated, arm.measurements.q[:5])
     assert bool((ik.all_branches(T).status == Status.REACHED).any(-1).all())
+
+
+def test_a_folder_keeps_what_the_sensors_found_out_about_themselves(tmp_path):
+    """Anchors and their zeros, correlated with the geometry; a folder of an older format does not hold them."""
+    rows, robot = wire_data(), true_robot().nominal
+    result = GeometricCalibrator(robot).fit(rows)
+    solved = result.solved
+    known = PositionUncertainty(solved.problem.space, solved.geometry, (), solved.root, 1.0)
+    hybrid = HybridResult(result, learned=None, uncertainty=known, trials=(), verdict="")
+    model = model_of_hybrid("wires", robot, hybrid, rows)
+    save_model(model, tmp_path)
+    kept = parameter_posterior(load_model(tmp_path))
+    assert any(name.startswith("anchor_") for name in kept.names)
+    assert kept.names == result.posterior.names
+    assert_close(kept.mean, result.posterior.mean, atol=1e-9)
+    scale = 1 / result.posterior.standard_errors.clamp(min=1e-12)
+    difference = (kept.covariance - result.posterior.covariance) * scale * scale[:, None]
+    assert_close(difference, torch.zeros_like(difference), atol=1e-5)
+    bare = IdentifiedGeometry(known.geometry.robot, known.geometry.bases, known.geometry.tools, {})
+    older = parameter_posterior(replace(model, uncertainty=replace(known, geometry=bare)))
+    assert bool(older.mean[-4:].isnan().all())

@@ -251,10 +251,13 @@ class IdentifiedGeometry:
         assert self.point is not None
         return coordinate_change(self.setup, self.point.cpu())
 
-    def values(self) -> Float64[Tensor, " parameters"]:
-        """Return all parameters as one vector, in the order of the `ParameterSpace` that they come from."""
-        owned = (values for owners in self.unknowns.values() for values in owners.values())
-        blocks = (self.robot.dh.ravel(), *self.bases.values(), *self.tools.values(), *owned)
+    def values_of(self, space: ParameterSpace) -> Float64[Tensor, " parameters"]:
+        """Return all parameters of a space as one vector; NaN for sensors' unknowns that are not here."""
+        unknowns = []
+        for own in space.unknowns:
+            missing, values = np.full(len(own.columns), np.nan), self.unknowns.get(own.name, {})
+            unknowns += [values.get(owner, missing) for owner in own.owners]
+        blocks = (self.robot.dh.ravel(), *self.bases.values(), *self.tools.values(), *unknowns)
         return torch.from_numpy(np.concatenate(blocks))
 
 

@@ -16,10 +16,10 @@ from pisigma.hybrid.alternating_products import AlternatingProducts
 from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.problem.parameters import ParameterSpace
+from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.joint_correction.feature import AbstractFeature, turning_rate
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.registry import feature_from
-from pisigma.model.accuracy import geometry_of
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_document import LearnedSection, ModelDocument, UncertaintySection
 from pisigma.model.row_poses import Frames
@@ -53,6 +53,10 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
     if (known := model.uncertainty) is not None:
         result["uncertainty"] = {
             **_unknowns_section(known.space.unknowns),
+            "values": {
+                group: {owner: values.tolist() for owner, values in owners.items()}
+                for group, owners in known.geometry.unknowns.items()
+            },
             "free": _free_rows(known),
             "turns": [chosen.turn for chosen in known.features if isinstance(chosen, AlternatingProducts)],
             "prior_scale": known.prior_scale,
@@ -222,7 +226,15 @@ def _uncertainty(
         raise ValueError(f"the free parameters are rising numbers below {count}, got {free}")
     full = torch.zeros(count + len(root) - len(free), root.shape[1], dtype=torch.float64)
     full[[*free, *range(count, len(full))]] = root.double()
-    geometry = geometry_of(robot, bases, tools)
+    unknowns = {
+        group: {owner: np.array(values) for owner, values in owners.items()}
+        for group, owners in known.values.items()
+    }
+    for own in space.unknowns:
+        wrong = {len(values) for values in unknowns.get(own.name, {}).values()} - {len(own.columns)}
+        if wrong:
+            raise ValueError(f"{len(own.columns)} values of every {own.name} were wanted, got {wrong.pop()}")
+    geometry = IdentifiedGeometry(robot, bases, tools, unknowns)
     return PositionUncertainty(space, geometry, _weighted(known, hybrid), full, known.prior_scale)
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import yaml
-from pydantic import ConfigDict, Field, PlainValidator, PositiveInt
+from pydantic import ConfigDict, Field, FiniteFloat, PlainValidator, PositiveInt
 
 from pisigma.errors import ModelError
 from pisigma.joint_correction.feature import FeatureSection
@@ -64,6 +64,8 @@ class UncertaintySection(Section):
         sockets: names of the fixed points of the calibration.
         anchors: the same of the ends of distances.
         others: the unknowns of other sensors by group.
+        values: by group and owner, the unknowns in the owner's frame [m or rad]; empty in folders that were upgraded
+            from a format without them.
         free: which parameters have a row in the root; the others' rows are 0. Behind them come all weights.
         turns: whose turn it is, for every stretch of weights of product units that stands behind the others: see
             `pisigma.hybrid.alternating_products.AlternatingProducts`.
@@ -73,6 +75,7 @@ class UncertaintySection(Section):
     sockets: tuple[str, ...]
     anchors: tuple[str, ...]
     others: dict[str, UnknownsSection] = Field(default_factory=dict)
+    values: dict[str, dict[str, tuple[FiniteFloat, ...]]] = Field(default_factory=dict)
     free: tuple[Annotated[int, Field(ge=0)], ...]
     turns: tuple[Annotated[int, Field(ge=0)], ...]
     prior_scale: Annotated[float, Field(gt=0)]
