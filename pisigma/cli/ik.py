@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder, PayloadKg, TemperatureC
-from pisigma.cli.output import fail, print_json, progress_of
+from pisigma.cli.output import fail, print_json, print_lines, progress_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -82,9 +82,10 @@ def _print_pose(
     else:
         solution = solver(T, branch=branch)
     if as_json:
-        print_json({"solutions": solution_records(solution, solver)})
+        print_json({"solutions": solution_records(solution, solver), "warnings": solver.warnings})
     else:
         print_solutions(solution, solver)
+        print_lines(f"Warning: {sentence}" for sentence in solver.warnings)
     if problem := failure(solution, places, any_will_do=all_branches):
         fail(problem)
 
@@ -104,12 +105,13 @@ def _write_file(
     with progress_of(f"solving {poses}") as tell:
         outcome = write_joint_file(solver, poses, out, branch, tell, accuracy, path)
     if as_json:
-        print_json({"file": str(out), **outcome.to_json(path)})
+        print_json({"file": str(out), **outcome.to_json(path), "warnings": solver.warnings})
     else:
         for line, switch in outcome.switches:
             typer.echo(f"{poses}, line {line}: {switch.sentence}")
         counts = ", ".join(f"{count} {status}" for status, count in outcome.statuses.most_common())
         typer.echo(f"{outcome.rows} rows written to {out}: {counts}.")
+        print_lines(f"Warning: {sentence}" for sentence in solver.warnings)
     if problem := outcome.problem(poses):
         fail(problem)
 

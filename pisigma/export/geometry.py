@@ -5,6 +5,7 @@ from dataclasses import replace
 from pisigma import __version__
 from pisigma.joint_correction.conditions import learned_conditions
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.stated_conditions import condition_warnings
 from pisigma.robot.description import Robot
 
 
@@ -44,12 +45,12 @@ def frame_remarks(model: CalibratedModel) -> tuple[str, ...]:
 
 
 def condition_remarks(model: CalibratedModel) -> tuple[str, ...]:
-    """A sentence on the payload and temperature that joint values are for, where the model learned what these do."""
+    """Sentences on the payload and temperature that joint values are for, where the model learned what these do."""
     learned = None if model.hybrid is None else learned_conditions(model.hybrid.correction)
     usual = {} if learned is None else dict(zip(learned.names, learned.mean, strict=True))
     stated = [f"{name} {value:g}" for name, value in model.conditions.items()]
     stated += [f"{name} {mean:.4g} (usual)" for name, mean in usual.items()]
-    return (f"Made for {' and '.join(stated)}.",) if stated else ()
+    return (f"Made for {' and '.join(stated)}.", *condition_warnings(model)) if stated else ()
 
 
 def offset_remarks(model: CalibratedModel) -> tuple[str, ...]:

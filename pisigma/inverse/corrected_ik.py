@@ -40,6 +40,7 @@ class CorrectedIK:
         limits: `(dof, 2)` joint limits [rad or m].
         revolute: `(dof,)`: which joints turn.
         closed_form: whether the nominal robot has a closed-form inverse, so that all branches are known.
+        warnings: sentences on conditions of `under` that lie beyond those of the calibration.
     """
 
     def __init__(self, model: "pisigma.model.calibrated_model.CalibratedModel") -> None:
@@ -49,6 +50,7 @@ class CorrectedIK:
             ModelError: the model names branches that its robot does not have, or gives the numeric inverse no start.
         """
         from pisigma.inverse.reference import NUMERIC, ReferenceIK
+        from pisigma.model.stated_conditions import condition_warnings
 
         route = ReferenceIK(model)
         self.name = model.name
@@ -56,6 +58,7 @@ class CorrectedIK:
         self.joints = tuple(joint.name for joint in model.robot.joints)
         self.limits, self.revolute = model.robot.limits, np.array(model.robot.revolute)
         self.closed_form = self.branches != (NUMERIC,)
+        self.warnings = condition_warnings(model)
         self.model, self.reference = model, route
         self._read: Callable[[], pisigma.model.calibrated_model.CalibratedModel] = lambda: model
 
@@ -71,6 +74,7 @@ class CorrectedIK:
         ik.name, ik.branches, ik.joints = kernels.name, kernels.branches, kernels.joints
         ik.order = tuple(int(index) for index in form.order)
         ik.limits, ik.revolute = arms.limits, np.asarray(arms.revolute, dtype=bool)
+        ik.warnings = ()
         ik.closed_form = bool(kernels.description.forms.closed_forms)
         ik._read, ik.compiled = read, kernels
         return ik
@@ -218,12 +222,15 @@ class CorrectedIK:
     def under(self, *, payload_kg: float | None = None, temperature_c: float | None = None) -> "CorrectedIK":
         """The same of the robot under other conditions than the usual ones of the calibration rows.
 
+        Beyond the measured temperatures the correction stays that of the nearest one, and what a payload does is
+        continued in proportion; then `warnings` of what is given back says so.
+
         Args:
             payload_kg: what it carries [kg]; as usual if None.
             temperature_c: of the robot [deg C]; as usual if None.
 
         Raises:
-            ModelError: the model did not learn what a stated condition does, or not near the stated value.
+            ModelError: the model did not learn what a stated condition does, or its value makes no sense.
         """
         from pisigma.model.stated_conditions import under_stated_conditions
 

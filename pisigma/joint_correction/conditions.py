@@ -24,6 +24,7 @@ class ConditionSection(FeatureSection):
     names: Annotated[tuple[Literal["payload_kg", "temperature_c"], ...], Field(min_length=1)]
     mean: tuple[float, ...]
     spread: tuple[float, ...]
+    measured: tuple[tuple[float, float], ...]
     gravity: Direction
 
 
@@ -31,12 +32,15 @@ class ConditionFeatures(AbstractFeature):
     """Payload and temperature: each times 1, sine and cosine of the joint's own value (prismatic: scaled value).
 
     A condition counts in standard deviations from its mean over the measured rows, so that joint values alone stand
-    for the usual conditions. The payload also goes with the gravity torques of a mass at the last row's frame.
+    for the usual conditions. The payload also goes with the gravity torques of a mass at the last row's frame; what it
+    does grows in proportion, beyond the measured values too. Beyond the lowest and the highest measured temperature the
+    correction stays as it is there: how an arm expands is no straight line, and one that is continued soon does harm.
 
     Attributes:
         names: of the conditions.
         mean: over the measured rows [kg, deg C].
         spread: standard deviation over them.
+        measured: lowest and highest value of every condition in them.
     """
 
     name = "conditions"
@@ -50,12 +54,13 @@ class ConditionFeatures(AbstractFeature):
         names: Sequence[str],
         mean: Sequence[float],
         spread: Sequence[float],
+        measured: Sequence[tuple[float, float]],
         gravity: Direction = (0.0, 0.0, -1.0),
     ) -> None:
         """Take some conditions.
 
         Raises:
-            ValueError: there is none, or one does not vary.
+            ValueError: there is none, one does not vary, or its mean does not lie within its measured values.
         """
         super().__init__(robot)
         if not names or not len(names) == len(mean) == len(spread) or min(spread) <= 0:
@@ -63,7 +68,15 @@ class ConditionFeatures(AbstractFeature):
                 f"conditions need names, means and positive spreads, got {tuple(names)}, {tuple(mean)}, "
                 f"{tuple(spread)}."
             )
-        self.names, self.mean, self.spread = tuple(names), tuple(mean), tuple(spread)
+        measured = tuple((low, high) for low, high in measured)
+        if len(measured) != len(names) or any(
+            not low <= middle <= high for middle, (low, high) in zip(mean, measured, strict=False)
+        ):
+            raise ValueError(
+                f"conditions need a lowest and a highest measured value about every mean, got {measured} about "
+                f"{tuple(mean)}."
+            )
+        self.names, self.mean, self.spread, self.measured = tuple(names), tuple(mean), tuple(spread), measured
         self._torques = GravityTorques(robot, gravity)
         self.gravity = self._torques.gravity
         loaded = 4 if "payload_kg" in self.names else 0
@@ -82,7 +95,8 @@ class ConditionFeatures(AbstractFeature):
             return ()
         values = torch.stack([state.stated[name] for name in options.varying], 1)
         mean, spread = values.mean(0).tolist(), values.std(0).tolist()
-        return (ConditionFeatures(robot, options.varying, mean, spread, options.gravity),)
+        measured = [(float(low), float(high)) for low, high in zip(*values.aminmax(dim=0), strict=True)]
+        return (ConditionFeatures(robot, options.varying, mean, spread, measured, options.gravity),)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """The products; 0 under the usual conditions, and for conditions that are NaN or missing."""
@@ -90,9 +104,7 @@ class ConditionFeatures(AbstractFeature):
         if not any(name in state.stated for name in self.names):
             return q.new_zeros((*q.shape, self.count))
         missing = torch.full_like(q[..., 0], torch.nan)
-        stated = torch.stack([state.stated.get(name, missing).to(q) for name in self.names], -1)
-        scaled = (stated - q.new_tensor(self.mean)) / q.new_tensor(self.spread)
-        scaled = torch.where(torch.isfinite(scaled), scaled, 0.0)
+        scaled = self.scaled(torch.stack([state.stated.get(name, missing).to(q) for name in self.names], -1))
         turning = torch.tensor(self.robot.revolute, device=q.device)
         sine = torch.where(turning, q.sin(), scaled_joints(self.robot, q))
         cosine = torch.where(turning, q.cos(), torch.zeros_like(q))
@@ -102,6 +114,17 @@ class ConditionFeatures(AbstractFeature):
             torques = self._torques.columns(state)[..., -4:]
             columns.append(torques * scaled[..., self.names.index("payload_kg"), None, None])
         return torch.cat(columns, -1)
+
+    def scaled(self, stated: Float[Tensor, "*batch conditions"]) -> Float[Tensor, "*batch conditions"]:
+        """Conditions [kg, deg C] in standard deviations from their means; 0 where one is NaN.
+
+        A temperature beyond the measured ones counts as the nearest of these.
+        """
+        low, high = stated.new_tensor(self.measured).unbind(-1)
+        kept = torch.tensor([name == "temperature_c" for name in self.names], device=stated.device)
+        inside = torch.where(kept, stated.clamp(low, high), stated)
+        scaled = (inside - stated.new_tensor(self.mean)) / stated.new_tensor(self.spread)
+        return torch.where(torch.isfinite(scaled), scaled, 0.0)
 
 
 def learned_conditions(correction: JointCorrection) -> ConditionFeatures | None:

@@ -82,6 +82,7 @@ class CalibratedModel:
         uncertainty: of predicted positions, or None.
         conditions: payload [kg] and temperature [deg C] that it was put under, by name; empty for the usual ones of
             the rows. See `pisigma.model.stated_conditions`.
+        measured_conditions: the lowest and the highest value of these that it was calibrated at, of stated ones only.
         provenance: recipe, data, versions.
         metrics: figures for the card, by name.
     """
@@ -101,6 +102,7 @@ class CalibratedModel:
     hybrid_tools: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
     uncertainty: PositionUncertainty | None = None
     conditions: dict[str, float] = field(default_factory=dict)
+    measured_conditions: dict[str, tuple[float, float]] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)
     metrics: dict[str, Any] = field(default_factory=dict)
 

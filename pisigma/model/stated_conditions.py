@@ -1,6 +1,7 @@
-"""A hybrid model under a given payload and temperature, instead of the usual ones."""
+"""A hybrid model under a stated payload and temperature; and which of these lie beyond the measured ones."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -9,11 +10,16 @@ from torch import Tensor
 
 from pisigma.errors import ModelError
 from pisigma.joint_correction.conditions import ConditionFeatures, at_conditions, learned_conditions
+from pisigma.measurement.conditions import conditions_of
+from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
 
-MOST_SPREADS = 3.0
-"""Conditions farther from the mean of the measured rows, in their standard deviations, were not measured."""
+_BEYOND = {
+    "payload_kg": "what the payload does is continued in proportion",
+    "temperature_c": "the correction stays that of the nearest measured temperature",
+}
+"""What a model does beyond the measured values of a condition."""
 
 
 def under_stated_conditions(
@@ -22,6 +28,7 @@ def under_stated_conditions(
     """The same model as a function of the joint values alone, under conditions that were learned.
 
     See `pisigma.joint_correction.conditions.at_conditions`; shifts of the joints go into the geometry's joint offsets.
+    Of conditions beyond the measured ones `condition_warnings` warns.
 
     Args:
         model: a hybrid one, calibrated on rows that state what is given here.
@@ -29,52 +36,78 @@ def under_stated_conditions(
         temperature_c: of the robot [deg C]; as usual if None.
 
     Raises:
-        ModelError: the model did not learn what a given condition does, or not near the given value.
+        ModelError: the model did not learn what a stated condition does, or its value makes no sense.
     """
-    stated = {"payload_kg": payload_kg, "temperature_c": temperature_c}
-    given = {name: value for name, value in stated.items() if value is not None}
-    if not given:
+    given = {"payload_kg": payload_kg, "temperature_c": temperature_c}
+    stated = {name: value for name, value in given.items() if value is not None}
+    if not stated:
         return model
-    arm = model.hybrid
-    learned = None if arm is None else learned_conditions(arm.correction)
+    arm, learned = model.hybrid, _learned(model)
     names = () if learned is None else learned.names
-    for name in given:
+    for name, value in stated.items():
         if name not in names:
             knows = ", ".join(names) or "joint values only"
             raise ModelError(
                 f"model '{model.name}' did not learn what {name} does; it knows {knows}. Calibrate with rows "
                 f"measured at several values of {name} (a column of that name)."
             )
+        if not math.isfinite(value) or (name == "payload_kg" and value < 0):
+            wanted = "a mass of 0 or more" if name == "payload_kg" else "a temperature"
+            raise ModelError(f"model '{model.name}': {name}={value:g} was stated; give {wanted}.")
     assert arm is not None
     assert learned is not None
     usual = dict(zip(learned.names, learned.mean, strict=True))
-    correction, shift = at_conditions(arm.correction, _scaled(model.name, learned, given))
+    values = torch.tensor([{**usual, **stated}[name] for name in learned.names], dtype=torch.float64)
+    correction, shift = at_conditions(arm.correction, learned.scaled(values))
     under = replace(arm, robot=_shifted(arm.robot, shift), correction=correction)
-    return replace(model, hybrid=under, conditions={**usual, **given})
+    measured = {
+        name: ends for name, ends in zip(learned.names, learned.measured, strict=True) if name in stated
+    }
+    return replace(model, hybrid=under, conditions={**usual, **stated}, measured_conditions=measured)
 
 
-def _scaled(
-    name: str, learned: ConditionFeatures, given: Mapping[str, float]
-) -> Float64[Tensor, " conditions"]:
-    """The conditions in standard deviations from their mean; 0 for those that are as usual.
+def condition_warnings(model: CalibratedModel, rows: Measurements | None = None) -> tuple[str, ...]:
+    """Warn of conditions beyond those that the model was calibrated under: a sentence for each.
 
-    Raises:
-        ModelError: one is far from all that were measured, not finite, or a payload below 0.
+    Args:
+        model: of any kind; only a hybrid learns what conditions do.
+        rows: whose conditions are meant; None for those that the model was put under.
     """
-    result = []
-    for known, mean, spread in zip(learned.names, learned.mean, learned.spread, strict=True):
-        value = given.get(known, mean)
-        low, high = mean - MOST_SPREADS * spread, mean + MOST_SPREADS * spread
-        if known == "payload_kg":
-            low = max(low, 0.0)
-        if not low <= value <= high:  # NaN neither
-            raise ModelError(
-                f"model '{name}': {known}={value:g} is not near the measured values, {mean:.4g} on average with a "
-                f"standard deviation of {spread:.4g}; give {low:.4g} to {high:.4g}, or calibrate with rows "
-                "measured there."
-            )
-        result.append((value - mean) / spread)
-    return torch.tensor(result, dtype=torch.float64)
+    if rows is None:
+        stated = [
+            (name, *ends, torch.tensor([model.conditions[name]], dtype=torch.float64))
+            for name, ends in model.measured_conditions.items()
+        ]
+    else:
+        learned = _learned(model)
+        if learned is None:
+            return ()
+        columns = conditions_of(rows, learned.names).unbind(1)
+        stated = [
+            (name, low, high, values)
+            for name, (low, high), values in zip(learned.names, learned.measured, columns, strict=True)
+        ]
+    return tuple(sentence for one in stated for sentence in _warning(*one, model.name, rows is None))
+
+
+def _warning(
+    name: str, low: float, high: float, values: Float64[Tensor, " rows"], model: str, single: bool
+) -> Sequence[str]:
+    """The sentence on one condition; none where all values were measured or are not stated."""
+    slack = 1e-9 * max(abs(low), abs(high), 1.0)
+    beyond = values[(values < low - slack) | (values > high + slack)]
+    if not len(beyond):
+        return ()
+    least, most = float(beyond.min()), float(beyond.max())
+    span = f"{least:.4g}" if least == most else f"{least:.4g} to {most:.4g}"
+    what = f"{name} {span}" if single else f"{len(beyond)} of {len(values)} rows have {name} {span}, which"
+    return (
+        f"{what} lies beyond the {low:.4g} to {high:.4g} that {model} was calibrated at: {_BEYOND[name]}.",
+    )
+
+
+def _learned(model: CalibratedModel) -> ConditionFeatures | None:
+    return None if model.hybrid is None else learned_conditions(model.hybrid.correction)
 
 
 def _shifted(robot: Robot, shift: Float64[Tensor, " dof"]) -> Robot:

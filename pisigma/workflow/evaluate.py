@@ -17,6 +17,7 @@ from pisigma.judging.reference_models import geometric_model, nominal_model
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
+from pisigma.model.stated_conditions import condition_warnings
 from pisigma.reporting.tables import figure_text
 
 REFERENCES = ("nominal", "geometric")
@@ -227,7 +228,10 @@ def evaluate(
         comparison=comparison,
         evaluated=evaluated,
         missed=tuple(sentence for figures in judged for sentence in settings.limits.missed_by(figures)),
-        warnings=tuple(_warnings(comparison, evaluated, settings.fit_frame)),
+        warnings=(
+            *_warnings(comparison, evaluated, settings.fit_frame),
+            *(sentence for model in loaded.values() for sentence in condition_warnings(model, rows)),
+        ),
         seconds=time.perf_counter() - begin,
     )
 

@@ -17,6 +17,7 @@ from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
+from pisigma.model.stated_conditions import condition_warnings
 from pisigma.verification.setup_faults import PLAUSIBLE_SHARE, SetupFault, find_setup_faults, length_text
 from pisigma.workflow.evaluate import test_rows
 
@@ -259,6 +260,7 @@ def _warnings(
         )
     if model.provenance.data_sha256 == rows.content_hash():
         warnings.append("The model was fitted to these rows: the figures say nothing about other poses.")
+    warnings += condition_warnings(model, rows)
     corrected = comparison.models[-1]
     if corrected.rows_not_predicted:
         warnings.append(

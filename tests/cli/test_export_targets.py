@@ -51,7 +51,7 @@ def export(run, model, poses, out, *options):
 
 def test_targets_for_a_payload(run, refuses, poses, tmp_path):
     robot = Robot.load("ur10")
-    learned = ConditionFeatures(robot, ("payload_kg",), (2.0,), (1.5,))
+    learned = ConditionFeatures(robot, ("payload_kg",), (2.0,), (1.5,), ((0.0, 5.0),))
     (tmp_path / "arm").mkdir()
     save_model(hybrid_model("ur10", [FourierSeries(robot, 2), learned]), tmp_path / "arm")
     path, out = poses(good_poses("ur10")), tmp_path / "targets.csv"
@@ -67,6 +67,15 @@ def test_targets_for_a_payload(run, refuses, poses, tmp_path):
     assert_close(
         poses_of_rows(load_model(tmp_path / "arm"), Measurements(q=q, payload=payload)), wanted, atol=1e-9
     )
+    beyond = "payload_kg 9 lies beyond the 0 to 5 that hybrid_ur10 was calibrated at"
+    assert export(run, tmp_path / "arm", path, out, "--payload-kg", 9).exit_code == 0
+    assert beyond in out.read_text()
+    written = run(
+        "ik", tmp_path / "arm", "--poses", path, "--out", tmp_path / "q.csv", "--payload-kg", 9, "--json"
+    )
+    assert json.loads(written.stdout)["warnings"][0].startswith(beyond)
+    pose = run("ik", tmp_path / "arm", "--pose", *[500, 200, 300, 0, 0, 0], "--payload-kg", 9)
+    assert "Warning: payload_kg 9 lies beyond the 0 to 5" in pose.stdout
     found = run("ik", tmp_path / "arm", "--poses", path, "--out", tmp_path / "q.csv", "--payload-kg", 5)
     assert found.exit_code == 0
     joints = list(csv.DictReader((tmp_path / "q.csv").read_text().splitlines()))
@@ -74,8 +83,8 @@ def test_targets_for_a_payload(run, refuses, poses, tmp_path):
     options = ("--format", "offsets", "--out", tmp_path / "offsets.csv", "--payload-kg")
     assert run("export", tmp_path / "arm", *options, 5).exit_code == 0
     assert "Made for payload_kg 5." in (tmp_path / "offsets.csv").read_text()
-    assert "payload_kg=50 is not near the measured values" in refuses(
-        "export", tmp_path / "arm", *options, 50
+    assert "payload_kg=-1 was stated; give a mass of 0 or more" in refuses(
+        "export", tmp_path / "arm", *options, -1
     )
     table = ("--format", "dh", "--out", tmp_path / "dh.csv", "--payload-kg", 5)
     assert "--payload-kg goes with --format offsets or targets, not with dh" in refuses(

@@ -138,7 +138,14 @@ def test_poses_of_a_file(run, models, tmp_path):
     out = tmp_path / "joints.csv"
     result = run("ik", models / "kiro4", "--poses", tmp_path / "poses.csv", "--out", out, "--json")
     assert result.exit_code == 0
-    printed = {"file": str(out), "rows": 5, "statuses": {"reached": 5}, "failed": 0, "first_failures": []}
+    printed = {
+        "file": str(out),
+        "rows": 5,
+        "statuses": {"reached": 5},
+        "failed": 0,
+        "first_failures": [],
+        "warnings": [],
+    }
     assert json.loads(result.stdout) == printed
     written = list(csv.DictReader(out.read_text().splitlines()))
     T = forward_kinematics(Robot.load("kiro4"), joints_around("kiro4", 5, seed=8, spread=0.1))

@@ -105,7 +105,7 @@ def features_of(robot: Robot, names: str):
         "sin_cos": lambda: SinesCosines(robot),
         "pose": lambda: NominalPose(robot),
         "conditions": lambda: ConditionFeatures(
-            robot, ("payload_kg", "temperature_c"), (2.0, 20.0), (1.0, 3.0)
+            robot, ("payload_kg", "temperature_c"), (2.0, 20.0), (1.0, 3.0), ((0.0, 4.0), (15.0, 26.0))
         ),
     }
     return [made[name]() for name in names.split()]

@@ -23,6 +23,7 @@ from pisigma.simulation.errors.joint_compliance import LinkMass, gravity_load
 
 GRAVITY = (1.0, -2.0, -9.0)
 CONDITIONS = ("payload_kg", "temperature_c")
+MEASURED = ((0.0, 6.0), (12.0, 28.0))
 SHARED = ("joints", "sin_cos", "pose")
 ROBOTS = ("kiro3", "rb5", "panda")
 
@@ -49,7 +50,7 @@ def every_kind(robot: Robot) -> list:
     return [
         FourierSeries(robot, 5),
         GravityTorques(robot, GRAVITY),
-        ConditionFeatures(robot, CONDITIONS, (3.0, 20.0), (1.5, 4.0), GRAVITY),
+        ConditionFeatures(robot, CONDITIONS, (3.0, 20.0), (1.5, 4.0), MEASURED, GRAVITY),
         *(FEATURES[name](robot) for name in SHARED),
         Backlash(robot),
     ]
@@ -214,8 +215,26 @@ def test_only_scaled_joints_change_with_full_turns():
         ({"name": "gravity", "harmonics": 3}, "harmonics\n  Extra inputs"),
         ({"name": "pose", "gravity": (0, 0, -1)}, "gravity\n  Extra inputs"),
         (
-            {"name": "conditions", "names": (), "mean": (), "spread": (), "gravity": (0.0, 0.0, 1.0)},
+            {
+                "name": "conditions",
+                "names": (),
+                "mean": (),
+                "spread": (),
+                "measured": (),
+                "gravity": (0.0, 0.0, 1.0),
+            },
             "names\n  Tuple should have at least 1 item",
+        ),
+        (
+            {
+                "name": "conditions",
+                "names": ("temperature_c",),
+                "mean": (20.0,),
+                "spread": (2.0,),
+                "measured": ((21.0, 25.0),),
+                "gravity": (0.0, 0.0, 1.0),
+            },
+            "a lowest and a highest measured value about every mean",
         ),
         ({"name": "series", "harmonics": 0}, "greater than or equal to 1"),
         ({"name": "gravity", "gravity": (0.0, 0.0, 0.0)}, "needs a direction"),

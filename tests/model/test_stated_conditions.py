@@ -12,7 +12,7 @@ from testing.models import joints_around
 
 from pisigma.errors import ModelError
 from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.joint_correction.conditions import ConditionFeatures
+from pisigma.joint_correction.conditions import ConditionFeatures, learned_conditions
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.shared_features import ScaledJoints
@@ -23,11 +23,16 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.row_poses import poses_of_rows
-from pisigma.model.stated_conditions import under_stated_conditions
+from pisigma.model.stated_conditions import condition_warnings, under_stated_conditions
+from pisigma.reporting.page.content import report_content
 from pisigma.robot.description import Robot
+from pisigma.workflow.evaluate import evaluate
+from pisigma.workflow.verify import verify
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
+MEASURED = ((0.0, 5.0), (15.0, 35.0))
+"""Payloads [kg] and temperatures [deg C]."""
 SIDEWAYS = (0.6, 0.0, -0.8)
 """Gravity of a robot that is mounted on a slope."""
 BESIDE = {
@@ -40,7 +45,7 @@ BESIDE = {
 def model_with(name: str, beside: str, orders: tuple[int, ...] = ()) -> CalibratedModel:
     """A model with random weights, those of both conditions among them."""
     robot = Robot.load(name)
-    learned = ConditionFeatures(robot, ("payload_kg", "temperature_c"), (2.0, 25.0), (1.5, 6.0))
+    learned = ConditionFeatures(robot, ("payload_kg", "temperature_c"), (2.0, 25.0), (1.5, 6.0), MEASURED)
     return hybrid_model(name, [*BESIDE[beside](robot), learned], orders=orders)
 
 
@@ -92,7 +97,9 @@ def test_the_accuracy_is_that_of_the_conditions() -> None:
     q = joints_in(arm.true.nominal, 30, seed=7)
     rows = Measurements(q=q, payload=torch.full((30,), 20.0, dtype=torch.float64))
     expected = deviation_of_rows(model, rows).norm(dim=-1)
-    solver = CorrectedIK(model)
+    solver, learned = CorrectedIK(model), learned_conditions(arm.result.learned.correction)
+    assert learned is not None
+    assert learned.measured == ((0.0, 20.0),)
     assert_close(solver.under(payload_kg=20.0).accuracy(q.numpy()), expected, rtol=1e-4)
     assert float(np.abs(solver.accuracy(q.numpy()) / expected.numpy() - 1).max()) > 1e-3
     true = replace(arm.measurements, payload=None)
@@ -103,25 +110,75 @@ def test_the_accuracy_is_that_of_the_conditions() -> None:
     assert errors[1] < 0.9 * errors[0]  # every second row was measured without a payload
 
 
+@pytest.mark.parametrize("name", ["kiro4", "kiro3"])
+def test_temperature_stays_at_its_edge_and_payload_goes_on(name: str) -> None:
+    model, q = model_with(name, "all"), joints_around(name, 30, seed=3)
+    for beyond, edge in ((60.0, 35.0), (-20.0, 15.0)):
+        at_edge = under_stated_conditions(model, temperature_c=edge)
+        under = under_stated_conditions(model, temperature_c=beyond)
+        assert_close(under.forward(q), at_edge.forward(q), atol=1e-15)
+        assert_close(poses_of_rows(model, rows_under(q, 2.0, beyond)), at_edge.forward(q), atol=1e-14)
+        for kernels in (CorrectedIK(under).compiled, CorrectedIK(at_edge).compiled):
+            assert kernels is not None
+            assert_close(kernels.forward(q.numpy())[0], at_edge.forward(q), atol=1e-13)
+    assert model.hybrid is not None
+    usual, measured, beyond = (
+        model.hybrid.correction.of_rows(rows_under(q, payload, 25.0)) for payload in (2.0, 5.0, 11.0)
+    )
+    assert_close(beyond - usual, 3 * (measured - usual), atol=1e-15)
+    assert float((measured - usual).abs().max()) > 1e-5
+
+
+def test_warnings_say_what_was_not_measured() -> None:
+    solver = CorrectedIK(model_with("kiro4", "all"))
+    assert solver.warnings == ()
+    assert solver.under(payload_kg=5.0, temperature_c=15.0).warnings == ()
+    payload, temperature = solver.under(payload_kg=9.0, temperature_c=40.0).warnings
+    assert payload.startswith(
+        "payload_kg 9 lies beyond the 0 to 5 that hybrid_kiro4 was calibrated at: what the"
+    )
+    assert temperature.startswith("temperature_c 40 lies beyond the 15 to 35 that")
+    assert "stays that of the nearest measured temperature" in temperature
+
+
+def test_rows_beyond_the_measured_conditions_are_counted_by_all_that_judge(tmp_path) -> None:
+    model, q = model_with("kiro4", "all"), joints_around("kiro4", 30, seed=3)
+    rows = rows_under(q, 2.0, 25.0)
+    rows = replace(rows, position=poses_of_rows(model, rows)[:, :3, 3])
+    assert rows.temperature is not None
+    warm = replace(rows, temperature=rows.temperature + torch.arange(30) * 0.5)
+    wanted = (
+        "9 of 30 rows have temperature_c 35.5 to 39.5, which lies beyond the 15 to 35 that hybrid_kiro4 was"
+    )
+    for judged, expected in ((warm, True), (rows, False), (replace(rows, temperature=None), False)):
+        for warnings in (
+            condition_warnings(model, judged),
+            evaluate(model, judged).warnings,
+            verify(model, judged).warnings,
+            report_content(model, tmp_path, judged).advice,
+        ):
+            assert any(sentence.startswith(wanted) for sentence in warnings) is expected
+    assert condition_warnings(hybrid_model("kiro4", [FourierSeries(model.robot, 2)]), warm) == ()
+
+
 @pytest.mark.parametrize(
     ("given", "complaint"),
     [
-        (
-            {"payload_kg": 9.0},
-            r"payload_kg=9 is not near the measured values, 2 on average .* give 0 to 6\.5",
-        ),
-        ({"payload_kg": -0.5}, "payload_kg=-0.5 is not near"),
-        ({"temperature_c": float("nan")}, "temperature_c=nan is not near"),
+        ({"payload_kg": -0.5}, r"payload_kg=-0\.5 was stated; give a mass of 0 or more"),
+        ({"payload_kg": float("inf")}, "payload_kg=inf was stated"),
+        ({"temperature_c": float("nan")}, "temperature_c=nan was stated; give a temperature"),
     ],
 )
-def test_conditions_that_were_not_measured_are_refused(given: dict[str, float], complaint: str) -> None:
+def test_conditions_that_make_no_sense_are_refused(given: dict[str, float], complaint: str) -> None:
     with pytest.raises(ModelError, match=complaint):
         CorrectedIK(model_with("kiro4", "all")).under(**given)
 
 
 def test_what_was_not_learned_is_refused(tmp_path) -> None:
     robot = Robot.load("kiro4")
-    warm = hybrid_model("kiro4", [ConditionFeatures(robot, ("temperature_c",), (25.0,), (6.0,))])
+    warm = hybrid_model(
+        "kiro4", [ConditionFeatures(robot, ("temperature_c",), (25.0,), (6.0,), MEASURED[1:])]
+    )
     for model, knows in (
         (warm, "temperature_c"),
         (hybrid_model("kiro4", [FourierSeries(robot, 2)]), "joint values only"),

@@ -50,6 +50,9 @@ _NO_FADE = (
     "to the geometric calibration beyond the measured ones."
 )
 
+MOST_SPREADS = 3.0
+"""Up to format 3 conditions counted as measured so many standard deviations from their mean."""
+
 
 @dataclass(frozen=True)
 class Upgrade:
@@ -91,7 +94,7 @@ def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
     document["metrics"] = _metrics(str(document.get("kind")), _renamed(document["metrics"]))
     if "uncertainty" in document:
         document["uncertainty"] = _renamed(document["uncertainty"])
-    changes = _without_fade(document)
+    changes = (*_without_fade(document), *_with_measured_conditions(document))
     with staged_folder(path) as scratch:
         shutil.copytree(path, scratch, dirs_exist_ok=True)
         (scratch / COMPILED).unlink(missing_ok=True)
@@ -112,6 +115,27 @@ def _without_fade(document: dict[str, Any]) -> tuple[str, ...]:
     learned = (document["metrics"].get("hybrid") or {}).get("learned") or {}
     learned.pop("fades_over_deg", None)
     return () if document.get("learned", {}).pop("fade_rad", None) is None else (_NO_FADE,)
+
+
+def _with_measured_conditions(document: Mapping[str, Any]) -> tuple[str, ...]:
+    """State the measured payloads and temperatures, which folders up to format 3 lack: about their means."""
+    for feature in document.get("learned", {}).get("features", ()):
+        if feature["name"] == "conditions" and "measured" not in feature:
+            spans = zip(feature["names"], feature["mean"], feature["spread"], strict=True)
+            feature["measured"] = [
+                [max(low, 0.0) if name == "payload_kg" else low, mean + MOST_SPREADS * spread]
+                for name, mean, spread in spans
+                for low in [mean - MOST_SPREADS * spread]
+            ]
+            named = " and ".join(
+                f"{name} {low:.4g} to {high:.4g}"
+                for name, (low, high) in zip(feature["names"], feature["measured"], strict=True)
+            )
+            return (
+                f"The folder does not say which conditions were measured; {named} are taken, three standard "
+                "deviations to either side of the mean. Calibrate again to keep the measured ones.",
+            )
+    return ()
 
 
 def _renamed(values: Any) -> Any:

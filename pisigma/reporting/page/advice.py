@@ -11,6 +11,7 @@ from torch import Tensor
 from pisigma.hybrid.arm import JointCoverage
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.stated_conditions import condition_warnings
 from pisigma.reporting.calibration_tables import warning_lines
 from pisigma.reporting.page.accuracy import MOSTLY, Accuracy, Limit
 from pisigma.reporting.page.judged_rows import JudgedRows
@@ -54,6 +55,7 @@ def advice_for(
         *_say("other_rows", model, held_out),
         *_say("joint_gaps", _joint_gaps(model, rows), model),
         *_outside(rows),
+        *(() if rows is None else condition_warnings(model, rows.measurements)),
     )
     if summary is None:
         return (*of_rows, *_conditions(rows))

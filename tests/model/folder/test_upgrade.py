@@ -7,14 +7,17 @@ from typing import Any
 
 import pytest
 import yaml
+from testing.identified import hybrid_model
 from testing.models import hand_made_model
 from testing.report import hybrid_under_test
 
 from pisigma.errors import ModelError
+from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.folder.upgrade import Upgrade, upgrade_folder
+from pisigma.robot import Robot
 
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
@@ -49,6 +52,8 @@ def write_old(model: CalibratedModel, folder: Path) -> dict[str, bytes]:
         document["uncertainty"]["unexplained_m"] = 1e-4
     if "learned" in document:
         document["learned"]["fade_rad"] = 0.17
+        for feature in document["learned"]["features"]:
+            feature.pop("measured", None)
         document["metrics"]["hybrid"]["learned"]["fades_over_deg"] = 10.0
     text = yaml.safe_dump(document | {"format": 2 if "uncertainty" in document else 1}, sort_keys=False)
     path.write_text(f"{text}sha256: {hashlib.sha256(text.encode()).hexdigest()}\n")
@@ -76,6 +81,18 @@ def test_a_hybrid_calibration_comes_back_with_all_figures(tmp_path):
     before = (tmp_path / "arm" / "model.yaml").read_bytes()
     assert upgrade_folder(tmp_path / "arm") == Upgrade("arm", 4, 4)
     assert (tmp_path / "arm" / "model.yaml").read_bytes() == before
+
+
+def test_measured_conditions_are_about_the_mean_where_a_folder_does_not_say(tmp_path):
+    robot = Robot.load("kiro4")
+    names = ("payload_kg", "temperature_c")
+    learned = ConditionFeatures(robot, names, (2.0, 20.0), (1.0, 3.0), ((0.0, 4.0), (15.0, 26.0)))
+    model = replace(hybrid_model("kiro4", [learned]), metrics={"parameters": [], "hybrid": {"learned": {}}})
+    write_old(model, tmp_path / "arm")
+    done = upgrade_folder(tmp_path / "arm")
+    assert "payload_kg 0 to 5 and temperature_c 11 to 29 are taken" in done.changes[1]
+    features = load_model(tmp_path / "arm").hybrid.correction.features
+    assert features[0].measured == ((0.0, 5.0), (11.0, 29.0))
 
 
 def test_figures_of_other_kinds_change_their_form(tmp_path):
