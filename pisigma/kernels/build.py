@@ -121,7 +121,7 @@ def intermediate_code() -> str:
         setattr(config, name, value)
 
     for name, module in list(sys.modules.items()):
-        if name.startswith("pisigma.kernels.") and hasattr(module, "njit"):
+        if name.startswith("pisigma.kernels.") and hasattr(module, "kernel"):
             del sys.modules[name]  # its kernels may have been made for other forms
     from pisigma.kernels.kernels import run
     from pisigma.kernels.layout import DESCRIPTION, MEMORY

@@ -1,17 +1,13 @@
 """Forward kinematics and joint Jacobian of one arm, at one place and at many, on plain numbers."""
 
 import math
-from typing import no_type_check
-
-from numba import njit
 
 from pisigma.kernels.arrays import FIXED, REVOLUTE
 from pisigma.kernels.layout import LANES
-from pisigma.kernels.rows import Array, Record
+from pisigma.kernels.rows import Array, Record, contracted_kernel
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def walk(arms: Record, arm: int, q: Array, axes: Array, T: Array) -> None:
     """Tool pose, and axis and origin of every joint, in the base frame: see `kinematics.forward`.
 
@@ -64,8 +60,7 @@ def walk(arms: Record, arm: int, q: Array, axes: Array, T: Array) -> None:
     T[2, 3] += cp
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def jacobian(arms: Record, axes: Array, T: Array, J: Array) -> None:
     """Geometric Jacobian in the base frame at the tool's origin: see `kinematics.jacobian`.
 
@@ -87,8 +82,7 @@ def jacobian(arms: Record, axes: Array, T: Array, J: Array) -> None:
             J[3, j], J[4, j], J[5, j] = 0.0, 0.0, 0.0
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def walk_many(arms: Record, arm: int, memory: Record, q: Array, T: Array, J: Array) -> None:
     """Tool poses and Jacobians at many joint values, `LANES` of them abreast, as `walk` and `jacobian` give them.
 
@@ -132,8 +126,7 @@ def walk_many(arms: Record, arm: int, memory: Record, q: Array, T: Array, J: Arr
             _write_jacobians(arms, axes, T, first, count, J)
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def _turn_by_joint(
     arms: Record, row: Array, kind: int, joint: int, q: Array, first: int, count: int, memory: Record
 ) -> None:
@@ -156,8 +149,7 @@ def _turn_by_joint(
             frame[i + 3, b] += (row[1] + turns[0, b]) * frame[i + 2, b]
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def cosines_sines(turns: Array, offset: float) -> None:
     """Replace angles `turns[0]` [rad] by the cosines of angle and offset, and write the sines into `turns[1]`.
 
@@ -194,8 +186,7 @@ def cosines_sines(turns: Array, offset: float) -> None:
         turns[1, b] = -second if quadrant >= 2.0 else second
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def _turn(frame: Array, u: int, v: int, cos: float, sin: float) -> None:
     """Turn frames by one angle, from their axis u towards their axis v."""
     if sin == 0.0 and cos == 1.0:
@@ -206,8 +197,7 @@ def _turn(frame: Array, u: int, v: int, cos: float, sin: float) -> None:
             frame[i + u, b], frame[i + v, b] = cos * x + sin * y, cos * y - sin * x
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def _shift(frame: Array, axis: int, distance: float) -> None:
     """Move the origins of frames along one of their axes [m]."""
     for i in range(0, 12, 4):
@@ -215,8 +205,7 @@ def _shift(frame: Array, axis: int, distance: float) -> None:
             frame[i + 3, b] += distance * frame[i + axis, b]
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def _write_poses(tool: Array, frame: Array, first: int, count: int, T: Array) -> None:
     """Write the frames with the tool behind them."""
     for b in range(count):
@@ -229,8 +218,7 @@ def _write_poses(tool: Array, frame: Array, first: int, count: int, T: Array) ->
         pose[3, 0], pose[3, 1], pose[3, 2], pose[3, 3] = 0.0, 0.0, 0.0, 1.0
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def _write_jacobians(arms: Record, axes: Array, T: Array, first: int, count: int, J: Array) -> None:
     """Write the columns of all joints; see `jacobian`."""
     for j in range(arms.dof):

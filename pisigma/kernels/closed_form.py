@@ -4,32 +4,28 @@ The formulas stand in the files of `pisigma.kinematics.closed_form`, which hand 
 """
 
 import math
-from typing import Any, no_type_check
-
-from numba import njit
+from typing import Any
 
 from pisigma.kernels.forms import compiled_closed_forms, compiled_plain
 from pisigma.kernels.rotations import wrap
-from pisigma.kernels.rows import Array, Record
+from pisigma.kernels.rows import Array, Record, kernel
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 
 
 def _chained() -> Any:
     """One function that calls the closed form that an arm has."""
 
-    @njit(error_model="numpy")
-    @no_type_check
+    @kernel
     def chain(form: Record, P: Array, only: int, rounding: float, q: Array) -> None:
         pass
 
     for kind, function in enumerate(compiled_closed_forms().values(), 1):
-        chain = _then(chain, compiled_plain(function, error_model="numpy"), kind)
+        chain = _then(chain, compiled_plain(function, kernel), kind)
     return chain
 
 
 def _then(chain: Any, function: Any, kind: int) -> Any:
-    @njit(error_model="numpy")
-    @no_type_check
+    @kernel
     def both(form: Record, P: Array, only: int, rounding: float, q: Array) -> None:
         if form.kind == kind:
             function(form, P, only, rounding, q)
@@ -42,8 +38,7 @@ def _then(chain: Any, function: Any, kind: int) -> Any:
 _solve = _chained()
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def all_branches(
     arms: Record, form: Record, T: Array, only: int, rounding: float, P: Array, q: Array
 ) -> None:
@@ -72,8 +67,7 @@ def all_branches(
         wrap_into_limits(arms, q[branch])
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def wrap_into_limits(arms: Record, q: Array) -> bool:
     """Move joints by full turns into their limits where that is possible; whether all are inside."""
     all_inside = True
@@ -93,8 +87,7 @@ def wrap_into_limits(arms: Record, q: Array) -> bool:
     return all_inside
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def nearest_turn(arms: Record, q: Array, near: Array, within_limits: bool) -> None:
     """Move revolute joints by full turns as near to given values as they can come."""
     for j in range(arms.dof):
@@ -109,8 +102,7 @@ def nearest_turn(arms: Record, q: Array, near: Array, within_limits: bool) -> No
             q[j] += 2 * math.pi * turns
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _canonical_pose(form: Record, T: Array, P: Array) -> None:
     """Pose of the last joint's frame, turned, in the frame before the first joint: `first · T · last`."""
     for i in range(3):

@@ -1,18 +1,14 @@
 """Damped least-squares steps and the distance from a singularity, on plain numbers."""
 
 import math
-from typing import no_type_check
 
-from numba import njit
-
-from pisigma.kernels.rows import Array, Record
+from pisigma.kernels.rows import Array, Record, contracted_kernel
 
 _FLOOR = 4 * 2.220446049250313e-16
 _SWEEPS = 30
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def scaled_square(reach: float, error: Array) -> float:
     """Squared pose error with translation in characteristic lengths."""
     scale = 1 / (reach * reach)
@@ -20,8 +16,7 @@ def scaled_square(reach: float, error: Array) -> float:
     return scale * position + error[3] * error[3] + error[4] * error[4] + error[5] * error[5]
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def _normal(arms: Record, reach: float, J: Array, memory: Record) -> tuple[int, float]:
     """Write the dimensionless Jacobian A and the smaller of `A A^T` and `A^T A`; give its size and trace."""
     A, S, dof = memory.scaled, memory.square, arms.dof
@@ -46,8 +41,7 @@ def _normal(arms: Record, reach: float, J: Array, memory: Record) -> tuple[int, 
     return size, trace
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def _factor(S: Array, size: int) -> float:
     """Cholesky factor in place, the inverse of the diagonal on it; the determinant, 0 where it breaks down."""
     determinant = 1.0
@@ -68,8 +62,7 @@ def _factor(S: Array, size: int) -> float:
     return determinant
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def damped_step(arms: Record, reach: float, J: Array, error: Array, damping: float, memory: Record) -> bool:
     """Write the step [rad or m] of `(J^T J + λ) dq = J^T e` into `memory.step`: see `kinematics.numeric`.
 
@@ -116,8 +109,7 @@ def damped_step(arms: Record, reach: float, J: Array, error: Array, damping: flo
     return True
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def is_singular(arms: Record, reach: float, J: Array, tolerance: float, memory: Record) -> bool:
     """Whether the smallest singular value of the dimensionless Jacobian is below a tolerance.
 
@@ -132,8 +124,7 @@ def is_singular(arms: Record, reach: float, J: Array, tolerance: float, memory: 
     return _smallest_singular_value(memory.scaled, size, arms.dof) < tolerance
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def _smallest_singular_value(A: Array, size: int, dof: int) -> float:
     """One-sided Jacobi rotations of A's columns, or of its rows where they are fewer; A is overwritten."""
     by_column = dof == size

@@ -82,14 +82,11 @@ def _functions(name: str) -> tuple[Callable[..., Any] | None, ...]:
     return (FORMS[name].add, FORMS[name].add_slope) if name in FORMS else (compiled_closed_forms()[name],)
 
 
-def compiled_plain(function: Callable[..., Any], **options: Any) -> Any:
-    """What numba compiles of a plain function and of the plain functions that it calls, with its options."""
-    from numba import njit
-
+def compiled_plain(function: Callable[..., Any], kernel: Callable[[Any], Any]) -> Any:
+    """What a decorator of `kernels.rows` compiles of a plain function and of the plain functions that it calls."""
     assert isinstance(function, FunctionType)
-    calls = {name: compiled_plain(called, **options) for name, called in _called(function)}
-    names = {**function.__globals__, **calls}
-    return njit(**options)(FunctionType(function.__code__, names, function.__name__))
+    calls = {name: compiled_plain(called, kernel) for name, called in _called(function)}
+    return kernel(FunctionType(function.__code__, {**function.__globals__, **calls}, function.__name__))
 
 
 def _called(function: Callable[..., Any]) -> Iterator[tuple[str, FunctionType]]:

@@ -1,9 +1,6 @@
 """Corrected inverse kinematics of one pose, on plain numbers: what `correction.corrected_ik` does for batches."""
 
 import math
-from typing import no_type_check
-
-from numba import njit
 
 from pisigma.kernels import arrays
 from pisigma.kernels.closed_form import all_branches, nearest_turn, wrap_into_limits
@@ -13,12 +10,11 @@ from pisigma.kernels.network import add_correction, choose_corrected, finish_cor
 from pisigma.kernels.newton import newton, search
 from pisigma.kernels.recovery import branch_of, nearest_starts, recover, within_reach
 from pisigma.kernels.rotations import pose_error, wrap
-from pisigma.kernels.rows import Array, Record, copy, fill
+from pisigma.kernels.rows import Array, Record, copy, fill, kernel
 from pisigma.kinematics import tolerances
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def solve_pose(description: Record, memory: Record, has_near: bool, branch: int, out: Array) -> None:
     """Find commanded joint values for the pose in `memory.pose`.
 
@@ -53,8 +49,7 @@ def solve_pose(description: Record, memory: Record, has_near: bool, branch: int,
     _write(description, memory, reached, status, wanted if chosen < 0 else chosen, out)
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _solve_by_network(
     description: Record, memory: Record, has_near: bool, branch: int, wanted: int, out: Array
 ) -> None:
@@ -71,8 +66,7 @@ def _solve_by_network(
     _write(description, memory, chosen >= 0, status, wanted if chosen < 0 else chosen, out)
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _write(description: Record, memory: Record, reached: bool, status: int, branch: int, out: Array) -> None:
     """Write the joint values in memory, NaN where they do not reach the pose, the status and the branch."""
     dof = description.arms.dof
@@ -82,8 +76,7 @@ def _write(description: Record, memory: Record, reached: bool, status: int, bran
     out[2 * dof + 3], out[2 * dof + 4] = status, branch
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _solve_in_order(description: Record, memory: Record, wanted: int) -> int:
     """Solve on the wanted branch, or on the first that reaches the pose inside the limits; -1 if none reaches it.
 
@@ -110,8 +103,7 @@ def _solve_in_order(description: Record, memory: Record, wanted: int) -> int:
     return outside
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _follow(description: Record, memory: Record, branch: int) -> bool:
     """Solve from the nominal joint values of a branch on, for joint values `memory.q` on their turns."""
     arms = description.arms
@@ -124,8 +116,7 @@ def _follow(description: Record, memory: Record, branch: int) -> bool:
     return True
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _solve_nearest(description: Record, memory: Record) -> int:
     """Solve for joint values `memory.solution` near to `memory.near`; give their branch, or -1.
 
@@ -155,8 +146,7 @@ def _solve_nearest(description: Record, memory: Record) -> int:
     return best
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _continue(description: Record, memory: Record, chosen: int) -> int:
     """Look from `memory.near` itself where nothing was found close to it; the branch, -1 where still nothing was."""
     arms, off = description.arms, math.inf
@@ -182,8 +172,7 @@ def _continue(description: Record, memory: Record, chosen: int) -> int:
     return lies
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _solve_nominal(description: Record, memory: Record) -> None:
     """Write joint values of the nominal arm near `memory.q` into `memory.nominal`, NaN where there are none."""
     newton(description, memory, arrays.NOMINAL, memory.pose, memory.q, tolerances.TOLERANCE)
@@ -195,8 +184,7 @@ def _solve_nominal(description: Record, memory: Record) -> None:
         copy(memory.q, memory.nominal)
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _nearest(description: Record, memory: Record) -> tuple[int, float]:
     """Of the branches that are left the nearest one and its squared distance; -1 where none is left."""
     arms, nearest, least = description.arms, -1, math.inf
@@ -211,8 +199,7 @@ def _nearest(description: Record, memory: Record) -> tuple[int, float]:
     return nearest, least
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _distance(arms: Record, q: Array, near: Array) -> float:
     total = 0.0
     for j in range(arms.dof):
@@ -220,8 +207,7 @@ def _distance(arms: Record, q: Array, near: Array) -> float:
     return total
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _solve_without_branches(description: Record, memory: Record, has_near: bool) -> bool:
     """Numeric inverse from `near`, then from the starts whose poses are nearest; whether one leads there.
 
@@ -249,8 +235,7 @@ def _solve_without_branches(description: Record, memory: Record, has_near: bool)
     return reached
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def finish(
     description: Record, memory: Record, has_near: bool, reached: bool, out: Array
 ) -> tuple[bool, int]:
@@ -281,8 +266,7 @@ def finish(
     return True, arrays.OUTSIDE_DOMAIN if beyond > tolerances.MEASURED_ROUNDING else arrays.REACHED
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _choose_turns(description: Record, memory: Record, has_near: bool) -> tuple[bool, bool]:
     """Bring joints into their limits and near to given values; whether they are inside, and still reach the pose."""
     arms, q = description.arms, memory.solution

@@ -2,33 +2,29 @@
 
 import math
 from collections.abc import Callable, Iterable
-from typing import Any, no_type_check
-
-from numba import njit
+from typing import Any
 
 from pisigma.kernels.arrays import DRAWN, FIXED, REVOLUTE
 from pisigma.kernels.forms import FORMS, compiled_plain
-from pisigma.kernels.rows import Array, Record
+from pisigma.kernels.rows import Array, Record, contracted_kernel, kernel
 
 
 def _chained(functions: Iterable[Callable[..., None] | None]) -> Any:
     """One function that calls those of the features that a correction has; see `CompiledForm`."""
 
-    @njit(error_model="numpy")
-    @no_type_check
+    @kernel
     def chain(arms: Record, correction: Record, memory: Record, q: Array) -> None:
         pass
 
     for index, function in enumerate(functions):
         if function is not None:
-            compiled = compiled_plain(function, error_model="numpy", fastmath={"contract"})
+            compiled = compiled_plain(function, contracted_kernel)
             chain = _then(chain, compiled, index)
     return chain
 
 
 def _then(chain: Any, function: Any, index: int) -> Any:
-    @njit(error_model="numpy")
-    @no_type_check
+    @kernel
     def both(arms: Record, correction: Record, memory: Record, q: Array) -> None:
         chain(arms, correction, memory, q)
         first = correction.first[index]
@@ -42,8 +38,7 @@ _add_features = _chained(form.add for form in FORMS.values())
 _add_slopes = _chained(form.add_slope for form in FORMS.values())
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def joint_correction(arms: Record, correction: Record, memory: Record, q: Array) -> None:
     """Write corrections to add to joint values [rad or m] into `memory.delta`; see `JointCorrection`.
 
@@ -73,8 +68,7 @@ def joint_correction(arms: Record, correction: Record, memory: Record, q: Array)
     _add_products(correction, dof, phi, memory.delta)
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def correction_slope(arms: Record, correction: Record, memory: Record, q: Array) -> None:
     """Write the slopes of every joint's correction by its own value into `memory.slope`, as far as they are steep.
 
@@ -89,8 +83,7 @@ def correction_slope(arms: Record, correction: Record, memory: Record, q: Array)
     _add_slopes(arms, correction, memory, q)
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def _add_products(correction: Record, dof: int, phi: Array, delta: Array) -> None:
     """Products of sums of the inputs, four joints abreast."""
     for j in range(0, dof, 4):
@@ -115,8 +108,7 @@ def _add_products(correction: Record, dof: int, phi: Array, delta: Array) -> Non
             total[3] += p_3
 
 
-@njit(error_model="numpy", fastmath={"contract"})
-@no_type_check
+@contracted_kernel
 def _walk_drawn(arms: Record, q: Array, turning: Array, frames: Array) -> None:
     """Write axis and origin of every joint, and axes and origin of its row's frame, of the arm as drawn.
 

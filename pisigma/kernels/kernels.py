@@ -3,13 +3,13 @@
 import math
 from typing import Any, no_type_check
 
-from numba import carray, njit  # type: ignore[attr-defined]
+from numba import carray  # type: ignore[attr-defined]
 
 from pisigma.kernels import arrays
 from pisigma.kernels.chain import walk_many
 from pisigma.kernels.inverse import solve_pose
 from pisigma.kernels.motion import beyond_measured, move
-from pisigma.kernels.rows import Array, Record, fill
+from pisigma.kernels.rows import Array, Record, fill, kernel
 from pisigma.kinematics.tolerances import POSE_TOLERANCE, POSE_TOLERANCE_SINGLE, ROUNDINGS
 
 Pointer = Any
@@ -70,8 +70,7 @@ def run(
     return arrays.FINE
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def solve_poses(
     description: Record,
     memory: Record,
@@ -111,16 +110,14 @@ def solve_poses(
     return arrays.FINE
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _take_row(values: Array, row: int, target: Array, dof: int) -> None:
     """Copy the row of a pose, or the only one."""
     for j in range(dof):
         target[j] = values[row if values.shape[0] > 1 else 0, j]
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _take_approach(approach: Array, row: int, target: Array, dof: int) -> None:
     """The same for approaches, which are all 0 where none is stated."""
     if approach.shape[0] > 0:
@@ -129,8 +126,7 @@ def _take_approach(approach: Array, row: int, target: Array, dof: int) -> None:
         fill(target, 0.0)
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _check_pose(T: Array, tolerance: float) -> int:
     """What is wrong with a matrix, in the order in which `se3.check_transforms` looks."""
     total = 0.0
@@ -153,8 +149,7 @@ def _check_pose(T: Array, tolerance: float) -> int:
     return arrays.FINE if x * T[0, 2] + y * T[1, 2] + z * T[2, 2] > 0 else arrays.LEFT_HANDED
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _check_near(near: Array, dof: int) -> int:
     total = 0.0
     for j in range(dof):
@@ -162,8 +157,7 @@ def _check_near(near: Array, dof: int) -> int:
     return arrays.FINE if total == 0.0 else arrays.NEAR_NOT_FINITE
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _mark(description: Record, branch: int, out: Array) -> None:
     """Say that there is no pose to solve for."""
     fill(out, math.nan)
@@ -171,8 +165,7 @@ def _mark(description: Record, branch: int, out: Array) -> None:
     out[out.shape[0] - 1] = description.closed_form.order[0] if branch < 0 else branch
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def evaluate(
     description: Record, memory: Record, arm: int, q: Array, approach: Array, T: Array, out: Array
 ) -> int:

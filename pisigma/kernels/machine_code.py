@@ -216,4 +216,4 @@ def _trusted(status: os.stat_result) -> bool:
 
 def address_of(array: Any) -> int:
     """Where the numbers of a contiguous array lie in memory."""
-    return array.__array_interface__["data"][0]  # type: ignore[no-any-return]
+    return array.__array_interface__["data"][0]

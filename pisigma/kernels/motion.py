@@ -1,18 +1,14 @@
 """Where the tool of an arm is and how it moves, with the correction, on plain numbers."""
 
 import math
-from typing import no_type_check
-
-from numba import njit
 
 from pisigma.kernels.arrays import CORRECTED, IDENTIFIED
 from pisigma.kernels.chain import jacobian, walk
 from pisigma.kernels.joint_correction import joint_correction
-from pisigma.kernels.rows import Array, Record
+from pisigma.kernels.rows import Array, Record, kernel
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def correct(description: Record, memory: Record, q: Array) -> None:
     """Write Δ(q) into `memory.delta` and q + Δ(q) into `memory.theta`."""
     arms, correction = description.arms, description.correction
@@ -21,8 +17,7 @@ def correct(description: Record, memory: Record, q: Array) -> None:
         memory.theta[j] = q[j] + memory.delta[j]
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def beyond_measured(description: Record, q: Array) -> float:
     """Angle [rad] by which the joint that is farthest out lies beyond its measured values; see `JointCoverage`."""
     coverage, arms, worst = description.coverage, description.arms, 0.0
@@ -38,8 +33,7 @@ def beyond_measured(description: Record, q: Array) -> float:
     return worst
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def move(description: Record, memory: Record, arm: int, q: Array) -> None:
     """Write pose and Jacobian of an arm into `memory.T` and `memory.J`.
 

@@ -4,9 +4,6 @@ The formulas are those of `network.correction_network` and `correction.domain`, 
 """
 
 import math
-from typing import no_type_check
-
-from numba import njit
 
 from pisigma.kernels import arrays
 from pisigma.kernels.chain import walk
@@ -14,12 +11,11 @@ from pisigma.kernels.closed_form import all_branches, nearest_turn, wrap_into_li
 from pisigma.kernels.damped_step import is_singular
 from pisigma.kernels.motion import move
 from pisigma.kernels.rotations import pose_error
-from pisigma.kernels.rows import Array, Record, copy
+from pisigma.kernels.rows import Array, Record, copy, kernel
 from pisigma.kinematics import tolerances
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def network_correction(description: Record, memory: Record, T: Array, q: Array) -> None:
     """Write the correction of nominal joint values into `memory.delta` and scaled inputs into `memory.seen`.
 
@@ -50,8 +46,7 @@ def network_correction(description: Record, memory: Record, T: Array, q: Array) 
         memory.delta[j] = net.output_offset[j] + net.output_scale[j] * total
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _input(description: Record, memory: Record, T: Array, q: Array, index: int) -> float:
     """One input, not scaled; see `network.inputs.Inputs`."""
     net = description.network
@@ -72,8 +67,7 @@ def _input(description: Record, memory: Record, T: Array, q: Array, index: int) 
     return math.sin(angle) if source == arrays.SINE else math.cos(angle)
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _roll_pitch_yaw(reference: Array, T: Array, R: Array, angles: Array) -> None:
     """Angles of a rotation seen from a reference, as `se3.rpy_from_rotation` gives them."""
     for i in range(3):
@@ -90,8 +84,7 @@ def _roll_pitch_yaw(reference: Array, T: Array, R: Array, angles: Array) -> None
         angles[2] = 0.0
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def domain_measure(description: Record, memory: Record) -> float:
     """Distance of the inputs in `memory.seen` to the nearest training row over the radius; NaN without a domain.
 
@@ -118,8 +111,7 @@ def domain_measure(description: Record, memory: Record) -> float:
     return math.sqrt(least) / net.radius
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def choose_corrected(
     description: Record, memory: Record, has_near: bool, branch: int, wanted: int
 ) -> tuple[int, bool]:
@@ -162,8 +154,7 @@ def choose_corrected(
     return best, inside
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def add_correction(description: Record, memory: Record, has_near: bool) -> bool:
     """Correct `memory.nominal` to `memory.solution`, both on the turns to command; whether inside the limits."""
     arms, q = description.arms, memory.q
@@ -181,8 +172,7 @@ def add_correction(description: Record, memory: Record, has_near: bool) -> bool:
     return inside
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def finish_corrected(description: Record, memory: Record, branch: int, inside: bool, out: Array) -> int:
     """Write what is left of the error and the measure of the domain; give the status."""
     arms, form, place = description.arms, description.closed_form, 2 * description.arms.dof
@@ -201,8 +191,7 @@ def finish_corrected(description: Record, memory: Record, branch: int, inside: b
     return arrays.REACHED if covered else arrays.OUTSIDE_DOMAIN
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _settle(description: Record, memory: Record, out: Array) -> None:
     """Write how far the pose is missed whose corrected joint values are the solution; NaN where there is none.
 

@@ -1,16 +1,13 @@
 """Damped Newton from a start to a pose, on plain numbers."""
 
 import math
-from typing import no_type_check
-
-from numba import njit
 
 from pisigma.kernels.arrays import CORRECTED, IDENTIFIED
 from pisigma.kernels.damped_step import damped_step, scaled_square
 from pisigma.kernels.joint_correction import correction_slope
 from pisigma.kernels.motion import correct, move
 from pisigma.kernels.rotations import pose_error
-from pisigma.kernels.rows import Array, Record, copy, copy_rows, fill
+from pisigma.kernels.rows import Array, Record, copy, copy_rows, fill, kernel
 from pisigma.kinematics import tolerances
 
 _CLOSE, _LAST, _SETTLED = 0.05, 1e-15, 3e-12
@@ -18,16 +15,14 @@ _CLOSE, _LAST, _SETTLED = 0.05, 1e-15, 3e-12
 _SETTLED: joint values [rad or m] move less after a step that is the last one."""
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _within(error: Array, position: float, rotation: float) -> bool:
     linear = error[0] * error[0] + error[1] * error[1] + error[2] * error[2]
     angular = error[3] * error[3] + error[4] * error[4] + error[5] * error[5]
     return linear < position * position and angular < rotation * rotation
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, tolerance: float) -> None:
     """Bring q to a pose, as `kinematics.numeric.solve_numeric` does; the error left stands in `memory.best`.
 
@@ -69,8 +64,7 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
             damping *= tolerances.DAMPING_UP
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _move_steeply(description: Record, memory: Record, arm: int, q: Array) -> None:
     """Do as `move`, and take the slope of the correction into the Jacobian of a corrected arm."""
     move(description, memory, arm, q)
@@ -83,8 +77,7 @@ def _move_steeply(description: Record, memory: Record, arm: int, q: Array) -> No
             memory.J[i, j] *= 1 + memory.slope[j]
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def search(description: Record, memory: Record, T: Array, q: Array) -> bool:
     """Bring q to a pose of the calibrated arm, and say whether that succeeded.
 
@@ -107,8 +100,7 @@ def search(description: Record, memory: Record, T: Array, q: Array) -> bool:
     return _within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
     """Solve for `q + Δ(q)` by Newton steps, then for q by fixed-point steps; checked on the arm itself.
 
@@ -142,8 +134,7 @@ def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
     return _checked(memory, q, tolerances.ACCEPTED)
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _checked(memory: Record, q: Array, tolerance: float) -> bool:
     """Whether the pose is reached; if so, keep that the pose, Jacobian and error in memory are those of q."""
     if not _within(memory.error, tolerance, tolerance):
@@ -152,8 +143,7 @@ def _checked(memory: Record, q: Array, tolerance: float) -> bool:
     return True
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _converge(description: Record, memory: Record, T: Array, q: Array) -> bool:
     """Newton steps of the identified arm as long as each is far better than the one before."""
     arms, dof = description.arms, description.arms.dof

@@ -1,9 +1,6 @@
 """Poses that the calibrated arm reaches and the nominal one does not, on plain numbers."""
 
 import math
-from typing import no_type_check
-
-from numba import njit
 
 from pisigma.kernels.arrays import IDENTIFIED, NEAREST, NOMINAL
 from pisigma.kernels.chain import walk
@@ -12,12 +9,11 @@ from pisigma.kernels.damped_step import scaled_square
 from pisigma.kernels.motion import move
 from pisigma.kernels.newton import search
 from pisigma.kernels.rotations import pose_error, wrap
-from pisigma.kernels.rows import Array, Record, copy, fill
+from pisigma.kernels.rows import Array, Record, copy, fill, kernel
 from pisigma.kinematics.tolerances import ATTEMPTS, BESIDE, REACH_ROUNDING
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def within_reach(description: Record, T: Array) -> bool:
     """Whether a pose is not farther away than the robot is long, whatever its joints do."""
     base, reach = description.arms.ends[IDENTIFIED, 0], description.arms.reach[IDENTIFIED]
@@ -25,8 +21,7 @@ def within_reach(description: Record, T: Array) -> bool:
     return math.sqrt(x * x + y * y + z * z) <= reach * (1 + REACH_ROUNDING)
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def nearest_starts(description: Record, memory: Record, T: Array, most: int) -> int:
     """Write the indices of the starts whose poses are nearest into `memory.nearest`, nearest first; their number."""
     starts, near = description.starts, memory.nearest
@@ -49,8 +44,7 @@ def nearest_starts(description: Record, memory: Record, T: Array, most: int) -> 
     return count
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def recover(description: Record, memory: Record, branch: int, any_branch: bool) -> int:
     """Look for joint values from other starts; see `inverse.identified_arm.IdentifiedArm.recover`.
 
@@ -89,8 +83,7 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
     return -1
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _is_near(description: Record, memory: Record, q: Array) -> bool:
     """Whether joint values of a nominal branch bring the identified arm near the pose; NaN do not."""
     move(description, memory, IDENTIFIED, q)
@@ -98,8 +91,7 @@ def _is_near(description: Record, memory: Record, q: Array) -> bool:
     return scaled_square(description.arms.reach[IDENTIFIED], memory.error) <= BESIDE * BESIDE
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def branch_of(description: Record, memory: Record, q: Array) -> int:
     """Index of the nominal arm's branch that is nearest to joint values."""
     walk(description.arms, NOMINAL, q, memory.axes, memory.T)

@@ -1,15 +1,11 @@
 """Rotation vectors and pose differences on plain numbers; the formulas of `pisigma.se3`."""
 
 import math
-from typing import no_type_check
 
-from numba import njit
-
-from pisigma.kernels.rows import Array
+from pisigma.kernels.rows import Array, kernel
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def rotation_vector(R: Array) -> tuple[float, float, float]:
     """Rotation vector [rad] of the rotation in the first three columns: axis times angle in [0, pi]."""
     x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
@@ -24,8 +20,7 @@ def rotation_vector(R: Array) -> tuple[float, float, float]:
     return factor * x, factor * y, factor * z
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def _near_pi(R: Array, x: float, y: float, z: float, cosine: float) -> tuple[float, float, float]:
     """Axis from the symmetric part, whose columns are `axis · axis_k (1 - cos)`; its sign from the other."""
     angle = math.atan2(math.sqrt(x * x + y * y + z * z) / 2, cosine)
@@ -45,8 +40,7 @@ def _near_pi(R: Array, x: float, y: float, z: float, cosine: float) -> tuple[flo
     return scale * u, scale * v, scale * w
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def pose_error(wanted: Array, actual: Array, R: Array, error: Array) -> None:
     """What moves the actual pose onto the wanted one, in the base frame.
 
@@ -63,8 +57,7 @@ def pose_error(wanted: Array, actual: Array, R: Array, error: Array) -> None:
     error[3], error[4], error[5] = rotation_vector(R)
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def rotation_from_vector(x: float, y: float, z: float, R: Array) -> None:
     """Write the rotation `(3, 3)` of a rotation vector [rad] (Rodrigues)."""
     square = x * x + y * y + z * z
@@ -89,8 +82,7 @@ def rotation_from_vector(x: float, y: float, z: float, R: Array) -> None:
     )
 
 
-@njit(error_model="numpy")
-@no_type_check
+@kernel
 def wrap(angle: float) -> float:
     """The same angle [rad] in (-pi, pi]; an angle that is there already keeps every digit."""
     if -math.pi < angle <= math.pi:
