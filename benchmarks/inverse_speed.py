@@ -3,9 +3,10 @@
 Run `OMP_NUM_THREADS=1 python benchmarks/inverse_speed.py` (scipy comes with `pip install -e ".[bench]"`). The arm has
 errors of 0.5 mm and 1 mrad in every row, base and tool, and a correction of a Fourier series, gravity torques and
 product units; every joint value counts as measured. With a model folder instead of a robot it is that model, between
-its measured joint values. scipy solves the same poses of the arm without its correction, from the
-joint values themselves with 0.05 rad added. Poses are those of uniformly drawn joint values; they are checked before
-solving and the residual is computed after it. The kernels are compiled before anything is timed.
+its measured joint values, or with `--anywhere` all over the limits, mostly outside its domain. scipy solves the same
+poses of the arm without its correction, from the joint values themselves with 0.05 rad added. Poses are those of
+uniformly drawn joint values; they are checked before solving and the residual is computed after it. The kernels are
+compiled before anything is timed.
 """
 
 import argparse
@@ -95,6 +96,11 @@ def main() -> None:
     parser.add_argument("robot", nargs="?", default="ur10", help="of the catalogue, or a model folder")
     parser.add_argument("--poses", type=int, default=100_000)
     parser.add_argument("--harmonics", type=int, default=24)
+    parser.add_argument(
+        "--anywhere",
+        action="store_true",
+        help="of a model folder: joint values all over their limits, not only between measured ones",
+    )
     options = parser.parse_args()
     torch.set_num_threads(1)
     rng = np.random.default_rng(0)
@@ -103,7 +109,7 @@ def main() -> None:
     kernels = CompiledIK.of(model)
     drawn = (
         draw_between(model.starts, options.poses, rng)
-        if folder
+        if folder and not options.anywhere
         else draw_joints(model.robot, options.poses, rng)
     )
     q = drawn.numpy()

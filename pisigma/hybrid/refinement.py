@@ -210,8 +210,8 @@ def with_frames_of(
     """A geometry whose frames that nothing determines are moved onto those of the geometric calibration.
 
     Sockets, and distances from anchors at unknown points, are met as well after any motion of the whole frame.
-    Geometric and hybrid arm, each somewhere else, must not be blended; so every such frame gets the motion that
-    takes the hybrid's poses nearest to the geometric ones.
+    Nominal joint values and predictions of both calibrations belong to one base, however; so every such frame gets the
+    motion that takes the hybrid's poses nearest to the geometric ones.
 
     Args:
         solved: the geometric calibration.

@@ -1,7 +1,5 @@
 """Where the tool of a hybrid arm is and how it moves, a chunk of poses at a time."""
 
-from collections.abc import Callable
-
 import torch
 from jaxtyping import Float, Float64
 from torch import Tensor
@@ -57,16 +55,13 @@ def hybrid_motion(
 def _motion(arm: HybridArm, q: Tensor, exact: bool) -> tuple[Tensor, Tensor]:
     T, J = joint_jacobian(arm.robot, q + arm.delta(q))
     if exact:
-        J = J + J @ _slope(arm.delta, q)
+        J = J + J @ _slope(arm, q)
     return T, J
 
 
-def _slope(
-    function: Callable[[Tensor], Tensor], q: Float[Tensor, "poses dof"]
-) -> Float[Tensor, "poses values dof"]:
-    """Derivatives of a function of every pose's joint values, by central differences in one call."""
+def _slope(arm: HybridArm, q: Float[Tensor, "poses dof"]) -> Float[Tensor, "poses dof dof"]:
+    """Derivatives of the corrections by the joint values, by central differences in one call."""
     step = STEP * torch.eye(q.shape[1], dtype=q.dtype, device=q.device)
-    values = function(q[:, None] + torch.cat([step, -step]))
-    above, below = torch.chunk(values, 2, 1)
+    above, below = torch.chunk(arm.delta(q[:, None] + torch.cat([step, -step])), 2, 1)
     slope: Tensor = (above - below).mT / (2 * STEP)
     return slope
