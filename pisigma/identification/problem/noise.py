@@ -57,7 +57,7 @@ class SensorSums:
         descent: `Σ w J r / sigma_row²`.
         residual: measured minus predicted, 0 where nothing was measured [m or rad].
         distance: length of the residual over sigma_row, 0 where nothing was measured.
-        measured: number of rows that were measured.
+        measured: number of rows of the problem that were measured.
     """
 
     normal: Float64[Tensor, "active active"]
@@ -70,6 +70,20 @@ class SensorSums:
     def rms(self) -> float:
         """Root mean square of the residuals' lengths [m or rad]."""
         return float((self.residual.square().sum() / max(self.measured, 1)).sqrt())
+
+
+def joined_sums(chunks: Sequence[SensorSums]) -> SensorSums:
+    """Add up what a sensor contributes in chunks of rows, one behind the other."""
+    first, *others = chunks
+    if not others:
+        return first
+    return SensorSums(
+        normal=torch.stack([sums.normal for sums in chunks]).sum(0),
+        descent=torch.stack([sums.descent for sums in chunks]).sum(0),
+        residual=torch.cat([sums.residual for sums in chunks], 1),
+        distance=torch.cat([sums.distance for sums in chunks]),
+        measured=first.measured,
+    )
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ from pisigma.identification.problem.noise import (
     SensorView,
     angle_disagreement,
     group_variance_ratio,
+    joined_sums,
     loss_scale,
     prior_group_of,
     prior_scales,
@@ -154,14 +155,13 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def linearise(self, point: Tensor, like: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
         """Sum up the normal equations; rows are weighted by the noise of `like`."""
         before = None if like is None else view_of(like)
-        sums = [self._empty(k) for k in range(len(self.sensors))]
+        noise = (float("inf"),) * len(self.sensors) if before is None else before.noise
         unknowns = self.space.sensor_unknowns(point)
+        chunks = []
         for rows in self.chunks():
             motion = self.motion(point, rows, self.active)
-            for k, total in enumerate(sums):
-                self._add(
-                    k, total, float("inf") if before is None else before.noise[k], motion, unknowns, rows
-                )
+            chunks.append([self._sums(k, sigma, motion, unknowns, rows) for k, sigma in enumerate(noise)])
+        sums = [joined_sums(of_sensor) for of_sensor in zip(*chunks, strict=True)]
         ones = (1.0,) * len(sums)
         view = (
             SensorView(tuple(sums), ones, ones, ones) if before is None else replace(before, sums=tuple(sums))
@@ -191,7 +191,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             )
         off = self._off(linearisation.point)
         renewed = replace(view, noise=noise, repetition=repetition)
-        if not refine:
+        if not refine and self._angular:
             held = view.scaled(self._prior, self.prior_group)
             renewed = replace(
                 renewed, disagreement=angle_disagreement(self.sensors, renewed, held, -held * off)
@@ -329,6 +329,11 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return any(sensor.turning for sensor in self.sensors)
 
     @cached_property
+    def _angular(self) -> bool:
+        """Whether any sensor measures angles."""
+        return any(sensor.unit == "rad" for sensor in self.sensors)
+
+    @cached_property
     def _prior(self) -> Float64[Tensor, " active"]:
         return self.precision[self.active]
 
@@ -341,23 +346,13 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             for values, sensor in zip(self.values_measured, self.sensors, strict=True)
         )
 
-    def _empty(self, sensor: int) -> SensorSums:
-        rows, size, components = self.q.shape[0], len(self.active), self.sensors[sensor].components
-        return SensorSums(
-            normal=self.q.new_zeros((size, size)),
-            descent=self.q.new_zeros(size),
-            residual=self.q.new_empty((components, rows)),
-            distance=self.q.new_empty(rows),
-            measured=self.values_measured[sensor] // components,
-        )
-
-    def _add(
-        self, number: int, sums: SensorSums, sigma: float, motion: ToolMotion, unknowns: Unknowns, rows: slice
-    ) -> None:
-        """Add one sensor's part of some rows, in place."""
-        sensor = self.sensors[number]
+    def _sums(
+        self, number: int, sigma: float, motion: ToolMotion, unknowns: Unknowns, rows: slice
+    ) -> SensorSums:
+        """What one sensor contributes in some rows, weighted by its noise."""
+        sensor, everywhere = self.sensors[number], self.measured_everywhere[number]
         residual = sensor.residual(motion, unknowns, rows)
-        if not self.measured_everywhere[number]:
+        if not everywhere:
             residual = torch.where(sensor.present[rows], residual, 0.0)
         distance = torch.linalg.vector_norm(residual, dim=0)
         if sensor.sigma is not None:
@@ -365,13 +360,11 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         root = self.loss_of(sensor).weight(distance / max(sigma, ALWAYS_GOOD), sensor.components).sqrt()
         if sensor.sigma is not None:
             root = root / sensor.sigma[rows]
-        if not self.measured_everywhere[number]:
+        if not everywhere:
             root = torch.where(sensor.present[rows], root, 0.0)
         A = (self.derivative(sensor, motion, unknowns, rows, self.active) * root).flatten(1)
-        sums.normal.addmm_(A, A.t())
-        sums.descent.addmv_(A, (residual * root).flatten())
-        sums.residual[:, rows] = residual
-        sums.distance[rows] = distance
+        measured = self.values_measured[number] // sensor.components
+        return SensorSums(A @ A.t(), A @ (residual * root).flatten(), residual, distance, measured)
 
 
 def _alike(before: SensorView, after: SensorView, share: float = SETTLED) -> bool:
