@@ -25,7 +25,7 @@ SHORTEST_STEP = 1e-3
 class SolutionStatus(Enum):
     """How a search ended; the value is a sentence."""
 
-    CONVERGED = "converged: the last step moved nothing by more than a thousandth of its standard error"
+    CONVERGED = "converged: a step moves nothing by more than a thousandth of its standard error any more"
     EXACT = "converged: the residuals are at rounding level"
     STALLED = "stopped: no step lowers the cost any more, though the residuals are above rounding level"
     ITERATION_LIMIT = (
@@ -119,7 +119,7 @@ def levenberg_marquardt(
         start: where to begin, or the problem as already seen from there.
         maximum_iterations: steps tried at most.
         close_enough: length [standard errors] of a step, as a vector of all unknowns, that is not worth taking; the
-            search then ends without it.
+            search then ends without it, as converged.
 
     Returns:
         The best point, with the reason for stopping (see `SolutionStatus`).
