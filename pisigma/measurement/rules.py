@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
 from pisigma.measurement.fields import NUMBERS, TEXTS, MeasuredFields
-from pisigma.measurement.readings import READINGS, RowFault, Unit, from_si, reading_numbers, reading_texts
+from pisigma.measurement.readings import READINGS, Unit, from_si, reading_numbers, reading_texts
 
 AXES = ("x", "y", "z")
 """Names of the axes of a frame, as a touch gives them."""
@@ -61,10 +61,8 @@ def check_fields(data: MeasuredFields) -> None:
     _check_rotations(data)
     sound = np.ones(data.rows, dtype=bool)
     for faults in (row_faults(data, Labels()), group_faults(data, Labels(), sound, data.label)):
-        for bad, describe in faults:
-            if bad.any():
-                row = int(bad.argmax())
-                raise MeasurementError(f"{data.label(row)}: {describe(row)}.")
+        for row, what in faults:
+            raise MeasurementError(f"{data.label(row)}: {what}.")
 
 
 def _check_shapes(data: MeasuredFields) -> None:
@@ -126,14 +124,15 @@ def _refuse(data: MeasuredFields, bad: Bool[Tensor, " rows"], name: str, what: s
         raise MeasurementError(f"{data.label(row)}: {name} {data.numbers[name][row].tolist()} {what}.")
 
 
-def row_faults(data: MeasuredFields, labels: Labels) -> Iterator[RowFault]:
+Fault = tuple[int, str]
+"""A row at fault, and what is wrong with it and what to do."""
+
+
+def row_faults(data: MeasuredFields, labels: Labels) -> Iterator[Fault]:
     """Find the rows that cannot be, or contradict themselves.
 
     A row holds one length: a position, a coordinate that was touched, a socket, or a distance. What a second
-    sensor measured at the same joint values is a second row.
-
-    Yields:
-        Rows at fault, and a function that says what is wrong with one of them and what to do.
+    sensor measured at the same joint values is a second row. A row may be found several times.
     """
     yield from _value_faults(data, labels)
     yield from _reading_faults(data, labels)
@@ -148,17 +147,21 @@ def row_faults(data: MeasuredFields, labels: Labels) -> Iterator[RowFault]:
         yield from _touch_faults(data, labels, lengths["touch"])
     if {"distance", "anchor", "anchor_place", "pair"} & {*data.numbers, *data.texts}:
         yield from _distance_faults(data, labels, lengths["distance"])
-
-    def describe(row: int) -> str:
+    for row in rows_where(np.sum(list(lengths.values()), axis=0) > 1):
         names = " and ".join(labels(name) for name, there in lengths.items() if there[row])
-        return (
-            f"{names}: a row holds one measured length; put each in a row of its own, with equal joint values"
+        yield (
+            row,
+            f"{names}: a row holds one measured length; put each in a row of its own, with equal joint values",
         )
 
-    yield np.sum(list(lengths.values()), axis=0) > 1, describe
+
+def rows_where(bad: Bool[np.ndarray, " rows"]) -> list[int]:
+    """The numbers of the rows where something is true."""
+    rows: list[int] = np.flatnonzero(bad).tolist()
+    return rows
 
 
-def _value_faults(data: MeasuredFields, labels: Labels) -> Iterator[RowFault]:
+def _value_faults(data: MeasuredFields, labels: Labels) -> Iterator[Fault]:
     """Rows with values that cannot be: of standard deviations, payloads, directions of approach, and sets."""
     for name, least in (
         ("sigma_position", SMALLEST_SIGMA),
@@ -166,120 +169,98 @@ def _value_faults(data: MeasuredFields, labels: Labels) -> Iterator[RowFault]:
         ("payload", 0.0),
     ):
         values = data.array(name)
-        yield (
-            values < least,
-            lambda row, name=name, least=least, values=values: (  # type: ignore[misc]
+        for row in rows_where(values < least):
+            what = (
                 f"{labels(name)}: {labels.shown(name, values[row])} stands where {labels.shown(name, least)} or more "
                 "was wanted; correct it or leave it empty"
-            ),
-        )
+            )
+            yield row, what
     if "approach" in data.numbers:
         for joint, values in enumerate(data.array("approach").T, start=1):
-            yield (
-                ~np.isnan(values) & (np.abs(values) != 1),
-                lambda row, joint=joint, values=values: (  # type: ignore[misc]
+            for row in rows_where(~np.isnan(values) & (np.abs(values) != 1)):
+                what = (
                     f"{labels(f'approach{joint}')}: {values[row]:.6g} stands where +1 (the joint value grew) or -1 (it "
                     "fell) was wanted; correct it or leave it empty"
-                ),
+                )
+                yield row, what
+    for row, split in enumerate(data.texts.get("split", ())):
+        if split not in SPLITS:
+            yield (
+                row,
+                f"{labels('split')}: '{split}' stands where train or test was wanted; write one of them",
             )
-    if "split" in data.texts:
-        splits = data.text("split")
-        yield (
-            np.array([name not in SPLITS for name in splits], dtype=bool),
-            lambda row: (
-                f"{labels('split')}: '{splits[row]}' stands where train or test was wanted; write one of them"
-            ),
-        )
 
 
-def _reading_faults(data: MeasuredFields, labels: Labels) -> Iterator[RowFault]:
+def _reading_faults(data: MeasuredFields, labels: Labels) -> Iterator[Fault]:
     """Rows whose readings of a registered sensor are there in part, or cannot be."""
     for sensor, readings in READINGS.items():
         if not {*readings.numbers, *readings.texts} & {*data.numbers, *data.texts}:
             continue
         numbers = {name: data.array(name) for name in readings.numbers}
         missing = np.isnan(np.stack(list(numbers.values())))
-        faults: list[RowFault] = [
-            (missing.any(0) & ~missing.all(0), lambda _: "is there in part; fill all of it or none"),
-            *readings.row_faults({**numbers, **{name: data.text(name) for name in readings.texts}}),
-        ]
-        for bad, describe in faults:
-            yield bad, lambda row, sensor=sensor, describe=describe: f"{labels(sensor)}: {describe(row)}"  # type: ignore[misc]
+        for row in rows_where(missing.any(0) & ~missing.all(0)):
+            yield row, f"{labels(sensor)}: is there in part; fill all of it or none"
+        texts = {name: data.text(name) for name in readings.texts}
+        for bad, describe in readings.row_faults({**numbers, **texts}):
+            for row in rows_where(bad):
+                yield row, f"{labels(sensor)}: {describe(row)}"
 
 
 def _named(names: Sequence[str]) -> Bool[np.ndarray, " rows"]:
     return np.array([bool(name) for name in names], dtype=bool)
 
 
-def _touch_faults(
-    data: MeasuredFields, labels: Labels, touch: Bool[np.ndarray, " rows"]
-) -> Iterator[RowFault]:
+def _touch_faults(data: MeasuredFields, labels: Labels, touch: Bool[np.ndarray, " rows"]) -> Iterator[Fault]:
     axes = data.text("touch_axis")
     axis = _named(axes)
     label, value = labels("touch_axis"), labels("touch")
-    yield (
-        np.array([name not in ("", *AXES) for name in axes], dtype=bool),
-        lambda row: f"{label}: '{axes[row]}' is no axis; write x, y or z",
-    )
-    yield touch & ~axis, lambda row: f"{label}: the touch has no axis; write x, y or z"
-    yield (
-        axis & ~touch,
-        lambda row: (
-            f"{value}: the touch along {axes[row]} has no coordinate; give it, or remove the axis too"
-        ),
-    )
-    yield (
-        touch & ~_named(data.text("frame")),
-        lambda row: (
-            f"{labels('frame')}: the touch names no frame; write which placement of the jig was touched, such as left"
-        ),
-    )
+    for row in rows_where(np.array([name not in ("", *AXES) for name in axes], dtype=bool)):
+        yield row, f"{label}: '{axes[row]}' is no axis; write x, y or z"
+    for row in rows_where(touch & ~axis):
+        yield row, f"{label}: the touch has no axis; write x, y or z"
+    for row in rows_where(axis & ~touch):
+        yield row, f"{value}: the touch along {axes[row]} has no coordinate; give it, or remove the axis too"
+    for row in rows_where(touch & ~_named(data.text("frame"))):
+        what = "the touch names no frame; write which placement of the jig was touched, such as left"
+        yield row, f"{labels('frame')}: {what}"
 
 
 def _distance_faults(
     data: MeasuredFields, labels: Labels, distance: Bool[np.ndarray, " rows"]
-) -> Iterator[RowFault]:
+) -> Iterator[Fault]:
     anchors, pairs, values = data.text("anchor"), data.text("pair"), data.array("distance")
     anchor, pair = _named(anchors), _named(pairs)
     label, names = labels("distance"), (labels("anchor"), labels("pair"))
-    yield (
-        values < 0,
-        lambda row: (
-            f"{label}: {labels.shown('distance', values[row])} stands where 0 or more was wanted; correct it"
-        ),
-    )
-    yield (
-        distance & ~anchor & ~pair,
-        lambda row: (
-            f"{names[0]}: the distance is from nowhere; name its anchor, or the pair of rows it lies between"
-        ),
-    )
-    yield (
-        anchor & pair,
-        lambda row: (
-            f"{names[0]} and {names[1]}: a distance is from an anchor or within a pair; keep one of them"
-        ),
-    )
-    yield (
-        (anchor | pair) & ~distance,
-        lambda row: f"{label}: the distance is missing for '{anchors[row] or pairs[row]}'; give it",
-    )
+    for row in rows_where(values < 0):
+        yield (
+            row,
+            f"{label}: {labels.shown('distance', values[row])} stands where 0 or more was wanted; correct it",
+        )
+    for row in rows_where(distance & ~anchor & ~pair):
+        yield (
+            row,
+            f"{names[0]}: the distance is from nowhere; name its anchor, or the pair of rows it lies between",
+        )
+    for row in rows_where(anchor & pair):
+        yield (
+            row,
+            f"{names[0]} and {names[1]}: a distance is from an anchor or within a pair; keep one of them",
+        )
+    for row in rows_where((anchor | pair) & ~distance):
+        yield row, f"{label}: the distance is missing for '{anchors[row] or pairs[row]}'; give it"
     missing = np.isnan(data.array("anchor_place", 3))
-    yield (
-        np.asarray(missing.any(1) & ~missing.all(1)),
-        lambda row: (
-            f"{labels('anchor_place')}: is there in part; give x, y and z of the anchor or none of them"
-        ),
-    )
-    yield (
-        np.asarray(~missing.all(1) & ~anchor),
-        lambda row: f"{names[0]}: the place of an anchor is stated without its name; name the anchor",
-    )
+    for row in rows_where(missing.any(1) & ~missing.all(1)):
+        yield (
+            row,
+            f"{labels('anchor_place')}: is there in part; give x, y and z of the anchor or none of them",
+        )
+    for row in rows_where(~missing.all(1) & ~anchor):
+        yield row, f"{names[0]}: the place of an anchor is stated without its name; name the anchor"
 
 
 def group_faults(
     data: MeasuredFields, labels: Labels, sound: Bool[np.ndarray, " rows"], place: Callable[[int], str]
-) -> Iterator[RowFault]:
+) -> Iterator[Fault]:
     """Find the rows that contradict other rows of the same pair, anchor or socket.
 
     Args:
@@ -287,32 +268,28 @@ def group_faults(
         labels: how complaints call fields.
         sound: rows that are not at fault themselves.
         place: what complaints call a row.
-
-    Yields:
-        Rows at fault, and a function that says what is wrong with one of them and what to do.
     """
     frame, anchor_place = data.text("frame"), data.array("anchor_place", 3)
     for name, rows in _groups(data.text("pair")).items():
-        yield _fault(data, rows, _pair_problem(data, labels, name, rows, sound, place))
+        if problem := _pair_problem(data, labels, name, rows, sound, place):
+            yield from ((row, problem) for row in rows)
     for kind in ("anchor", "socket"):
         for name, rows in _groups(data.text(kind)).items():
             frames = sorted({frame[row] for row in rows})
-            if len(frames) > 1:
-                yield _fault(
-                    data,
-                    rows,
+            for row in rows if len(frames) > 1 else ():
+                what = (
                     f"{labels('frame')}: {kind} '{name}' is in the frames '{frames[0]}' and '{frames[1]}', but its "
-                    "place is one point of one frame; use another name in each frame",
+                    "place is one point of one frame; use another name in each frame"
                 )
+                yield row, what
     for name, rows in _groups(data.text("anchor")).items():
         places = np.where(np.isnan(anchor_place[rows]), np.inf, anchor_place[rows])  # NaN equals NaN
-        if (places != places[0]).any():
-            yield _fault(
-                data,
-                rows,
+        for row in rows if (places != places[0]).any() else ():
+            what = (
                 f"{labels('anchor_place')}: anchor '{name}' has not the same place in all its rows; give one place in "
-                "all of them or in none, or name the anchors apart",
+                "all of them or in none, or name the anchors apart"
             )
+            yield row, what
 
 
 def _groups(names: Sequence[str]) -> dict[str, list[int]]:
@@ -322,12 +299,6 @@ def _groups(names: Sequence[str]) -> dict[str, list[int]]:
         if name:
             rows.setdefault(name, []).append(row)
     return rows
-
-
-def _fault(data: MeasuredFields, rows: list[int], problem: str) -> RowFault:
-    bad = np.zeros(data.rows, dtype=bool)
-    bad[rows] = bool(problem)
-    return bad, lambda row: problem
 
 
 def _pair_problem(

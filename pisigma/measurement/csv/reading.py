@@ -63,12 +63,10 @@ def read_fields(
     layout = read_header(table, robot)
     rows = check_cells(table, layout, robot)
     data, labels, faults = _fields(table, layout, rows), _labels(layout), rows.faults
-    for bad, describe in row_faults(data, labels):
-        faults.add(bad, describe)
+    faults.add(row_faults(data, labels))
     check_equal_rows(rows, layout, table)
     lines = [f"line {line}" for line in table.lines]
-    for bad, describe in group_faults(data, labels, faults.sound(data.rows), lines.__getitem__):
-        faults.add(bad, describe)
+    faults.add(group_faults(data, labels, faults.sound(data.rows), lines.__getitem__))
     if faults.reasons and (on_bad_row == "error" or len(faults.reasons) == data.rows):
         raise MeasurementError(_complaint(table, faults.reasons))
     sound = data.select(torch.from_numpy(np.flatnonzero(faults.sound(data.rows))))

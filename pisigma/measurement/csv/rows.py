@@ -11,6 +11,7 @@ from pisigma.measurement.csv.columns import QUATERNION, Column, quoted
 from pisigma.measurement.csv.header import Layout
 from pisigma.measurement.csv.table import Faults, Table
 from pisigma.measurement.readings import READINGS, from_si, to_si
+from pisigma.measurement.rules import rows_where
 from pisigma.robot import Robot, Row
 
 LARGEST = 1e9
@@ -74,20 +75,15 @@ def _cells(table: Table, faults: Faults) -> list[Sequence[str]]:
     """The cells by column; rows of a wrong length are noted and stand there empty."""
     names, wanted = table.header, len(table.header)
     records = table.records
-    wrong = np.array([len(record) != wanted for record in records])
-
-    def describe(row: int) -> str:
-        came = len(records[row])
+    for row, record in enumerate(records):
+        came = len(record)
         if came > wanted:
-            return (
-                f"column {wanted + 1}: {came} fields, but the header has {wanted}; remove what is too much "
-                "(numbers need a decimal point, not a comma)"
-            )
-        return f"column '{names[came]}': {came} fields, but the header has {wanted}; complete the row"
-
-    faults.add(wrong, describe)
-    if wrong.any():
-        records = [[""] * wanted if bad else record for bad, record in zip(wrong, records, strict=True)]
+            what = "remove what is too much (numbers need a decimal point, not a comma)"
+            faults.add([(row, f"column {wanted + 1}: {came} fields, but the header has {wanted}; {what}")])
+        elif came < wanted:
+            what = f"column '{names[came]}': {came} fields, but the header has {wanted}; complete the row"
+            faults.add([(row, what)])
+    records = [record if len(record) == wanted else [""] * wanted for record in records]
     return list(zip(*records, strict=True))
 
 
@@ -101,25 +97,16 @@ def _numbers(cells: Sequence[str], column: Column, faults: Faults) -> Float64[np
         values = np.array([float(cell) if cell else np.nan for cell in cells])
     except ValueError:
         values = np.array([_number(cell) for cell in cells])
-    odd = ~np.isfinite(values)
-    if odd.any():
-        odd[odd] = [bool(cells[row].strip()) for row in np.flatnonzero(odd).tolist()]
-        remedy = (
-            "" if column.joint else ", or leave it empty with all that belongs to it if it was not measured"
-        )
-        faults.add(
-            odd,
-            lambda row: (
-                f"column '{column.name}': '{cells[row].strip()}' is no finite number; write one such as -12.5{remedy}"
-            ),
-        )
+    remedy = "" if column.joint else ", or leave it empty with all that belongs to it if it was not measured"
+    odd = [(row, cell) for row in rows_where(~np.isfinite(values)) if (cell := cells[row].strip())]
+    faults.add(
+        (row, f"column '{column.name}': '{cell}' is no finite number; write one such as -12.5{remedy}")
+        for row, cell in odd
+    )
     with np.errstate(invalid="ignore"):
-        faults.add(
-            np.abs(values) > LARGEST,
-            lambda row: (
-                f"column '{column.name}': {values[row]:.4g} {column.unit} is more than can be measured; correct it"
-            ),
-        )
+        large = rows_where(np.abs(values) > LARGEST)
+    said = f"{column.unit} is more than can be measured; correct it"
+    faults.add((row, f"column '{column.name}': {values[row]:.4g} {said}") for row in large)
     return values
 
 
@@ -136,16 +123,10 @@ def _check_joints(values: _Values, layout: Layout, robot: Robot | None, faults: 
     """Every joint value is there and within the robot's limits."""
     for number, quantity in enumerate(layout.joints):
         column, q = layout.column(quantity), values[:, layout.index[quantity]]
-        _check_present(q, column, faults)
+        empty = f"column '{column.name}': the cell is empty; every row needs all joints"
+        faults.add((row, empty) for row in rows_where(np.isnan(q)))
         if robot is not None:
             _check_limits(q, column, robot.joints[number], robot.name, faults)
-
-
-def _check_present(q: Float64[np.ndarray, " rows"], column: Column, faults: Faults) -> None:
-    """One joint has a value in every row."""
-    faults.add(
-        np.isnan(q), lambda row: f"column '{column.name}': the cell is empty; every row needs all joints"
-    )
 
 
 def _check_limits(
@@ -155,12 +136,13 @@ def _check_limits(
     q_si = to_si(q, column.unit)
     outside = (q_si < joint.lower - LIMIT_TOLERANCE) | (q_si > joint.upper + LIMIT_TOLERANCE)
     lower, upper = from_si(np.array([joint.lower, joint.upper]), column.unit).tolist()
+    limits = f"the limits {lower:.6g} to {upper:.6g} {column.unit} of joint '{joint.name}' of robot '{robot}'"
     faults.add(
-        outside,
-        lambda row: (
-            f"column '{column.name}': {q[row]:.10g} {column.unit} is outside the limits {lower:.6g} to {upper:.6g} "
-            f"{column.unit} of joint '{joint.name}' of robot '{robot}'; {_UNIT_DOUBT[column.unit]}"
-        ),
+        (
+            row,
+            f"column '{column.name}': {q[row]:.10g} {column.unit} is outside {limits}; {_UNIT_DOUBT[column.unit]}",
+        )
+        for row in rows_where(outside)
     )
 
 
@@ -177,41 +159,35 @@ def _check_measured(values: _Values, cells: list[Sequence[str]], layout: Layout,
     measured = quoted(
         layout.column(quantity) for quantity in (*layout.position, *layout.orientation, *layout.lengths)
     )
-    faults.add(
-        nothing, lambda row: f"columns {measured}: nothing was measured in this row; remove it or fill them"
-    )
+    empty = f"columns {measured}: nothing was measured in this row; remove it or fill them"
+    faults.add((row, empty) for row in rows_where(nothing))
     if layout.orientation == QUATERNION:
         norm = np.linalg.norm(values[:, [layout.index[quantity] for quantity in QUATERNION]], axis=1)
+        four = quoted(layout.column(name) for name in QUATERNION)
+        wanted = "where 1 was wanted; check the values and their order x, y, z, w"
         faults.add(
-            np.abs(norm - 1) > QUATERNION_TOLERANCE,
-            lambda row: (
-                f"columns {quoted(layout.column(name) for name in QUATERNION)}: the quaternion has norm "
-                f"{norm[row]:.6g} where 1 was wanted; check the values and their order x, y, z, w"
-            ),
+            (row, f"columns {four}: the quaternion has norm {norm[row]:.6g} {wanted}")
+            for row in rows_where(np.abs(norm - 1) > QUATERNION_TOLERANCE)
         )
 
 
 def _check_whole(missing: Bool[np.ndarray, "rows group"], columns: list[Column], faults: Faults) -> None:
     """All cells of a group are filled or none."""
-    faults.add(
-        np.asarray(missing.any(1) & ~missing.all(1)),
-        lambda row: (
-            f"column '{columns[int(missing[row].argmax())].name}': the cell is empty, but not all of "
-            f"{quoted(columns)} are; fill all of them or none"
-        ),
-    )
+    for row in rows_where(np.asarray(missing.any(1) & ~missing.all(1))):
+        first = columns[int(missing[row].argmax())].name
+        what = f"the cell is empty, but not all of {quoted(columns)} are; fill all of them or none"
+        faults.add([(row, f"column '{first}': {what}")])
 
 
 def check_equal_rows(rows: CheckedRows, layout: Layout, table: Table) -> None:
     """Find rows that equal another one in all columns; the later one is at fault."""
     texts = [rows.texts(i) for i, column in enumerate(layout.columns) if not column.is_number]
     first = first_of_equal_rows(rows.values, texts)
+    again = rows.faults.sound(len(rows.values)) & (first != np.arange(len(rows.values)))
+    remedy = "remove one of them (a repeated measurement has other readings)"
     rows.faults.add(
-        rows.faults.sound(len(rows.values)) & (first != np.arange(len(rows.values))),
-        lambda row: (
-            f"all columns: the row equals line {table.lines[first[row]]}; remove one of them "
-            "(a repeated measurement has other readings)"
-        ),
+        (row, f"all columns: the row equals line {table.lines[first[row]]}; {remedy}")
+        for row in rows_where(again)
     )
 
 

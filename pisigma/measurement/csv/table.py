@@ -2,7 +2,7 @@
 
 import csv
 import os
-from collections.abc import Callable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -109,11 +109,10 @@ class Faults:
             row: f"all columns: no valid CSV ({what}); check the quotes" for row, what in broken.items()
         }
 
-    def add(self, rows: Bool[np.ndarray, " rows"], describe: Callable[[int], str]) -> None:
-        """Note rows at fault; `describe` says what is wrong with one of them."""
-        for row in np.flatnonzero(rows).tolist():
-            if row not in self.reasons:
-                self.reasons[row] = describe(row)
+    def add(self, faults: Iterable[tuple[int, str]]) -> None:
+        """Note rows at fault, and what is wrong with each."""
+        for row, what in faults:
+            self.reasons.setdefault(row, what)
 
     def sound(self, rows: int) -> Bool[np.ndarray, " rows"]:
         """The rows without a fault so far, of so many."""
