@@ -1,5 +1,6 @@
 """What errors depend on: joint values, order of measurement, payload, temperature, frame and target."""
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from pisigma.judging.rank_tests import SIGNIFICANT, groups_differ, rank_correlat
 from pisigma.measurement.conditions import CONDITIONS, conditions_of
 from pisigma.measurement.groups import groups_of_equal_joints, numbers_of_names
 from pisigma.reporting.page.judged_rows import JudgedRows
-from pisigma.reporting.tables import figure_text
+from pisigma.reporting.rendering import sentences
 from pisigma.robot.description import Robot
 
 NOTABLE = 1.25
@@ -143,13 +144,8 @@ def by_name(rows: JudgedRows, names: Sequence[str]) -> tuple[tuple[NameErrors, .
         rms = [root_mean_square(lengths[inside]) for lengths in (before, after)]
         result.append(NameErrors(name, int(inside.sum()), rms[0], rms[1], bias))
     _, chance = groups_differ(number[judged], after[judged])
-    if chance >= SIGNIFICANT:
-        return tuple(result), f"They do not differ more than by chance ({chance_text(chance)})."
-    largest = max((one for one in result if one.rows), key=lambda one: one.after)
-    return tuple(result), (
-        f"They differ more than by chance ({chance_text(chance)}); '{largest.name}' has the largest errors "
-        f"({figure_text(largest.after)} {unit} RMS)."
-    )
+    largest = max((one for one in result if one.rows), key=lambda one: one.after, default=None)
+    return tuple(result), _say("by_name", largest, unit, chance_text(chance), chance < SIGNIFICANT)[0]
 
 
 def _over_values(
@@ -165,16 +161,9 @@ def _over_values(
     _, chance = groups_differ(bins.number[first], np.bincount(group, errors) / np.bincount(group))
     worst = int(np.nanargmax(bins.rms))
     high, low = bins.rms[worst], np.nanmin(bins.rms)
-    between = f"RMS from {figure_text(low)} to {figure_text(high)} {unit}"
-    if chance >= SIGNIFICANT:
-        return f"No dependence on {name} beyond chance ({chance_text(chance)}): {between} over its values."
-    if high < NOTABLE * low:
-        return f"Depends on {name} a little, yet more than by chance ({chance_text(chance)}): {between}."
-    return (
-        f"Largest at {name} from {bins.edges[worst]:.0f} to {bins.edges[worst + 1]:.0f} {joint_unit}, "
-        f"{figure_text(high)} {unit} RMS, {high / low:.1f} times the smallest part: more than by chance "
-        f"({chance_text(chance)})."
-    )
+    sure, notable = chance < SIGNIFICANT, high >= NOTABLE * low
+    edges = (bins.edges[worst], bins.edges[worst + 1])
+    return _say("over_joint", name, joint_unit, unit, chance_text(chance), sure, notable, low, high, edges)[0]
 
 
 def _over_time(rows: JudgedRows, errors: dict[str, np.ndarray], judged: np.ndarray, unit: str) -> Dependence:
@@ -187,45 +176,34 @@ def _over_time(rows: JudgedRows, errors: dict[str, np.ndarray], judged: np.ndarr
     name = max(tests, key=lambda name: abs(tests[name][0]))
     (r, chance), values = tests[name], components[name]
     what = f"component {name} of the error" if signed else "length of the error"
-    if chance >= SIGNIFICANT:
-        sentence = (
-            f"No drift beyond chance: the largest rank correlation with the order of the rows is {r:.2f}, of the "
-            f"{what} ({chance_text(chance)})."
+    sure, tenth = chance < SIGNIFICANT, max(len(number) // 10, 1)
+    moved = float(values[-tenth:].mean() - values[:tenth].mean()) if sure else 0.0
+    sentence = " ".join(
+        (
+            *_say("over_time", what, r, chance_text(chance), sure, moved, unit),
+            *(_order_remark(rows) if sure else ()),
         )
-    else:
-        tenth = max(len(number) // 10, 1)
-        moved = float(values[-tenth:].mean() - values[:tenth].mean())
-        sentence = (
-            f"{what[0].upper()}{what[1:]} changes with the order of the rows (rank correlation {r:.2f}, "
-            f"{chance_text(chance)}): by {moved:+.3f} {unit} on average from the first tenth of them to the last."
-            f"{_order_remark(rows)}"
-        )
+    )
     if signed and rows.residual_origin == "training":
         sentence += " Signed errors are residuals of the rows that the model was made of."
     shown = components if signed else errors
     return Dependence("order", "order of the rows", "", number, shown, unit, sentence)
 
 
-def _order_remark(rows: JudgedRows) -> str:
+def _order_remark(rows: JudgedRows) -> tuple[str, ...]:
     """Warn where the rows were measured joint value after joint value."""
     q = rows.measurements.q.numpy()
     r = [abs(rank_correlation(np.arange(len(q)), values)[0]) for values in q.T]
-    if max(r) < ORDERED:
-        return ""
-    return (
-        f" The rows were measured in an order (rank correlation of joint {int(np.argmax(r)) + 1} with it "
-        f"{max(r):.2f}), so this may come of the poses instead of the time."
-    )
+    return () if max(r) < ORDERED else _say("ordered", int(np.argmax(r)) + 1, max(r))
 
 
 def _over_condition(title: str, unit: str, values: np.ndarray, errors: np.ndarray) -> str:
     r, chance = rank_correlation(values, errors)
-    test = (
-        f"({values.min():.4g} to {values.max():.4g} {unit}; rank correlation {r:.2f}, {chance_text(chance)})"
-    )
-    if chance >= SIGNIFICANT:
-        return f"No dependence on {title} beyond chance {test}."
-    return f"The error {'grows' if r > 0 else 'falls'} with {title} {test}."
+    low, high, sure = values.min(), values.max(), chance < SIGNIFICANT
+    return _say("over_condition", title, unit, low, high, r, chance_text(chance), sure)[0]
+
+
+_say = functools.partial(sentences, "report.txt.j2")
 
 
 def root_mean_square(values: Float64[np.ndarray, " values"]) -> float:
