@@ -1,6 +1,6 @@
 """Joint offsets alone: the most that a controller can take which knows nothing but its zero positions."""
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
@@ -148,25 +148,16 @@ class Departure:
     """How far a robot's tool is from where the whole model has it.
 
     Attributes:
-        mean: of the distances [m].
-        p95: their 95 % quantile [m].
-        maximum: the largest [m].
-        mean_angle: mean angle between the two rotations [rad].
+        mean_mm: of the distances [mm].
+        p95_mm: their 95 % quantile [mm].
+        max_mm: the largest [mm].
+        mean_mrad: mean angle between the two rotations [mrad].
     """
 
-    mean: float
-    p95: float
-    maximum: float
-    mean_angle: float
-
-    def in_file_units(self) -> dict[str, float]:
-        """mean_mm, p95_mm, max_mm, mean_mrad."""
-        return {
-            "mean_mm": self.mean * 1e3,
-            "p95_mm": self.p95 * 1e3,
-            "max_mm": self.maximum * 1e3,
-            "mean_mrad": self.mean_angle * 1e3,
-        }
+    mean_mm: float
+    p95_mm: float
+    max_mm: float
+    mean_mrad: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,11 +180,8 @@ class JointOffsets:
     nominal: Departure
 
     def departures(self) -> dict[str, object]:
-        """Both departures in the units of files, by their keys there."""
-        return {
-            "off_the_whole_model": self.lost.in_file_units(),
-            "robot_as_drawn": self.nominal.in_file_units(),
-        }
+        """Both departures, by their keys in files."""
+        return {"off_the_whole_model": asdict(self.lost), "robot_as_drawn": asdict(self.nominal)}
 
 
 def fit_joint_offsets(model: CalibratedModel, seed: int = 0) -> JointOffsets:
@@ -261,10 +249,10 @@ def _departure(T: Float64[Tensor, "poses 4 4"], T_model: Float64[Tensor, "poses 
     distance = (T[:, :3, 3] - T_model[:, :3, 3]).norm(dim=-1)
     angle = rotation_vector(T[:, :3, :3].mT @ T_model[:, :3, :3]).norm(dim=-1)
     return Departure(
-        mean=float(distance.mean()),
-        p95=float(distance.quantile(0.95)),
-        maximum=float(distance.max()),
-        mean_angle=float(angle.mean()),
+        mean_mm=float(distance.mean()) * 1e3,
+        p95_mm=float(distance.quantile(0.95)) * 1e3,
+        max_mm=float(distance.max()) * 1e3,
+        mean_mrad=float(angle.mean()) * 1e3,
     )
 
 
@@ -276,13 +264,13 @@ MEANING = (
 
 def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
     """What the offsets mean and what they give up."""
-    lost, nominal = offsets.lost.in_file_units(), offsets.nominal.in_file_units()
+    lost, nominal = offsets.lost, offsets.nominal
     said = [
         MEANING,
-        f"Offsets alone are off the whole model by {lost['mean_mm']:.4g} mm in the mean, {lost['p95_mm']:.4g} mm in 95 "
-        f"% of its poses, {lost['max_mm']:.4g} mm at most, and {lost['mean_mrad']:.4g} mrad in the mean (the robot as "
-        f"drawn, on the model's base and tool: {nominal['mean_mm']:.4g}, {nominal['p95_mm']:.4g}, "
-        f"{nominal['max_mm']:.4g} mm and {nominal['mean_mrad']:.4g} mrad).",
+        f"Offsets alone are off the whole model by {lost.mean_mm:.4g} mm in the mean, {lost.p95_mm:.4g} mm in 95 "
+        f"% of its poses, {lost.max_mm:.4g} mm at most, and {lost.mean_mrad:.4g} mrad in the mean (the robot as "
+        f"drawn, on the model's base and tool: {nominal.mean_mm:.4g}, {nominal.p95_mm:.4g}, "
+        f"{nominal.max_mm:.4g} mm and {nominal.mean_mrad:.4g} mrad).",
     ]
     if offsets.unobservable:
         said.append(f"Base or tool take in the offset of {', '.join(offsets.unobservable)}, which is 0 here.")

@@ -1,7 +1,7 @@
 """Touches: the robot moves along a face's normal until the tip really meets the face."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
@@ -97,16 +97,9 @@ def simulate_touches(
             f"{source}: {left_out[0].reason} ({len(left_out)} of {candidates.count} touches "
             "miss); correct the placement, ask for more margin or travel, or leave such touches out with on_miss."
         )
-    touched = candidates.select(met)
-    return Measurements(
-        q=contact.q[met],
-        frame=touched.frame,
-        touch_axis=touched.touch_axis,
-        touch=touched.coordinate,
-        sigma_position=row_sigma(noise, touched.count),
-        source=source,
-        left_out=left_out,
-    )
+    touched = replace(candidates.select(met), q=contact.q[met])
+    sigma = row_sigma(noise, touched.count)
+    return replace(touched.as_measurements(), sigma_position=sigma, source=source, left_out=left_out)
 
 
 @dataclass(frozen=True, eq=False)

@@ -49,9 +49,9 @@ def test_offsets_come_back(name):
     found = fit_joint_offsets(model)
     assert_close(found.values, [0, *offsets[1:5], 0], atol=1e-9)
     assert found.unobservable == ("theta_1", "theta_6")
-    assert found.lost.maximum < 1e-9
-    assert found.nominal.mean > 1e-3
-    assert found.nominal.mean < found.nominal.p95 < found.nominal.maximum
+    assert found.lost.max_mm < 1e-6
+    assert found.nominal.mean_mm > 1
+    assert found.nominal.mean_mm < found.nominal.p95_mm < found.nominal.max_mm
     q = joints_around(name, 20)
     T = forward_kinematics(model.calibrated, q)
     assert_close(forward_kinematics(found.robot, q), T, atol=1e-9)
@@ -65,15 +65,15 @@ def test_parallel_axes_leave_base_and_tool_open():
     found = fit_joint_offsets(model)
     assert found.unobservable == ("theta_1", "d_3", "theta_4")
     assert_close(found.values, [0, 0.02, 0, 0], atol=1e-6)
-    assert found.lost.maximum < 1e-7
+    assert found.lost.max_mm < 1e-4
     assert np.abs(found.robot.base).max() < 0.1
 
 
 @pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur10"])
 def test_a_learned_correction_is_followed_in_part(name):
     found = fit_joint_offsets(hand_made_model(name))
-    assert 0 < found.lost.mean < found.nominal.mean
-    assert found.lost.in_file_units()["mean_mm"] == found.lost.mean * 1e3
+    assert 0 < found.lost.mean_mm < found.nominal.mean_mm
+    assert found.departures()["off_the_whole_model"]["mean_mm"] == found.lost.mean_mm
 
 
 def test_the_fit_is_the_best_there_is():

@@ -29,21 +29,8 @@ _LONGEST_CELL = 40
 
 
 @dataclass(frozen=True, eq=False)
-class WantedPoses:
-    """Poses read from a file.
-
-    Attributes:
-        T: T_base_tool [m].
-        line: line of every pose in the file.
-    """
-
-    T: Float64[Tensor, "rows 4 4"]
-    line: tuple[int, ...]
-
-
-@dataclass(frozen=True, eq=False)
 class PoseChunk:
-    """Some rows of a file of poses.
+    """Some rows of a file of poses, or all.
 
     Attributes:
         T: T_base_tool [m] of the rows that are poses.
@@ -58,7 +45,7 @@ class PoseChunk:
     share: float
 
 
-def read_poses(path: str | os.PathLike[str]) -> WantedPoses:
+def read_poses(path: str | os.PathLike[str]) -> PoseChunk:
     """Read wanted poses: `x_mm,y_mm,z_mm` (or `_m`) with `roll_deg,pitch_deg,yaw_deg` or `qx,qy,qz,qw`.
 
     Raises:
@@ -73,7 +60,7 @@ def read_poses(path: str | os.PathLike[str]) -> WantedPoses:
             raise MeasurementError(f"{path}, line {bad.line}{joined}{bad.reason}.")
         T.append(chunk.T)
         lines.extend(chunk.line)
-    return WantedPoses(torch.cat(T), tuple(lines))
+    return PoseChunk(torch.cat(T), tuple(lines), bad=(), share=1.0)
 
 
 def read_pose_chunks(path: str | os.PathLike[str], rows: int = CHUNK_ROWS) -> Iterator[PoseChunk]:
