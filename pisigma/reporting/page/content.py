@@ -7,7 +7,6 @@ from typing import Any
 
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.judging.held_out_rows import read_held_out
-from pisigma.judging.validation_figures import LearningPoint
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_figures import CORRELATION_PNG
@@ -32,13 +31,6 @@ from pisigma.reporting.page.judged_rows import JudgedRows, rows_of_file, rows_of
 from pisigma.reporting.page.verdict import Verdict, verdict_of
 from pisigma.reporting.rendering import sentences
 
-KINDS = {
-    "hybrid_calibration": "Hybrid calibration: geometry, and a learned correction of the joints",
-    "geometric_calibration": "Geometric calibration",
-    "distilled": "Network that stands for the full solution of another model",
-    "inverse_calibration": "Network that corrects the nominal joint values",
-}
-
 
 @dataclass(frozen=True, eq=False)
 class ReportContent:
@@ -46,7 +38,6 @@ class ReportContent:
 
     Attributes:
         model: the model.
-        kind: what it is, in words.
         summary: figures of its calibration; None of other models.
         verdict: what there is to say first.
         accuracies: the first one is that of the verdict.
@@ -60,7 +51,6 @@ class ReportContent:
         curves: of the learned correction.
         learned: of the learned correction, in sentences.
         not_identified: parameters that the data cannot determine, in sentences.
-        learning_curve: points; empty where there is none.
         advice: what to measure next.
         provenance: name and value.
         joints: errors of joints that a network was judged by; empty for other models.
@@ -69,7 +59,6 @@ class ReportContent:
     """
 
     model: CalibratedModel
-    kind: str
     summary: CalibrationSummary | None
     verdict: Verdict
     accuracies: tuple[Accuracy, ...]
@@ -83,7 +72,6 @@ class ReportContent:
     curves: tuple[CorrectionCurve, ...]
     learned: tuple[str, ...]
     not_identified: tuple[str, ...]
-    learning_curve: tuple[LearningPoint, ...]
     advice: tuple[str, ...]
     provenance: tuple[tuple[str, str], ...]
     joints: tuple[JudgedJoint, ...]
@@ -154,7 +142,6 @@ def report_content(
     limit = limit_of(model, summary, figures[0] if figures else None, rows)
     return ReportContent(
         model=model,
-        kind=KINDS.get(model.kind, model.kind.replace("_", " ")),
         summary=summary,
         verdict=verdict_of(model, figures, joints, rows, limit),
         accuracies=figures,
@@ -168,7 +155,6 @@ def report_content(
         curves=correction_curves(model),
         learned=_learned(summary),
         not_identified=() if summary is None else (*undetermined_lines(summary), *warning_lines(summary)),
-        learning_curve=(summary.learning_curve or ()) if summary is not None else (),
         advice=advice_for(model, summary, rows, figures, limit),
         provenance=_provenance(model, rows),
         joints=joints,

@@ -162,7 +162,7 @@ def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
 
 def draw_figures(content: ReportContent) -> ReportFigures:
     """Draw what a report shows."""
-    points = content.learning_curve
+    points = (content.summary.learning_curve if content.summary else None) or ()
     return ReportFigures(
         map=draw_map(content.map),
         dependences=tuple(map(draw_dependence, content.dependences)),

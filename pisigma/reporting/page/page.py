@@ -2,7 +2,6 @@
 
 import base64
 import json
-from collections.abc import Sequence
 from importlib.resources import files
 from typing import Any
 
@@ -11,17 +10,15 @@ from markupsafe import Markup
 
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.reporting.calibration_tables import parameter_table
-from pisigma.reporting.page.accuracy import LABELS, Accuracy
+from pisigma.reporting.page.accuracy import LABELS
 from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.error_map import ErrorMap
 from pisigma.reporting.page.figures import Drawing, ReportFigures
 from pisigma.reporting.rendering import render
-from pisigma.reporting.tables import figure_text
 from pisigma.robot.description import Robot
 
 _ESCAPED = {ord(mark): f"\\u{ord(mark):04x}" for mark in "<>&\u2028\u2029"}
 _PACKAGE = "pisigma.reporting.page"
-_STATISTICS = (("mean", "mean"), ("rms", "RMS"), ("p95", "95 %"), ("max", "maximum"))
 
 
 def render_page(content: ReportContent, figures: ReportFigures) -> str:
@@ -37,7 +34,6 @@ def render_page(content: ReportContent, figures: ReportFigures) -> str:
         parameter_table=parameter_table,
         image=_image,
         png=lambda png: _address("png", png),
-        error_lines=_error_lines,
         map_data=script_json(map_data(content.map, content.model.robot)),
         style=Markup(_resource("style.css")),  # ours
         script=Markup(_resource("viewer.js")),
@@ -83,21 +79,3 @@ def _image(drawing: Drawing) -> str:
 
 def _address(kind: str, content: bytes) -> str:
     return f"data:image/{kind};base64,{base64.b64encode(content).decode()}"
-
-
-def _error_lines(accuracy: Accuracy) -> list[tuple[str, list[str], str]]:
-    """Write the lines of a table of errors: a label, a cell per model, and how much better the last is."""
-    lines = []
-    for unit, quantity in (("mm", "position"), ("deg", "orientation")):
-        for key, label in _STATISTICS:
-            cells = [getattr(figures, f"{key}_{unit}") for figures in accuracy.models.values()]
-            if any(cell is not None for cell in cells):
-                texts = ["" if cell is None else figure_text(cell) for cell in cells]
-                lines.append((f"{quantity}, {label} [{unit}]", texts, _better(cells)))
-    return lines
-
-
-def _better(cells: Sequence[float | None]) -> str:
-    """Say how much smaller the last figure is than the first."""
-    first, last = cells[0], cells[-1]
-    return f"{first / last:.1f} ×" if len(cells) > 1 and first is not None and last else ""
