@@ -29,18 +29,9 @@ _TWISTS = (-_RIGHT, 0.0, -_RIGHT, _RIGHT, -_RIGHT)
 
 
 @no_type_check
-def _spherical_joints(
-    form: Any,
-    P: Any,
-    t_1: float,
-    t_2: float,
-    t_3: float,
-    only: int,
-    branch: int,
-    rounding: float,
-    q: Any,
-) -> None:
-    """Joints 4 to 6, both flips, from `M = R_03^T · R = RotZ(t_4) RotY(-t_5) RotZ(t_6)`."""
+def _spherical_joints(form: Any, P: Any, t: Any, only: int, branch: int, rounding: float, q: Any) -> None:
+    """Joints 4 to 6, of t = joints 1 to 3, both flips, from `M = R_03^T · R = RotZ(t_4) RotY(-t_5) RotZ(t_6)`."""
+    t_1, t_2, t_3 = t
     c_1, s_1 = math.cos(t_1), math.sin(t_1)
     c, s = math.cos(t_2 + t_3), math.sin(t_2 + t_3)
     xx, xy, xz = c_1 * c, s_1 * c, -s
@@ -89,7 +80,7 @@ def spherical_wrist_branches(form: Any, P: Any, only: int, rounding: float, q: A
             ahead - a[0], d[0] - P[2, 3], a[1], forearm, upwards, zero, rounding, margin
         )
         if reached or nearest:
-            _spherical_joints(form, P, t_1, t_2, bend - math.atan2(d[3], a[2]), only, 2 * pair, rounding, q)
+            _spherical_joints(form, P, (t_1, t_2, bend - math.atan2(d[3], a[2])), only, 2 * pair, rounding, q)
 
 
 @dataclass(frozen=True, eq=False)

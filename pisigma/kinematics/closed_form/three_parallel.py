@@ -31,19 +31,10 @@ _TWISTS = (_RIGHT, 0.0, 0.0, _RIGHT, -_RIGHT)
 
 @no_type_check
 def _plane_joints(
-    form: Any,
-    P: Any,
-    t_1: float,
-    t_5: float,
-    t_6: float,
-    x: float,
-    upwards: float,
-    free: bool,
-    margin: float,
-    rounding: float,
-    q: Any,
+    form: Any, P: Any, t: Any, x: float, upwards: float, free: bool, margin: float, rounding: float, q: Any
 ) -> None:
-    """Joints 2 to 4: the two links that carry axis 4; joint 6 of a straight wrist may turn for them."""
+    """Joints 2 to 4, of t = joints 1, 5, 6: the two links that carry axis 4; a straight wrist may turn for them."""
+    t_1, t_5, t_6 = t
     a, y, zero = form.a, P[2, 3] - form.d[0], form.sign[1] * form.offset[1]
     along, across, b = a[3], -form.d[4], abs(a[2])
     for attempt in range(2):
@@ -51,16 +42,8 @@ def _plane_joints(
         u, v = -s_6 * P[0, 0] - c_6 * P[0, 1], -s_6 * P[1, 0] - c_6 * P[1, 1]
         t_234 = math.atan2(math.cos(t_1) * u + math.sin(t_1) * v, s_6 * P[2, 0] + c_6 * P[2, 1])
         c, s = math.cos(t_234), math.sin(t_234)
-        first, bend, reached = two_link(
-            x - (c * along - s * across),
-            y - (s * along + c * across),
-            a[1],
-            b,
-            upwards,
-            zero,
-            rounding,
-            margin,
-        )
+        x_4, y_4 = x - (c * along - s * across), y - (s * along + c * across)
+        first, bend, reached = two_link(x_4, y_4, a[1], b, upwards, zero, rounding, margin)
         turned = attempt == 1 or not free or math.hypot(along, across) == 0.0
         if reached or (margin > 0.0 and turned):
             t_3 = bend - (math.pi if a[2] < 0 else 0.0)
@@ -115,7 +98,7 @@ def three_parallel_branches(form: Any, P: Any, only: int, rounding: float, q: An
                 if only < 0 or only == branch:
                     upwards = -(1.0 - 2 * shoulder) * (1.0 - 2 * elbow) * math.copysign(1.0, a[1])
                     ahead_of_2, out = ahead - a[0], q[branch]
-                    _plane_joints(form, P, t_1, t_5, t_6, ahead_of_2, upwards, free, margin, rounding, out)
+                    _plane_joints(form, P, (t_1, t_5, t_6), ahead_of_2, upwards, free, margin, rounding, out)
 
 
 @dataclass(frozen=True, eq=False)
