@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -44,11 +45,8 @@ class Difference:
 
     def to_json(self, unit: str) -> dict[str, object]:
         """Return the figures as plain values, the unit in their names."""
-        values: dict[str, object] = {}
-        for name, value in self.statistics.items():
-            interval = self.intervals[name]
-            values[f"{name}_{unit}"] = value
-            values[f"{name}_{unit}_interval"] = None if interval is None else list(interval)
+        values: dict[str, object] = {f"{name}_{unit}": value for name, value in self.statistics.items()}
+        values |= {f"{name}_{unit}_interval": interval for name, interval in self.intervals.items()}
         return values | {"better_share": self.better_share, "wilcoxon": asdict(self.test)}
 
 
@@ -112,11 +110,7 @@ class ModelFigures:
         errors = list(self.quantities.values())
         values: dict[str, object] = {"name": self.name, "rows_not_predicted": self.rows_not_predicted}
         values |= self.statistics_in_file_units
-        values["intervals"] = {
-            f"{name}_{one.unit}": None if interval is None else list(interval)
-            for one in errors
-            for name, interval in one.intervals.items()
-        }
+        values["intervals"] = _with_units(errors, "intervals")
         values["axes"] = {
             axis: {f"{name}_{one.unit}": value for one in errors for name, value in one.axes[axis].items()}
             for axis in self.position.axes
@@ -299,5 +293,5 @@ def _some(errors: Float64[Tensor, "rows 3"], rows: Bool[Tensor, " rows"] | None)
     return {} if rows is None or not bool(rows.any()) else error_statistics(errors[rows].norm(dim=-1))
 
 
-def _with_units(errors: Sequence[QuantityErrors], name: str) -> dict[str, float]:
+def _with_units(errors: Sequence[QuantityErrors], name: str) -> dict[str, Any]:
     return {f"{key}_{one.unit}": value for one in errors for key, value in getattr(one, name).items()}

@@ -231,7 +231,7 @@ def test_differences_are_paired():
     same = compared(worse, worse, Bootstrap(100)).models[1].position.difference
     assert same.intervals["rms"] == (0.0, 0.0)
     assert (same.better_share, same.test.p) == (0.0, 1.0)
-    assert same.to_json("mm")["mean_mm_interval"] == [0.0, 0.0]
+    assert same.to_json("mm")["mean_mm_interval"] == (0.0, 0.0)
 
 
 def test_one_configuration_has_no_interval():
