@@ -18,6 +18,8 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.se3 import rpy_from_rotation
 
+GUESS_STEPS = 2
+"""Steps by which a guess in closed form is polished where it is not clear."""
 CLEAR_FIT = 5e-3
 """A start that ends with an RMS below this share of the reach is taken without trying others."""
 
@@ -41,7 +43,7 @@ class BaseToolFit:
     @property
     def rms_position(self) -> float:
         """Root mean square of the position errors' lengths [m]."""
-        return _rms_position(self.problem, self.solution)
+        return _rms_position(self.problem, self.solution.linearisation.point)
 
     @property
     def rms_rotation(self) -> float:
@@ -72,7 +74,6 @@ def fit_base_and_tool(
     free_base: bool = True,
     free_tool: bool = True,
     maximum_iterations: int = 50,
-    close_enough: float = 0.0,
 ) -> BaseToolFit:
     """Fit base and tool of a robot to measured poses or positions; no initial guess is needed.
 
@@ -87,23 +88,14 @@ def fit_base_and_tool(
         free_base: whether to fit the base; else the robot's is taken as it is.
         free_tool: whether to fit the tool; else the robot's is taken as it is.
         maximum_iterations: steps of the least squares.
-        close_enough: length of a step [standard errors] that is not worth taking.
 
     Raises:
         IdentificationError: no positions, several frames, or too few rows for what has to be fitted.
         PoseError: the joint values do not fit the robot.
     """
     problem = build_base_and_tool_problem(robot, measurements, free_base, free_tool)
-    solution = _solved(robot, problem, maximum_iterations, close_enough)
-    state = solution.linearisation.point
-    rpy_base, rpy_tool = rpy_from_rotation(torch.stack([state.R_base, state.R_tool])).cpu().numpy()
-    if not problem.turned:
-        rpy_tool = robot.tool[3:]
-    tools = {
-        name: np.concatenate([point.cpu().numpy(), rpy_tool])
-        for name, point in zip(problem.targets, state.points, strict=True)
-    }
-    base = np.concatenate([state.p_base.cpu().numpy(), rpy_base])
+    solution = _solved(robot, problem, maximum_iterations)
+    base, tools = _base_and_tools(robot, problem, solution.linearisation.point)
     return BaseToolFit(
         robot=robot.with_geometry(
             base=base if free_base else None, tool=tools[problem.targets[0]] if free_tool else None
@@ -114,13 +106,50 @@ def fit_base_and_tool(
     )
 
 
-def _solved(
-    robot: Robot, problem: BaseToolProblem, maximum_iterations: int, close_enough: float
-) -> Solution[BaseToolState]:
+def guess_base_and_tool(
+    robot: Robot, measurements: Measurements, free_base: bool, free_tool: bool
+) -> tuple[Float64[np.ndarray, " 6"], dict[str, Float64[np.ndarray, " 6"]]]:
+    """Guess base and tools in closed form, polished where that does not meet the positions clearly.
+
+    Args:
+        robot: see `fit_base_and_tool`, as for the others.
+        measurements: see there.
+        free_base: see there.
+        free_tool: see there.
+
+    Returns:
+        The base, and the tool of every target: x, y, z [m], roll, pitch, yaw [rad].
+
+    Raises:
+        IdentificationError: see `fit_base_and_tool`.
+        PoseError: the joint values do not fit the robot.
+    """
+    problem = build_base_and_tool_problem(robot, measurements, free_base, free_tool)
+    state = next(base_and_tool_starts(robot, problem))
+    if _rms_position(problem, state) >= CLEAR_FIT * robot.reach:
+        state = _solved(robot, problem, GUESS_STEPS).linearisation.point
+    return _base_and_tools(robot, problem, state)
+
+
+def _base_and_tools(
+    robot: Robot, problem: BaseToolProblem, state: BaseToolState
+) -> tuple[Float64[np.ndarray, " 6"], dict[str, Float64[np.ndarray, " 6"]]]:
+    """The base and every target's tool; where no rotation was measured the tool stays turned as it is."""
+    rpy_base, rpy_tool = rpy_from_rotation(torch.stack([state.R_base, state.R_tool])).cpu().numpy()
+    if not problem.turned:
+        rpy_tool = robot.tool[3:]
+    tools = {
+        name: np.concatenate([point.cpu().numpy(), rpy_tool])
+        for name, point in zip(problem.targets, state.points, strict=True)
+    }
+    return np.concatenate([state.p_base.cpu().numpy(), rpy_base]), tools
+
+
+def _solved(robot: Robot, problem: BaseToolProblem, maximum_iterations: int) -> Solution[BaseToolState]:
     """The best end of a search from any start."""
     best: tuple[float, Solution[BaseToolState], bool] | None = None
     for start in base_and_tool_starts(robot, problem):
-        solution = levenberg_marquardt(problem, start, maximum_iterations, close_enough)
+        solution = levenberg_marquardt(problem, start, maximum_iterations)
         off, clear = _off(robot, problem, solution)
         if best is None or off < best[0] * (1 - 1e-6):
             best = off, solution, clear
@@ -136,13 +165,13 @@ def _off(robot: Robot, problem: BaseToolProblem, solution: Solution[BaseToolStat
     An angle counts as what it moves at the end of the arm. It is not the cost, which every search divides by its own
     noise.
     """
-    shift = _rms_position(problem, solution)
+    shift = _rms_position(problem, solution.linearisation.point)
     turn = robot.reach * _rms_rotation(problem, solution.linearisation.point) if problem.turned else 0.0
     return math.hypot(shift, turn), shift < CLEAR_FIT * robot.reach
 
 
-def _rms_position(problem: BaseToolProblem, solution: Solution[BaseToolState]) -> float:
-    return float(problem.position_residual(solution.linearisation.point).square().sum(-1).mean().sqrt())
+def _rms_position(problem: BaseToolProblem, state: BaseToolState) -> float:
+    return float(problem.position_residual(state).square().sum(-1).mean().sqrt())
 
 
 def _rms_rotation(problem: BaseToolProblem, state: BaseToolState) -> float:

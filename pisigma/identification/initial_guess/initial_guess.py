@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError, nearest_choice
-from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
+from pisigma.identification.initial_guess.base_and_tool import guess_base_and_tool
 from pisigma.identification.initial_guess.base_and_tool_closed_form import base_by_points, nearest_rotation
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.kinematics.forward import forward_kinematics
@@ -28,8 +28,6 @@ from pisigma.sensors.socket import means
 
 GUESS_ROWS = 1_024
 """Rows from which base and tool are guessed."""
-GUESS_STEPS = 2
-"""Steps by which their closed-form guess is polished."""
 FEW = 9
 """Positions below which a frame's base is guessed with tools of other frames, not with tools of its own."""
 ENOUGH = 5
@@ -155,11 +153,11 @@ def _from_positions(
         if find_base and 3 <= len(rows) < FEW and not turned and set(part.target) <= set(tools):
             bases[name] = _base_by_tools(robot, part, tools)
             continue
-        fit = fit_base_and_tool(robot, part, find_base, free_tool, GUESS_STEPS, close_enough=1.0)
+        base, guessed = guess_base_and_tool(robot, part, find_base, free_tool)
         if free_base:
-            bases[name] = fit.robot.base
+            bases[name] = base if find_base else robot.base
         if free_tool:
-            tools = {**fit.tools, **tools}
+            tools = {**guessed, **tools}
     return bases, tools
 
 
