@@ -1,0 +1,34 @@
+"""Sentences and cards from templates."""
+
+from pisigma.judging.calibration_summary import NoiseFigures, OutlierFigures
+from pisigma.model.folder.folder_files import CARD
+from pisigma.reporting.rendering import sentences, write_card
+
+
+def outlier(row):
+    return OutlierFigures(row=row, place=f"a.csv, line {row}", sensor="position", deviations=9.0)
+
+
+def test_every_paragraph_is_a_sentence():
+    left_out, first = sentences("report.txt.j2", "weak_parameters", ["a + b is weak."], ["c_1"], "2")
+    assert left_out == "Hardly identified: a + b is weak. Choose poses that move more of what it depends on."
+    assert first.startswith("c_1: the change from nominal is less than 2 standard errors")
+
+
+def test_a_macro_may_say_nothing():
+    assert sentences("report.txt.j2", "outliers", []) == ()
+    (said,) = sentences("report.txt.j2", "outliers", [outlier(row) for row in range(2, 7)])
+    assert said.startswith("5 rows counted")
+    assert said.endswith("(a.csv, line 2, a.csv, line 3, a.csv, line 4).")
+
+
+def test_noise_is_said_in_its_own_unit():
+    stated = NoiseFigures(sensor="position", values=9, used_by_parameters=1.0, factor_on_stated_sigma=1.5)
+    turning = NoiseFigures(sensor="rotation", values=9, used_by_parameters=1.0, sigma_deg=0.01)
+    assert "1.5 times the standard deviation" in sentences("calibration.txt.j2", "noise", stated)[0]
+    assert ": 0.01 deg per value" in sentences("calibration.txt.j2", "noise", turning)[0]
+
+
+def test_a_card_ends_with_a_line(tmp_path):
+    write_card(tmp_path, "card.md.j2")
+    assert (tmp_path / CARD).read_text().endswith("\n")
