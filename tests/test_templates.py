@@ -3,11 +3,11 @@
 import jinja2
 import pytest
 
-from pisigma.export.programs import language
+from pisigma.export.programs import languages
 from pisigma.reporting import rendering
 from pisigma.templates import template_environment
 
-ENVIRONMENTS = {"reporting": rendering._environment(), "programs": language._templates()}
+ENVIRONMENTS = {"reporting": rendering._environment(), "programs": languages._templates()}
 
 
 @pytest.mark.parametrize(
