@@ -5,7 +5,7 @@ from pathlib import Path
 
 from pisigma.judging.training_summary import TrainingRun, TrainingSummary
 from pisigma.reporting import figures
-from pisigma.reporting.calibration_card import CardTexts
+from pisigma.reporting.cards import CardTexts
 from pisigma.reporting.rendering import write_card
 
 

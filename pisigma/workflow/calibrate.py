@@ -24,7 +24,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import SplitBy, TrainTest, draw_rows, holdout, repeats, with_fewer
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
-from pisigma.reporting.calibration_card import CardTexts, write_calibration_card
+from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
 from pisigma.workflow.result import AbstractModelResult
 

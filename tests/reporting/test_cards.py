@@ -5,7 +5,7 @@ from testing.models import trained_run
 
 from pisigma.judging.training_summary import summarise_training
 from pisigma.model.folder.folder_files import CARD
-from pisigma.reporting.calibration_card import CardTexts
+from pisigma.reporting.cards import CardTexts
 from pisigma.reporting.tables import joint_table
 from pisigma.reporting.training_card import write_training_card
 
