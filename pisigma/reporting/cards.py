@@ -1,5 +1,6 @@
-"""The card of a calibration, with its figures: accuracy first, then what was learned, parameters and provenance."""
+"""The cards of calibrations and of trained networks, with their figures: what they are, how good, and how made."""
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -7,10 +8,12 @@ from pisigma.hybrid.result import HybridResult
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.judging.calibration_validation import CalibrationValidation
 from pisigma.judging.trained_calibrations import Result, geometric_result
+from pisigma.judging.training_summary import TrainingRun, TrainingSummary
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting import calibration_figures as figures
 from pisigma.reporting import calibration_tables as tables
+from pisigma.reporting import figures as training_figures
 from pisigma.reporting.rendering import write_card
 
 
@@ -66,4 +69,37 @@ def write_calibration_card(
     write_card(
         folder, "calibration_card.md.j2", model=model, result=geometric, summary=summary, texts=texts, drawn=drawn,
         figures=figures, say=tables,
+    )  # fmt: skip
+
+
+def write_training_card(
+    name: str, texts: CardTexts, run: TrainingRun, summary: TrainingSummary, folder: Path
+) -> None:
+    """Write the card and its figures into a model folder.
+
+    Args:
+        name: of the model.
+        texts: description, and what was not validated.
+        run: what came out.
+        summary: all figures.
+        folder: where to write.
+    """
+    joints, energies = run.history.joints, run.history.energies
+    training_figures.write_energy_csv(joints, energies, folder / training_figures.ENERGY_CSV)
+    training_figures.draw_energy(joints, energies, folder / training_figures.ENERGY_PNG)
+    shown = run.held_out or run.training
+    robot = run.model.robot
+    names = [joint.name for joint in robot.joints]
+    index = [names.index(joint) for joint in joints]
+    units = ["deg" if robot.revolute[i] else "mm" for i in index]
+    scale = shown.before.new_tensor([math.degrees(1) if unit == "deg" else 1e3 for unit in units])
+    before, after = shown.before[:, index] * scale, shown.after[:, index] * scale
+    training_figures.draw_errors_over_workspace(
+        joints, units, shown.T[:, :3, 3], before, after, folder / training_figures.WORKSPACE_PNG
+    )
+    groups = run.model.network.groups if run.model.network else ()
+    inputs = dict.fromkeys(name for group in groups for name in group.inputs.names)
+    write_card(
+        folder, "training_card.md.j2", name=name, texts=texts, run=run, summary=summary, inputs=inputs,
+        figures=training_figures,
     )  # fmt: skip

@@ -23,8 +23,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.recipes.data import RecipeData, load_data
 from pisigma.recipes.reader import read_recipe, recipe_hash
 from pisigma.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe, Recipe
-from pisigma.reporting.cards import CardTexts
-from pisigma.reporting.training_card import write_training_card
+from pisigma.reporting.cards import CardTexts, write_training_card
 from pisigma.workflow.calibrate import Calibration, compose
 from pisigma.workflow.result import AbstractModelResult
 from pisigma.workflow.train_networks import DEFAULTS, TrainSettings, cross_validate, train_networks

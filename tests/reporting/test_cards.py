@@ -5,9 +5,8 @@ from testing.models import trained_run
 
 from pisigma.judging.training_summary import summarise_training
 from pisigma.model.folder.folder_files import CARD
-from pisigma.reporting.cards import CardTexts
+from pisigma.reporting.cards import CardTexts, write_training_card
 from pisigma.reporting.tables import joint_table
-from pisigma.reporting.training_card import write_training_card
 
 SECTIONS = ("Data", "Joint errors", "Figures", "Domain", "Not validated", "Use", "Provenance")
 

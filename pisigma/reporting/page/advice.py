@@ -17,6 +17,8 @@ from pisigma.reporting.page.accuracy import MOSTLY, Accuracy, Limit
 from pisigma.reporting.page.judged_rows import JudgedRows
 from pisigma.reporting.rendering import sentences
 
+_say = functools.partial(sentences, "report.txt.j2")
+
 Stretch = tuple[float, float]
 """Lowest and highest joint value [rad or m]."""
 
@@ -69,9 +71,6 @@ def advice_for(
         *_conditions(rows),
         *_say("outliers", summary.outliers),
     )
-
-
-_say = functools.partial(sentences, "report.txt.j2")
 
 
 def measured_stretches(

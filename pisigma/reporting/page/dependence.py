@@ -15,6 +15,8 @@ from pisigma.reporting.page.judged_rows import JudgedRows
 from pisigma.reporting.rendering import sentences
 from pisigma.robot.description import Robot
 
+_say = functools.partial(sentences, "report.txt.j2")
+
 NOTABLE = 1.25
 """Bins whose RMS errors differ by a smaller factor are called alike."""
 ORDERED = 0.3
@@ -201,9 +203,6 @@ def _over_condition(title: str, unit: str, values: np.ndarray, errors: np.ndarra
     r, chance = rank_correlation(values, errors)
     low, high, sure = values.min(), values.max(), chance < SIGNIFICANT
     return _say("over_condition", title, unit, low, high, r, chance_text(chance), sure)[0]
-
-
-_say = functools.partial(sentences, "report.txt.j2")
 
 
 def root_mean_square(values: Float64[np.ndarray, " values"]) -> float:

@@ -23,6 +23,8 @@ from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
 from pisigma.reporting.rendering import sentences
 from pisigma.se3 import invert, transform_from_xyzrpy
 
+_say = functools.partial(sentences, "report.txt.j2")
+
 MOST_PREDICTED = 4_000
 """The accuracy is predicted at so many rows at most, evenly over them: each costs a millisecond."""
 
@@ -159,9 +161,6 @@ def _judged(
         inside=inside(model, rows.q),
         remarks=remarks,
     )
-
-
-_say = functools.partial(sentences, "report.txt.j2")
 
 
 def _test_rows(measurements: Measurements) -> Measurements:
