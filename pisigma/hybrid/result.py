@@ -73,8 +73,7 @@ class HybridResult:
             PoseError: the joint values do not fit the robot.
         """
         if self.learned is None:
-            result = self.geometric
-            return predicted_poses(result.robot, result.bases, result.tools, measurements)
+            return self.geometric.predicted_poses(measurements)
         geometry = self.learned.geometry
         moved = replace(measurements, q=self._moved_joints(measurements))
         return predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)

@@ -288,6 +288,10 @@ class CalibrationResult:
                 return parameter
         raise KeyError(name)
 
+    def predicted_poses(self, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
+        """Where the targets were, each in the frame of its row; see `pisigma.identification.prediction`."""
+        return predicted_poses(self.robot, self.bases, self.tools, measurements)
+
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
         """Measured - predicted of any measurements in calibrated frames with calibrated targets, such as held-out ones.
 
@@ -298,8 +302,7 @@ class CalibrationResult:
         Raises:
             IdentificationError: a row has a frame, a target or an anchor that was not calibrated.
         """
-        T = predicted_poses(self.robot, self.bases, self.tools, measurements)
-        return measured_errors(T, measurements, self.unknowns)
+        return measured_errors(self.predicted_poses(measurements), measurements, self.unknowns)
 
 
 def _warnings(solved: SolvedCalibration) -> tuple[str, ...]:

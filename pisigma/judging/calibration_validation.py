@@ -10,7 +10,6 @@ from torch import Tensor
 from pisigma.errors import IdentificationError
 from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.prediction import predicted_poses
 from pisigma.judging.pose_statistics import PoseErrors, error_statistics
 from pisigma.judging.predicted_spread import PredictedSpread, predicted_spread
 from pisigma.judging.progress import Progress, stage
@@ -317,10 +316,7 @@ def _distance_errors(
     pairs = {pair: distance for pair, distance in stated.items() if set(pair) <= held_out}
     if not pairs:
         return torch.zeros(0, dtype=torch.float64)
-    if isinstance(result, HybridResult):
-        T = result.predicted_poses(rows)
-    else:
-        T = predicted_poses(result.robot, result.bases, result.tools, rows)
+    T = result.predicted_poses(rows)
     ball = T[:, :3, 3].detach().cpu()
     centre = {
         name: ball[torch.tensor([other == name for other in names])].mean(0)
