@@ -15,7 +15,7 @@ from pisigma.errors import MeasurementError, nearest_choice
 from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, Column, find_column, quoted
 from pisigma.measurement.csv.header import check_separators
 from pisigma.measurement.csv.rows import QUATERNION_TOLERANCE
-from pisigma.measurement.csv.table import split_line
+from pisigma.measurement.csv.table import content_lines, header_names, split_line
 from pisigma.measurement.fields import LeftOut
 from pisigma.measurement.readings import to_si
 from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy, transform
@@ -84,14 +84,8 @@ def read_pose_chunks(path: str | os.PathLike[str], rows: int = CHUNK_ROWS) -> It
 
 def _chunks(file: TextIO, source: str, rows: int) -> Iterator[PoseChunk]:
     length = os.fstat(file.fileno()).st_size
-    content = (
-        (number, line)
-        for number, line in enumerate(file, start=1)
-        if (start := line.lstrip()) and not start.startswith("#")
-    )
-    header_line, header = next(content, (0, ""))
-    if not header_line:
-        raise MeasurementError(f"{source}: the file is empty; a header and at least one row were wanted.")
+    content = content_lines(file, source)
+    header_line, header = next(content)
     layout = _Layout.of(header, f"{source}, line {header_line}")
     any_row = False
     while some := list(islice(content, rows)):
@@ -129,14 +123,11 @@ class _Layout:
         """Read the header; all of a pose is there, once, and lengths are in one unit."""
         if _is_foreign(line):
             raise MeasurementError(f"{place}: is not UTF-8 text; save the file as CSV in UTF-8.")
-        names, problem = split_line(line.rstrip("\n"))
-        if problem:
-            raise MeasurementError(f"{place}: the header is no valid CSV ({problem}); check its quotes.")
-        names = [name.strip() for name in names]
+        names = header_names(line.rstrip("\n"), place)
         columns = _columns(names, place)
         orientation = RPY if RPY[0] in columns else QUATERNION
         position, angles = (tuple(columns[name] for name in group) for group in (POSITION, orientation))
-        return _Layout(tuple(names), position, angles)
+        return _Layout(names, position, angles)
 
     def values(self, lines: Sequence[str]) -> tuple[Float64[np.ndarray, "rows columns"], dict[int, str]]:
         """The numbers of rows in the file's units, and what is wrong with which row."""

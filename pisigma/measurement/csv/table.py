@@ -2,7 +2,7 @@
 
 import csv
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -43,32 +43,50 @@ def read_table(path: str | os.PathLike[str]) -> Table:
         MeasurementError: the file is missing, not UTF-8, empty, or holds nothing but a header.
     """
     source = str(path)
-    content = [
-        (number, line)
-        for number, line in enumerate(_read_text(path, source).split("\n"), start=1)
-        if (start := line.lstrip()) and not start.startswith("#")
-    ]
+    lines = content_lines(_read_text(path, source).split("\n"), source)
+    header_line, line = next(lines)
+    header = header_names(line, f"{source}, line {header_line}")
+    content = list(lines)
     if not content:
-        raise MeasurementError(f"{source}: the file is empty; a header and at least one row were wanted.")
-    header_line = content[0][0]
-    header, problem = split_line(content[0][1])
-    if problem:
-        raise MeasurementError(
-            f"{source}, line {header_line}: the header is no valid CSV ({problem}); check its quotes."
-        )
-    if len(content) == 1:
         raise MeasurementError(
             f"{source}, line {header_line}: the file ends after its header; add one row per measurement."
         )
-    split = [split_line(line) for _, line in content[1:]]
+    split = [split_line(line) for _, line in content]
     return Table(
         source=source,
-        header=tuple(name.strip() for name in header),
+        header=header,
         header_line=header_line,
         records=[fields for fields, _ in split],
-        lines=tuple(number for number, _ in content[1:]),
+        lines=tuple(number for number, _ in content),
         broken={row: problem for row, (_, problem) in enumerate(split) if problem},
     )
+
+
+def content_lines(lines: Iterable[str], source: str) -> Iterator[tuple[int, str]]:
+    """The lines that are neither blank nor begin with #, the header first, each with its number.
+
+    Raises:
+        MeasurementError: there is none.
+    """
+    empty = True
+    for number, line in enumerate(lines, start=1):
+        if (start := line.lstrip()) and not start.startswith("#"):
+            empty = False
+            yield number, line
+    if empty:
+        raise MeasurementError(f"{source}: the file is empty; a header and at least one row were wanted.")
+
+
+def header_names(line: str, place: str) -> tuple[str, ...]:
+    """The names of the columns, without surrounding blanks.
+
+    Raises:
+        MeasurementError: the line is no valid CSV.
+    """
+    names, problem = split_line(line)
+    if problem:
+        raise MeasurementError(f"{place}: the header is no valid CSV ({problem}); check its quotes.")
+    return tuple(name.strip() for name in names)
 
 
 def _read_text(path: str | os.PathLike[str], source: str) -> str:
