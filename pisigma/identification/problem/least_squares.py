@@ -118,23 +118,23 @@ def levenberg_marquardt(
         problem: what to minimise.
         start: where to begin, or the problem as already seen from there.
         maximum_iterations: steps tried at most.
-        close_enough: length [standard errors] of a step, as a vector of all unknowns, that is not worth taking; the
-            search then ends without it, as converged.
+        close_enough: length [standard errors] of a step that is not taken any more; the search has converged then.
 
     Returns:
         The best point, with the reason for stopping (see `SolutionStatus`).
     """
     first = start if isinstance(start, Linearisation) else problem.linearise(start, None)
     best, settled = problem.renewed(first)
-    here, path = best, [best]
-    damping, uphill, iterations = START_DAMPING, 0, 0
-    status = SolutionStatus.ITERATION_LIMIT
+    here, path, damping, uphill, iterations = best, [best], START_DAMPING, 0, 0
+
+    def ended(status: SolutionStatus) -> Solution[Point]:
+        return Solution(best, iterations, status, tuple(path))
+
     while iterations < maximum_iterations:
         step = solve_damped(here, problem.step_scale, damping)
         decrement = float((here.normal @ step).dot(step))
         if here is best and decrement < close_enough**2:
-            status = SolutionStatus.CONVERGED
-            break
+            return ended(SolutionStatus.CONVERGED)
         iterations += 1
         there = problem.linearise(problem.moved(here.point, step), best)
         if there.cost <= best.cost:
@@ -142,28 +142,23 @@ def levenberg_marquardt(
             here, uphill, damping = best, 0, max(damping / 10, SMALLEST_DAMPING)
             path.append(best)
             if best.misfit <= best.rounding:
-                status = SolutionStatus.EXACT
-                break
+                return ended(SolutionStatus.EXACT)
             if decrement <= SHORTEST_STEP**2 and settled:
-                status = SolutionStatus.CONVERGED
-                break
+                return ended(SolutionStatus.CONVERGED)
             continue
         if best.misfit <= 1e4 * best.rounding:
-            status = SolutionStatus.EXACT
-            break
+            return ended(SolutionStatus.EXACT)
         if here is best and (decrement <= SHORTEST_STEP**2 or decrement <= 1e-10 * best.cost):
-            status = SolutionStatus.CONVERGED
-            break
+            return ended(SolutionStatus.CONVERGED)
         if damping > LARGEST_DAMPING:
-            status = SolutionStatus.STALLED
-            break
+            return ended(SolutionStatus.STALLED)
         uphill += 1
         lost = not bool(there.descent.any())  # such as where a loss rejects every row
         if uphill <= PATIENCE and there.cost < float("inf") and not lost:
             here = problem.renewed(there)[0]
         else:
             here, uphill, damping = best, 0, max(100 * damping, 0.1)
-    return Solution(best, iterations, status, tuple(path))
+    return ended(SolutionStatus.ITERATION_LIMIT)
 
 
 def solve_damped(
