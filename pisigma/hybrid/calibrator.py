@@ -1,35 +1,40 @@
 """The hybrid calibrator: geometry, base, tool, sensor unknowns and a Pi-Sigma joint correction together."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from jaxtyping import Int64
+from torch import Tensor
+
 from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.hybrid.arm import JointCoverage
-from pisigma.hybrid.design import Rows
-from pisigma.hybrid.evidence import effective_share
+from pisigma.hybrid.design import Design
 from pisigma.hybrid.mini_batches import MANY_ROWS, MiniBatches, batch_checkpoints, refine_in_batches
-from pisigma.hybrid.refinement import Refined, refine, with_all_factors, with_frames_of
+from pisigma.hybrid.refinement import Refined, linearised, refine, with_frames_of
+from pisigma.hybrid.regression import regression
 from pisigma.hybrid.result import HybridResult, LearnedPart
-from pisigma.hybrid.search import LARGEST_EFFECTIVE_SHARE, Additive, Search, best_products
-from pisigma.hybrid.sensor_values import sensor_values
+from pisigma.hybrid.search import LARGEST_EFFECTIVE_SHARE, Fitted, Search
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.initial_guess.initial_guess import chosen_rows
-from pisigma.identification.problem.noise import view_of
+from pisigma.identification.problem.noise import renumbered, view_of
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.setup import identified_geometry
 from pisigma.identification.result import SolvedCalibration
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions
+from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.registry import FEATURES, feature_named
 from pisigma.measurement.conditions import stated_conditions
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.groups import groups_of_equal_joints
+from pisigma.measurement.groups import groups_of_equal_joints, held_out_groups
 from pisigma.robot.description import Robot
 
 SEARCHED_ROWS = 4_000
-"""Features and product units are chosen on so many rows at most; everything is fitted to all in the end."""
+"""Features are chosen on so many rows at most; everything is fitted to all in the end."""
+FIRST_SIZES = 3
+"""Rows are first weighted by a model of all features, one that comes in several sizes in the third of them."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +49,7 @@ class HybridCalibrator:
         robot: the nominal robot; or its geometric calibrator, where that needs other settings than its defaults.
         features: of the unit of order 1 that are tried, by the names of `joint_correction.registry.FEATURES`.
         harmonics: of the Fourier series, tried in this order.
-        orders: numbers of factors of product units, tried in this order; none for an additive correction.
+        products: whether product units are tried; without them the correction is additive.
         gravity: direction in which things fall, in the frame of the robot's first row.
         mini_batches: whether the unknowns of the chosen model are trained on mini-batches instead of with the
             normal equations of all rows: True or False; how; or "auto", which does so from `MANY_ROWS` rows on.
@@ -52,8 +57,8 @@ class HybridCalibrator:
 
     robot: Robot | GeometricCalibrator
     features: tuple[str, ...] = ("gravity", "conditions", "backlash", "series")
-    harmonics: tuple[int, ...] = (8, 24, 56, 110)
-    orders: tuple[tuple[int, ...], ...] = ((2,), (2, 2), (2, 2, 2, 2))
+    harmonics: tuple[int, ...] = (8, 24, 56, 110, 160)
+    products: bool = True
     gravity: tuple[float, float, float] = (0.0, 0.0, -1.0)
     mini_batches: MiniBatches | bool | Literal["auto"] = "auto"
 
@@ -68,10 +73,6 @@ class HybridCalibrator:
             raise IdentificationError(
                 f"harmonics={self.harmonics}: whole numbers of at least 1 were wanted for the series; leave "
                 "'series' out of features for none."
-            )
-        if any(min(orders, default=0) < 2 for orders in self.orders):
-            raise IdentificationError(
-                f"orders={self.orders}: a product unit has two factors or more; give tuples such as (2,)."
             )
 
     @property
@@ -108,31 +109,32 @@ class HybridCalibrator:
         if batches is not None and checkpoints is not None:
             kept = batch_checkpoints(checkpoints, f"{self}|{measurements.content_hash()}", resume)
         solved = self.geometric.solve(measurements)
-        search, additive, orders = self._chosen(solved, progress)
-        if not additive.design.features and not orders:
+        group = held_out_groups(solved.setup.measurements)
+        search, chosen = self._chosen(solved, group, progress)
+        if not chosen.design.features:
             verdict = "Nothing beyond the geometry was found in the data: the geometric calibration stands."
             return _geometric_alone(solved, search, verdict)
         progress("solving for everything")
-        loss, trained = self.geometric.loss, ""
+        trained = ""
         if batches is None:
-            refined = refine(solved, additive, orders, loss)
+            refined = refine(solved.problem, group, search.rows, chosen)
         else:
-            few = searched_rows(solved.problem)
+            few = refine(search.rows.problem, search.rows.group, search.rows, chosen)
             refined, trained = refine_in_batches(
-                solved, few, additive, orders, loss, batches=batches, progress=progress, checkpoints=kept
+                solved, few, group, batches=batches, progress=progress, checkpoints=kept
             )
-        if effective_share(refined.sums, refined.posterior) > LARGEST_EFFECTIVE_SHARE:
+        if refined.regression.effective_share(refined.posterior) > LARGEST_EFFECTIVE_SHARE:
             verdict = (
                 "A joint correction would take up nearly all that the few rows say, so the geometric calibration "
                 "stands; measure more poses."
             )
             return _geometric_alone(solved, search, verdict)
         learned = self._learned(solved, refined)
-        verdict = _kept_sentence(search, additive, orders, trained)
-        whole = with_all_factors(refined)
+        progress("looking at left-out rows")
         uncertainty = position_uncertainty(
-            whole.rows, whole.design, whole.posterior, whole.sums, learned.geometry
+            refined.rows, refined.design, refined.regression, refined.posterior, learned.geometry
         )
+        verdict = _kept_sentence(search, chosen, trained)
         return HybridResult(solved.result(), learned, uncertainty, tuple(search.trials), verdict)
 
     def _learned(self, solved: SolvedCalibration, refined: Refined) -> LearnedPart:
@@ -144,7 +146,7 @@ class HybridCalibrator:
             coverage=JointCoverage.of(self.geometric.robot, solved.problem.q),
             noise={geometric.sensor: sigma for geometric, sigma in noise},
             unknowns=refined.design.unknowns,
-            effective=refined.effective,
+            effective=refined.posterior.effective,
             rounds=refined.rounds,
         )
 
@@ -156,28 +158,31 @@ class HybridCalibrator:
         return MiniBatches() if wanted else None
 
     def _chosen(
-        self, solved: SolvedCalibration, progress: Callable[[str], None]
-    ) -> tuple[Search, Additive, tuple[int, ...]]:
-        """Features and orders of product units, on at most `SEARCHED_ROWS` rows."""
-        problem = searched_rows(solved.problem)
-        here = solved.solution.linearisation
-        view = view_of(here)
-        values = sensor_values(problem, here.point)
-        weights = []
-        for number, sensor in enumerate(values):
-            distance = sensor.residual.norm(dim=1) * sensor.root / view.scale(number)
-            loss = problem.loss_of(problem.sensors[number])
-            weights.append(loss.weight(distance, sensor.components))
-        point = (here.point - problem.nominal)[problem.active]
-        rows = Rows(problem, values, point, groups_of_equal_joints(problem.q)).weighted(weights)
-        growing, others = self._features(solved, rows)
-        search = Search(rows, view.noise, view.prior_scale, [*others, *growing[-1:]], progress)
-        additive = search.best_additive(growing, others)
-        additive, orders = best_products(search, additive, self.orders)
-        return search, additive, orders
+        self, solved: SolvedCalibration, group: Int64[Tensor, " rows"], progress: Callable[[str], None]
+    ) -> tuple[Search, Fitted]:
+        """Features, chosen on at most `SEARCHED_ROWS` rows.
+
+        What a geometric calibration does not explain is not for that reason wrong: rows are weighted by their distance
+        from a first hybrid model.
+        """
+        problem, view = solved.problem, view_of(solved.solution.linearisation)
+        if problem.q.shape[0] > SEARCHED_ROWS:
+            chosen = chosen_rows(problem.q.shape[0], SEARCHED_ROWS).to(problem.q.device)
+            problem, group = problem.select(chosen), renumbered(group[chosen])
+        design = Design(problem, ())
+        x = (solved.solution.linearisation.point - problem.nominal)[problem.active]
+        rows = linearised(design, x, float(len(x)), group)
+        growing, others = self._features(solved, problem)
+        first = Design(problem, (*others, *growing[:FIRST_SIZES][-1:]))
+        posterior = regression(first, rows).maximise_evidence(first.prior(view.prior_scale), view.noise)
+        rows = linearised(first, posterior.x, posterior.effective, group)
+        products = [InputProducts(self.geometric.robot)] if self.products else []
+        largest = [*others, *growing[-1:], *products]
+        search = Search(rows, view.noise, view.prior_scale, largest, progress)
+        return search, search.best(growing, others, products)
 
     def _features(
-        self, solved: SolvedCalibration, rows: Rows
+        self, solved: SolvedCalibration, problem: CalibrationProblem
     ) -> tuple[list[AbstractFeature], list[AbstractFeature]]:
         """What is tried: ever larger features of one name, and one feature each of the other names.
 
@@ -185,7 +190,9 @@ class HybridCalibrator:
             IdentificationError: two features would be tried in several sizes.
         """
         varying = stated_conditions(solved.setup.measurements)
-        options = FeatureOptions(self.harmonics, self.gravity, rows.configurations, varying)
+        options = FeatureOptions(
+            self.harmonics, self.gravity, int(groups_of_equal_joints(problem.q).max()) + 1, varying
+        )
         growing: list[AbstractFeature] = []
         others: list[AbstractFeature] = []
         for name in self.features:
@@ -202,13 +209,11 @@ class HybridCalibrator:
         return growing, others
 
 
-def _kept_sentence(search: Search, additive: Additive, orders: tuple[int, ...], trained: str) -> str:
+def _kept_sentence(search: Search, chosen: Fitted, trained: str) -> str:
     """What was kept, and how much better left-out rows are predicted with it."""
-    names = [feature.label for feature in additive.design.features]
-    names += [f"product units of orders {orders}"] if orders else []
     share = [trial.left_out for trial in search.trials if trial.kept][-1]
     return (
-        f"A joint correction was kept ({' + '.join(names)}): left-out rows are predicted with {share:.2f} "
+        f"A joint correction was kept ({chosen.name}): left-out rows are predicted with {share:.2f} "
         f"times the error of the geometric calibration. {trained}".rstrip()
     )
 
@@ -217,12 +222,5 @@ def _geometric_alone(solved: SolvedCalibration, search: Search, verdict: str) ->
     """The geometric calibration, with the uncertainty of its positions."""
     geometry = identified_geometry(solved.setup, solved.solution.linearisation.point)
     first = search.geometry
-    uncertainty = position_uncertainty(search.rows, first.design, first.posterior, first.sums, geometry)
+    uncertainty = position_uncertainty(search.rows, first.design, first.regression, first.posterior, geometry)
     return HybridResult(solved.result(), None, uncertainty, tuple(search.trials), verdict)
-
-
-def searched_rows(problem: CalibrationProblem) -> CalibrationProblem:
-    """The problem with the rows that features and product units are chosen on."""
-    if problem.q.shape[0] <= SEARCHED_ROWS:
-        return problem
-    return problem.select(chosen_rows(problem.q.shape[0], SEARCHED_ROWS).to(problem.q.device))

@@ -1,20 +1,24 @@
-"""From linearised values and chosen features to normal equations, chunk by chunk."""
+"""Which unknowns there are, and the linearised values that they are fitted to."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.hybrid.evidence import FIRST_SIZE, GaussianPrior, Posterior, Sums
+from pisigma.hybrid.evidence import FIRST_SIZE, GaussianPrior, Posterior, SensorCount
 from pisigma.hybrid.sensor_values import SensorValues
-from pisigma.identification.problem.loss import AbstractLoss, SquaredLoss
+from pisigma.identification.problem.loss import SquaredLoss
+from pisigma.identification.problem.noise import PriorGroup
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.joint_correction.feature import AbstractFeature
+from pisigma.measurement.conditions import JointState
 
-CHUNK = 1_024
+CHUNK = 2_048
 """Rows whose columns are in memory at a time."""
+FOLDS = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +39,11 @@ class Design:
         return len(self.problem.active)
 
     @property
+    def classes(self) -> int:
+        """Number of classes of geometric parameters, whose prior sizes come first."""
+        return len(PriorGroup)
+
+    @property
     def unknowns(self) -> int:
         """Number of unknowns."""
         return self.active + sum(int(chosen.used.sum()) for chosen in self.features)
@@ -43,6 +52,27 @@ class Design:
         """Where the weights of a choice of features stand."""
         start = self.active + sum(int(chosen.used.sum()) for chosen in self.features[:number])
         return slice(start, start + int(self.features[number].used.sum()))
+
+    def correction(self, x: Float64[Tensor, " unknowns"], state: JointState) -> Float64[Tensor, "rows dof"]:
+        """Joint corrections [rad or m] of rows with the weights of some unknowns."""
+        total = torch.zeros_like(state.q)
+        for number, chosen in enumerate(self.features):
+            weight = torch.zeros(chosen.used.shape).to(x).masked_scatter(chosen.used, x[self.stretch(number)])
+            total = total + (chosen.columns(state) * weight).sum(-1)
+        return total
+
+    def moved(
+        self, values: SensorValues, change: Float64[Tensor, " unknowns"]
+    ) -> Float64[Tensor, "values components"]:
+        """Change of a sensor's predicted values with the unknowns, not weighted."""
+        moved = values.geometry @ change[: self.active]
+        if not self.features or not len(values.row):
+            return moved
+        for row, joints in values.sides:
+            for rows in torch.arange(len(row)).split(CHUNK):
+                delta = self.correction(change, self.problem.state[row[rows]])
+                moved[rows] += torch.einsum("rcj,rj->rc", joints[rows], delta)
+        return moved
 
     def columns(self, values: SensorValues, rows: slice) -> Float64[Tensor, "values components unknowns"]:
         """Derivative of a sensor's values by all unknowns, not weighted."""
@@ -105,148 +135,128 @@ class Design:
         return torch.cat(indices)
 
 
-def weighted_columns(
-    design: Design, values: Sequence[SensorValues], here: Float64[Tensor, " unknowns"] | None = None
-) -> tuple[list[Float64[Tensor, "values components unknowns"]], list[Float64[Tensor, "values components"]]]:
-    """Columns and targets of all rows of every sensor at once, weighted; for data that fit into memory."""
-    columns, targets = [], []
-    for sensor in values:
-        X = design.columns(sensor, slice(None))
-        y = sensor.residual + (0.0 if here is None else X @ here)
-        columns.append(X * sensor.root[:, None, None])
-        targets.append(y * sensor.root[:, None])
-    return columns, targets
-
-
-def sum_up(design: Design, values: Sequence[SensorValues], here: Float64[Tensor, " unknowns"] | None) -> Sums:
-    """Normal equations of all rows.
-
-    Args:
-        design: the unknowns.
-        values: per sensor; rows that count not at all are left out already.
-        here: the unknowns' values that the values were linearised at, counted from nominal.
-    """
-    size = design.unknowns
-    normal = design.problem.q.new_zeros((len(values), size, size))
-    descent = design.problem.q.new_zeros((len(values), size))
-    square = []
-    for k, sensor in enumerate(values):
-        total = 0.0
-        for start in range(0, len(sensor.row), CHUNK):
-            rows = slice(start, min(start + CHUNK, len(sensor.row)))
-            X = design.columns(sensor, rows)
-            y = sensor.residual[rows] + (0.0 if here is None else X @ here)
-            root = sensor.root[rows, None]
-            X, y = (X * root[..., None]).flatten(0, 1), (y * root).flatten()
-            normal[k].addmm_(X.t(), X)
-            descent[k].addmv_(X.t(), y)
-            total += float(y @ y)
-        square.append(total)
-    return Sums(
-        normal=normal,
-        descent=descent,
-        square=tuple(square),
-        count=tuple(float(sensor.residual.numel()) for sensor in values),
-        stated=tuple(sensor.stated for sensor in values),
-        exact=tuple(sensor.certain for sensor in values),
-    )
-
-
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Values of all sensors, linearised at one point.
+    """Values of all sensors, linearised.
 
     Attributes:
         problem: free parameters and joint values.
-        values: per sensor, weighted, repeats of a pose as one row.
-        here: free parameters counted from nominal where the values were linearised.
-        configuration: number of every row's joint values; rows of one are never parted.
-        weights: of the joint correction that was in force there; None for none.
+        values: per sensor, weighted, repeats of a pose as one row; residuals are those of the nominal parameters and no
+            correction, as far as the linearised values say.
+        group: number of every row's group; rows of one, such as those of one placement of sockets, are held out
+            together.
     """
 
     problem: CalibrationProblem
     values: tuple[SensorValues, ...]
-    here: Float64[Tensor, " active"]
-    configuration: Int64[Tensor, " rows"]
-    weights: Float64[Tensor, " weights"] | None = None
+    group: Int64[Tensor, " rows"]
 
     @property
-    def configurations(self) -> int:
-        """How many different joint values there are."""
-        return int(self.configuration.max()) + 1
+    def groups(self) -> int:
+        """How many groups there are."""
+        return int(self.group.max()) + 1
 
-    def of(self, chosen: Bool[Tensor, " configurations"] | Int64[Tensor, " chosen"]) -> "Rows":
-        """The rows of some configurations, by mask or by number."""
-        mask = torch.zeros(self.configurations, dtype=torch.bool, device=self.configuration.device)
-        mask[chosen.to(mask.device)] = True
-        kept = tuple(sensor.select(mask[self.configuration[sensor.row]]) for sensor in self.values)
+    @property
+    def sensors(self) -> tuple[SensorCount, ...]:
+        """How many values there are of every sensor."""
+        return tuple(
+            SensorCount(
+                sensor.residual.numel() / sensor.repetition, sensor.stated, sensor.certain, sensor.repetition
+            )
+            for sensor in self.values
+        )
+
+    def of(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
+        """The rows of some groups."""
+        mask = torch.zeros(self.groups, dtype=torch.bool, device=self.group.device)
+        mask[groups.to(mask.device)] = True
+        kept = tuple(sensor.select(mask[self.group[sensor.row]]) for sensor in self.values)
         return replace(self, values=kept)
 
-    def shuffled(self) -> Int64[Tensor, " configurations"]:
-        """Numbers of all configurations in a random order that is always the same."""
-        return torch.randperm(self.configurations, generator=torch.Generator().manual_seed(0))
+    def held_out(self, groups: Int64[Tensor, " chosen"]) -> "Rows":
+        """The rows of some groups, without those of sensors that are certain."""
+        rows = self.of(groups)
+        kept = [sensor.select(slice(0, 0)) if sensor.certain else sensor for sensor in rows.values]
+        return replace(rows, values=tuple(kept))
 
-    def weighted(self, weights: Sequence[Float64[Tensor, " _values"]]) -> "Rows":
-        """The same with the values of every sensor weighted; then repeats of a pose are one row."""
-        kept = [sensor.weighted(weight) for sensor, weight in zip(self.values, weights, strict=True)]
-        if self.problem.pose is not None:
-            kept = [sensor.collapsed(self.problem.pose) for sensor in kept]
-        return replace(self, values=tuple(kept))
+    def folds(self, count: int, most_groups: int) -> tuple[Int64[Tensor, " groups"], ...]:
+        """Numbers of the groups of every fold, drawn at random but always the same.
 
-    def start(self, design: Design) -> Float64[Tensor, " unknowns"]:
-        """All unknowns of a design where the values were linearised."""
-        weights = self.weights
-        if weights is None:
-            weights = self.here.new_zeros(design.unknowns - len(self.here))
-        return torch.cat([self.here, weights])
+        Args:
+            count: how many folds, or one for every group where there are fewer groups.
+            most_groups: only so many groups are held out at all.
+        """
+        order = torch.randperm(self.groups, generator=torch.Generator().manual_seed(0))[:most_groups]
+        count = min(count, len(order))
+        return tuple(order[k::count] for k in range(count))
 
-    def sample(self, most: int) -> "Rows":
-        """At most so many configurations, drawn at random but always the same."""
-        return self if self.configurations <= most else self.of(self.shuffled()[:most])
+    @staticmethod
+    def linearised(
+        design: Design,
+        x: Float64[Tensor, " unknowns"],
+        values: Sequence[SensorValues],
+        weights: Sequence[Float64[Tensor, " _values"]],
+        group: Int64[Tensor, " rows"],
+    ) -> "Rows":
+        """Weighted values; repeats of a pose become one row.
 
-    def left(
-        self, design: Design, posterior: Posterior, noise: Sequence[float]
-    ) -> Float64[Tensor, " configurations"]:
-        """Sum of squared residuals over variances of every configuration, under a posterior."""
-        total = posterior.x.new_zeros(self.configurations)
-        change = self.start(design) - posterior.x
-        for sensor, sigma in zip(self.values, noise, strict=True):
-            if sensor.certain or not len(sensor.row):
-                continue
-            residual = sensor.residual + design.columns(sensor, slice(None)) @ change
-            square = (residual * sensor.root[:, None] / sigma).square().sum(1)
-            total.index_add_(0, self.configuration[sensor.row], square)
+        Args:
+            design: the unknowns that the values were linearised at.
+            x: these unknowns, the parameters counted from nominal.
+            values: of all rows, with residuals there.
+            weights: of the rows of every sensor.
+            group: see the attributes.
+        """
+        problem, rows = design.problem, []
+        for sensor, weight in zip(values, weights, strict=True):
+            one = sensor.weighted(weight)
+            if problem.pose is not None:
+                one = one.collapsed(problem.pose)
+            if problem.configuration is not None:
+                one = one.shared(problem.configuration)
+            rows.append(replace(one, residual=one.residual + design.moved(one, x)))
+        return Rows(problem, tuple(rows), group)
+
+    def agrees(
+        self, other: "Rows", x: Float64[Tensor, " unknowns"], design: Design, noise: Sequence[float]
+    ) -> float:
+        """Sum of the squared differences between weighted residuals, over the noise; infinite for other rows.
+
+        Args:
+            other: linearised at another point.
+            x: unknowns at which the residuals are compared.
+            design: of them.
+            noise: per sensor.
+        """
+        total = 0.0
+        for here, there, sigma in zip(self.values, other.values, noise, strict=True):
+            if not torch.equal(here.row, there.row):
+                return math.inf
+            moved = design.moved(here, x)
+            first, second = ((one.residual - moved) * one.root[:, None] for one in (here, there))
+            total += float((first - second).square().sum()) / sigma**2
         return total
 
 
 def weigh(
-    values: Sequence[SensorValues],
-    design: Design,
-    change: Float64[Tensor, " unknowns"],
-    used: Sequence[float],
-    loss: AbstractLoss,
+    problem: CalibrationProblem, values: Sequence[SensorValues], effective: float
 ) -> tuple[Float64[Tensor, " values"], ...]:
-    """Weights of all rows of every sensor by their distance from a prediction.
+    """Weights of all rows of every sensor by the lengths of their residuals.
 
     Args:
+        problem: how far-off rows of a sensor count; the scale is automatic.
         values: not weighted.
-        design: the unknowns.
-        change: unknowns where the values were linearised, minus those of the prediction.
-        used: values that the unknowns use up, per sensor.
-        loss: how far-off rows count; its scale is automatic.
+        effective: number of unknowns that the data determine.
     """
     weights = []
-    for sensor, taken in zip(values, used, strict=True):
-        residual = torch.cat(
-            [
-                sensor.residual[rows] + design.columns(sensor, rows) @ change
-                for rows in (slice(k, k + 1024) for k in range(0, len(sensor.row), 1024))
-            ]
-        )
-        distance = residual.norm(dim=1) * sensor.root
+    counts = [0.0 if sensor.certain else float(sensor.residual.numel()) for sensor in values]
+    for number, sensor in enumerate(values):
+        loss = problem.loss_of(problem.sensors[number])
+        distance = sensor.residual.norm(dim=1) * sensor.root
         if sensor.certain or isinstance(loss, SquaredLoss):
             weights.append(torch.ones_like(distance))
             continue
+        taken = effective * counts[number] / max(sum(counts), 1.0)
         scale = max(loss.scale(distance, sensor.components, taken), 1e-10)
         weights.append(loss.weight(distance / scale, sensor.components))
     return tuple(weights)

@@ -1,55 +1,25 @@
-"""Bayesian linear least squares: the posterior, and prior sizes and noise by the evidence."""
+"""Bayesian linear regression: the posterior, and prior sizes and noise by the evidence."""
 
 import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.errors import IdentificationError
 from pisigma.identification.problem.noise import LEAST_EFFECTIVE, SMALLEST_NOISE, SMALLEST_PRIOR
 
 SMALLEST_SIZE = 1e-9
 """Prior size [rad] below which a group of weights is off."""
 FIRST_SIZE = 2e-5
 """Prior size [rad] that weights start with."""
-
-
-@dataclass(frozen=True, eq=False)
-class Sums:
-    """Normal equations of every sensor, before division by its noise's variance.
-
-    Attributes:
-        normal: `Σ X^T X` per sensor, rows already weighted.
-        descent: `Σ X^T y`.
-        square: `Σ y^T y`.
-        count: number of values that count as independent.
-        stated: per sensor whether its rows state their noise, which then is at least as large.
-        exact: per sensor whether it is exactly as stated.
-    """
-
-    normal: Float64[Tensor, "sensors unknowns unknowns"]
-    descent: Float64[Tensor, "sensors unknowns"]
-    square: tuple[float, ...]
-    count: tuple[float, ...]
-    stated: tuple[bool, ...]
-    exact: tuple[bool, ...]
-
-    def select(self, columns: Int64[Tensor, " chosen"]) -> "Sums":
-        """The same for some of the unknowns."""
-        normal = self.normal[:, columns][:, :, columns]
-        return replace(self, normal=normal, descent=self.descent[:, columns])
-
-    def minus(self, other: "Sums") -> "Sums":
-        """Without the rows of another."""
-        return replace(
-            self,
-            normal=self.normal - other.normal,
-            descent=self.descent - other.descent,
-            square=tuple(a - b for a, b in zip(self.square, other.square, strict=True)),
-            count=tuple(a - b for a, b in zip(self.count, other.count, strict=True)),
-        )
+RELAXATION = 1.5
+"""Steps of MacKay's rule are longer by this, in logarithms; from about 1.8 on they overshoot."""
+SINGULAR = 1e-6
+"""Share of a left-out value's variance below which no other value says anything of it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +33,6 @@ class GaussianPrior:
         classes: the first so many groups are classes of geometric parameters, whose sizes are factors on what
             was stated; they move only within limits.
         fixed: whether the sizes of these classes stand.
-        standing: other groups whose sizes stand.
     """
 
     base: Float64[Tensor, " unknowns"]
@@ -71,30 +40,29 @@ class GaussianPrior:
     sizes: Float64[Tensor, " groups"]
     classes: int
     fixed: bool = False
-    standing: tuple[int, ...] = ()
 
     @property
     def precision(self) -> Float64[Tensor, " unknowns"]:
         """1 / variance."""
         return self.base / self.sizes[self.group].square()
 
-    def select(self, columns: Int64[Tensor, " chosen"]) -> "GaussianPrior":
-        """Of some of the unknowns."""
-        return replace(self, base=self.base[columns], group=self.group[columns])
+    def of_groups(self, values: Float64[Tensor, " unknowns"]) -> Float64[Tensor, " groups"]:
+        """Sum over the unknowns of every group of which there is prior knowledge."""
+        return torch.zeros_like(self.sizes).index_add(0, self.group, values * (self.base > 0))
 
     def updated(
-        self, x: Float64[Tensor, " unknowns"], variance: Float64[Tensor, " unknowns"]
+        self, square: Float64[Tensor, " groups"], determined: Float64[Tensor, " groups"]
     ) -> "GaussianPrior":
-        """Sizes by MacKay's rule (1992, Neural Computation 4(3), eq. 4.7), `size² = Σ x² base / Σ determined`."""
-        determined = (1 - self.precision * variance) * (self.base > 0)
-        count = torch.zeros_like(self.sizes).index_add(0, self.group, determined)
-        square = torch.zeros_like(self.sizes).index_add(0, self.group, x.square() * self.base)
-        is_class = torch.arange(len(self.sizes), device=x.device) < self.classes
+        """Sizes by MacKay's rule (1992, Neural Computation 4(3), eq. 4.7), `size² = Σ x² base / Σ determined`.
+
+        As the rule comes near to its fixed point from one side, in ever shorter steps, these are lengthened.
+        """
+        is_class = torch.arange(len(self.sizes), device=square.device) < self.classes
         least = torch.where(is_class, LEAST_EFFECTIVE, 1e-9)
         floor = torch.where(is_class, SMALLEST_PRIOR, SMALLEST_SIZE)
-        sizes = torch.maximum((square / count.clamp(min=1e-12)).sqrt(), floor)
-        stands = (count <= least) | (is_class & self.fixed)
-        stands[list(self.standing)] = True
+        sizes = torch.maximum((square / determined.clamp(min=1e-12)).sqrt(), floor)
+        sizes = self.sizes * (sizes / self.sizes) ** RELAXATION
+        stands = (determined <= least) | (is_class & self.fixed)
         return replace(self, sizes=torch.where(stands, self.sizes, sizes))
 
 
@@ -104,124 +72,195 @@ class Posterior:
 
     Attributes:
         x: most probable values.
-        covariance: of the unknowns; empty where it was not asked for.
         log_evidence: of the data under the prior, up to a constant of the data.
         prior: with its sizes as estimated.
         noise: standard deviation per sensor [m or rad], or a factor on the stated ones.
-        iterations: updates made.
+        square: `Σ base x²` of the unknowns of every group.
+        determined: how many unknowns of every group the data determine; the prior holds the others.
+        misfit: `Σ (y - X x)²` per sensor.
+        used: values of every sensor that the unknowns use up.
     """
 
     x: Float64[Tensor, " unknowns"]
-    covariance: Float64[Tensor, "uncertain uncertain"]
     log_evidence: float
     prior: GaussianPrior
     noise: tuple[float, ...]
-    iterations: int
+    square: Float64[Tensor, " groups"]
+    determined: Float64[Tensor, " groups"]
+    misfit: tuple[float, ...]
+    used: tuple[float, ...]
 
     @property
-    def determined(self) -> Float64[Tensor, " unknowns"]:
-        """Share of every unknown that the data determine, from 0 to 1; the prior holds the rest."""
-        return 1 - self.prior.precision * self.covariance.diagonal()
+    def effective(self) -> float:
+        """Number of unknowns that the data determine, those without prior knowledge among them."""
+        return float(self.determined.sum()) + int((self.prior.base == 0).sum())
 
 
-def effective_share(sums: Sums, posterior: Posterior) -> float:
-    """Share of the values that the unknowns use up; near 1 nothing is left that tells noise from error."""
-    values = sum(count for count, exact in zip(sums.count, sums.exact, strict=True) if not exact)
-    return float(posterior.determined.sum()) / max(values, 1.0)
+@dataclass(frozen=True)
+class SensorCount:
+    """What a regression knows of one sensor.
 
-
-def solve_posterior(sums: Sums, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
-    """Solve `(Σ_s N_s / noise_s² + precision) x = Σ_s b_s / noise_s²` by Cholesky with column scaling.
-
-    The log evidence is that of MacKay 1992, eq. (4.9), for several sensors.
+    Attributes:
+        values: that count as independent.
+        stated: whether its rows state their noise, which then is at least as large.
+        exact: whether it is exactly as stated.
+        repetition: see `SensorValues.repetition`.
     """
-    precision = prior.precision
-    x, scale, factor = _solved(sums, prior, noise)
-    covariance = torch.cholesky_inverse(factor) * scale * scale[:, None]
-    log_det = 2 * float(factor.diagonal().log().sum()) - 2 * float(scale.log().sum())
-    log_prior = float(precision[precision > 0].log().sum())
-    fit = sum(misfit / sigma**2 for misfit, sigma in zip(misfits(sums, x), noise, strict=True))
-    spread = sum(2 * count * math.log(sigma) for count, sigma in zip(sums.count, noise, strict=True))
-    evidence = -0.5 * (fit + float((x.square() * precision).sum()) + spread + log_det - log_prior)
-    return Posterior(x, covariance, evidence, prior, noise, 0)
+
+    values: float
+    stated: bool
+    exact: bool
+    repetition: float = 1.0
 
 
-def solve_mean(sums: Sums, prior: GaussianPrior, noise: tuple[float, ...]) -> Float64[Tensor, " unknowns"]:
-    """Most probable values alone, without covariance and evidence; see `solve_posterior`."""
-    return _solved(sums, prior, noise)[0]
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Errors of values that were left out, in standard deviations of the noise.
 
-
-def _solved(sums: Sums, prior: GaussianPrior, noise: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
-    """Most probable values, and column scale and Cholesky factor of the matrix that they solve."""
-    weight = prior.base.new_tensor([sigma**-2 for sigma in noise])
-    normal = torch.einsum("s,sij->ij", weight, sums.normal)
-    normal.diagonal().add_(prior.precision)
-    scale, factor = _factored(normal)
-    descent = weight @ sums.descent
-    return scale * torch.cholesky_solve((scale * descent)[:, None], factor)[:, 0], scale, factor
-
-
-def _factored(normal: Float64[Tensor, "unknowns unknowns"]) -> tuple[Tensor, Tensor]:
-    """Column scale, and Cholesky factor of the scaled matrix.
-
-    Raises:
-        IdentificationError: the matrix is not finite.
+    Attributes:
+        error: measured minus predicted.
+        spread: its predicted standard deviation, parameters and noise.
+        sensor: number of every value's sensor.
     """
-    scale = normal.diagonal().clamp(min=1e-300).rsqrt()
-    scaled = normal * scale * scale[:, None]
-    jitter = 1e-14
-    while True:
-        scaled.diagonal().fill_(1 + jitter)
-        factor, failed = torch.linalg.cholesky_ex(scaled)
-        if not failed:
-            return scale, factor
-        if not bool(torch.isfinite(scaled).all()):
-            raise IdentificationError(
-                "the normal equations are not finite; look for values without limit in the measurements."
-            )
-        jitter *= 10
+
+    error: Float64[Tensor, " values"]
+    spread: Float64[Tensor, " values"]
+    sensor: Int64[Tensor, " values"]
+
+    @staticmethod
+    def of(
+        M: Float64[Tensor, "values values"],
+        residual: Float64[Tensor, " values"],
+        sensor: Int64[Tensor, " values"],
+        counts: Sequence[SensorCount],
+    ) -> "LeftOut":
+        """Of the values of a fold, from a fit to all values: errors `M^-1 r` of the covariance `M^-1`.
+
+        Where only these values determine an unknown, such as where a socket is, M is singular; that unknown counts as
+        fitted to them, and the errors are scaled by what that takes away (Cook and Weisberg 1982, section 2.2).
+
+        Args:
+            M: block of `I - X C X^T` of the values, whitened.
+            residual: r, whitened.
+            sensor: number of every value's sensor.
+            counts: of the sensors.
+        """
+        factor, failed = torch.linalg.cholesky_ex(M)
+        if len(M) and (failed or float(factor.diagonal().min()) < SINGULAR):
+            values, vectors = torch.linalg.eigh(M)
+            certain = values > SINGULAR
+            inverse = (vectors * torch.where(certain, 1 / values, 0.0)) @ vectors.t()
+            residual = residual * (len(M) / max(int(certain.sum()), 1)) ** 0.5
+        else:
+            inverse = torch.cholesky_inverse(factor)
+        repetition = residual.new_tensor([one.repetition for one in counts])[sensor]
+        spread = 1 + repetition * (inverse.diagonal() - 1).clamp(min=0)
+        return LeftOut((inverse @ residual) * repetition.sqrt(), spread.sqrt(), sensor)
+
+    @staticmethod
+    def joined(parts: "Sequence[LeftOut]") -> "LeftOut":
+        """One after the other."""
+        names = ("error", "spread", "sensor")
+        return LeftOut(*(torch.cat([getattr(part, name) for part in parts]) for name in names))
+
+    def rms(self, noise: Sequence[float], unit: Sequence[float]) -> float:
+        """Root mean square in other standard deviations than those of the noise, such as that of another model."""
+        scale = self.error.new_tensor(noise) / self.error.new_tensor(unit)
+        return float((self.error * scale[self.sensor]).square().mean().sqrt())
 
 
-def misfits(sums: Sums, x: Float64[Tensor, " unknowns"]) -> tuple[float, ...]:
-    """`Σ (y - X x)²` per sensor."""
-    cross = (sums.descent @ x).tolist()
-    inner = ((sums.normal @ x) @ x).tolist()
-    return tuple(max(square - 2 * a + b, 0.0) for square, a, b in zip(sums.square, cross, inner, strict=True))
+class AbstractRegression(ABC):
+    """Weighted linear regression `y = X x + e` of all measured values on the unknowns.
 
-
-def maximise_evidence(
-    sums: Sums, prior: GaussianPrior, noise: tuple[float, ...], iterations: int = 40, tolerance: float = 5e-2
-) -> Posterior:
-    """Estimate prior sizes and noise together with the unknowns.
-
-    Args:
-        sums: normal equations.
-        prior: with sizes to start from.
-        noise: to start from.
-        iterations: updates at most.
-        tolerance: the search ends when the log evidence rises by less.
-
-    Returns:
-        The posterior of the last update.
+    Attributes:
+        sensors: how many values there are of every sensor.
     """
-    posterior = solve_posterior(sums, prior, noise)
-    for made in range(1, iterations + 1):
-        prior = posterior.prior.updated(posterior.x, posterior.covariance.diagonal())
-        noise = renewed_noise(sums, posterior)
-        following = replace(solve_posterior(sums, prior, noise), iterations=made)
-        gain = following.log_evidence - posterior.log_evidence
-        posterior = following
-        if abs(gain) < tolerance:
-            break
-    return posterior
 
+    sensors: tuple[SensorCount, ...]
 
-def renewed_noise(sums: Sums, posterior: Posterior) -> tuple[float, ...]:
-    """Noise of every sensor from its misfit and the values that the unknowns use up (Förstner 1979)."""
-    used = (sums.normal * posterior.covariance).sum((1, 2)).tolist()
-    noise = []
-    for k, misfit in enumerate(misfits(sums, posterior.x)):
-        left = max(sums.count[k] - used[k] / posterior.noise[k] ** 2, 1.0)
-        sigma = 1.0 if sums.exact[k] else math.sqrt(misfit / left)
-        noise.append(max(sigma, 1.0 if sums.stated[k] else SMALLEST_NOISE))
-    return tuple(noise)
+    @abstractmethod
+    def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
+        """The posterior under a prior and noise; the log evidence is that of MacKay 1992, eq. (4.9)."""
+
+    @abstractmethod
+    def covariance(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
+        """Covariance of the unknowns."""
+
+    @abstractmethod
+    def select(self, design: Any) -> "AbstractRegression":
+        """The same for the unknowns of a design that has some of the features, or smaller ones."""
+
+    @abstractmethod
+    def without(self, groups: Int64[Tensor, " groups"]) -> "AbstractRegression":
+        """The same without the values of some groups of rows, see `Rows.group`; values that are certain stay."""
+
+    @abstractmethod
+    def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " groups"]]) -> LeftOut:
+        """Leave out one fold after the other and predict it, with the prior sizes and the noise of a posterior.
+
+        Args:
+            posterior: of all values.
+            folds: groups that are left out together, see `Rows.group`.
+        """
+
+    def left_out_anew(
+        self, posterior: Posterior, folds: Sequence[Int64[Tensor, " groups"]], updates: int
+    ) -> LeftOut:
+        """The same with so many updates of noise and prior sizes for every fold: few rows leave these uncertain."""
+        parts = []
+        for groups in folds:
+            rest = self.without(groups).maximise_evidence(posterior.prior, posterior.noise, updates)
+            parts.append(self.left_out(rest, [groups]))
+        return LeftOut.joined(parts)
+
+    def first_sizes(
+        self, posterior: Posterior, design: Any, features: Any
+    ) -> tuple[float, Float64[Tensor, " groups"] | None]:
+        """By how much more features raise the log evidence with all other prior sizes and the noise fixed.
+
+        Args:
+            posterior: without them.
+            design: without them.
+            features: that are added.
+
+        Returns:
+            The gain, infinite where a fit says it as quickly; and the prior sizes of the features, to start from.
+        """
+        return math.inf, None
+
+    def effective_share(self, posterior: Posterior) -> float:
+        """Share of the values that the unknowns use up; near 1 nothing is left that tells noise from error."""
+        values = sum(sensor.values for sensor in self.sensors if not sensor.exact)
+        return posterior.effective / max(values, 1.0)
+
+    def renewed_noise(self, posterior: Posterior) -> tuple[float, ...]:
+        """Noise of every sensor from its misfit and the values that the unknowns use up (Förstner 1979)."""
+        noise = []
+        for sensor, misfit, used in zip(self.sensors, posterior.misfit, posterior.used, strict=True):
+            sigma = 1.0 if sensor.exact else math.sqrt(misfit / max(sensor.values - used, 1.0))
+            noise.append(max(sigma, 1.0 if sensor.stated else SMALLEST_NOISE))
+        return tuple(noise)
+
+    def maximise_evidence(
+        self, prior: GaussianPrior, noise: tuple[float, ...], iterations: int = 40, tolerance: float = 0.2
+    ) -> Posterior:
+        """Estimate prior sizes and noise together with the unknowns.
+
+        Args:
+            prior: with sizes to start from.
+            noise: to start from.
+            iterations: updates at most.
+            tolerance: the search ends when the log evidence rises by less.
+
+        Returns:
+            The posterior of the last update.
+        """
+        posterior = self.solve(prior, noise)
+        for _ in range(iterations):
+            prior = posterior.prior.updated(posterior.square, posterior.determined)
+            following = self.solve(prior, self.renewed_noise(posterior))
+            gain = following.log_evidence - posterior.log_evidence
+            posterior = following
+            if abs(gain) < tolerance:
+                break
+        return posterior

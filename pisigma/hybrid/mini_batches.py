@@ -11,20 +11,14 @@ import torch
 from jaxtyping import Float64, Int64
 from pydantic import Field, PositiveFloat, PositiveInt
 from torch import Tensor
-from torch.func import functional_call
 
-from pisigma.hybrid.alternating_products import AlternatingProducts, normalised
 from pisigma.hybrid.design import Design
 from pisigma.hybrid.evidence import Posterior
-from pisigma.hybrid.refinement import Refined, refine, refined_at, with_all_factors
-from pisigma.hybrid.search import Additive
+from pisigma.hybrid.refinement import Refined, network, refined_at
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.hybrid.uncertainty import covariance_root
-from pisigma.identification.problem.loss import AbstractLoss
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.result import SolvedCalibration
-from pisigma.joint_correction.feature import AbstractFeature
-from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.conditions import JointState
 from pisigma.yaml_file import Section
 
@@ -87,10 +81,8 @@ def batch_checkpoints(folder: Path, identity: str, resume: bool) -> "Checkpoints
 
 def refine_in_batches(
     solved: SolvedCalibration,
-    searched: CalibrationProblem,
-    additive: Additive,
-    orders: tuple[int, ...],
-    loss: AbstractLoss,
+    few: Refined,
+    group: Int64[Tensor, " rows"],
     *,
     batches: MiniBatches,
     progress: Callable[[str], None],
@@ -98,15 +90,13 @@ def refine_in_batches(
 ) -> tuple[Refined, str]:
     """Fit a chosen model as `pisigma.hybrid.refinement.refine` does, but on mini-batches.
 
-    Prior sizes and noise come from the rows that were searched on. All unknowns are then trained on all rows,
-    whitened with what those rows say; a last pass over all rows finds how sure they are.
+    Prior sizes and noise come from some of the rows. All unknowns are then trained on all rows, whitened with what
+    those rows say; a last pass over all rows finds how sure they are.
 
     Args:
         solved: the geometric calibration, where it starts.
-        searched: the problem with the rows on which the model was chosen.
-        additive: the chosen unit of order 1, as fitted in the search.
-        orders: of the chosen product units.
-        loss: how far-off rows count.
+        few: the model fitted to some of the rows.
+        group: see `Rows.group`, of all rows.
         batches: how the unknowns are trained.
         progress: called with what is being done.
         checkpoints: kept on the way; None keeps none.
@@ -119,64 +109,56 @@ def refine_in_batches(
     """
     from pisigma.training.mini_batches import minimise_in_batches
 
-    unknowns = WhitenedUnknowns.around(refine(replace(solved, problem=searched), additive, orders, loss))
+    unknowns = WhitenedUnknowns.around(few)
     schedule = batches.schedule(solved.problem.q.shape[0])
     cost = HybridBatchCost(solved.problem, unknowns, schedule)
     z = minimise_in_batches(cost, len(unknowns.start), schedule, progress, checkpoints)
-    design, posterior = unknowns.solution(unknowns.values(z.to(solved.problem.q)))
+    posterior = replace(few.posterior, x=unknowns.values(z.to(solved.problem.q)).detach())
     progress("looking at all rows")
-    refined = refined_at(solved, replace(design, problem=solved.problem), posterior, loss, schedule.epochs)
-    deviation = refined.posterior.covariance.diagonal().clamp(min=1e-300).sqrt()
+    refined = refined_at(replace(few.design, problem=solved.problem), posterior, group, schedule.epochs)
+    deviation = refined.regression.covariance(refined.posterior).diagonal().clamp(min=1e-300).sqrt()
     off = float(((refined.posterior.x - posterior.x) / deviation).square().mean().sqrt())
     sentence = f"Trained on mini-batches to within {off:.2g} standard deviations of the optimum."
     if not off <= SETTLED:
         sentence += f" That is not settled: give more than {schedule.epochs} epochs."
-    return replace(refined, posterior=replace(refined.posterior, x=posterior.x)), sentence
+    correction = network(refined.design, posterior.x)
+    point = solved.problem.nominal.index_add(0, solved.problem.active, posterior.x[: few.design.active])
+    there = replace(refined.posterior, x=posterior.x)
+    return replace(refined, posterior=there, point=point, correction=correction), sentence
 
 
 @dataclass(frozen=True, eq=False)
 class WhitenedUnknowns:
     """`x = start + root · z`, where some rows say that z is about 0 with covariance 1.
 
-    The unknowns x are the free parameters counted from nominal, the weights of the features, and of the product
-    units first the weights of the free factors and then the changes of the fixed ones.
+    The unknowns x are the free parameters counted from nominal, and the weights of the features.
 
     Attributes:
         design: of the few rows.
         posterior: of their unknowns, whose prior sizes and noise stand.
-        products: product units by choice of free factors, that of `design` first; none without product units.
-        start: x where z is 0.
         root: root of the covariance of x.
-        precision: 1 / variance of x in the prior, whose mean is 0.
-        correction: the network, for its shape.
     """
 
     design: Design
     posterior: Posterior
-    products: tuple[AlternatingProducts, ...]
-    start: Float64[Tensor, " unknowns"]
     root: Float64[Tensor, "unknowns unknowns"]
-    precision: Float64[Tensor, " unknowns"]
-    correction: JointCorrection
 
     @staticmethod
     def around(few: Refined) -> "WhitenedUnknowns":
         """Around the solution of a part of the rows."""
-        whole = with_all_factors(few)
-        covariance = whole.posterior.covariance
-        change = torch.eye(few.design.active).to(covariance)
-        extra = len(covariance) - few.design.unknowns
-        return WhitenedUnknowns(
-            design=few.design,
-            posterior=few.posterior,
-            products=tuple(
-                units for units in whole.design.features if isinstance(units, AlternatingProducts)
-            ),
-            start=torch.cat([few.posterior.x, few.posterior.x.new_zeros(extra)]),
-            root=covariance_root(covariance, change),
-            precision=whole.posterior.prior.precision,
-            correction=few.correction,
-        )
+        covariance = few.regression.covariance(few.posterior)
+        root = covariance_root(covariance, torch.eye(few.design.active).to(covariance))
+        return WhitenedUnknowns(few.design, few.posterior, root)
+
+    @property
+    def start(self) -> Float64[Tensor, " unknowns"]:
+        """The unknowns x where z is 0."""
+        return self.posterior.x
+
+    @property
+    def precision(self) -> Float64[Tensor, " unknowns"]:
+        """1 / variance of x in the prior, whose mean is 0."""
+        return self.posterior.prior.precision
 
     def values(self, z: Float64[Tensor, " unknowns"]) -> Float64[Tensor, " unknowns"]:
         """The unknowns x."""
@@ -184,50 +166,7 @@ class WhitenedUnknowns:
 
     def shift(self, x: Float64[Tensor, " unknowns"], state: JointState) -> Float64[Tensor, "rows dof"]:
         """Joint corrections [rad or m] of rows, to be derived by x."""
-        weights = {}
-        for number, chosen in enumerate(self._additive):
-            none = torch.zeros(chosen.used.shape).to(x)
-            weights[f"linear.{number}"] = none.masked_scatter(chosen.used, x[self.design.stretch(number)])
-        if self.products:
-            factors = self.factors(x)
-            weights |= {"bias": factors[..., 0], "weight": factors[..., 1:]}
-        delta: Tensor = functional_call(self.correction, weights, (state,))
-        return delta
-
-    def factors(self, x: Float64[Tensor, " unknowns"]) -> Float64[Tensor, "dof factors inputs"]:
-        """Weights of all factors of the product units, the bias first."""
-        first, *others = self.products
-        dof, _, inputs = first.factors.shape
-        place = self.design.stretch(len(self._additive)).start
-        total = first.factors.clone()
-        total[:, list(first.free)] = 0.0
-        for chosen in (first, *others):
-            part = x[place : place + chosen.used.numel()].reshape(dof, len(chosen.orders), inputs)
-            total = total.index_add(1, torch.tensor(chosen.free, device=x.device), part)
-            place += chosen.used.numel()
-        return total
-
-    def solution(self, x: Float64[Tensor, " unknowns"]) -> tuple[Design, Posterior]:
-        """Design and posterior with these unknowns as the most probable values, fixed factors of length 1."""
-        x = x.detach()
-        if not self.products:
-            return self.design, replace(self.posterior, x=x)
-        first, factors = self.products[0], self.factors(x)
-        length, unit = factors.norm(dim=-1), normalised(factors)
-        free = [
-            factors[:, place] * length[:, others].prod(1)[:, None]
-            for place, others in zip(first.free, first.fixed, strict=True)
-        ]
-        units = AlternatingProducts(self.design.problem.space.robot, first.orders, unit, first.turn)
-        weights = x[: self.design.stretch(len(self._additive)).start]
-        x = torch.cat([weights, torch.stack(free, 1).flatten()])
-        design = replace(self.design, features=(*self._additive, units))
-        return design, replace(self.posterior, x=x)
-
-    @property
-    def _additive(self) -> tuple[AbstractFeature, ...]:
-        """Features of the unit of order 1."""
-        return self.design.features[:-1] if self.products else self.design.features
+        return self.design.correction(x, state)
 
 
 class BatchRows:

@@ -1,33 +1,30 @@
-"""Solve the chosen model on all rows: weights, linearisation and posterior in turn until they agree."""
+"""Solve the chosen model on all rows: linearisation and posterior in turn until they agree."""
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.hybrid.alternating_products import AlternatingProducts
-from pisigma.hybrid.design import Design, Rows, sum_up, weigh
-from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence, renewed_noise, solve_posterior
-from pisigma.hybrid.products import ProductFit
-from pisigma.hybrid.search import Additive
+from pisigma.hybrid.design import Design, Rows, weigh
+from pisigma.hybrid.evidence import AbstractRegression, Posterior
+from pisigma.hybrid.regression import regression
+from pisigma.hybrid.search import Fitted
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.identification.identifiability.sufficiency import floating_frames
 from pisigma.identification.prediction import predicted_poses
-from pisigma.identification.problem.loss import AbstractLoss
+from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.setup import IdentifiedGeometry, identified_geometry
 from pisigma.identification.result import SolvedCalibration
+from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.groups import groups_of_equal_joints
 from pisigma.se3 import transform, transform_from_xyzrpy, xyzrpy_from_transform
 
 MOST_ROUNDS = 5
-SETTLED = 0.02
-"""[standard deviations] Rounds end when no unknown moves by more, on average."""
-PRODUCT_CONFIGURATIONS = 3_000
-"""Factors of product units are solved for on so many configurations at most."""
+SETTLED = 0.05
+"""Rounds end when linearised and true residuals, weighted, differ by less variance for every determined unknown."""
 ARM = 0.1
 """Points of the tool at this share of the reach from its origin are met as well, so that rotations count."""
 
@@ -38,9 +35,9 @@ class Refined:
 
     Attributes:
         rows: as last linearised and weighted.
-        design: all unknowns, the free factors of product units last.
+        design: all unknowns.
         posterior: of them.
-        sums: normal equations of the rows.
+        regression: of the rows on them.
         point: all parameters of the problem.
         correction: the network.
         rounds: linearisations made.
@@ -49,159 +46,92 @@ class Refined:
     rows: Rows
     design: Design
     posterior: Posterior
-    sums: Sums
+    regression: AbstractRegression
     point: Float64[Tensor, " parameters"]
     correction: JointCorrection
     rounds: int
 
-    @property
-    def effective(self) -> float:
-        """Number of unknowns that the data determine."""
-        return float(self.posterior.determined.sum())
 
-
-def refine(
-    solved: SolvedCalibration, additive: Additive, orders: tuple[int, ...], loss: AbstractLoss
-) -> Refined:
-    """Fit the chosen features and product units to all rows.
+def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], rows: Rows, chosen: Fitted) -> Refined:
+    """Fit the chosen features to all rows.
 
     Args:
-        solved: the geometric calibration, where it starts.
-        additive: the chosen unit of order 1, as fitted in the search.
-        orders: of the chosen product units.
-        loss: how far-off rows count.
+        problem: of all rows.
+        group: see `Rows.group`.
+        rows: on which they were chosen.
+        chosen: as fitted to those.
     """
-    problem = solved.problem
-    design = Design(problem, additive.design.features)
-    posterior, point = additive.posterior, solved.solution.linearisation.point
-    refined: Refined | None = None
-    for rounds in range(1, MOST_ROUNDS + 1):
-        rows = _rows(solved, point, refined.correction if refined else None, design, posterior, loss)
-        before = posterior.x
-        if orders and refined is None:
-            design, posterior, sums = _with_products(rows, design, posterior, orders)
-        else:
-            sums = sum_up(design, rows.values, rows.start(design))
-            posterior = maximise_evidence(sums, posterior.prior, posterior.noise)
-        point = problem.nominal.index_add(0, problem.active, posterior.x[: design.active])
-        refined = Refined(rows, design, posterior, sums, point, network(design, posterior), rounds)
-        if rounds > 1:
-            moved = (posterior.x - before) / posterior.covariance.diagonal().clamp(min=1e-300).sqrt()
-            if float(moved.square().mean().sqrt()) < SETTLED:
-                break
-    assert refined is not None
-    return refined
+    design, posterior, fit = Design(problem, chosen.design.features), chosen.posterior, chosen.regression
+    for rounds in range(MOST_ROUNDS):
+        there = linearised(design, posterior.x, posterior.effective, group)
+        differs = there.agrees(rows, posterior.x, design, posterior.noise)
+        if differs < SETTLED * posterior.effective:
+            break
+        rows, fit = there, regression(design, there)
+        posterior = fit.maximise_evidence(posterior.prior, posterior.noise)
+    return _refined(rows, design, posterior, fit, rounds + 1)
 
 
-def refined_at(
-    solved: SolvedCalibration, design: Design, posterior: Posterior, loss: AbstractLoss, rounds: int
-) -> Refined:
+def refined_at(design: Design, posterior: Posterior, group: Int64[Tensor, " rows"], rounds: int) -> Refined:
     """All rows linearised and weighted at the most probable values of a posterior, and the posterior there.
 
     Args:
-        solved: the geometric calibration.
         design: all unknowns.
         posterior: where to look from, with prior sizes, which stand, and noise, which is renewed.
-        loss: how far-off rows count.
+        group: see `Rows.group`.
         rounds: rounds that it took to get there.
     """
-    problem = solved.problem
+    rows = linearised(design, posterior.x, posterior.effective, group)
+    fit = regression(design, rows)
+    there = fit.solve(posterior.prior, posterior.noise)
+    there = fit.solve(posterior.prior, fit.renewed_noise(there))
+    return _refined(rows, design, there, fit, rounds)
+
+
+def _refined(
+    rows: Rows, design: Design, posterior: Posterior, fit: AbstractRegression, rounds: int
+) -> Refined:
+    problem = design.problem
     point = problem.nominal.index_add(0, problem.active, posterior.x[: design.active])
-    correction = network(design, posterior)
-    rows = _rows(solved, point, correction, design, posterior, loss)
-    sums = sum_up(design, rows.values, rows.start(design))
-    there = solve_posterior(sums, posterior.prior, posterior.noise)
-    there = solve_posterior(sums, posterior.prior, renewed_noise(sums, there))
-    return Refined(rows, design, there, sums, point, correction, rounds)
+    return Refined(rows, design, posterior, fit, point, network(design, posterior.x), rounds)
 
 
-def network(design: Design, posterior: Posterior) -> JointCorrection:
-    """The network with the weights of a posterior."""
-    robot = design.problem.space.robot
-    last = design.features[-1] if design.features else None
-    products = last if isinstance(last, AlternatingProducts) else None
-    features = design.features[:-1] if products else design.features
-    made = JointCorrection(robot, features, products.orders if products else ())
+def network(design: Design, x: Float64[Tensor, " unknowns"]) -> JointCorrection:
+    """The network with the weights of some unknowns; products of inputs as product units."""
+    features = [chosen for chosen in design.features if not isinstance(chosen, InputProducts)]
+    factors, linear = None, []
+    for number, chosen in enumerate(design.features):
+        weights = x[design.stretch(number)].cpu()
+        if isinstance(chosen, InputProducts):
+            factors = chosen.factors(weights)
+        else:
+            linear.append(torch.zeros(chosen.used.shape).to(weights).masked_scatter(chosen.used, weights))
+    orders = () if factors is None else (2,) * (factors.shape[1] // 2)
+    made = JointCorrection(design.problem.space.robot, features, orders)
     with torch.no_grad():
-        for number, chosen in enumerate(features):
-            made.linear[number][chosen.used] = posterior.x[design.stretch(number)].cpu()
-        if products:
-            factors = products.solved(posterior.x[design.stretch(len(features))])
-            made.bias.copy_(factors[..., 0])
-            made.weight.copy_(factors[..., 1:])
+        for parameter, values in zip(made.linear, linear, strict=True):
+            parameter.copy_(values)
+        if factors is not None:
+            made.weight.copy_(factors)
     made.requires_grad_(False)
     return made
 
 
-def _rows(
-    solved: SolvedCalibration,
-    point: Tensor,
-    correction: JointCorrection | None,
-    design: Design,
-    posterior: Posterior,
-    loss: AbstractLoss,
+def linearised(
+    design: Design, x: Float64[Tensor, " unknowns"], effective: float, group: Int64[Tensor, " rows"]
 ) -> Rows:
-    """All rows linearised at a point, weighted by their distance from what the posterior predicts."""
-    problem = solved.problem
-    values = sensor_values(problem, point, correction)
-    here = (point - problem.nominal)[problem.active]
-    weights = None if correction is None else posterior.x[len(here) :]
-    rows = Rows(problem, values, here, groups_of_equal_joints(problem.q), weights)
-    change = rows.start(design) - posterior.x
-    used = [0.0] * len(values) if correction is None else _used(rows, design, posterior)
-    return rows.weighted(weigh(values, design, change, used, loss))
+    """All rows linearised at some unknowns, weighted by their distance from what these predict.
 
-
-def _used(rows: Rows, design: Design, posterior: Posterior) -> list[float]:
-    """Values of every sensor that the unknowns use up: those that are determined, shared out by the sensors' values."""
-    counts = [0.0 if sensor.certain else float(sensor.residual.numel()) for sensor in rows.values]
-    return [float(posterior.determined.sum()) * count / max(sum(counts), 1.0) for count in counts]
-
-
-def _with_products(
-    rows: Rows, design: Design, additive: Posterior, orders: tuple[int, ...]
-) -> tuple[Design, Posterior, Sums]:
-    """Fit product units beside the unit of order 1; the factors on a sample of the rows, the rest on all."""
-    few = rows.sample(PRODUCT_CONFIGURATIONS)
-    sums = sum_up(design, few.values, few.start(design))
-    additive = maximise_evidence(sums, additive.prior, additive.noise)
-    fitted = ProductFit(design, few.values, few.start(design), additive, sums).fit(orders)
-    sums = sum_up(fitted.design, rows.values, rows.start(fitted.design))
-    return fitted.design, maximise_evidence(sums, fitted.posterior.prior, fitted.posterior.noise), sums
-
-
-def with_all_factors(refined: Refined) -> Refined:
-    """The same with all factors of product units free, for what is uncertain in those that were fixed.
-
-    Their columns are the derivatives at the solution, their changes normal about 0 with the size of a weight among
-    all of a factor of length 1.
+    Args:
+        design: of the unknowns.
+        x: the unknowns, parameters counted from nominal.
+        effective: how many of them the data determine.
+        group: see `Rows.group`.
     """
-    units = refined.design.features[-1] if refined.design.features else None
-    if not isinstance(units, AlternatingProducts):
-        return refined
-    weights = refined.posterior.x[refined.design.stretch(len(refined.design.features) - 1)]
-    factors = units.solved(weights)
-    others = [
-        AlternatingProducts(refined.design.problem.space.robot, units.orders, factors, units.turn + k)
-        for k in range(1, max(units.orders))
-    ]
-    design = replace(refined.design, features=(*refined.design.features, *others))
-    extra = design.unknowns - refined.design.unknowns
-    in_force = refined.rows.weights
-    start = refined.posterior.x[refined.design.active :] if in_force is None else in_force
-    rows = replace(refined.rows, weights=torch.cat([start, start.new_zeros(extra)]))
-    sums = sum_up(design, rows.values, rows.start(design))
-    prior = refined.posterior.prior
-    size = len(prior.sizes)
-    prior = replace(
-        prior,
-        base=torch.cat([prior.base, prior.base.new_ones(extra)]),
-        group=torch.cat([prior.group, torch.full((extra,), size)]),
-        sizes=torch.cat([prior.sizes, prior.sizes.new_tensor([factors.shape[-1] ** -0.5])]),
-        standing=(size,),
-    )
-    posterior = solve_posterior(sums, prior, refined.posterior.noise)
-    return replace(refined, rows=rows, design=design, posterior=posterior, sums=sums)
+    problem = design.problem
+    point = problem.nominal.index_add(0, problem.active, x[: design.active])
+    values = sensor_values(problem, point, network(design, x) if design.features else None)
+    return Rows.linearised(design, x, values, weigh(problem, values, effective), group)
 
 
 def with_frames_of(

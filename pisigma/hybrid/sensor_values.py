@@ -32,6 +32,8 @@ class SensorValues:
         certain: whether the values are certain rather than measured.
         other_row: of distances between the targets of two rows, the number of the other one; else None.
         other_joints: derivative by the joint values of that row.
+        repetition: 1 or more: so many values of one configuration say no more than one, because what the model gets
+            wrong there is the same for several targets (the design effect, Kish 1965).
     """
 
     name: str
@@ -44,6 +46,15 @@ class SensorValues:
     certain: bool
     other_row: Int64[Tensor, " values"] | None = None
     other_joints: Float64[Tensor, "values components dof"] | None = None
+    repetition: float = 1.0
+
+    @property
+    def sides(self) -> list[tuple[Tensor, Tensor]]:
+        """Rows of the problem, and the derivative by their joint values; two of distances between two rows."""
+        sides = [(self.row, self.joints)]
+        if self.other_row is not None and self.other_joints is not None:
+            sides.append((self.other_row, self.other_joints))
+        return sides
 
     def feature_columns(
         self, chosen: AbstractFeature, state: JointState, rows: slice
@@ -55,17 +66,15 @@ class SensorValues:
             state: of all rows of the problem.
             rows: which of the rows of this sensor.
         """
-        block = weight_columns(self.joints[rows], chosen, state[self.row[rows]])
-        if self.other_row is not None and self.other_joints is not None:
-            block = block + weight_columns(self.other_joints[rows], chosen, state[self.other_row[rows]])
-        return block
+        blocks = [weight_columns(joints[rows], chosen, state[row[rows]]) for row, joints in self.sides]
+        return torch.stack(blocks).sum(0)
 
     @property
     def components(self) -> int:
         """Values a row."""
         return self.residual.shape[1]
 
-    def select(self, chosen: Tensor) -> "SensorValues":
+    def select(self, chosen: Tensor | slice) -> "SensorValues":
         """Some of the rows, by index or mask."""
         return replace(
             self,
@@ -114,6 +123,22 @@ class SensorValues:
             residual=mean(self.residual),
             root=total.sqrt(),
         )
+
+    def shared(self, configuration: Int64[Tensor, " rows"]) -> "SensorValues":
+        """The same with rows that count less where the residuals of several targets of a configuration are alike."""
+        if not len(self.row) or self.certain or self.other_row is not None:
+            return self
+        key = renumbered(configuration[self.row])
+        groups = int(key.max()) + 1
+        weight = self.root.square()
+        total = weight.new_zeros(groups).index_add(0, key, weight)
+        summed = self.residual.new_zeros((groups, self.components)).index_add(
+            0, key, self.residual * weight[:, None]
+        )
+        square = float((self.residual.square() * weight[:, None]).sum()) / len(key)
+        shared = float((summed.square().sum(1) / total).sum()) / groups
+        repetition = max(shared / max(square, 1e-300), 1.0)
+        return replace(self, repetition=repetition, root=self.root * repetition**-0.5)
 
     def _sights(self) -> Int64[Tensor, " values"]:
         """Number of every row's derivatives among the different ones."""

@@ -7,9 +7,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.hybrid.design import Design, Rows
-from pisigma.hybrid.evidence import Posterior, Sums, effective_share
-from pisigma.hybrid.left_out import LeftOut, folds_left_out, left_out
+from pisigma.hybrid.design import FOLDS, Design, Rows
+from pisigma.hybrid.evidence import AbstractRegression, LeftOut, Posterior
 from pisigma.hybrid.sensor_values import joint_columns, weight_columns
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.problem.setup import IdentifiedGeometry
@@ -21,10 +20,12 @@ from pisigma.sensors.sensor import numbers_of
 
 CHUNK = 512
 """Rows whose columns are in memory at a time."""
-MOST_CONFIGURATIONS = 2_000
-"""Left-out rows are looked at on so many configurations at most."""
-FEW_CONFIGURATIONS = 600
-"""Up to so many, whole folds are left out instead of single configurations."""
+MOST_GROUPS = 400
+"""Left-out rows are looked at of so many groups at most."""
+FEW_GROUPS = 600
+"""Up to so many, noise and prior sizes are estimated anew for every fold that is left out."""
+FOLD_UPDATES = 4
+"""Updates of noise and prior sizes then."""
 LEAST_EFFECTIVE = 0.5
 """Prior sizes of groups of which the data determine fewer unknowns do not matter."""
 LARGEST_SCALE = 1e4
@@ -108,7 +109,9 @@ def covariance_root(
     return torch.cat([change @ root[:active], root[active:]])
 
 
-def covariance_of_sizes(posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
+def covariance_of_sizes(
+    posterior: Posterior, covariance: Float64[Tensor, "unknowns unknowns"]
+) -> Float64[Tensor, "unknowns unknowns"]:
     """What the uncertainty of the prior's sizes adds to the covariance of the unknowns.
 
     With `dx / d log s_g = 2 C Λ_g x` for the unknowns of group g and `var(log s_g) = 1 / (2 n_g)`, where n_g of
@@ -117,9 +120,9 @@ def covariance_of_sizes(posterior: Posterior) -> Float64[Tensor, "unknowns unkno
     prior, x = posterior.prior, posterior.x
     groups = torch.zeros(len(x), len(prior.sizes), dtype=x.dtype, device=x.device)
     groups[torch.arange(len(x)), prior.group] = 1.0
-    determined = (groups * (posterior.determined * (prior.base > 0))[:, None]).sum(0)
-    moved = 2 * posterior.covariance @ (groups * (prior.precision * x)[:, None])
-    moved = moved[:, determined > LEAST_EFFECTIVE] * (2 * determined[determined > LEAST_EFFECTIVE]).rsqrt()
+    certain = posterior.determined > LEAST_EFFECTIVE
+    moved = 2 * covariance @ (groups * (prior.precision * x)[:, None])[:, certain]
+    moved = moved * (2 * posterior.determined[certain]).rsqrt()
     return moved @ moved.t()
 
 
@@ -142,34 +145,36 @@ def left_out_scale(errors: LeftOut) -> float:
     return math.exp(high)
 
 
-def degrees_of_freedom_factor(posterior: Posterior, sums: Sums) -> float:
+def degrees_of_freedom_factor(fit: AbstractRegression, posterior: Posterior) -> float:
     """`n / (n - determined)` with n values of which the unknowns use up `determined`.
 
     Features, prior sizes and noise are chosen on the same rows, which makes the posterior a little too sure; new rows
     err by about so much more (as in generalised cross-validation, Craven and Wahba 1979).
     """
-    return 1 / max(1 - effective_share(sums, posterior), 0.2)
+    return 1 / max(1 - fit.effective_share(posterior), 0.2)
 
 
 def position_uncertainty(
-    rows: Rows, design: Design, posterior: Posterior, sums: Sums, geometry: IdentifiedGeometry
+    rows: Rows, design: Design, fit: AbstractRegression, posterior: Posterior, geometry: IdentifiedGeometry
 ) -> PositionUncertainty:
     """Of the positions that a posterior predicts, scaled by what left-out rows show.
 
     Args:
         rows: linearised values.
         design: the unknowns.
+        fit: regression of the rows on them.
         posterior: of them.
-        sums: normal equations of the rows.
         geometry: in the user's coordinates.
     """
-    if rows.configurations <= FEW_CONFIGURATIONS:
-        missed = folds_left_out(rows, design, posterior, sums)
+    folds = rows.folds(FOLDS, MOST_GROUPS)
+    if rows.groups <= FEW_GROUPS:
+        missed = fit.left_out_anew(posterior, folds, FOLD_UPDATES)
     else:
-        missed = left_out(rows.sample(MOST_CONFIGURATIONS), design, posterior)
-    prior_scale = max(left_out_scale(missed), degrees_of_freedom_factor(posterior, sums))
+        missed = fit.left_out(posterior, folds)
+    prior_scale = max(left_out_scale(missed), degrees_of_freedom_factor(fit, posterior))
     space = design.problem.space
     active = design.problem.active.cpu()
-    covariance = posterior.covariance + covariance_of_sizes(posterior)
+    covariance = fit.covariance(posterior)
+    covariance = covariance + covariance_of_sizes(posterior, covariance)
     root = covariance_root(prior_scale * covariance.cpu(), geometry.change[:, active])
     return PositionUncertainty(space, geometry, design.features, root, prior_scale)

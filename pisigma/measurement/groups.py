@@ -9,6 +9,9 @@ from torch import Tensor
 from pisigma.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
 
+FEWEST_GROUPS = 3
+"""Fewer placements, sockets or anchors than these are not held out whole, because too little would be left."""
+
 
 def groups_of_equal_joints(q: Float64[Tensor, "rows dof"]) -> Int64[Tensor, " rows"]:
     """Number the different joint vectors in the order of their first row.
@@ -48,6 +51,31 @@ def groups_to_keep_whole(measurements: Measurements) -> Int64[Tensor, " rows"]:
     """
     group = groups_of_equal_joints(measurements.q)
     return group if measurements.pair is None else _joined(group, measurements.pair)
+
+
+def held_out_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
+    """Number the groups of rows that are held out together where models are chosen.
+
+    Rows of one socket or one anchor predict each other better than those of another, and so do the sockets of one
+    placement. So whole placements are groups where there are `FEWEST_GROUPS` of them; else whole sockets and anchors;
+    else the groups of `groups_to_keep_whole`.
+
+    Returns:
+        For every row the number of its group, from 0.
+    """
+    whole = groups_to_keep_whole(measurements)
+    owners = [
+        measurements.socket or ("",) * measurements.rows,
+        measurements.anchor or ("",) * measurements.rows,
+    ]
+    placed = [name.rpartition("/")[0] or name for name in owners[0]]
+    for names in ([placed, owners[1]], owners):
+        group = whole
+        for column in names:
+            group = _joined(group, column)
+        if measurements.rows and int(group.max()) + 1 >= FEWEST_GROUPS:
+            return group
+    return whole
 
 
 def placements(measurements: Measurements) -> tuple[str, ...]:

@@ -1,0 +1,139 @@
+"""Held-out accuracy of the hybrid on measured robots: at random, with few rows, and beyond what was measured.
+
+Run `OMP_NUM_THREADS=1 python benchmarks/hybrid_accuracy.py [PART ...]` with the measured files in `PISIGMA_DATA`. A
+part is one of the names in `PARTS`. Every line is one fit: root mean square of the position error of the held-out rows
+under the geometric and the hybrid calibration, their ratio, and the share of held-out coordinates inside the predicted
+95 %. A box is trained on the rows whose joints all lie within their 4 % and 96 % quantiles and judged on all
+others; a half is trained on one side of a joint's median and judged on the other side.
+"""
+
+import argparse
+import math
+import os
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.judging.predicted_spread import PredictedSpread, predicted_spread
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.splits import k_folds, with_fewer
+from pisigma.robot import Robot
+
+DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
+FILES = {"ur5": "ur5/grid.csv", "ur10": "ur10/series_c_train.csv"}
+HALVED = {"ur5": (1, 2, 3, 4, 5), "ur10": (1, 3, 5)}
+FEW = (300, 100, 50, 30)
+PARTS = ("folds", "few", "boxes", "halves")
+
+
+@dataclass(frozen=True)
+class Case:
+    """One split: rows to fit to, and rows to judge on."""
+
+    name: str
+    robot: Robot
+    train: Measurements
+    test: Measurements
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Squared position errors of the held-out rows [m²] and what was predicted of them."""
+
+    geometric: Tensor
+    hybrid: Tensor
+    spread: PredictedSpread
+
+
+def folds(name: str, robot: Robot, data: Measurements) -> Iterator[Case]:
+    """Five folds of rows at random."""
+    for k, (train, test) in enumerate(k_folds(data, 5, 0)):
+        yield Case(f"{name} fold {k + 1}", robot, data.select(train), data.select(test))
+
+
+def few(name: str, robot: Robot, data: Measurements) -> Iterator[Case]:
+    """Fewer and fewer of the training rows of the five folds, the UR10 only."""
+    for rows in FEW if name == "ur10" else ():
+        for train, test in with_fewer(data, k_folds(data, 5, 0), rows, 0):
+            yield Case(f"{name} {rows} rows", robot, data.select(train), data.select(test))
+
+
+def boxes(name: str, robot: Robot, data: Measurements) -> Iterator[Case]:
+    """Joints within their 4 % and 96 % quantiles; all others."""
+    low, high = (torch.quantile(data.q, share, 0) for share in (0.04, 0.96))
+    inside = ((data.q >= low) & (data.q <= high)).all(1)
+    yield Case(
+        f"{name} box", robot, data.select(inside.nonzero()[:, 0]), data.select((~inside).nonzero()[:, 0])
+    )
+
+
+def halves(name: str, robot: Robot, data: Measurements) -> Iterator[Case]:
+    """One side of a joint's median; the other."""
+    for joint in HALVED[name]:
+        below = data.q[:, joint - 1] < data.q[:, joint - 1].median()
+        for side, mask in (("below", below), ("above", ~below)):
+            train, test = (data.select(rows.nonzero()[:, 0]) for rows in (mask, ~mask))
+            yield Case(f"{name} joint {joint} {side}", robot, train, test)
+
+
+def judged(case: Case) -> Judged:
+    """Fit and judge."""
+    began = time.perf_counter()
+    result = HybridCalibrator(case.robot).fit(case.train)
+    seconds = time.perf_counter() - began
+    square = [model.errors_of(case.test)["position"].square().sum(1) for model in (result.geometric, result)]
+    one = Judged(*square, predicted_spread(result, case.test))
+    print_line(
+        case.name, one, f"{seconds:5.1f} s  {[trial.name for trial in result.trials if trial.kept][-1]}"
+    )
+    return one
+
+
+def print_line(name: str, one: Judged, more: str) -> None:
+    """One line of the table."""
+    before, after = (float(square.mean().sqrt()) * 1e3 for square in (one.geometric, one.hybrid))
+    print(
+        f"{name:20s} {before:7.4f} {after:7.4f} {after / before:6.3f} {one.spread.coverage:6.1%}  {more}",
+        flush=True,
+    )
+
+
+def main() -> None:
+    """Print one line a fit, and a line for what belongs together."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("parts", nargs="*", default=PARTS)
+    parser.add_argument("--robot", choices=FILES, action="append")
+    arguments = parser.parse_args()
+    print(f"{'case':20s} {'geom.':>7s} {'hybrid':>7s} {'ratio':>6s} {'95 %':>6s}")
+    for part in arguments.parts:
+        ratios, spreads = [], []
+        for name in arguments.robot or FILES:
+            robot = Robot.load(name)
+            data = Measurements.read_csv(DATA / FILES[name], robot)
+            groups: dict[str, list[Judged]] = {}
+            for case in globals()[part](name, robot, data):
+                groups.setdefault(case.name.rsplit(" fold")[0], []).append(judged(case))
+            for group, cases in groups.items():
+                together = Judged(
+                    torch.cat([one.geometric for one in cases]),
+                    torch.cat([one.hybrid for one in cases]),
+                    PredictedSpread.joined([one.spread for one in cases]),
+                )
+                if len(cases) > 1:
+                    print_line(f"{group}, all", together, "")
+                ratios.append(float((together.hybrid.mean() / together.geometric.mean()).sqrt()))
+                spreads.append(together.spread)
+        coverage = PredictedSpread.joined(spreads).coverage
+        mean = math.exp(sum(map(math.log, ratios)) / len(ratios))
+        print(
+            f"{part}: geometric mean of the ratios {mean:.3f}, worst {max(ratios):.3f}, 95 %: {coverage:.1%}\n"
+        )
+
+
+if __name__ == "__main__":
+    main()

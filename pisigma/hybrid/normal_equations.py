@@ -1,0 +1,245 @@
+"""Regression by normal equations: for many values and fewer unknowns."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError
+from pisigma.hybrid.design import CHUNK, Design, Rows
+from pisigma.hybrid.evidence import AbstractRegression, GaussianPrior, LeftOut, Posterior, SensorCount
+from pisigma.hybrid.sensor_values import SensorValues
+from pisigma.joint_correction.feature import AbstractFeature
+
+
+@dataclass(frozen=True, eq=False)
+class NormalEquations(AbstractRegression):
+    """Normal equations of every sensor, before division by its noise's variance.
+
+    Attributes:
+        design: the unknowns.
+        rows: linearised values.
+        normal: `Σ X^T X` per sensor, rows already weighted.
+        descent: `Σ X^T y`.
+        square: `Σ y^T y`.
+        sensors: how many values there are.
+    """
+
+    design: Design
+    rows: Rows
+    normal: Float64[Tensor, "sensors unknowns unknowns"]
+    descent: Float64[Tensor, "sensors unknowns"]
+    square: tuple[float, ...]
+    sensors: tuple[SensorCount, ...]
+
+    @staticmethod
+    def of(design: Design, rows: Rows) -> "NormalEquations":
+        """Sum up the rows, chunk by chunk.
+
+        The columns of a joint's weights are its features times the derivative by its value, `J_j f_jm`. So for two
+        joints `X_j^T X_i = f_j^T diag(J_j^T J_i) f_i`: the components of a value are summed before the products.
+        """
+        sums = [_sensor_sums(design, sensor) for sensor in rows.values]
+        return NormalEquations(
+            design=design,
+            rows=rows,
+            normal=torch.stack([normal for normal, _, _ in sums]),
+            descent=torch.stack([descent for _, descent, _ in sums]),
+            square=tuple(square for _, _, square in sums),
+            sensors=rows.sensors,
+        )
+
+    def select(self, design: Design) -> "NormalEquations":
+        """See `AbstractRegression.select`."""
+        columns = self.design.indices(design.features)
+        normal = torch.stack([N[columns][:, columns] for N in self.normal])
+        return replace(self, design=design, normal=normal, descent=self.descent[:, columns])
+
+    def without(self, groups: Int64[Tensor, " groups"]) -> "NormalEquations":
+        """See `AbstractRegression.without`."""
+        return self._minus(NormalEquations.of(self.design, self.rows.held_out(groups)))
+
+    def _minus(self, other: "NormalEquations") -> "NormalEquations":
+        counts = zip(self.sensors, other.sensors, strict=True)
+        return replace(
+            self,
+            normal=self.normal - other.normal,
+            descent=self.descent - other.descent,
+            square=tuple(a - b for a, b in zip(self.square, other.square, strict=True)),
+            sensors=tuple(replace(a, values=a.values - b.values) for a, b in counts),
+        )
+
+    def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " groups"]]) -> LeftOut:
+        """See `AbstractRegression.left_out`."""
+        scale, factor, x = self._solved(posterior.prior, posterior.noise)
+        parts = []
+        for groups in folds:
+            X, r, number = [], [], []
+            test = self.rows.held_out(groups).values
+            for k, (sensor, sigma) in enumerate(zip(test, posterior.noise, strict=True)):
+                root = sensor.root[:, None] / sigma
+                columns = self.design.columns(sensor, slice(None))
+                X.append((columns * root[..., None]).flatten(0, 1))
+                r.append(((sensor.residual - columns @ x) * root).flatten())
+                number.append(torch.full(r[-1].shape, k, device=x.device))
+            S = torch.linalg.solve_triangular(factor, (torch.cat(X) * scale).t(), upper=False)
+            M = -S.t() @ S
+            M.diagonal().add_(1.0)
+            parts.append(LeftOut.of(M, torch.cat(r), torch.cat(number), self.sensors))
+        return LeftOut.joined(parts)
+
+    def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
+        """Solve `(Σ_s N_s / noise_s² + precision) x = Σ_s b_s / noise_s²` by Cholesky with column scaling."""
+        precision = prior.precision
+        scale, factor, x = self._solved(prior, noise)
+        covariance = _inverse(scale, factor)
+        used = [
+            float(torch.dot(N.flatten(), covariance.flatten())) / sigma**2
+            for N, sigma in zip(self.normal, noise, strict=True)
+        ]
+        misfit = self._misfits(x)
+        log_det = 2 * float(factor.diagonal().log().sum()) - 2 * float(scale.log().sum())
+        log_prior = float(precision[precision > 0].log().sum())
+        fit = sum(total / sigma**2 for total, sigma in zip(misfit, noise, strict=True))
+        evidence = fit + float((x.square() * precision).sum()) + log_det - log_prior
+        evidence = -0.5 * (evidence + log_noise(self.sensors, noise))
+        determined = prior.of_groups(1 - precision * covariance.diagonal())
+        square = prior.of_groups(x.square() * prior.base)
+        return Posterior(x, evidence, prior, noise, square, determined, misfit, tuple(used))
+
+    def first_sizes(
+        self, posterior: Posterior, design: Design, features: AbstractFeature
+    ) -> tuple[float, Tensor | None]:
+        """See `AbstractRegression.first_sizes`.
+
+        The other unknowns are taken out of the normal equations (Schur complement), so that only the weights of the
+        features are left.
+        """
+        columns = self.design.indices((*design.features, features))
+        old, new = columns[: design.unknowns], columns[design.unknowns :]
+        scale, factor, x = self.select(design)._solved(posterior.prior, posterior.noise)
+        normal = sum(N[new] * sigma**-2 for N, sigma in zip(self.normal, posterior.noise, strict=True))
+        descent = sum(b * sigma**-2 for b, sigma in zip(self.descent, posterior.noise, strict=True))
+        square = sum(total / sigma**2 for total, sigma in zip(self.square, posterior.noise, strict=True))
+        cross = normal[:, old]
+        root = torch.linalg.solve_triangular(factor, (cross * scale).t(), upper=False)
+        rest = square - float(descent[old] @ x)
+        alone = replace(
+            self,
+            normal=(normal[:, new] - root.t() @ root)[None],
+            descent=(descent[new] - cross @ x)[None],
+            square=(rest,),
+            sensors=(SensorCount(float(len(new)), False, True),),
+        )
+        whole = Design(design.problem, (*design.features, features)).prior((1.0,) * design.classes)
+        first = int(whole.group[design.unknowns :].min())
+        prior = GaussianPrior(
+            whole.base[design.unknowns :], whole.group[design.unknowns :] - first, whole.sizes[first:], 0
+        )
+        best = alone.maximise_evidence(prior, (1.0,))
+        return best.log_evidence + rest / 2, best.prior.sizes
+
+    def covariance(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
+        """See `AbstractRegression.covariance`."""
+        scale, factor, _ = self._solved(posterior.prior, posterior.noise)
+        return _inverse(scale, factor)
+
+    def _solved(self, prior: GaussianPrior, noise: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
+        """Column scale and Cholesky factor of the matrix, and the most probable values."""
+        normal, descent = torch.zeros_like(self.normal[0]), torch.zeros_like(self.descent[0])
+        for N, b, sigma in zip(self.normal, self.descent, noise, strict=True):
+            normal.add_(N, alpha=sigma**-2)
+            descent.add_(b, alpha=sigma**-2)
+        normal.diagonal().add_(prior.precision)
+        scale, factor = factored(normal)
+        return scale, factor, scale * torch.cholesky_solve((scale * descent)[:, None], factor)[:, 0]
+
+    def _misfits(self, x: Float64[Tensor, " unknowns"]) -> tuple[float, ...]:
+        """`Σ (y - X x)²` per sensor."""
+        cross = (self.descent @ x).tolist()
+        inner = [float(x @ (N @ x)) for N in self.normal]
+        return tuple(
+            max(total - 2 * a + b, 0.0) for total, a, b in zip(self.square, cross, inner, strict=True)
+        )
+
+
+def log_noise(sensors: Sequence[SensorCount], noise: Sequence[float]) -> float:
+    """`Σ log noise²` over all values."""
+    pairs = zip(sensors, noise, strict=True)
+    return sum(2 * sensor.values * math.log(sigma) for sensor, sigma in pairs)
+
+
+def factored(normal: Float64[Tensor, "unknowns unknowns"]) -> tuple[Tensor, Tensor]:
+    """Column scale, and Cholesky factor of the scaled matrix; the matrix is changed in place.
+
+    Raises:
+        IdentificationError: the matrix is not finite.
+    """
+    scale = normal.diagonal().clamp(min=1e-300).rsqrt()
+    scaled = normal.mul_(scale).mul_(scale[:, None])
+    jitter = 1e-14
+    while True:
+        scaled.diagonal().fill_(1 + jitter)
+        factor, failed = torch.linalg.cholesky_ex(scaled)
+        if not failed:
+            return scale, factor
+        if not bool(torch.isfinite(scaled).all()):
+            raise IdentificationError(
+                "the normal equations are not finite; look for values without limit in the measurements."
+            )
+        jitter *= 10
+
+
+def _inverse(scale: Tensor, factor: Tensor) -> Tensor:
+    return torch.cholesky_inverse(factor).mul_(scale).mul_(scale[:, None])
+
+
+def _sensor_sums(design: Design, sensor: SensorValues) -> tuple[Tensor, Tensor, float]:
+    """Normal matrix, right side and square of one sensor's values."""
+    active, dof = design.active, sensor.joints.shape[-1]
+    count = sum(chosen.count for chosen in design.features)
+    size = active + dof * count
+    normal = sensor.root.new_zeros((size, size))
+    descent, square, weight = normal.new_zeros(size), 0.0, sensor.root.square()
+    for rows in torch.arange(len(sensor.row), device=normal.device).split(CHUNK):
+        G, y, w = sensor.geometry[rows], sensor.residual[rows], weight[rows]
+        Gw = G * w[:, None, None]
+        normal[:active, :active] += Gw.flatten(0, 1).t() @ G.flatten(0, 1)
+        descent[:active] += Gw.flatten(0, 1).t() @ y.flatten()
+        square += float((y.square() * w[:, None]).sum())
+        sides = [(_feature_columns(design, row[rows]), joints[rows]) for row, joints in sensor.sides if count]
+        for f, J in sides:
+            Jw = J * w[:, None, None]
+            along, pull = Jw.mT @ G, torch.einsum("rcj,rc->rj", Jw, y)
+            for j in range(dof):
+                block = slice(active + j * count, active + (j + 1) * count)
+                normal[:active, block] += along[:, j].t() @ f[j]
+                descent[block] += pull[:, j] @ f[j]
+            for g, other in sides:
+                shared = Jw.mT @ other
+                for j in range(dof):
+                    blocks = f[j].t() @ (g[j:] * shared[:, j, j:].t()[..., None])
+                    own = slice(active + j * count, active + (j + 1) * count)
+                    normal[own, active + j * count :] += blocks.transpose(0, 1).reshape(count, -1)
+    normal = normal.triu() + normal.triu(1).t()
+    order = torch.cat([torch.arange(active), active + _places(design, dof, count)])
+    return normal[order][:, order], descent[order], square
+
+
+def _feature_columns(design: Design, row: Tensor) -> Float64[Tensor, "dof rows columns"]:
+    """Columns of all features at some rows of the problem, those that a joint does not have as well."""
+    state = design.problem.state[row]
+    return torch.cat([chosen.columns(state) for chosen in design.features], -1).movedim(1, 0).contiguous()
+
+
+def _places(design: Design, dof: int, count: int) -> Int64[Tensor, " weights"]:
+    """Where the weights stand, joint by joint and all columns of all features in turn."""
+    first, places = 0, [torch.zeros(0, dtype=torch.int64)]
+    for chosen in design.features:
+        own = torch.arange(dof)[:, None] * count + first + torch.arange(chosen.count)
+        places.append(own[chosen.used])
+        first += chosen.count
+    return torch.cat(places)

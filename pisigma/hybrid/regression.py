@@ -1,0 +1,16 @@
+"""Which form of the regression is the cheaper one."""
+
+from pisigma.hybrid.design import Design, Rows
+from pisigma.hybrid.evidence import AbstractRegression
+from pisigma.hybrid.normal_equations import NormalEquations
+from pisigma.hybrid.value_covariance import ValueCovariance
+
+MOST_VALUES = 1_000
+"""The covariance of the values is used up to so many, whose matrices of all groups then take up to 200 MB."""
+
+
+def regression(design: Design, rows: Rows) -> AbstractRegression:
+    """Normal equations, or the covariance of the values where there are few values and more unknowns."""
+    values = sum(sensor.residual.numel() for sensor in rows.values)
+    few = values <= min(MOST_VALUES, design.unknowns)
+    return ValueCovariance.of(design, rows) if few else NormalEquations.of(design, rows)

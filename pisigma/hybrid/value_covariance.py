@@ -1,0 +1,200 @@
+"""Regression by the covariance of the values, as with Gaussian processes: for few values and many unknowns."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.hybrid.design import Design, Rows
+from pisigma.hybrid.evidence import AbstractRegression, GaussianPrior, LeftOut, Posterior, SensorCount
+from pisigma.hybrid.normal_equations import factored, log_noise
+
+
+@dataclass(frozen=True, eq=False)
+class ValueCovariance(AbstractRegression):
+    """The values' covariance `V = Σ_g size_g² K_g + noise²` under the prior of the weights, beside the parameters.
+
+    With G the columns of the parameters and Z those of the weights, `K_g = Σ_i Z_i Z_i^T / base_i` over the
+    weights of group g, and `P = V^-1 - V^-1 G (G^T V^-1 G + Λ)^-1 G^T V^-1`::
+
+        parameters = (G^T V^-1 G + Λ)^-1 G^T V^-1 y        weights_i = size² / base_i · Z_i^T P y
+        determined_g = size_g² tr(P K_g)                    y - X x = noise² P y
+
+    By Woodbury's identity posterior and evidence are those of `NormalEquations`. Source: Rasmussen and Williams,
+    Gaussian Processes for Machine Learning, 2006, sections 2.2, 2.7 and 5.4.
+
+    Attributes:
+        design: the unknowns.
+        X: weighted columns, the parameters first.
+        y: weighted values.
+        sensor: number of every value's sensor.
+        group: of the rows that are held out together; -1 of values that are certain.
+        prior: whose groups and base the matrices K are of; its sizes do not matter.
+        K: of every group of weights, the lower triangle.
+        sensors: how many values there are.
+    """
+
+    design: Design
+    X: Float64[Tensor, "values unknowns"]
+    y: Float64[Tensor, " values"]
+    sensor: Int64[Tensor, " values"]
+    group: Int64[Tensor, " values"]
+    prior: GaussianPrior
+    K: Float64[Tensor, "groups pairs"]
+    sensors: tuple[SensorCount, ...]
+
+    @staticmethod
+    def of(design: Design, rows: Rows) -> "ValueCovariance":
+        """Make the matrices K of all rows."""
+        parts = []
+        for number, sensor in enumerate(rows.values):
+            X = design.columns(sensor, slice(None))
+            root = sensor.root[:, None]
+            y = sensor.residual * root
+            group = torch.full_like(sensor.row, -1) if sensor.certain else rows.group[sensor.row]
+            parts.append(
+                (
+                    (X * root[..., None]).flatten(0, 1),
+                    y.flatten(),
+                    torch.full((y.numel(),), number, device=y.device),
+                    group.repeat_interleave(sensor.components),
+                )
+            )
+        X, y, number, group = (torch.cat(column) for column in zip(*parts, strict=True))
+        prior = design.prior((1.0,) * design.classes)
+        K = [_gram(X, prior, g, design.active) for g in range(prior.classes, len(prior.sizes))]
+        return ValueCovariance(design, X, y, number, group, prior, _stacked(K, y), rows.sensors)
+
+    def select(self, design: Design) -> "ValueCovariance":
+        """See `AbstractRegression.select`."""
+        columns = self.design.indices(design.features)
+        X, prior = self.X[:, columns], design.prior((1.0,) * design.classes)
+        before = self.prior.group[columns]
+        K = []
+        for g in range(prior.classes, len(prior.sizes)):
+            other = int(before[(prior.group == g).nonzero()[0, 0]])
+            whole = int((prior.group == g).sum()) == int((self.prior.group == other).sum())
+            K.append(self.K[other - prior.classes] if whole else _gram(X, prior, g, design.active))
+        return replace(self, design=design, X=X, prior=prior, K=_stacked(K, self.y))
+
+    def without(self, groups: Int64[Tensor, " groups"]) -> "ValueCovariance":
+        """See `AbstractRegression.without`."""
+        kept = (~torch.isin(self.group, groups)).nonzero()[:, 0]
+        sensor = self.sensor[kept]
+        share = torch.bincount(sensor, minlength=len(self.sensors)) / torch.bincount(
+            self.sensor, minlength=len(self.sensors)
+        ).clamp(min=1)
+        counts = zip(self.sensors, share.tolist(), strict=True)
+        return replace(
+            self,
+            X=self.X[kept],
+            y=self.y[kept],
+            sensor=sensor,
+            group=self.group[kept],
+            K=self.K[:, (torch.isin(self._triangle, kept)).all(0)],
+            sensors=tuple(replace(one, values=one.values * part) for one, part in counts),
+        )
+
+    def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " groups"]]) -> LeftOut:
+        """See `AbstractRegression.left_out`; `noise² P` is `I - X C X^T`, and `noise² P y` the residual."""
+        sigma = self.y.new_tensor(posterior.noise)[self.sensor]
+        P = self._projection(posterior.prior, posterior.noise)[0].mul_(sigma).mul_(sigma[:, None])
+        residual = P @ (self.y / sigma)
+        parts = []
+        for groups in folds:
+            chosen = torch.isin(self.group, groups).nonzero()[:, 0]
+            parts.append(
+                LeftOut.of(P[chosen][:, chosen], residual[chosen], self.sensor[chosen], self.sensors)
+            )
+        return LeftOut.joined(parts)
+
+    def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
+        """See `AbstractRegression.solve`."""
+        P, parameters, covariance, log_det = self._projection(prior, noise)
+        active, precision = self.design.active, prior.precision
+        variance = self.y.new_tensor(noise).square()[self.sensor]
+        alpha = P @ self.y
+        x = torch.cat([parameters, (self.X[:, active:].t() @ alpha) / precision[active:]])
+        own = torch.zeros_like(x)
+        own[:active] = parameters.square() * prior.base[:active]
+        square = prior.of_groups(own)
+        own[:active] = 1 - precision[:active] * covariance.diagonal()
+        determined = prior.of_groups(own)
+        size = prior.sizes[prior.classes :].square()
+        row, column = self._triangle
+        twice = torch.where(row == column, 1.0, 2.0)
+        by_group = self.K @ torch.stack([P[row, column] * twice, alpha[row] * alpha[column] * twice], 1)
+        determined[prior.classes :] = size * by_group[:, 0]
+        square[prior.classes :] = size.square() * by_group[:, 1]
+        held = precision[:active]
+        evidence = float(self.y @ alpha) + log_det - float(held[held > 0].log().sum())
+        evidence += log_noise(self.sensors, noise) - float(variance.log().sum())
+        misfit = self._by_sensor((variance * alpha).square())
+        used = self._by_sensor(1 - variance * P.diagonal())
+        return Posterior(x, -0.5 * evidence, prior, noise, square, determined, misfit, used)
+
+    def covariance(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
+        """See `AbstractRegression.covariance`."""
+        prior, active = posterior.prior, self.design.active
+        P, _, own, _ = self._projection(prior, posterior.noise)
+        V = self._covariance(prior, posterior.noise)
+        scaled = self.X[:, active:] / prior.precision[active:]
+        covariance = -scaled.t() @ (P @ scaled)
+        covariance.diagonal().add_(1 / prior.precision[active:])
+        cross = -own @ torch.linalg.solve(V, self.X[:, :active]).t() @ scaled
+        return torch.cat([torch.cat([own, cross], 1), torch.cat([cross.t(), covariance], 1)])
+
+    def _covariance(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Tensor:
+        """V."""
+        row, column = self._triangle
+        V = self.y.new_zeros((len(self.y), len(self.y)))
+        V[row, column] = prior.sizes[prior.classes :].square() @ self.K
+        V = V + V.tril(-1).t()
+        V.diagonal().add_(self.y.new_tensor(noise).square()[self.sensor])
+        return V
+
+    @cached_property
+    def _triangle(self) -> Int64[Tensor, "2 pairs"]:
+        """Row and column of the values' pairs."""
+        return torch.tril_indices(len(self.y), len(self.y), device=self.y.device)
+
+    def _projection(
+        self, prior: GaussianPrior, noise: tuple[float, ...]
+    ) -> tuple[Tensor, Tensor, Tensor, float]:
+        """P, the parameters and their covariance, and `log |V| + log |G^T V^-1 G + Λ|`."""
+        active = self.design.active
+        scale, factor = factored(self._covariance(prior, noise))
+        G = self.X[:, :active]
+        inverse = torch.cholesky_inverse(factor).mul_(scale).mul_(scale[:, None])
+        along = inverse @ G
+        normal = G.t() @ along
+        normal.diagonal().add_(prior.precision[:active])
+        own_scale, own_factor = factored(normal)
+        covariance = torch.cholesky_inverse(own_factor).mul_(own_scale).mul_(own_scale[:, None])
+        parameters = covariance @ (along.t() @ self.y)
+        log_det = sum(
+            2 * float(f.diagonal().log().sum()) - 2 * float(s.log().sum())
+            for s, f in ((scale, factor), (own_scale, own_factor))
+        )
+        return inverse - along @ covariance @ along.t(), parameters, covariance, log_det
+
+    def _by_sensor(self, values: Tensor) -> tuple[float, ...]:
+        """Sums of the values of every sensor, those that are alike counted less."""
+        sums = torch.zeros(len(self.sensors)).to(values).index_add(0, self.sensor, values)
+        return tuple(sums.tolist())
+
+
+def _gram(X: Tensor, prior: GaussianPrior, group: int, active: int) -> Tensor:
+    """K of one group."""
+    columns = (prior.group == group).nonzero()[:, 0]
+    columns = columns[columns >= active]
+    Z = X[:, columns] * prior.base[columns].rsqrt()
+    row, column = torch.tril_indices(len(X), len(X), device=X.device)
+    return (Z @ Z.t())[row, column]
+
+
+def _stacked(K: list[Tensor], y: Tensor) -> Tensor:
+    return torch.stack(K) if K else y.new_zeros((0, len(y) * (len(y) + 1) // 2))
