@@ -1,7 +1,7 @@
 """The hybrid calibrator: geometry, base, tool, sensor unknowns and a Pi-Sigma joint correction together."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.hybrid.evidence import FIRST_SIZE, GaussianPrior, Posterior, SensorCount
+from pisigma.hybrid.evidence import FIRST_SIZE, GaussianPrior, SensorCount
 from pisigma.hybrid.sensor_values import SensorValues
 from pisigma.identification.problem.loss import SquaredLoss
 from pisigma.identification.problem.noise import PriorGroup
@@ -69,7 +69,7 @@ class Design:
         if not self.features or not len(values.row):
             return moved
         for row, joints in values.sides:
-            for rows in torch.arange(len(row)).split(CHUNK):
+            for rows in chunks(len(row)):
                 delta = self.correction(change, self.problem.state[row[rows]])
                 moved[rows] += torch.einsum("rcj,rj->rc", joints[rows], delta)
         return moved
@@ -236,6 +236,11 @@ class Rows:
             first, second = ((one.residual - moved) * one.root[:, None] for one in (here, there))
             total += float((first - second).square().sum()) / sigma**2
         return total
+
+
+def chunks(count: int) -> list[slice]:
+    """Rows that are worked on together."""
+    return [slice(start, start + CHUNK) for start in range(0, count, CHUNK)]
 
 
 def weigh(

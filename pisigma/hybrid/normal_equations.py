@@ -9,7 +9,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
-from pisigma.hybrid.design import CHUNK, Design, Rows
+from pisigma.hybrid.design import Design, Rows, chunks
 from pisigma.hybrid.evidence import AbstractRegression, GaussianPrior, LeftOut, Posterior, SensorCount
 from pisigma.hybrid.sensor_values import SensorValues
 from pisigma.joint_correction.feature import AbstractFeature
@@ -204,7 +204,7 @@ def _sensor_sums(design: Design, sensor: SensorValues) -> tuple[Tensor, Tensor, 
     size = active + dof * count
     normal = sensor.root.new_zeros((size, size))
     descent, square, weight = normal.new_zeros(size), 0.0, sensor.root.square()
-    for rows in torch.arange(len(sensor.row), device=normal.device).split(CHUNK):
+    for rows in chunks(len(sensor.row)):
         G, y, w = sensor.geometry[rows], sensor.residual[rows], weight[rows]
         Gw = G * w[:, None, None]
         normal[:active, :active] += Gw.flatten(0, 1).t() @ G.flatten(0, 1)

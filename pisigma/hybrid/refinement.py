@@ -62,14 +62,16 @@ def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], rows: Row
         chosen: as fitted to those.
     """
     design, posterior, fit = Design(problem, chosen.design.features), chosen.posterior, chosen.regression
-    for rounds in range(MOST_ROUNDS):
+    rounds = 1
+    while rounds < MOST_ROUNDS:
         there = linearised(design, posterior.x, posterior.effective, group)
         differs = there.agrees(rows, posterior.x, design, posterior.noise)
         if differs < SETTLED * posterior.effective:
             break
         rows, fit = there, regression(design, there)
         posterior = fit.maximise_evidence(posterior.prior, posterior.noise)
-    return _refined(rows, design, posterior, fit, rounds + 1)
+        rounds += 1
+    return _refined(rows, design, posterior, fit, rounds)
 
 
 def refined_at(design: Design, posterior: Posterior, group: Int64[Tensor, " rows"], rounds: int) -> Refined:

@@ -107,7 +107,7 @@ class Search:
         self, features: Sequence[AbstractFeature], near: Fitted | None = None, sizes: Tensor | None = None
     ) -> Fitted:
         """Fit geometry and features, from the noise and the prior sizes of another fit; the last sizes may be given."""
-        design = Design(self._regression.design.problem, tuple(features))
+        design = Design(self.rows.problem, tuple(features))
         noise, prior = self.noise, design.prior(self.prior_scale)
         if near is not None:
             noise, prior = near.posterior.noise, design.prior_like(near.design, near.posterior.prior)

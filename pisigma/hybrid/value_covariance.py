@@ -50,7 +50,7 @@ class ValueCovariance(AbstractRegression):
     def of(design: Design, rows: Rows) -> "ValueCovariance":
         """Make the matrices K of all rows."""
         parts = []
-        for number, sensor in enumerate(rows.values):
+        for k, sensor in enumerate(rows.values):
             X = design.columns(sensor, slice(None))
             root = sensor.root[:, None]
             y = sensor.residual * root
@@ -59,7 +59,7 @@ class ValueCovariance(AbstractRegression):
                 (
                     (X * root[..., None]).flatten(0, 1),
                     y.flatten(),
-                    torch.full((y.numel(),), number, device=y.device),
+                    torch.full((y.numel(),), k, device=y.device),
                     group.repeat_interleave(sensor.components),
                 )
             )

@@ -181,7 +181,7 @@ class HybridSection(Section):
     Attributes:
         features: of the unit of order 1 that are tried.
         harmonics: of the Fourier series, tried in this order.
-        orders: numbers of factors of product units, tried in this order.
+        products: whether product units are tried.
         gravity: direction in which things fall, in the frame of the robot's first row.
         mini_batches: whether the unknowns are trained on mini-batches: true, false, or "auto" for many rows only; or
             their `batch_rows`, `epochs`, `learning_rate` and `seed`.
@@ -189,7 +189,7 @@ class HybridSection(Section):
 
     features: tuple[str, ...] = HybridCalibrator.features
     harmonics: tuple[int, ...] = HybridCalibrator.harmonics
-    orders: tuple[tuple[int, ...], ...] = HybridCalibrator.orders
+    products: bool = HybridCalibrator.products
     gravity: tuple[float, float, float] = HybridCalibrator.gravity
     mini_batches: MiniBatches | bool | Literal["auto"] = HybridCalibrator.mini_batches
 

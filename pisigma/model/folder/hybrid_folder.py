@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pisigma.hybrid.alternating_products import AlternatingProducts
 from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.joint_correction.feature import AbstractFeature, turning_rate
+from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.registry import feature_from
 from pisigma.model.calibrated_model import CalibratedModel
@@ -58,7 +58,7 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
                 for group, owners in known.geometry.unknowns.items()
             },
             "free": _free_rows(known),
-            "turns": [chosen.turn for chosen in known.features if isinstance(chosen, AlternatingProducts)],
+            "products": any(isinstance(chosen, InputProducts) for chosen in known.features),
             "prior_scale": known.prior_scale,
         }
     return result
@@ -101,8 +101,8 @@ def hybrid_shapes(document: ModelDocument, robot: Robot) -> dict[str, Shape]:
         result |= {f"correction.{key}": tuple(value.shape) for key, value in empty.state_dict().items()}
         result |= {f"coverage.{name}": (None,) for name in ("joint", "middle", "half")}
         weights = sum(int(chosen.used.sum()) for chosen in empty.features)
-        turns = 0 if known is None else len(known.turns)
-        weights += turns * robot.dof * len(empty.orders) * (empty.weight.shape[2] + 1)
+        if known is not None and known.products:
+            weights += InputProducts(robot).used.numel()
     if known is not None:
         result["uncertainty.root"] = (len(known.free) + weights, None)
     return result
@@ -219,9 +219,6 @@ def _uncertainty(
     robot, bases, tools = place
     space = ParameterSpace(drawn, tuple(bases), tuple(tools), _unknowns(known))
     count, free = len(space.parameters), list(known.free)
-    products = 0 if hybrid is None else len(hybrid.correction.orders)
-    if bool(products) != bool(known.turns):
-        raise ValueError(f"turns of product units do not fit: {products} units and turns {list(known.turns)}")
     if sorted(set(free)) != free or (free and free[-1] >= count):
         raise ValueError(f"the free parameters are rising numbers below {count}, got {free}")
     full = torch.zeros(count + len(root) - len(free), root.shape[1], dtype=torch.float64)
@@ -267,10 +264,8 @@ def _unknowns(known: UncertaintySection) -> tuple[UnknownGroup, ...]:
 
 
 def _weighted(known: UncertaintySection, hybrid: HybridArm | None) -> tuple[AbstractFeature, ...]:
-    """What the weights in the root belong to: the features, and factors of product units with the others held."""
+    """What the weights in the root belong to: the features, and the products that product units make up."""
     if hybrid is None:
         return ()
-    correction = hybrid.correction
-    factors = torch.cat([correction.bias[..., None], correction.weight], -1).detach()
-    held = [AlternatingProducts(correction.robot, correction.orders, factors, turn) for turn in known.turns]
-    return (*correction.features, *held)
+    features, robot = hybrid.correction.features, hybrid.correction.robot
+    return (*features, InputProducts(robot)) if known.products else features

@@ -67,8 +67,8 @@ class UncertaintySection(Section):
         values: by group and owner, the unknowns in the owner's frame [m or rad]; empty in folders that were upgraded
             from a format without them.
         free: which parameters have a row in the root; the others' rows are 0. Behind them come all weights.
-        turns: whose turn it is, for every stretch of weights of product units that stands behind the others: see
-            `pisigma.hybrid.alternating_products.AlternatingProducts`.
+        products: whether the weights of products of inputs stand behind the others: see
+            `pisigma.joint_correction.input_products.InputProducts`.
         prior_scale: see `pisigma.hybrid.uncertainty.PositionUncertainty`.
     """
 
@@ -77,7 +77,7 @@ class UncertaintySection(Section):
     others: dict[str, UnknownsSection] = Field(default_factory=dict)
     values: dict[str, dict[str, tuple[FiniteFloat, ...]]] = Field(default_factory=dict)
     free: tuple[Annotated[int, Field(ge=0)], ...]
-    turns: tuple[Annotated[int, Field(ge=0)], ...]
+    products: bool
     prior_scale: Annotated[float, Field(gt=0)]
 
 
