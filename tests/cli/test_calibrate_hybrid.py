@@ -25,7 +25,7 @@ TRIAL = {"name", "unknowns", "log_evidence", "left_out", "seconds", "kept"}
 def few_choices():
     """Try few features, so that a calibration takes a second."""
     whole = HybridCalibrator.__init__
-    few = {"features": ("gravity", "series"), "harmonics": (4, 8), "orders": ()}
+    few = {"features": ("gravity", "series"), "harmonics": (4, 8), "products": False}
 
     def with_few(self, robot, **options):
         whole(self, robot, **(few | options))
@@ -217,7 +217,7 @@ def trained_hybrid(run, repository, tmp_path_factory):
     ):
         assert old in text
         text = text.replace(old, new)
-    (folder / "small.yaml").write_text(text + "hybrid: {harmonics: [4, 8], orders: []}\n")
+    (folder / "small.yaml").write_text(text + "hybrid: {harmonics: [4, 8], products: false}\n")
     result = run("train", folder / "small.yaml", "--out", folder / "model", "--json")
     assert result.exit_code == 0, result.output
     return folder, json.loads(result.stdout)
@@ -258,7 +258,7 @@ def test_simulated_rows_of_a_hybrid_recipe(run, refuses, trained_hybrid, tmp_pat
 def test_a_measured_recipe_is_cross_validated(run, repository, data, tmp_path):
     text = (repository / "training" / "ur5_hybrid.yaml").read_text().replace("robot: ur5", "robot: rb5")
     text = text.replace("folds: 5", "folds: 2").replace("[30, 50, 100, 300]", "[60]")
-    (tmp_path / "measured.yaml").write_text(text + "hybrid: {harmonics: [8], orders: []}\n")
+    (tmp_path / "measured.yaml").write_text(text + "hybrid: {harmonics: [8], products: false}\n")
     result = run("train", tmp_path / "measured.yaml", "--data", data, "--out", tmp_path / "model")
     assert result.exit_code == 0, result.output
     assert "pose errors of 200 held-out rows (2 folds)" in result.stdout

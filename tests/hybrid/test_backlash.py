@@ -52,7 +52,7 @@ def measured(play_deg: float, rows: int, seed: int, noise: float) -> Measurement
 def fitted(play_deg: float, stated: bool) -> HybridResult:
     data = measured(play_deg, 60, 0, NOISE)
     with no_type_checker():
-        return HybridCalibrator(ROBOT, harmonics=(8,), orders=()).fit(
+        return HybridCalibrator(ROBOT, harmonics=(8,), products=False).fit(
             data if stated else dataclasses.replace(data, approach=None)
         )
 
@@ -97,7 +97,7 @@ def test_rows_of_one_side_alone_do_not_show_it():
     data = measured(ARC_MINUTE, 60, 0, NOISE)
     one = dataclasses.replace(data, approach=torch.ones_like(data.q))
     with no_type_checker():
-        result = HybridCalibrator(ROBOT, features=("backlash",), orders=()).fit(one)
+        result = HybridCalibrator(ROBOT, features=("backlash",), products=False).fit(one)
     assert result.learned is None
 
 
@@ -116,7 +116,7 @@ def test_equal_joint_values_from_both_sides_are_no_repeats():
         q=q, position=position + NOISE * torch.from_numpy(rng.normal(size=position.shape)), approach=approach
     )
     with no_type_checker():
-        result = HybridCalibrator(ROBOT, features=("backlash",), orders=()).fit(twice)
+        result = HybridCalibrator(ROBOT, features=("backlash",), products=False).fit(twice)
     assert result.learned is not None
     assert rms(result, from_the_other_side(ARC_MINUTE)) < 6e-5
 

@@ -48,7 +48,7 @@ def distances(rows: int) -> tuple[TrueRobot, Measurements]:
 
 def test_frames_that_no_distance_tells_are_those_of_the_geometric_calibration():
     _, data = distances(360)
-    calibrator = HybridCalibrator(GeometricCalibrator(Robot.load("rb5")), harmonics=(4,), orders=())
+    calibrator = HybridCalibrator(GeometricCalibrator(Robot.load("rb5")), harmonics=(4,), products=False)
     result = calibrator.fit(data)
     learned = result.learned
     assert learned is not None

@@ -1,15 +1,19 @@
-"""Normal equations of chosen columns, their prior, and smaller designs as parts of larger ones."""
+"""Unknowns of a design, their prior and their columns, and what they change."""
+
+from dataclasses import replace
 
 import pytest
 import torch
 from testing.closeness import assert_close
 from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data
+from testing.regression_cases import all_kinds
 
-from pisigma.hybrid.design import Design, sum_up, weighted_columns
+from pisigma.hybrid.design import Design
 from pisigma.hybrid.evidence import FIRST_SIZE
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
+from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.shared_features import ScaledJoints
 from pisigma.measurement.conditions import JointState
 from pisigma.robot import Robot
@@ -27,51 +31,56 @@ def features(robot: Robot, harmonics: int) -> tuple[AbstractFeature, ...]:
     return ScaledJoints(robot), GravityTorques(robot), FourierSeries(robot, harmonics)
 
 
-def test_sums_are_those_of_all_columns_at_once(arm: LinearisedArm, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever fits into a chunk; rows count by the square of their root."""
-    monkeypatch.setattr("pisigma.hybrid.design.CHUNK", 17)
-    design = Design(arm.rows.problem, features(arm.rows.problem.space.robot, 3))
-    weight = torch.linspace(0.5, 2.0, 60, dtype=torch.float64)
-    values = [sensor.weighted(weight) for sensor in arm.rows.values]
-    here = 1e-4 * torch.randn(design.unknowns, generator=torch.Generator().manual_seed(1)).double()
-    found = sum_up(design, values, here)
-    for k, (sensor, X, y) in enumerate(zip(values, *weighted_columns(design, values, here), strict=True)):
-        columns = design.columns(sensor, slice(None))
-        assert_close(X, columns * weight.sqrt()[:, None, None], atol=1e-14)
-        assert_close(y, (sensor.residual + columns @ here) * weight.sqrt()[:, None], atol=1e-14)
-        scale = float(columns.abs().max()) ** 2 * 60
-        assert_close(found.normal[k], torch.einsum("rci,rcj->ij", X, X), atol=1e-13 * scale)
-        assert_close(found.descent[k], torch.einsum("rci,rc->i", X, y), atol=1e-13 * scale)
-        assert_close(found.square[k], float(y.square().sum()), rtol=1e-12)
-    assert found.count == (180.0, 180.0)
+def test_what_unknowns_move_is_their_columns_times_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever fits into a chunk; of sensors of all kinds, distances between two rows among them."""
+    case = all_kinds()
+    x = 1e-4 * torch.randn(case.design.unknowns, generator=torch.Generator().manual_seed(1)).double()
+    for chunk in (2_048, 7):
+        monkeypatch.setattr("pisigma.hybrid.design.CHUNK", chunk)
+        for values in case.rows.values:
+            expected = case.design.columns(values, slice(None)) @ x
+            assert_close(case.design.moved(values, x), expected, atol=1e-14)
+    geometry = Design(case.rows.problem, ())
+    values = case.rows.values[0]
+    moved = geometry.moved(values, x[: geometry.unknowns])
+    assert_close(moved, values.geometry @ x[: geometry.unknowns], atol=1e-15)
 
 
-def test_sums_count_from_nominal_or_from_where_the_values_were_linearised(arm: LinearisedArm) -> None:
-    design = Design(arm.rows.problem, ())
-    nowhere, zero = (
-        sum_up(design, arm.rows.values, here) for here in (None, torch.zeros(design.unknowns).double())
-    )
-    assert_close(nowhere.descent, zero.descent)
-    assert nowhere.square == zero.square
-    there = sum_up(design, arm.rows.values, arm.rows.here)
-    moved = zero.descent + zero.normal @ arm.rows.here
-    assert_close(there.descent, moved, atol=1e-12 * float(zero.normal.abs().max()))
+def test_the_correction_is_the_weighted_sum_of_the_used_columns(arm: LinearisedArm) -> None:
+    robot = arm.rows.problem.space.robot
+    design = Design(arm.rows.problem, features(robot, 3))
+    x = torch.randn(design.unknowns, generator=torch.Generator().manual_seed(1)).double()
+    q = drawn_joints(robot, 6, 4)
+    made = JointCorrection(robot, design.features).requires_grad_(False)
+    for number, chosen in enumerate(design.features):
+        made.linear[number][chosen.used] = x[design.stretch(number)]
+    assert_close(design.correction(x, JointState(q)), made(q), atol=1e-13)
 
 
 @pytest.mark.parametrize("chosen", [(0,), (1, 2), (2,), (2, 0), ()])
-def test_sums_of_a_smaller_design_are_a_part_of_those_of_a_larger(
+def test_columns_of_a_smaller_design_are_a_part_of_those_of_a_larger(
     arm: LinearisedArm, chosen: tuple[int, ...]
 ) -> None:
     """Of fewer features, in another order, and of a series with fewer harmonics."""
     robot = arm.rows.problem.space.robot
     large = Design(arm.rows.problem, features(robot, 7))
     small = Design(arm.rows.problem, tuple(features(robot, 3)[k] for k in chosen))
-    whole, part = (sum_up(design, arm.rows.values, arm.rows.start(design)) for design in (large, small))
     places = large.indices(small.features)
     assert len(places) == len(set(places.tolist())) == small.unknowns
-    found = whole.select(places)
-    assert_close(found.normal, part.normal, atol=1e-13 * float(part.normal.abs().max()))
-    assert_close(found.descent, part.descent, atol=1e-13 * float(part.descent.abs().max()))
+    values = arm.rows.values[1]
+    assert_close(large.columns(values, slice(None))[..., places], small.columns(values, slice(None)))
+
+
+def test_a_prior_starts_from_the_sizes_that_another_design_came_to(arm: LinearisedArm) -> None:
+    """New bands of a series as its last one; other features as always."""
+    robot, problem = arm.rows.problem.space.robot, arm.rows.problem
+    small = Design(problem, (FourierSeries(robot, 2), ScaledJoints(robot)))
+    large = Design(problem, (GravityTorques(robot), ScaledJoints(robot), FourierSeries(robot, 4)))
+    sizes = torch.tensor([0.5, 2.0, 1.0, 3.0, 1e-4, 2e-4, 5e-4], dtype=torch.float64)
+    found = large.prior_like(small, replace(small.prior((1.0,) * 4), sizes=sizes))
+    expected = [0.5, 2.0, 1.0, 3.0, FIRST_SIZE, 5e-4, 1e-4, 2e-4, 2e-4, 2e-4]
+    assert_close(found.sizes, torch.tensor(expected, dtype=torch.float64), rtol=1e-7)
+    assert_close(found.base, large.prior((1.0,) * 4).base)
 
 
 def test_columns_that_a_joint_does_not_have_get_no_unknown(arm: LinearisedArm) -> None:

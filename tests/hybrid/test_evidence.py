@@ -8,19 +8,12 @@ import pytest
 import torch
 from scipy.stats import multivariate_normal
 from testing.closeness import assert_close
+from testing.dense_regression import DenseRegression
+from testing.regression_cases import poses
 from torch import Tensor
 
-from pisigma.errors import IdentificationError
-from pisigma.hybrid.evidence import (
-    SMALLEST_SIZE,
-    GaussianPrior,
-    Sums,
-    maximise_evidence,
-    misfits,
-    renewed_noise,
-    solve_mean,
-    solve_posterior,
-)
+from pisigma.hybrid.evidence import SMALLEST_SIZE, GaussianPrior
+from pisigma.hybrid.normal_equations import NormalEquations
 from pisigma.identification.problem.noise import SMALLEST_PRIOR
 
 GROUP = torch.tensor([0, 0, 1, 1, 1, 2, 2, 2])
@@ -43,17 +36,6 @@ def problem(seed: int = 0, rows: int = 30) -> tuple[list[Tensor], list[Tensor]]:
     return X, y
 
 
-def sums_of(X: list[Tensor], y: list[Tensor], known: tuple[bool, ...] = (False, False)) -> Sums:
-    return Sums(
-        torch.stack([columns.t() @ columns for columns in X]),
-        torch.stack([columns.t() @ target for columns, target in zip(X, y, strict=True)]),
-        tuple(float(target @ target) for target in y),
-        tuple(float(len(target)) for target in y),
-        known,
-        (False,) * len(y),
-    )
-
-
 def prior(sizes: tuple[float, ...] = (0.7, 1.5, 0.4), classes: int = 0, **options: object) -> GaussianPrior:
     base = torch.linspace(0.5, 2.0, 8, dtype=torch.float64)
     return GaussianPrior(base, GROUP, torch.tensor(sizes, dtype=torch.float64), classes, **options)  # type: ignore[arg-type]
@@ -70,15 +52,19 @@ def marginal(X: list[Tensor], y: list[Tensor], precision: Tensor, noise: tuple[f
 @pytest.mark.parametrize("seed", range(3))
 def test_posterior_is_that_of_normal_variables(seed: int) -> None:
     X, y = problem(seed)
-    found = solve_posterior(sums_of(X, y), prior(), NOISE)
+    fit = DenseRegression.between(X, y)
+    found = fit.solve(prior(), NOISE)
     columns, targets = (
         np.concatenate([(part / sigma).numpy() for part, sigma in zip(parts, NOISE, strict=True)])
         for parts in (X, y)
     )
     covariance = np.linalg.inv(columns.T @ columns + np.diag(prior().precision.numpy()))
-    assert_close(found.covariance, covariance, atol=1e-12)
+    assert_close(fit.covariance(found), covariance, atol=1e-12)
     assert_close(found.x, covariance @ columns.T @ targets, atol=1e-12)
-    assert_close(solve_mean(sums_of(X, y), prior(), NOISE), found.x, atol=1e-13)
+    told = 1 - prior().precision.numpy() * covariance.diagonal()
+    assert_close(found.effective, told.sum(), rtol=1e-10)
+    assert_close(found.determined, np.bincount(GROUP, told), rtol=1e-10)
+    assert_close(found.square, np.bincount(GROUP, prior().base.numpy() * found.x.numpy() ** 2), rtol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -86,7 +72,7 @@ def test_log_evidence_is_the_marginal_density_up_to_a_constant_of_the_data(seed:
     X, y = problem(seed)
     constant = 0.5 * sum(map(len, y)) * math.log(2 * math.pi)
     for sizes, noise in (((0.7, 1.5, 0.4), NOISE), ((3.0, 0.1, 1e-3), (0.2, 2.0))):
-        found = solve_posterior(sums_of(X, y), prior(sizes), noise).log_evidence
+        found = DenseRegression.between(X, y).solve(prior(sizes), noise).log_evidence
         assert_close(found, marginal(X, y, prior(sizes).precision, noise) + constant, atol=1e-7)
 
 
@@ -97,23 +83,15 @@ def test_unknowns_without_a_prior_add_a_constant_to_the_log_evidence() -> None:
     flat = replace(known, base=torch.where(GROUP == 0, 0.0, known.base))
     precision = torch.where(GROUP == 0, wide, known.precision)
     constant = 0.5 * sum(map(len, y)) * math.log(2 * math.pi) - 0.5 * 2 * math.log(wide)
-    found = solve_posterior(sums_of(X, y), flat, NOISE).log_evidence
+    found = DenseRegression.between(X, y).solve(flat, NOISE).log_evidence
     assert_close(found, marginal(X, y, precision, NOISE) + constant, atol=1e-4)
-
-
-def test_misfits_are_the_squared_residuals() -> None:
-    X, y = problem()
-    x = normal(8, seed=7)
-    expected = [float((target - columns @ x).square().sum()) for columns, target in zip(X, y, strict=True)]
-    assert_close(np.array(misfits(sums_of(X, y), x)), np.array(expected), rtol=1e-12)
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_log_evidence_is_stationary_in_sizes_and_noise(seed: int) -> None:
     X, y = problem(seed, rows=60)
-    sums = sums_of(X, y)
-    found = maximise_evidence(sums, prior(), NOISE, iterations=500, tolerance=0.0)
-    assert found.iterations == 500
+    fit = DenseRegression.between(X, y)
+    found = fit.maximise_evidence(prior(), NOISE, iterations=500, tolerance=0.0)
 
     def evidence(log_change: Tensor) -> float:
         sizes = found.prior.sizes * log_change[:3].exp()
@@ -121,7 +99,7 @@ def test_log_evidence_is_stationary_in_sizes_and_noise(seed: int) -> None:
             sigma * math.exp(change)
             for sigma, change in zip(found.noise, log_change[3:].tolist(), strict=True)
         )
-        return solve_posterior(sums, replace(found.prior, sizes=sizes), noise).log_evidence
+        return fit.solve(replace(found.prior, sizes=sizes), noise).log_evidence
 
     step = 1e-4
     slopes = []
@@ -130,16 +108,46 @@ def test_log_evidence_is_stationary_in_sizes_and_noise(seed: int) -> None:
         change[k] = step
         slopes.append((evidence(change) - evidence(-change)) / (2 * step))
     assert_close(np.array(slopes), 0.0, atol=1e-4)
-    assert found.log_evidence > solve_posterior(sums, prior(), NOISE).log_evidence
+    assert found.log_evidence > fit.solve(prior(), NOISE).log_evidence
+
+
+def test_log_evidence_of_linearised_rows_is_stationary() -> None:
+    """Of normal equations, in the sizes of all groups that the data determine, and in both noises."""
+    case = poses()
+    fit = NormalEquations.of(case.design, case.rows)
+    found = fit.maximise_evidence(case.prior, case.noise, 300, 1e-9)
+    moving = (found.prior.sizes > 10 * SMALLEST_SIZE).nonzero()[found.prior.classes :, 0].tolist()
+    assert moving
+    step, slopes = 1e-3, []
+    for number in [*moving, -1, -2]:
+        ends = []
+        for sign in (1, -1):
+            sizes, noise = found.prior.sizes.clone(), list(found.noise)
+            if number < 0:
+                noise[number] *= math.exp(sign * step)
+            else:
+                sizes[number] *= math.exp(sign * step)
+            ends.append(fit.solve(replace(found.prior, sizes=sizes), tuple(noise)).log_evidence)
+        slopes.append((ends[0] - ends[1]) / (2 * step))
+    assert_close(np.array(slopes), 0.0, atol=1e-2)
 
 
 def test_more_updates_never_make_a_settled_search_worse() -> None:
     X, y = problem(rows=60)
-    few, many = (maximise_evidence(sums_of(X, y), prior(), NOISE, count, 0.0) for count in (10, 400))
+    fit = DenseRegression.between(X, y)
+    few, many = (fit.maximise_evidence(prior(), NOISE, count, 0.0) for count in (10, 400))
     assert many.log_evidence >= few.log_evidence - 1e-9
-    settled = maximise_evidence(sums_of(X, y), prior(), NOISE, 400, 1e-3)
-    assert settled.iterations < 400
+    settled = fit.maximise_evidence(prior(), NOISE, 400, 1e-3)
+    assert settled.log_evidence < many.log_evidence
     assert_close(settled.log_evidence, many.log_evidence, atol=0.1)
+
+
+def test_no_updates_are_the_posterior_as_it_is() -> None:
+    fit = DenseRegression.between(*problem())
+    found = fit.maximise_evidence(prior(), NOISE, 0)
+    assert_close(found.prior.sizes, prior().sizes)
+    assert found.noise == NOISE
+    assert found.log_evidence == fit.solve(prior(), NOISE).log_evidence
 
 
 def test_groups_without_effect_go_to_the_floor_and_the_others_do_not() -> None:
@@ -150,7 +158,7 @@ def test_groups_without_effect_go_to_the_floor_and_the_others_do_not() -> None:
     noise = normal(200, seed=3)
     noise = noise - X @ torch.linalg.lstsq(X, noise).solution
     y = X[:, ~quiet] @ normal(int((~quiet).sum()), seed=2) + 0.1 * noise
-    found = maximise_evidence(sums_of([X], [y]), prior(), (0.5,), 100, 0.0)
+    found = DenseRegression.between([X], [y]).maximise_evidence(prior(), (0.5,), 100, 0.0)
     assert_close(found.prior.sizes[2], SMALLEST_SIZE, rtol=1e-6)
     assert float(found.prior.sizes[:2].min()) > 0.1
     assert_close(found.x[quiet], torch.zeros(3), atol=1e-12)
@@ -160,20 +168,19 @@ def test_groups_without_effect_go_to_the_floor_and_the_others_do_not() -> None:
 def test_sizes_of_classes_keep_their_limits_and_stand_where_they_are_fixed() -> None:
     X, y = problem()
     nothing = [torch.zeros_like(target) for target in y]
-    shrunk = maximise_evidence(sums_of(X, nothing), prior(classes=2), NOISE, 50, 0.0).prior.sizes
+    shrunk = (
+        DenseRegression.between(X, nothing).maximise_evidence(prior(classes=2), NOISE, 50, 0.0).prior.sizes
+    )
     assert_close(shrunk, torch.tensor([SMALLEST_PRIOR, SMALLEST_PRIOR, SMALLEST_SIZE]).double(), rtol=1e-6)
-    fixed = maximise_evidence(sums_of(X, y), prior(classes=2, fixed=True), NOISE).prior.sizes
+    fixed = DenseRegression.between(X, y).maximise_evidence(prior(classes=2, fixed=True), NOISE).prior.sizes
     assert_close(fixed[:2], prior().sizes[:2])
     assert float((fixed[2] / prior().sizes[2]).log().abs()) > 1e-3
-    standing = maximise_evidence(sums_of(X, y), prior(standing=(1,)), NOISE).prior.sizes
-    assert float(standing[1]) == 1.5
-    assert float(standing[0]) != 0.7
 
 
 def test_sizes_of_which_nothing_is_told_stand() -> None:
     X, y = problem()
     X = [columns * (GROUP != 1) for columns in X]
-    found = maximise_evidence(sums_of(X, y), prior(), NOISE, 30, 0.0)
+    found = DenseRegression.between(X, y).maximise_evidence(prior(), NOISE, 30, 0.0)
     assert float(found.prior.sizes[1]) == 1.5
     assert_close(found.x[GROUP == 1], torch.zeros(3))
 
@@ -182,51 +189,33 @@ def test_noise_that_is_given_falls_below_it_never_and_of_what_is_certain_not_at_
     X, y = problem()
     scaled = [part / sigma for part, sigma in zip(X, NOISE, strict=True)]
     small = [0.3 * target / sigma for target, sigma in zip(y, NOISE, strict=True)]
-    sums = sums_of(scaled, small, (True, False))
-    found = renewed_noise(sums, solve_posterior(sums, prior(), (1.0, 1.0)))
+    fit = DenseRegression.between(scaled, small, stated=(True, False))
+    found = fit.renewed_noise(fit.solve(prior(), (1.0, 1.0)))
     assert found[0] == 1.0
     assert 0.1 < found[1] < 0.6
-    large = sums_of(scaled, [10 * target for target in small], (True, True))
-    posterior = solve_posterior(large, prior(), (1.0, 1.0))
-    assert renewed_noise(large, posterior)[0] > 2.0
-    assert renewed_noise(replace(large, exact=(True, False)), posterior)[0] == 1.0
+    more = [10 * target for target in small]
+    large = DenseRegression.between(scaled, more, stated=(True, True))
+    posterior = large.solve(prior(), (1.0, 1.0))
+    assert large.renewed_noise(posterior)[0] > 2.0
+    exact = DenseRegression.between(scaled, more, stated=(True, True), exact=(True, False))
+    assert exact.renewed_noise(posterior)[0] == 1.0
 
 
-def test_sums_without_some_rows_are_the_sums_of_the_others() -> None:
+def test_noise_is_the_misfit_over_the_values_that_the_unknowns_leave() -> None:
+    fit = DenseRegression.between(*problem())
+    posterior = fit.solve(prior(), NOISE)
+    C, X = fit.covariance(posterior), fit.X[:30] / NOISE[0]
+    residual = fit.y[:30] - fit.X[:30] @ posterior.x
+    used = float(((X @ C) * X).sum())
+    assert_close(posterior.used[0], used, rtol=1e-10)
+    expected = math.sqrt(float(residual.square().sum()) / (30 - used))
+    assert_close(fit.renewed_noise(posterior)[0], expected, rtol=1e-10)
+
+
+def test_share_of_the_values_that_are_used_up_counts_what_is_measured() -> None:
     X, y = problem()
-    whole = sums_of(X, y)
-    part = sums_of([columns[::3] for columns in X], [target[::3] for target in y])
-    left = [torch.arange(len(target)) % 3 != 0 for target in y]
-    rest = sums_of(*([part[keep] for part, keep in zip(parts, left, strict=True)] for parts in (X, y)))
-    found = whole.minus(part)
-    assert_close(found.normal, rest.normal, atol=1e-11)
-    assert_close(found.descent, rest.descent, atol=1e-11)
-    assert_close(np.array(found.square), np.array(rest.square), rtol=1e-11)
-    assert found.count == rest.count
-
-
-def test_sums_and_prior_of_some_unknowns_are_those_of_their_columns() -> None:
-    X, y = problem()
-    chosen = torch.tensor([7, 1, 2])
-    found, own = sums_of(X, y).select(chosen), sums_of([columns[:, chosen] for columns in X], y)
-    assert_close(found.normal, own.normal, atol=1e-12)
-    assert_close(found.descent, own.descent, atol=1e-12)
-    assert_close(prior().select(chosen).precision, prior().precision[chosen])
-
-
-def test_equal_columns_without_a_prior_are_still_solved() -> None:
-    X, y = problem()
-    twice = [torch.cat([columns, columns[:, :1] * 1e-6], 1) for columns in X]
-    flat = GaussianPrior(
-        torch.zeros(9).double(), torch.zeros(9, dtype=torch.int64), torch.ones(1).double(), 0
-    )
-    x = solve_mean(sums_of(twice, y), flat, (1.0, 1.0))
-    best = torch.linalg.lstsq(torch.cat(X), torch.cat(y)).solution
-    assert_close(torch.cat(twice) @ x, torch.cat(X) @ best, atol=1e-5)
-
-
-def test_values_that_are_not_finite_are_refused() -> None:
-    X, y = problem()
-    broken = sums_of([X[0] * float("nan"), X[1]], y)
-    with pytest.raises(IdentificationError, match="not finite"):
-        solve_posterior(broken, prior(), NOISE)
+    fit = DenseRegression.between(X, y)
+    posterior = fit.solve(prior(), NOISE)
+    assert_close(fit.effective_share(posterior), posterior.effective / 45, rtol=1e-12)
+    known = DenseRegression.between(X, y, exact=(False, True))
+    assert_close(known.effective_share(posterior), posterior.effective / 30, rtol=1e-12)

@@ -19,7 +19,7 @@ def rms(result: HybridResult | CalibrationResult, measurements: Measurements) ->
 
 
 def calibrator(robot: Robot) -> HybridCalibrator:
-    return HybridCalibrator(robot, harmonics=(8, 24), orders=())
+    return HybridCalibrator(robot, harmonics=(8, 24), products=False)
 
 
 @pytest.mark.parametrize(

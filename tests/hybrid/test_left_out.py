@@ -1,120 +1,120 @@
-"""Left-out errors in closed form against solving again without the rows."""
+"""Left-out errors in closed form against fitting again without the rows."""
 
 from dataclasses import replace
 
 import pytest
 import torch
 from testing.closeness import assert_close
-from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data
-from testing.sensors import mixed_data, true_robot
+from testing.regression_cases import CASES, few_values, poses
+from torch import Tensor
 
-from pisigma.hybrid.design import sum_up
-from pisigma.hybrid.evidence import solve_posterior
-from pisigma.hybrid.left_out import folds_left_out, left_out
-from pisigma.joint_correction.feature import AbstractFeature
-from pisigma.joint_correction.fourier_series import FourierSeries
-from pisigma.joint_correction.gravity_torques import GravityTorques
-from pisigma.measurement.dataset import Measurements
-from pisigma.robot import Robot
+from pisigma.hybrid.evidence import AbstractRegression, LeftOut, SensorCount
+from pisigma.hybrid.normal_equations import NormalEquations
+from pisigma.hybrid.value_covariance import ValueCovariance
+
+FORMS = {"normal equations": NormalEquations, "value covariance": ValueCovariance}
 
 
-def poses_with_repeats() -> tuple[LinearisedArm, tuple[AbstractFeature, ...]]:
-    """Positions and rotations; some joint values are measured twice, some three times."""
-    robot = Robot.load("rb5")
-    q = drawn_joints(robot, 30, 0)
-    q = torch.cat([q, q[:10], q[:5]])
-    data = tracker_data(robot, q, 2e-4 * torch.sin(q), 3e-5, turn_noise=1e-4, several=True)
-    return linearised(robot, data), (FourierSeries(robot, 2),)
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("name", CASES)
+def test_closed_form_equals_fitting_without_every_group(name: str, form: str) -> None:
+    """Where nothing else says where sockets of a placement or an anchor are, that is fitted to the left-out rows."""
+    case = CASES[name]()
+    fit: AbstractRegression = FORMS[form].of(case.design, case.rows)
+    found = fit.left_out(fit.solve(case.prior, case.noise), case.folds)
+    expected = case.refitted
+    assert found.sensor.tolist() == expected.sensor.tolist()
+    assert len(found.error) >= len(case.folds)
+    assert_close(found.error, expected.error, atol=1e-4 if name == "all kinds" else 1e-6)
+    assert_close(found.spread, expected.spread, rtol=1e-4 if name == "all kinds" else 1e-6)
 
 
-def positions_beside_poses() -> tuple[LinearisedArm, tuple[AbstractFeature, ...]]:
-    """Rows of different kinds: some without a rotation, some without a position."""
-    robot = Robot.load("rb5")
-    data = tracker_data(robot, drawn_joints(robot, 45, 1), noise=3e-5, turn_noise=1e-4, several=False)
-    position, rotation = data.position, data.rotation
-    assert position is not None
-    assert rotation is not None
-    position[::5], rotation[1::5] = torch.nan, torch.nan
-    return linearised(robot, Measurements(q=data.q, position=position, rotation=rotation)), (
-        GravityTorques(robot),
-    )
+@pytest.mark.parametrize("form", FORMS)
+def test_several_groups_can_be_left_out_together(form: str) -> None:
+    case = poses()
+    folds = case.rows.folds(4, 1000)
+    assert sorted(torch.cat(folds).tolist()) == list(range(case.rows.groups))
+    fit: AbstractRegression = FORMS[form].of(case.design, case.rows)
+    found = fit.left_out(fit.solve(case.prior, case.noise), folds)
+    expected = case.dense.left_out(case.dense.solve(case.prior, case.noise), folds)
+    assert_close(found.error, expected.error, atol=1e-6)
+    assert_close(found.spread, expected.spread, rtol=1e-6)
 
 
-def all_kinds() -> tuple[LinearisedArm, tuple[AbstractFeature, ...]]:
-    """All kinds of sensors, and a distance of sockets that is known for certain."""
-    robot, data = true_robot().nominal, mixed_data()
-    generator = torch.Generator().manual_seed(2)
-
-    def noisy(values: torch.Tensor | None) -> torch.Tensor:
-        assert values is not None
-        return values + 5e-5 * torch.randn(values.shape, generator=generator, dtype=torch.float64)
-
-    assert data.distance is not None
-    assert data.pair is not None
-    distance = torch.where(torch.tensor([not p for p in data.pair]), noisy(data.distance), data.distance)
-    data = replace(
-        data, q=noisy(data.q), position=noisy(data.position), touch=noisy(data.touch), distance=distance
-    )
-    known = {("plate/0", "plate/1"): 0.05}
-    arm = linearised(robot, data, socket_distances=known)
-    return arm, (FourierSeries(robot, 1),)
+@pytest.mark.parametrize("form", FORMS)
+def test_sizes_and_noise_can_be_estimated_anew_for_every_fold(form: str) -> None:
+    case = poses()
+    folds = case.rows.folds(3, 1000)
+    fit: AbstractRegression = FORMS[form].of(case.design, case.rows)
+    found = fit.left_out_anew(fit.solve(case.prior, case.noise), folds, 3)
+    expected = case.dense.left_out_anew(case.dense.solve(case.prior, case.noise), folds, 3)
+    assert_close(found.error, expected.error, atol=1e-4)
+    assert_close(found.spread, expected.spread, rtol=1e-4)
+    held = fit.left_out(fit.solve(case.prior, case.noise), folds)
+    assert float((held.error - found.error).abs().max()) > 1e-2
 
 
-CASES = {"repeats": poses_with_repeats, "gaps": positions_beside_poses, "all kinds": all_kinds}
-
-
-@pytest.mark.parametrize("name", sorted(CASES))
-def test_closed_form_equals_solving_without_each_configuration(name: str) -> None:
-    arm, features = CASES[name]()
-    fitted = arm.fitted(features, 10)
-    rows, design, posterior = arm.rows, fitted.design, fitted.posterior
-    found = left_out(rows, design, posterior)
-    measured = [sensor for sensor in rows.values if not sensor.certain]
-    assert len(found.error) == sum(sensor.residual.numel() for sensor in measured)
-    scale = float(found.error.square().mean().sqrt())
-    for number in range(0, rows.configurations, max(rows.configurations // 25, 1)):
-        mask = torch.zeros(rows.configurations, dtype=torch.bool)
-        mask[number] = True
-        test = rows.of(mask)  # what is certain is not left out
-        measured_only = tuple(
-            sensor.select(torch.tensor([], dtype=torch.int64)) if sensor.certain else sensor
-            for sensor in test.values
-        )
-        test = replace(test, values=measured_only)
-        rest = fitted.sums.minus(sum_up(design, test.values, test.start(design)))
-        without = solve_posterior(rest, posterior.prior, posterior.noise)
-        for k, sensor in enumerate(test.values):
-            own = (found.configuration == number) & (found.sensor == k)
-            if sensor.certain or not len(sensor.row):
-                assert not bool(own.any())
-                continue
-            X = design.columns(sensor, slice(None))
-            root = sensor.root[:, None] / posterior.noise[k]
-            error = (sensor.residual + X @ (test.start(design) - without.x)) * root
-            whitened = X * root[..., None]
-            spread = (1 + ((whitened @ without.covariance) * whitened).sum(-1)).sqrt()
-            assert_close(found.error[own], error.flatten(), atol=1e-6 * scale, rtol=1e-6)
-            assert_close(found.spread[own], spread.flatten(), rtol=1e-6)
-
-
-def test_errors_are_larger_than_the_residuals_and_as_large_as_predicted() -> None:
-    arm, features = poses_with_repeats()
-    fitted = arm.fitted(features)
-    found = left_out(arm.rows, fitted.design, fitted.posterior)
-    residual = arm.rows.left(fitted.design, fitted.posterior, fitted.posterior.noise).sum()
-    assert float(found.error.square().sum()) > float(residual)
+def test_errors_are_larger_than_the_residuals_and_about_as_large_as_predicted() -> None:
+    case = few_values()
+    fit = ValueCovariance.of(case.design, case.rows)
+    posterior = fit.maximise_evidence(case.prior, case.noise)
+    found = fit.left_out(posterior, case.folds)
+    residual = sum(m / sigma**2 for m, sigma in zip(posterior.misfit, posterior.noise, strict=True))
+    assert float(found.error.square().sum()) > residual
     assert float(found.spread.min()) >= 1.0
-    assert 0.8 < float((found.error / found.spread).square().mean()) < 1.25
+    assert 0.5 < float((found.error / found.spread).square().mean()) < 2.0
 
 
-def test_folds_agree_roughly_with_single_configurations() -> None:
-    arm, features = positions_beside_poses()
-    fitted = arm.fitted(features)
-    one = left_out(arm.rows, fitted.design, fitted.posterior)
-    folds = folds_left_out(arm.rows, fitted.design, fitted.posterior, fitted.sums)
-    assert sorted(folds.configuration.tolist()) == sorted(one.configuration.tolist())
-    assert float(folds.spread.min()) >= 1.0
-    ratio = float((folds.error.square().mean() / one.error.square().mean()).sqrt())
-    assert 0.8 < ratio < 1.4
-    again = folds_left_out(arm.rows, fitted.design, fitted.posterior, fitted.sums)
-    assert_close(again.error, folds.error)
+def test_placements_of_sockets_and_anchors_are_among_what_is_left_out() -> None:
+    """All values of three placements of two sockets each, and of a wire; of none of what is certain."""
+    case = CASES["all kinds"]()
+    names = [values.name for values in case.rows.values]
+    count = torch.bincount(case.refitted.sensor, minlength=len(names)).tolist()
+    assert count[names.index("socket")] == case.rows.values[names.index("socket")].residual.numel()
+    assert count[names.index("distance")] == 80
+    assert count[names.index("socket distance")] == 0
+
+
+def residuals(count: int, seed: int = 0) -> tuple[Tensor, Tensor, Tensor]:
+    """Columns of unknowns that only these values determine, a covariance, and values."""
+    generator = torch.Generator().manual_seed(seed)
+    Z, A = (torch.randn(count, k, generator=generator, dtype=torch.float64) for k in (2, count))
+    return Z, torch.eye(count).double() + 0.1 * A @ A.t(), torch.randn(count, generator=generator).double()
+
+
+def test_what_only_left_out_values_determine_counts_as_fitted_to_them() -> None:
+    """By least squares; errors are scaled to what as many values would show that nothing is fitted to."""
+    Z, S, y = residuals(8)
+    inverse = torch.linalg.inv(S)
+    M = inverse - inverse @ Z @ torch.linalg.inv(Z.t() @ inverse @ Z) @ Z.t() @ inverse
+    sensor = torch.zeros(8, dtype=torch.int64)
+    counts = [SensorCount(8.0, False, False)]
+    found = LeftOut.of(M, M @ y, sensor, counts)
+    expected = (y - Z @ torch.linalg.lstsq(Z, y).solution) * (8 / 6) ** 0.5
+    assert_close(found.error, expected, atol=1e-9)
+    free = torch.eye(8).double() - Z @ torch.linalg.pinv(Z)
+    spread = (free @ S @ free).diagonal().clamp(min=1.0).sqrt()
+    assert_close(found.spread, spread, rtol=1e-9)
+
+
+def test_values_that_say_no_more_than_one_err_by_more_than_their_share() -> None:
+    """Counted as a third, a value has three times the variance of noise that its weight says."""
+    _, S, y = residuals(6, 1)
+    sensor = torch.tensor([0, 0, 0, 1, 1, 1])
+    counts = [SensorCount(3.0, False, False), SensorCount(1.0, False, False, 3.0)]
+    M = torch.linalg.inv(S)
+    alone = LeftOut.of(M, M @ y, sensor, [counts[0], replace(counts[1], repetition=1.0)])
+    found = LeftOut.of(M, M @ y, sensor, counts)
+    assert_close(alone.error, y, atol=1e-12)
+    assert_close(alone.spread, S.diagonal().sqrt(), rtol=1e-12)
+    assert_close(found.error[:3], alone.error[:3])
+    assert_close(found.error[3:], 3**0.5 * alone.error[3:], rtol=1e-12)
+    assert_close(found.spread[3:].square() - 1, 3 * (alone.spread[3:].square() - 1), rtol=1e-12)
+
+
+def test_root_mean_square_can_be_counted_in_another_noise() -> None:
+    sensor = torch.tensor([0, 0, 1])
+    errors = LeftOut(torch.tensor([3.0, 4.0, 5.0]).double(), torch.ones(3).double(), sensor)
+    assert_close(errors.rms((1.0, 1.0), (1.0, 1.0)), (50 / 3) ** 0.5, rtol=1e-14)
+    assert_close(errors.rms((1.0, 2.0), (1.0, 1.0)), (125 / 3) ** 0.5, rtol=1e-14)
+    assert_close(errors.rms((1.0, 2.0), (2.0, 4.0)), (12.5 / 3) ** 0.5, rtol=1e-14)

@@ -1,40 +1,44 @@
-"""The chosen model on all rows: linearised anew until it settles, and what is uncertain in held factors."""
+"""The chosen model on all rows: linearised anew until it settles, and written as a network."""
+
+from dataclasses import replace
 
 import pytest
 import torch
 from testing.closeness import assert_close
-from testing.hybrid import product_values
 from testing.linearised import drawn_joints, tracker_data
 
-from pisigma.hybrid.alternating_products import AlternatingProducts
 from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.hybrid.refinement import Refined, refine, with_all_factors
+from pisigma.hybrid.refinement import Refined, linearised, refine, refined_at
+from pisigma.hybrid.search import Fitted
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.problem.loss import HampelLoss
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.conditions import JointState
+from pisigma.measurement.groups import held_out_groups
 from pisigma.robot import Robot
 
 ROBOT = Robot.load("rb5")
+ROWS = 260
 
 
-@pytest.fixture(scope="module", params=[(), (2, 2)])
+@pytest.fixture(scope="module", params=[False, True], ids=["additive", "products"])
 def refined(request: pytest.FixtureRequest) -> Refined:
-    """Large joint errors, so that one linearisation is not enough; with product units and without."""
-    q = drawn_joints(ROBOT, 150, 0)
-    delta = 4e-3 * torch.sin(q) + 3e-3 * (q.sin() * q.cos().roll(1, 1))
-    calibrator = HybridCalibrator(GeometricCalibrator(ROBOT), harmonics=(2,), orders=())
+    """Large joint errors, so that one linearisation is not enough for products, which are chosen last."""
+    q = drawn_joints(ROBOT, ROWS, 0)
+    delta = 4e-3 * q.sin() + 3e-3 * (2 * q).cos()
+    if request.param:
+        delta = delta + 1e-2 * q.sin() * q.cos().roll(1, 1)
+    calibrator = HybridCalibrator(GeometricCalibrator(ROBOT), harmonics=(2,), products=request.param)
     solved = calibrator.geometric.solve(tracker_data(ROBOT, q, delta, 3e-5))
-    additive = calibrator._chosen(solved, lambda what: None)[1]
-    return refine(solved, additive, request.param, HampelLoss())
+    group = held_out_groups(solved.setup.measurements)
+    search, chosen = calibrator._chosen(solved, group, lambda what: None)
+    return refine(solved.problem, group, search.rows, chosen)
 
 
 def test_residuals_at_the_solution_are_those_of_the_nonlinear_model(refined: Refined) -> None:
     rows, problem = refined.rows, refined.rows.problem
-    assert refined.rounds >= 2
+    assert refined.rounds >= (2 if refined.correction.orders else 1)
     (values,) = rows.values
-    change = rows.start(refined.design) - refined.posterior.x
-    linear = values.residual + refined.design.columns(values, slice(None)) @ change
+    linear = values.residual - refined.design.columns(values, slice(None)) @ refined.posterior.x
     moved = problem.q + refined.correction(problem.q)
     dh, bases, tools = problem.space.split(refined.point)
     robot = ROBOT.with_geometry(dh=dh.numpy(), base=bases[0].numpy(), tool=tools[0].numpy())
@@ -44,41 +48,52 @@ def test_residuals_at_the_solution_are_those_of_the_nonlinear_model(refined: Ref
 
 
 def test_no_row_is_left_worse_than_noise_and_model_allow(refined: Refined) -> None:
-    products = len(refined.correction.orders)
-    assert (refined.posterior.noise[0] < 6e-5) == bool(products)
-    assert 0 < refined.effective < refined.design.unknowns
+    assert 2e-5 < refined.posterior.noise[0] < 4e-5
+    assert 0 < refined.posterior.effective < refined.design.unknowns
 
 
-def test_held_factors_are_uncertain_too(refined: Refined) -> None:
-    """What they change is the derivative of the products by them, and nothing moves at the solution."""
-    whole = with_all_factors(refined)
-    if not refined.correction.orders:
-        assert whole is refined
-        return
-    held, other = whole.design.features[-2], whole.design.features[-1]
-    assert isinstance(held, AlternatingProducts)
-    assert isinstance(other, AlternatingProducts)
-    assert sorted((*held.free, *other.free)) == [0, 1, 2, 3]
-    q = drawn_joints(ROBOT, 10, 5)
-    factors = other.factors
-    weights = factors[:, list(other.free)].flatten()
-    expected = product_values(ROBOT, factors, (2, 2), q)
-    assert_close((other.columns(JointState(q)) * weights.view(6, -1)).sum(-1), expected, atol=1e-12)
-    assert_close(expected, refined.correction(q) - _additive(refined, q), atol=1e-12)
-    size = refined.design.unknowns
-    assert whole.design.unknowns == size + len(weights)
-    values = refined.rows.values[0]
-    X = whole.design.columns(values, slice(0, 40))
-    more = ((X @ whole.posterior.covariance) * X).sum(-1)
-    less = ((X[..., :size] @ refined.posterior.covariance) * X[..., :size]).sum(-1)
-    assert float((more / less).min()) > 0.99
-    assert float((more / less).median()) > 1.02
+def test_the_network_predicts_what_the_design_does(refined: Refined) -> None:
+    """Products of inputs as product units of order 2, half as many as a joint has inputs at most."""
+    q, design = drawn_joints(ROBOT, 20, 5), refined.design
+    expected = design.correction(refined.posterior.x, JointState(q))
+    assert_close(refined.correction(q), expected, atol=1e-13)
+    orders, names = refined.correction.orders, [chosen.name for chosen in refined.correction.features]
+    assert "products" not in names
+    assert set(orders) <= {2}
+    assert len(orders) <= 12
+    assert bool(orders) == any(chosen.name == "products" for chosen in design.features)
 
 
-def _additive(refined: Refined, q: torch.Tensor) -> torch.Tensor:
-    made = refined.correction
-    parts = [
-        (chosen.columns(JointState(q)) * weight).sum(-1)
-        for chosen, weight in zip(made.features, made.linear, strict=True)
-    ]
-    return torch.stack(parts).sum(0)
+def test_a_solution_that_has_settled_is_not_linearised_again(refined: Refined) -> None:
+    chosen = Fitted(refined.design, refined.regression, refined.posterior)
+    again = refine(refined.rows.problem, refined.rows.group, refined.rows, chosen)
+    assert again.rounds == 1
+    assert again.rows is refined.rows
+    assert again.regression is refined.regression
+    assert_close(again.point, refined.point)
+
+
+def test_rows_on_which_nothing_was_chosen_are_fitted_as_well(refined: Refined) -> None:
+    """Chosen on every other row, it is fitted to all."""
+    problem = refined.rows.problem
+    half = torch.arange(0, ROWS, 2)
+    rows = linearised(
+        replace(refined.design, problem=problem.select(half)),
+        refined.posterior.x,
+        10.0,
+        torch.arange(ROWS // 2),
+    )
+    chosen = Fitted(refined.design, refined.regression, refined.posterior)
+    found = refine(problem, refined.rows.group, rows, chosen)
+    assert found.rounds >= 2
+    assert len(found.rows.values[0].row) == len(refined.rows.values[0].row)
+
+
+def test_unknowns_at_the_solution_are_solved_with_their_sizes_as_they_stand(refined: Refined) -> None:
+    """For a training that ended there: prior sizes stand, noise is renewed."""
+    found = refined_at(refined.design, refined.posterior, refined.rows.group, 7)
+    assert found.rounds == 7
+    assert_close(found.posterior.prior.sizes, refined.posterior.prior.sizes)
+    assert_close(found.posterior.noise[0], refined.posterior.noise[0], rtol=0.05)
+    deviation = refined.regression.covariance(refined.posterior).diagonal().sqrt()
+    assert float(((found.posterior.x - refined.posterior.x) / deviation).abs().max()) < 0.5

@@ -10,13 +10,14 @@ from testing.linearised import drawn_joints, tracker_data, with_directions
 from testing.sensors import mixed_data, pair_data
 from torch import Tensor
 
-from pisigma.hybrid.alternating_products import AlternatingProducts
 from pisigma.hybrid.design import Design
+from pisigma.hybrid.refinement import network
 from pisigma.hybrid.sensor_values import joint_columns, sensor_values
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.problem import CalibrationProblem, MotionMemory
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
+from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.shared_features import SinesCosines
 from pisigma.kinematics.forward import forward_kinematics
@@ -145,44 +146,25 @@ def test_joint_derivatives_are_those_of_the_forward_kinematics(name: str) -> Non
 
 @pytest.mark.parametrize("name", sorted(CASES))
 def test_columns_are_the_derivative_by_the_weights(name: str) -> None:
-    """With a correction in force: of gravity, a series, and product units of which one factor is free."""
+    """With a correction in force: of gravity, a series and products of inputs."""
     robot, _ = CASES[name]()
-    made = JointCorrection(robot, (GravityTorques(robot), FourierSeries(robot, 2)), (2, 3))
+    chosen = (GravityTorques(robot), FourierSeries(robot, 2), InputProducts(robot))
     generator = torch.Generator().manual_seed(4)
-    with torch.no_grad():
-        for parameter in made.parameters():
-            parameter.copy_(0.02 * torch.randn(parameter.shape, generator=generator, dtype=torch.float64))
-        made.weight.add_(0.1)
-    made.requires_grad_(False)
-    factors = torch.cat([made.bias[..., None], made.weight], -1)
-    held = AlternatingProducts(robot, (2, 3), factors, 1)
-    problem, point = case(name, made)
-    design = Design(problem, (*made.features, held))
-    values = sensor_values(problem, point, made)
-    weights = torch.cat(
-        [
-            made.linear[0][made.features[0].used],
-            made.linear[1][made.features[1].used],
-            factors[:, list(held.free)].flatten(),
-        ]
-    )
+    count = sum(int(feature.used.sum()) for feature in chosen)
+    weights = 0.01 * torch.randn(count, generator=generator, dtype=torch.float64)
+    empty = Design(GeometricCalibrator(robot).build(CASES[name]()[1]).problem.with_active([]), chosen)
+    problem, point = case(name, network(empty, weights))
+    design = Design(problem, chosen)
+    values = sensor_values(problem, point, network(empty, weights))
     assert design.unknowns == design.active + len(weights)
 
     def at(moved: Tensor) -> list[Tensor]:
-        own = torch.split(moved, [int(chosen.used.sum()) for chosen in design.features])
-        with torch.no_grad():
-            for k in range(2):
-                made.linear[k][made.features[k].used] = own[k]
-            solved = held.solved(own[2])
-            made.bias.copy_(solved[..., 0])
-            made.weight.copy_(solved[..., 1:])
-        return residuals(problem, point, problem.q + made(problem.q))
+        return residuals(problem, point, problem.q + empty.correction(moved, problem.state))
 
     columns = [design.columns(sensor, slice(None)) for sensor in values]
     for k in torch.randperm(len(weights), generator=generator)[:8].tolist():
         for X, expected in zip(columns, differences(at, weights, 1e-3, k), strict=True):
             assert_close(X[..., design.active + k], expected, atol=1e-9)
-    at(weights)
 
 
 def test_columns_of_pairs_are_the_derivative_by_the_weights() -> None:

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.dense_regression import DenseRegression
 from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data, with_directions
 from torch import Tensor
 
-from pisigma.hybrid.evidence import GaussianPrior, Posterior, Sums, solve_mean, solve_posterior
-from pisigma.hybrid.left_out import LeftOut
+from pisigma.hybrid.evidence import GaussianPrior, LeftOut
+from pisigma.hybrid.search import Fitted
 from pisigma.hybrid.uncertainty import (
     LARGEST_SCALE,
     LEAST_EFFECTIVE,
@@ -44,20 +45,22 @@ def test_root_is_of_the_covariance_in_the_users_coordinates() -> None:
     assert_close(root @ root.t() / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-9)
 
 
-def small_problem() -> tuple[Sums, GaussianPrior]:
+def small_problem() -> tuple[DenseRegression, GaussianPrior]:
     group = torch.tensor([0] * 4 + [1] * 6 + [2] * 3)
     X = normal(60, 13, seed=3)
     X[:, 10:] *= 1e-4  # a group of which hardly anything is told
     truth = normal(13, seed=4) * torch.tensor([1.0, 0.3, 0.5], dtype=torch.float64)[group]
     y = X @ truth + 0.4 * normal(60, seed=5)
-    sums = Sums((X.t() @ X)[None], (X.t() @ y)[None], (float(y @ y),), (60.0,), (False,), (False,))
     sizes = torch.tensor([1.0, 0.3, 0.5], dtype=torch.float64)
-    return sums, GaussianPrior(torch.ones(13, dtype=torch.float64), group, sizes, 0)
+    return DenseRegression.between([X], [y]), GaussianPrior(
+        torch.ones(13, dtype=torch.float64), group, sizes, 0
+    )
 
 
 def test_uncertain_sizes_add_what_the_unknowns_move_with_them() -> None:
-    sums, prior = small_problem()
-    posterior = solve_posterior(sums, prior, (0.4,))
+    fit, prior = small_problem()
+    posterior = fit.solve(prior, (0.4,))
+    covariance = fit.covariance(posterior)
     expected, step = torch.zeros(13, 13, dtype=torch.float64), 1e-4
     told_at_all = []
     for g in range(3):
@@ -65,26 +68,29 @@ def test_uncertain_sizes_add_what_the_unknowns_move_with_them() -> None:
         for sign in (1, -1):
             sizes = prior.sizes.clone()
             sizes[g] *= math.exp(sign * step)
-            ends.append(solve_mean(sums, replace(prior, sizes=sizes), (0.4,)))
+            ends.append(fit.solve(replace(prior, sizes=sizes), (0.4,)).x)
         slope = (ends[0] - ends[1]) / (2 * step)
-        told = float((1 - prior.precision * posterior.covariance.diagonal())[prior.group == g].sum())
+        told = float((1 - prior.precision * covariance.diagonal())[prior.group == g].sum())
         told_at_all.append(told > LEAST_EFFECTIVE)
         if told > LEAST_EFFECTIVE:
             expected += slope[:, None] * slope / (2 * told)
     assert told_at_all == [True, True, False]
-    assert_close(covariance_of_sizes(posterior), expected, atol=1e-7 * float(expected.abs().max()))
+    assert_close(
+        covariance_of_sizes(posterior, covariance), expected, atol=1e-7 * float(expected.abs().max())
+    )
 
 
 def test_sizes_of_unknowns_without_a_prior_add_nothing() -> None:
-    sums, prior = small_problem()
+    fit, prior = small_problem()
     flat = replace(prior, base=torch.where(prior.group == 2, prior.base, 0.0))
-    added = covariance_of_sizes(solve_posterior(sums, flat, (0.4,)))
+    posterior = fit.solve(flat, (0.4,))
+    added = covariance_of_sizes(posterior, fit.covariance(posterior))
     assert_close(added, torch.zeros(13, 13))
 
 
 def missed(error: Tensor, spread: Tensor) -> LeftOut:
     zeros = torch.zeros(len(error), dtype=torch.int64)
-    return LeftOut(error, spread, zeros, zeros)
+    return LeftOut(error, spread, zeros)
 
 
 def test_widening_makes_left_out_errors_as_large_as_predicted() -> None:
@@ -103,22 +109,17 @@ def test_errors_as_small_as_predicted_widen_nothing_and_there_is_a_limit() -> No
 
 
 def test_values_that_the_unknowns_use_up_widen() -> None:
-    sums, prior = small_problem()
-    posterior = solve_posterior(sums, prior, (0.4,))
-    told = float((1 - prior.precision * posterior.covariance.diagonal()).sum())
+    fit, prior = small_problem()
+    posterior = fit.solve(prior, (0.4,))
+    covariance = fit.covariance(posterior)
+    told = float((1 - prior.precision * covariance.diagonal()).sum())
     assert 8 < told < 10
-    assert_close(degrees_of_freedom_factor(posterior, sums), 60 / (60 - told), rtol=1e-12)
-    few = replace(sums, count=(10.0,))
-    assert_close(degrees_of_freedom_factor(posterior, few), 5.0, rtol=1e-12)
-    certain = Sums(
-        torch.cat([sums.normal, sums.normal]),
-        torch.cat([sums.descent] * 2),
-        (*sums.square, 1.0),
-        (60.0, 40.0),
-        (False, True),
-        (False, True),
-    )
-    assert_close(degrees_of_freedom_factor(posterior, certain), 60 / (60 - told), rtol=1e-12)
+    assert_close(degrees_of_freedom_factor(fit, posterior), 60 / (60 - told), rtol=1e-12)
+    (count,) = fit.sensors
+    few = replace(fit, sensors=(replace(count, values=10.0),))
+    assert_close(degrees_of_freedom_factor(few, posterior), 5.0, rtol=1e-12)
+    certain = replace(fit, sensors=(count, replace(count, values=40.0, exact=True)))
+    assert_close(degrees_of_freedom_factor(certain, posterior), 60 / (60 - told), rtol=1e-12)
 
 
 @pytest.fixture(scope="module")
@@ -129,17 +130,17 @@ def arm() -> LinearisedArm:
     return linearised(robot, tracker_data(robot, q, 2e-4 * torch.sin(q), 3e-5, 1e-4, several=True))
 
 
-def uncertainty(arm: LinearisedArm) -> tuple[PositionUncertainty, Posterior, JointCorrection]:
+def uncertainty(arm: LinearisedArm) -> tuple[PositionUncertainty, Fitted, JointCorrection]:
     robot = arm.rows.problem.space.robot
     fitted = arm.fitted((GravityTorques(robot), FourierSeries(robot, 1)), 5)
     problem = arm.rows.problem
     point = problem.nominal.index_add(0, problem.active, fitted.posterior.x[: fitted.design.active])
     known = identified_geometry(arm.setup, point)
-    found = position_uncertainty(arm.rows, fitted.design, fitted.posterior, fitted.sums, known)
+    found = position_uncertainty(arm.rows, fitted.design, fitted.regression, fitted.posterior, known)
     correction = JointCorrection(robot, fitted.design.features).requires_grad_(False)
     for k, chosen in enumerate(fitted.design.features):
         correction.linear[k][chosen.used] = fitted.posterior.x[fitted.design.stretch(k)]
-    return found, fitted.posterior, correction
+    return found, fitted, correction
 
 
 def test_deviation_is_that_of_the_derivative_by_all_unknowns(arm: LinearisedArm) -> None:
@@ -188,10 +189,9 @@ def test_deviation_is_that_of_the_derivative_by_all_unknowns(arm: LinearisedArm)
 
 def test_deviation_is_that_of_drawn_calibrations(arm: LinearisedArm) -> None:
     """The covariance of positions at the training rows, as their columns give it, widened."""
-    robot = arm.rows.problem.space.robot
-    found, _, correction = uncertainty(arm)
-    fitted = arm.fitted((GravityTorques(robot), FourierSeries(robot, 1)), 5)
-    C = fitted.posterior.covariance + covariance_of_sizes(fitted.posterior)
+    found, fitted, correction = uncertainty(arm)
+    C = fitted.regression.covariance(fitted.posterior)
+    C = C + covariance_of_sizes(fitted.posterior, C)
     values = arm.rows.values[0].select(torch.arange(10))
     X = fitted.design.columns(values, slice(None))
     draws = torch.linalg.cholesky(C) @ normal(len(C), 4000, seed=8)
@@ -214,11 +214,11 @@ def test_more_rows_make_it_surer_and_the_widening_is_one_or_more() -> None:
     assert 0.3 < deviations[1] / deviations[0] < 0.75
 
 
-def test_many_configurations_are_left_out_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_of_many_groups_sizes_and_noise_are_those_of_all_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     robot = Robot.load("rb5")
     own = linearised(robot, tracker_data(robot, drawn_joints(robot, 80, 2), noise=3e-5))
     folds = uncertainty(own)[0].prior_scale
-    monkeypatch.setattr("pisigma.hybrid.uncertainty.FEW_CONFIGURATIONS", 10)
+    monkeypatch.setattr("pisigma.hybrid.uncertainty.FEW_GROUPS", 10)
     single = uncertainty(own)[0].prior_scale
     assert 1.0 <= single < 1.5 * folds
     monkeypatch.setattr("pisigma.hybrid.uncertainty.CHUNK", 3)

@@ -21,7 +21,7 @@ from pisigma.se3 import pose_error
 pytestmark = pytest.mark.usefixtures("without_type_checker")
 
 SET_UPS = {
-    "fanuc_r2000": {"orders": ((2,),)},
+    "fanuc_r2000": {"products": True},
     "kiro4": {"share": 0.5},
     "rb5": {},
     "panda": {"features": ("series",)},

@@ -27,7 +27,7 @@ pytestmark = pytest.mark.usefixtures("without_type_checker")
 
 SET_UPS = {
     "additive": {"name": "rb5"},
-    "products": {"name": "rb5", "orders": ((2,),), "frames": True},
+    "products": {"name": "rb5", "products": True, "frames": True},
     "half": {"name": "kiro4", "share": 0.5},
     "joints": {"name": "ur5", "features": ("joints",)},
     "slide": {"name": "kiro3"},

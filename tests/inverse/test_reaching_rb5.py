@@ -16,7 +16,7 @@ def test_commanded_poses_are_reached_as_well_as_positions_are_predicted():
     simulated = simulated_tracker(0, 150)
     geometric = GeometricCalibrator(simulated.robot)
     with no_type_checker():
-        result = HybridCalibrator(geometric, harmonics=(8, 24), orders=()).fit(simulated.train)
+        result = HybridCalibrator(geometric, harmonics=(8, 24), products=False).fit(simulated.train)
         model = model_of_hybrid("rb5", simulated.robot, result, simulated.train)
         wanted = model.forward(simulated.test.q[:1000])  # of the target, which the model takes for the tool
         solution = CorrectedIK(model)(wanted)

@@ -72,7 +72,7 @@ def model() -> CalibratedModel:
     with no_type_checker():
         position = true_poses(q)[:, :3, 3] + 1e-5 * torch.from_numpy(rng.normal(size=(60, 3)))
         rows = Measurements(q=q, position=position)
-        result = HybridCalibrator(ROBOT, features=("coupling",), orders=()).fit(rows)
+        result = HybridCalibrator(ROBOT, features=("coupling",), products=False).fit(rows)
         assert result.learned is not None
         return model_of_hybrid("coupled", ROBOT, result, rows)
 

@@ -45,10 +45,10 @@ def test_every_error_source_is_on(repository):
     [
         (HYBRID, "hybrid: {features: [gravty]}\n", "'hybrid': features: 'gravty' is no choice; did you mean 'gravity'"),
         (HYBRID, "hybrid: {harmonics: []}\n", "'hybrid': harmonics"),
-        (HYBRID, "hybrid: {orders: [[1]]}\n", "'hybrid': orders"),
+        (HYBRID, "hybrid: {products: 3}\n", "'hybrid.products'"),
         (HYBRID, "hybrid: {mini_batches: {batch_rows: 0}}\n", "mini_batches.*batch_rows"),
         (HYBRID, "hybrid: {mini_batches: never}\n", "mini_batches"),
-        (HYBRID, "hybrid: {order: [[2]]}\n", "unknown key 'order' in 'hybrid'; did you mean 'orders'"),
+        (HYBRID, "hybrid: {product: true}\n", "unknown key 'product' in 'hybrid'; did you mean 'products'"),
         (HYBRID, "repeats: 0\n", "'repeats'"),
         ("rows: [30, 50, 75, 100]", "rows: []", "'learning_curve.rows'"),
         ("rows: [30, 50, 75, 100]", "rows: [0]", "'learning_curve.rows"),

@@ -1,19 +1,16 @@
 """Hybrid calibrations of simulated arms, for tests."""
 
 import functools
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from testing.models import no_type_checker
 
-from pisigma.hybrid.alternating_products import with_bias
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
-from pisigma.network.pi_sigma import sum_of_products
 from pisigma.robot import Robot
 from pisigma.se3 import invert, transform_from_xyzrpy
 from pisigma.simulation import TrueRobot
@@ -80,7 +77,7 @@ def hybrid_of(
     name: str,
     rows: int = 200,
     share: float = 1.0,
-    orders: tuple[tuple[int, ...], ...] = (),
+    products: bool = False,
     frames: bool = False,
     features: tuple[str, ...] = ("gravity", "series"),
     payloads: tuple[float, ...] = (),
@@ -91,7 +88,7 @@ def hybrid_of(
         name: of the catalogue.
         rows: measured positions.
         share: of the joint ranges that is measured.
-        orders: of product units that are tried.
+        products: whether product units are tried.
         frames: measure in two frames and with two targets, else in one.
         features: that are tried.
         payloads: masses [kg] that the rows carry in turn, as they state; the usual one and not stated where none.
@@ -119,14 +116,6 @@ def hybrid_of(
     measurements = Measurements(q=q, position=position, **names)
     with no_type_checker():
         calibrator = HybridCalibrator(
-            GeometricCalibrator(true.nominal), features=features, harmonics=(4, 8), orders=orders
+            GeometricCalibrator(true.nominal), features=features, harmonics=(4, 8), products=products
         )
         return HybridArmUnderTest(true, measurements, calibrator.fit(measurements))
-
-
-def product_values(
-    robot: Robot, factors: torch.Tensor, orders: Sequence[int], q: torch.Tensor
-) -> torch.Tensor:
-    """What product units come to [rad or m], from their factors' weights `(dof, factors, inputs)`."""
-    values = torch.einsum("...i,jsi->...js", with_bias(robot, q), factors.to(q))
-    return sum_of_products(values, orders)

@@ -7,8 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pisigma.hybrid.design import Design, Rows, sum_up
-from pisigma.hybrid.evidence import Posterior, Sums, maximise_evidence
+from pisigma.hybrid.design import Design, Rows
+from pisigma.hybrid.normal_equations import NormalEquations
+from pisigma.hybrid.search import Fitted
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import SquaredLoss
@@ -17,7 +18,7 @@ from pisigma.identification.problem.setup import CalibrationSetup
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.groups import groups_of_equal_joints
+from pisigma.measurement.groups import held_out_groups
 from pisigma.robot import Robot
 from pisigma.se3 import invert, rotation_from_vector, transform_from_xyzrpy
 
@@ -84,22 +85,13 @@ class LinearisedArm:
     noise: tuple[float, ...]
     prior_scale: tuple[float, ...]
 
-    def fitted(self, features: Sequence[AbstractFeature], iterations: int = 40) -> "Fitted":
+    def fitted(self, features: Sequence[AbstractFeature], iterations: int = 40) -> Fitted:
         """Geometry and a unit of order 1, prior sizes and noise by the evidence."""
         design = Design(self.rows.problem, tuple(features))
-        sums = sum_up(design, self.rows.values, self.rows.start(design))
+        sums = NormalEquations.of(design, self.rows)
         return Fitted(
-            design, sums, maximise_evidence(sums, design.prior(self.prior_scale), self.noise, iterations)
+            design, sums, sums.maximise_evidence(design.prior(self.prior_scale), self.noise, iterations)
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Fitted:
-    """A design with its normal equations and its posterior."""
-
-    design: Design
-    sums: Sums
-    posterior: Posterior
 
 
 def linearised(robot: Robot, measurements: Measurements, **options: object) -> LinearisedArm:
@@ -107,12 +99,10 @@ def linearised(robot: Robot, measurements: Measurements, **options: object) -> L
     solved = GeometricCalibrator(robot, loss=SquaredLoss(), **options).solve(measurements)  # type: ignore[arg-type]
     here, problem = solved.solution.linearisation, solved.problem
     view = view_of(here)
-    rows = Rows(
-        problem,
-        sensor_values(problem, here.point),
-        (here.point - problem.nominal)[problem.active],
-        groups_of_equal_joints(problem.q),
-    )
+    values, design = sensor_values(problem, here.point), Design(problem, ())
+    weights = [torch.ones_like(sensor.root) for sensor in values]
+    x, group = (here.point - problem.nominal)[problem.active], held_out_groups(solved.setup.measurements)
+    rows = Rows.linearised(design, x, values, weights, group)
     return LinearisedArm(solved.setup, rows, view.noise, view.prior_scale)
 
 

@@ -1,0 +1,151 @@
+"""The regression of the hybrid with all columns in one matrix, by orthogonal factors: what its forms have to equal."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from pisigma.hybrid.design import Design, Rows
+from pisigma.hybrid.evidence import AbstractRegression, GaussianPrior, LeftOut, Posterior, SensorCount
+
+
+@dataclass(frozen=True, eq=False)
+class DenseRegression(AbstractRegression):
+    """All values and their columns.
+
+    Attributes:
+        X: weighted columns.
+        y: weighted values.
+        sensor: number of every value's sensor.
+        group: of the rows that are held out together; -1 of values that are certain.
+        sensors: how many values there are.
+    """
+
+    X: Tensor
+    y: Tensor
+    sensor: Tensor
+    group: Tensor
+    sensors: tuple[SensorCount, ...]
+
+    @staticmethod
+    def of(design: Design, rows: Rows) -> "DenseRegression":
+        """All rows of all sensors, weighted."""
+        parts = []
+        for number, values in enumerate(rows.values):
+            root = values.root[:, None]
+            group = torch.full_like(values.row, -1) if values.certain else rows.group[values.row]
+            parts.append(
+                (
+                    (design.columns(values, slice(None)) * root[..., None]).flatten(0, 1),
+                    (values.residual * root).flatten(),
+                    torch.full((values.residual.numel(),), number),
+                    group.repeat_interleave(values.components),
+                )
+            )
+        return DenseRegression(*map(torch.cat, zip(*parts, strict=True)), sensors=rows.sensors)
+
+    @staticmethod
+    def between(X: Sequence[Tensor], y: Sequence[Tensor], **known: tuple[bool, ...]) -> "DenseRegression":
+        """Of given columns and values of several sensors, every value a group of its own."""
+        sensor = torch.arange(len(y)).repeat_interleave(torch.tensor([len(values) for values in y]))
+        none = (False,) * len(y)
+        flags = zip(y, known.get("stated", none), known.get("exact", none), strict=True)
+        counts = tuple(SensorCount(float(len(values)), stated, exact) for values, stated, exact in flags)
+        return DenseRegression(
+            torch.cat(list(X)), torch.cat(list(y)), sensor, torch.arange(len(sensor)), counts
+        )
+
+    def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
+        """Least squares of the values and the prior together."""
+        sigma, precision = self._sigma(noise), prior.precision
+        R, x = self._factor(prior, noise)
+        residual = self.y - self.X @ x
+        fit = float((residual / sigma).square().sum() + (precision * x.square()).sum())
+        log_det = 2 * float(R.diagonal().abs().log().sum()) - float(precision[precision > 0].log().sum())
+        counts = zip(self.sensors, noise, strict=True)
+        evidence = -0.5 * (fit + log_det + sum(2 * one.values * math.log(s) for one, s in counts))
+        covariance = self._covariance(R)
+        used = ((self.X @ covariance) * self.X).sum(1) / sigma.square()
+        return Posterior(
+            x=x,
+            log_evidence=evidence,
+            prior=prior,
+            noise=noise,
+            square=prior.of_groups(prior.base * x.square()),
+            determined=prior.of_groups(1 - precision * covariance.diagonal()),
+            misfit=self._by_sensor(residual.square()),
+            used=self._by_sensor(used),
+        )
+
+    def covariance(self, posterior: Posterior) -> Tensor:
+        """Inverse of the precision of values and prior together."""
+        return self._covariance(self._factor(posterior.prior, posterior.noise)[0])
+
+    def select(self, design: Tensor) -> "DenseRegression":
+        """Of some columns, by their numbers."""
+        return replace(self, X=self.X[:, design])
+
+    def without(self, groups: Tensor) -> "DenseRegression":
+        """The values of the other groups."""
+        kept = ~torch.isin(self.group, groups)
+        share = [float(kept[self.sensor == k].double().mean()) for k in range(len(self.sensors))]
+        counts = zip(self.sensors, share, strict=True)
+        return DenseRegression(
+            self.X[kept],
+            self.y[kept],
+            self.sensor[kept],
+            self.group[kept],
+            tuple(replace(one, values=one.values * part) for one, part in counts),
+        )
+
+    def left_out(self, posterior: Posterior, folds: Sequence[Tensor]) -> LeftOut:
+        """Fit again without every fold; what the other values say nothing of is fitted to the fold by least squares."""
+        parts = []
+        for groups in folds:
+            chosen = torch.isin(self.group, groups)
+            x, root, unknown = self.without(groups)._solution(posterior.prior, posterior.noise)
+            sigma, sensor = self._sigma(posterior.noise)[chosen], self.sensor[chosen]
+            X, error = self.X[chosen] / sigma[:, None], (self.y - self.X @ x)[chosen] / sigma
+            U, size, _ = torch.linalg.svd(X @ unknown, full_matrices=False)
+            own = U[:, size > 1e-6]
+            free = torch.eye(len(error)).double() - own @ own.t()
+            count = len(error) - own.shape[1]
+            error = free @ error * (len(error) / max(count, 1)) ** 0.5
+            variance = (free @ (torch.eye(len(error)).double() + X @ root @ (X @ root).t()) @ free).diagonal()
+            repetition = error.new_tensor([one.repetition for one in self.sensors])[sensor]
+            spread = (1 + repetition * (variance - 1).clamp(min=0)).sqrt()
+            parts.append(LeftOut(error * repetition.sqrt(), spread, sensor))
+        return LeftOut.joined(parts)
+
+    def _solution(self, prior: GaussianPrior, noise: Sequence[float]) -> tuple[Tensor, Tensor, Tensor]:
+        """Unknowns, root of their covariance, and the directions of which values and prior say nothing."""
+        whole, right = self._whole(prior, noise)
+        scale = whole.norm(dim=0).clamp(min=1.0)
+        U, size, V = torch.linalg.svd(whole / scale, full_matrices=False)
+        known = size > 1e-9
+        root = V[known].t() / size[known] / scale[:, None]
+        return root @ (U[:, known].t() @ right), root, V[~known].t() / scale[:, None]
+
+    def _whole(self, prior: GaussianPrior, noise: Sequence[float]) -> tuple[Tensor, Tensor]:
+        """Values and prior as one least-squares problem."""
+        sigma, precision = self._sigma(noise)[:, None], prior.precision
+        whole = torch.cat([self.X / sigma, torch.diag(precision.sqrt())[precision > 0]])
+        return whole, torch.cat([self.y / sigma[:, 0], torch.zeros(int((precision > 0).sum())).double()])
+
+    def _factor(self, prior: GaussianPrior, noise: Sequence[float]) -> tuple[Tensor, Tensor]:
+        """Triangular root of the precision of all unknowns, and their most probable values."""
+        whole, right = self._whole(prior, noise)
+        Q, R = torch.linalg.qr(whole)
+        return R, torch.linalg.solve_triangular(R, (Q.t() @ right)[:, None], upper=True)[:, 0]
+
+    def _covariance(self, R: Tensor) -> Tensor:
+        inverse = torch.linalg.solve_triangular(R, torch.eye(len(R)).double(), upper=True)
+        return inverse @ inverse.t()
+
+    def _sigma(self, noise: Sequence[float]) -> Tensor:
+        return torch.tensor(noise, dtype=torch.float64)[self.sensor]
+
+    def _by_sensor(self, values: Tensor) -> tuple[float, ...]:
+        return tuple(float(values[self.sensor == k].sum()) for k in range(len(self.sensors)))

@@ -1,0 +1,125 @@
+"""Linearised rows of all kinds with features, prior and noise, for tests of the hybrid's regressions."""
+
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from testing.dense_regression import DenseRegression
+from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data
+from testing.sensors import mixed_data, true_robot
+from torch import Tensor
+
+from pisigma.hybrid.design import Design, Rows
+from pisigma.hybrid.evidence import GaussianPrior, LeftOut
+from pisigma.joint_correction.feature import AbstractFeature
+from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gravity_torques import GravityTorques
+from pisigma.joint_correction.input_products import InputProducts
+from pisigma.joint_correction.shared_features import ScaledJoints
+from pisigma.robot import Robot
+
+
+@dataclass(frozen=True, eq=False)
+class RegressionCase:
+    """What a regression is made from and solved with.
+
+    Attributes:
+        design: all unknowns.
+        smaller: features that are a part of them, one of which may be smaller.
+        rows: linearised.
+        prior: of the unknowns.
+        noise: per sensor.
+        exactness: how near to the dense solution its other forms come, in standard deviations of the unknowns; less
+            where a sensor is nearly certain.
+    """
+
+    design: Design
+    smaller: tuple[AbstractFeature, ...]
+    rows: Rows
+    prior: GaussianPrior
+    noise: tuple[float, ...]
+    exactness: float
+
+    @functools.cached_property
+    def dense(self) -> DenseRegression:
+        """All columns in one matrix."""
+        return DenseRegression.of(self.design, self.rows)
+
+    @functools.cached_property
+    def folds(self) -> tuple[Tensor, ...]:
+        """Groups of many rows, such as those of a placement of sockets or an anchor, and some others, a fold each."""
+        large = torch.bincount(self.rows.group) > 4
+        others = torch.arange(self.rows.groups)[~large][:: max(self.rows.groups // 8, 1)]
+        return tuple(torch.cat([large.nonzero()[:, 0], others])[:, None])
+
+    @functools.cached_property
+    def refitted(self) -> LeftOut:
+        """Values of the folds, predicted by fits without them."""
+        return self.dense.left_out(self.dense.solve(self.prior, self.noise), self.folds)
+
+
+def case_of(
+    arm: LinearisedArm,
+    features: tuple[AbstractFeature, ...],
+    smaller: tuple[AbstractFeature, ...],
+    exactness: float = 1e-6,
+) -> RegressionCase:
+    """With prior sizes that differ from group to group."""
+    design = Design(arm.rows.problem, features)
+    prior = design.prior(arm.prior_scale)
+    factor = torch.linspace(0.5, 3.0, len(prior.sizes), dtype=torch.float64)
+    return RegressionCase(
+        design, smaller, arm.rows, replace(prior, sizes=prior.sizes * factor), arm.noise, exactness
+    )
+
+
+@functools.cache
+def poses() -> RegressionCase:
+    """Positions and rotations of an arm with a sliding joint, rows that count more or less; unused columns."""
+    robot = Robot.load("kiro3")
+    q = drawn_joints(robot, 30, 0)
+    arm = linearised(robot, tracker_data(robot, q, 1e-4 * (3 * q).sin(), 1e-5, turn_noise=1e-5, several=True))
+    weight = torch.linspace(0.5, 2.0, 30, dtype=torch.float64)
+    values = tuple(sensor.weighted(weight) for sensor in arm.rows.values)
+    features = (ScaledJoints(robot), GravityTorques(robot), FourierSeries(robot, 3))
+    smaller = (features[1], FourierSeries(robot, 2))
+    return case_of(replace(arm, rows=replace(arm.rows, values=values)), features, smaller)
+
+
+@functools.cache
+def several_targets() -> RegressionCase:
+    """Two targets a configuration, whose residuals are alike."""
+    robot = Robot.load("rb5")
+    q = drawn_joints(robot, 25, 2).repeat_interleave(4, 0)
+    arm = linearised(robot, tracker_data(robot, q, 3e-4 * (3 * q).sin(), 1e-5, several=True))
+    return case_of(arm, (GravityTorques(robot), FourierSeries(robot, 2)), (FourierSeries(robot, 2),))
+
+
+@functools.cache
+def all_kinds() -> RegressionCase:
+    """All kinds of sensors, sides of pairs, and one row of a distance of sockets that is certain."""
+    robot, data = true_robot().nominal, mixed_data()
+    off = 3e-5 * torch.randn(data.q.shape, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    known = {("plate/0", "plate/1"): 0.05}
+    arm = linearised(robot, replace(data, q=data.q + off), socket_distances=known)
+    features = (GravityTorques(robot), FourierSeries(robot, 2))
+    return case_of(arm, features, (FourierSeries(robot, 1),), exactness=1e-3)
+
+
+@functools.cache
+def few_values() -> RegressionCase:
+    """Far fewer values than unknowns, products among these."""
+    robot = Robot.load("rb5")
+    q = drawn_joints(robot, 20, 1)
+    arm = linearised(robot, tracker_data(robot, q, 2e-4 * q.sin(), 3e-5))
+    features = (GravityTorques(robot), FourierSeries(robot, 4), InputProducts(robot))
+    return case_of(arm, features, (features[0], FourierSeries(robot, 3)))
+
+
+CASES: dict[str, Callable[[], RegressionCase]] = {
+    "poses": poses,
+    "several targets": several_targets,
+    "all kinds": all_kinds,
+    "few values": few_values,
+}
