@@ -99,8 +99,7 @@ class Design:
             count = len(chosen.group_names)
             sizes.append(torch.full((count,), FIRST_SIZE, dtype=torch.float64))
             following += count
-        fixed = problem.prior_sizes != "estimated"
-        return GaussianPrior(torch.cat(base), torch.cat(group), torch.cat(sizes), classes, fixed)
+        return GaussianPrior(torch.cat(base), torch.cat(group), torch.cat(sizes), classes)
 
     def prior_like(self, other: "Design", prior: GaussianPrior) -> GaussianPrior:
         """The prior with sizes to start from that another design's fit came to; new bands as its last one."""

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.identification.problem.noise import LEAST_EFFECTIVE, SMALLEST_NOISE, SMALLEST_PRIOR
+from pisigma.identification.problem.noise import SMALLEST_NOISE
 
 SMALLEST_SIZE = 1e-9
 """Prior size [rad] below which a group of weights is off."""
@@ -30,16 +30,15 @@ class GaussianPrior:
         base: 1 / variance at size 1; 0 where there is no prior knowledge.
         group: number of every unknown's size.
         sizes: standard deviations.
-        classes: the first so many groups are classes of geometric parameters, whose sizes are factors on what
-            was stated; they move only within limits.
-        fixed: whether the sizes of these classes stand.
+        classes: the first so many groups are classes of geometric parameters. Their sizes, factors on what was
+            stated, stand as the geometric calibration found them: over a narrow range of a joint low harmonics look
+            like geometry, and where they may take its part the arm errs beyond that range.
     """
 
     base: Float64[Tensor, " unknowns"]
     group: Int64[Tensor, " unknowns"]
     sizes: Float64[Tensor, " groups"]
     classes: int
-    fixed: bool = False
 
     @property
     def precision(self) -> Float64[Tensor, " unknowns"]:
@@ -57,12 +56,9 @@ class GaussianPrior:
 
         As the rule comes near to its fixed point from one side, in ever shorter steps, these are lengthened.
         """
-        is_class = torch.arange(len(self.sizes), device=square.device) < self.classes
-        least = torch.where(is_class, LEAST_EFFECTIVE, 1e-9)
-        floor = torch.where(is_class, SMALLEST_PRIOR, SMALLEST_SIZE)
-        sizes = torch.maximum((square / determined.clamp(min=1e-12)).sqrt(), floor)
+        sizes = (square / determined.clamp(min=1e-12)).sqrt().clamp(min=SMALLEST_SIZE)
         sizes = self.sizes * (sizes / self.sizes) ** RELAXATION
-        stands = (determined <= least) | (is_class & self.fixed)
+        stands = (determined <= 1e-9) | (torch.arange(len(sizes), device=sizes.device) < self.classes)
         return replace(self, sizes=torch.where(stands, self.sizes, sizes))
 
 
