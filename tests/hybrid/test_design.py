@@ -110,7 +110,6 @@ def test_prior_has_a_size_for_every_class_and_every_group_of_weights(arm: Linear
     assert prior.group[design.stretch(0)].unique().tolist() == [4]
     assert prior.group[design.stretch(1)].unique().tolist() == [5]
     assert prior.group[design.stretch(2)].view(4, 6).tolist() == [[6, 7, 8] * 2] * 4
-    assert not prior.fixed
 
 
 def test_weights_of_a_sliding_joint_count_in_radians_times_the_reach(arm: LinearisedArm) -> None:

@@ -9,7 +9,7 @@ import torch
 from testing.closeness import assert_close
 from testing.models import no_type_checker
 from testing.rb5_with_all_errors import NOISE, SimulatedTracker, simulated_tracker
-from testing.sensors import socket_data, true_robot
+from testing.sensors import pair_data, socket_data, touch_data, true_robot
 
 from pisigma.errors import IdentificationError
 from pisigma.hybrid.calibrator import HybridCalibrator
@@ -18,7 +18,8 @@ from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.result import CalibrationResult
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.dataset import Measurements, join
+from pisigma.measurement.groups import held_out_groups
 from pisigma.robot import Robot
 
 
@@ -193,6 +194,21 @@ def test_choosing_on_a_part_of_the_rows_fits_to_all(monkeypatch: pytest.MonkeyPa
     simulated, whole = fitted()
     result = calibrator(simulated.robot).fit(simulated.train)
     assert rms(result, simulated.test) < 1.1 * rms(whole, simulated.test)
+
+
+def test_choosing_on_a_part_of_the_rows_takes_pairs_with_both_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every row of the searched ones has the group that it has among all."""
+    monkeypatch.setattr("pisigma.hybrid.calibrator.SEARCHED_ROWS", 60)
+    made = calibrator(true_robot().nominal, features=("joints",))
+    solved = made.geometric.solve(join([touch_data(), pair_data(40)]))
+    group = held_out_groups(solved.setup.measurements)
+    search, _ = made._chosen(solved, group, lambda what: None)
+    q = search.rows.problem.q
+    assert 60 < len(q) < solved.problem.q.shape[0]
+    assert len(search.rows.group) == len(q)
+    place = torch.cdist(q, solved.problem.q).argmin(1)
+    together = group[place][:, None] == group[place]
+    assert torch.equal(search.rows.group[:, None] == search.rows.group, together)
 
 
 @pytest.mark.parametrize("features", [("sin_cos",), ("joints", "series"), ("pose",), ()])

@@ -54,6 +54,21 @@ def test_sizes_and_noise_can_be_estimated_anew_for_every_fold(form: str) -> None
     assert float((held.error - found.error).abs().max()) > 1e-2
 
 
+@pytest.mark.parametrize("form", FORMS)
+def test_the_noise_of_a_sensor_stands_of_which_a_fold_takes_all_values(form: str) -> None:
+    """All distances are from one anchor; without them nothing says how noisy they are."""
+    case = CASES["all kinds"]()
+    number = [values.name for values in case.rows.values].index("distance")
+    wire = case.rows.group[case.rows.values[number].row].unique()
+    assert len(wire) == 1
+    fit: AbstractRegression = FORMS[form].of(case.design, case.rows)
+    posterior = fit.solve(case.prior, case.noise)
+    rest = fit.without(wire).maximise_evidence(posterior.prior, posterior.noise, 2)
+    assert rest.noise[number] == case.noise[number]
+    errors = fit.left_out_anew(posterior, [wire], 2)
+    assert float(errors.error.square().mean()) < 4.0
+
+
 def test_errors_are_larger_than_the_residuals_and_about_as_large_as_predicted() -> None:
     case = few_values()
     fit = ValueCovariance.of(case.design, case.rows)

@@ -52,7 +52,7 @@ def everywhere(arm, rows: int = 300) -> torch.Tensor:
 
 def test_the_set_ups_are_what_their_names_say():
     assert model_of("additive")[1].hybrid.correction.orders == ()
-    assert model_of("products")[1].hybrid.correction.orders == (2,)
+    assert set(model_of("products")[1].hybrid.correction.orders) == {2}
     assert [f.name for f in model_of("joints")[1].hybrid.correction.features] == ["joints"]
     assert "conditions" in [f.name for f in model_of("payload")[1].hybrid.correction.features]
     arm, model = model_of("half")
@@ -306,7 +306,10 @@ def _put(name: str, value: torch.Tensor):
         (lambda tensors: tensors.pop("correction.linear.0"), "'correction.linear.0' is missing"),
         (_put("correction.linear.9", torch.zeros(1).double()), "'correction.linear.9' is unknown"),
         (_put("correction.weight", torch.zeros(6, 3, 12).double()), "'correction.weight' of shape"),
-        (_put("correction.bias", torch.zeros(6, 2)), "'correction.bias' in float64 was wanted"),
+        (
+            lambda tensors: tensors.update({"correction.bias": tensors["correction.bias"].float()}),
+            "'correction.bias' in float64 was wanted",
+        ),
         (_put("coverage.joint", torch.zeros(6).double()), "'coverage.joint' in int64 was wanted"),
         (_put("coverage.joint", torch.zeros(6, dtype=torch.int64)), "a stretch"),
         (_put("coverage.middle", torch.zeros(99).double()), "joint, middle or half is missing"),
