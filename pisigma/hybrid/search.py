@@ -18,7 +18,7 @@ CLEARLY = 5.0
 """The log evidence has to rise by so much (a Bayes factor of 150: very strong, Kass and Raftery 1995)."""
 LARGEST_EFFECTIVE_SHARE = 0.75
 """Unknowns may use up so much of the values, or the noise cannot be separated from them."""
-ROUGHLY = 0.5
+ROUGHLY = 1.0
 """While features are chosen, a log evidence that rises by less has settled."""
 MOST_GROUPS = 400
 """So many groups of rows are held out at most."""

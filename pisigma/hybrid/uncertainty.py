@@ -24,7 +24,7 @@ MOST_GROUPS = 400
 """Left-out rows are looked at of so many groups at most."""
 FEW_GROUPS = 600
 """Up to so many, noise and prior sizes are estimated anew for every fold that is left out."""
-FOLD_UPDATES = 4
+FOLD_UPDATES = 3
 """Updates of noise and prior sizes then."""
 LEAST_EFFECTIVE = 0.5
 """Prior sizes of groups of which the data determine fewer unknowns do not matter."""
