@@ -125,7 +125,7 @@ def test_tables_are_never_cut(capsys):
 
 def test_tables_fit_80_columns(capsys):
     columns = ("tried", "unknowns", "log evidence", "left-out error", "seconds", "kept")
-    name = "gravity + series 110 + products (2, 2, 2, 2)"
+    name = "gravity + conditions + series 110 + products"
     print_table(
         "title",
         columns,
@@ -138,7 +138,7 @@ def test_tables_fit_80_columns(capsys):
         [*columns[:2], "evidence", "error", *columns[4:]],
     ]
     assert lines[4].split()[-5:] == ["1431", "29288.8", "0.488", "0.5", "yes"]
-    assert lines[5].strip() == "2, 2, 2)"
+    assert lines[5].strip() == "products"
 
 
 def test_a_missing_extra_is_named_in_one_sentence(tmp_path):
