@@ -15,7 +15,7 @@ from pisigma.hybrid.mini_batches import MANY_ROWS, MiniBatches, batch_checkpoint
 from pisigma.hybrid.refinement import Refined, linearised, refine, with_frames_of
 from pisigma.hybrid.regression import regression
 from pisigma.hybrid.result import HybridResult, LearnedPart
-from pisigma.hybrid.search import LARGEST_EFFECTIVE_SHARE, Fitted, Search
+from pisigma.hybrid.search import LARGEST_EFFECTIVE_SHARE, Choice, Search
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.initial_guess.initial_guess import chosen_rows
@@ -110,16 +110,16 @@ class HybridCalibrator:
             kept = batch_checkpoints(checkpoints, f"{self}|{measurements.content_hash()}", resume)
         solved = self.geometric.solve(measurements)
         group = held_out_groups(solved.setup.measurements)
-        search, chosen = self._chosen(solved, group, progress)
-        if not chosen.design.features:
+        choice = self._chosen(solved, group, progress)
+        if not choice.best.design.features:
             verdict = "Nothing beyond the geometry was found in the data: the geometric calibration stands."
-            return _geometric_alone(solved, search, verdict)
+            return _geometric_alone(solved, choice, verdict)
         progress("solving for everything")
         trained = ""
         if batches is None:
-            refined = refine(solved.problem, group, search.rows, chosen)
+            refined = refine(solved.problem, group, choice.rows, choice.best)
         else:
-            few = refine(search.rows.problem, search.rows.group, search.rows, chosen)
+            few = refine(choice.rows.problem, choice.rows.group, choice.rows, choice.best)
             refined, trained = refine_in_batches(
                 solved, few, group, batches=batches, progress=progress, checkpoints=kept
             )
@@ -128,14 +128,14 @@ class HybridCalibrator:
                 "A joint correction would take up nearly all that the few rows say, so the geometric calibration "
                 "stands; measure more poses."
             )
-            return _geometric_alone(solved, search, verdict)
+            return _geometric_alone(solved, choice, verdict)
         learned = self._learned(solved, refined)
         progress("looking at left-out rows")
         uncertainty = position_uncertainty(
             refined.rows, refined.design, refined.regression, refined.posterior, learned.geometry
         )
-        verdict = _kept_sentence(search, chosen, trained)
-        return HybridResult(solved.result(), learned, uncertainty, tuple(search.trials), verdict)
+        verdict = _kept_sentence(choice, trained)
+        return HybridResult(solved.result(), learned, uncertainty, choice.trials, verdict)
 
     def _learned(self, solved: SolvedCalibration, refined: Refined) -> LearnedPart:
         """The correction with the geometry that belongs to it, and where it was measured."""
@@ -159,7 +159,7 @@ class HybridCalibrator:
 
     def _chosen(
         self, solved: SolvedCalibration, group: Int64[Tensor, " rows"], progress: Callable[[str], None]
-    ) -> tuple[Search, Fitted]:
+    ) -> Choice:
         """Features, chosen on at most `SEARCHED_ROWS` rows.
 
         What a geometric calibration does not explain is not for that reason wrong: rows are weighted by their distance
@@ -168,6 +168,7 @@ class HybridCalibrator:
         problem, view = solved.problem, view_of(solved.solution.linearisation)
         if problem.q.shape[0] > SEARCHED_ROWS:
             chosen = chosen_rows(problem.q.shape[0], SEARCHED_ROWS).to(problem.q.device)
+            chosen = problem.with_partners(chosen)
             problem, group = problem.select(chosen), renumbered(group[chosen])
         design = Design(problem, ())
         x = (solved.solution.linearisation.point - problem.nominal)[problem.active]
@@ -178,8 +179,7 @@ class HybridCalibrator:
         rows = linearised(first, posterior.x, posterior.effective, group)
         products = [InputProducts(self.geometric.robot)] if self.products else []
         largest = [*others, *growing[-1:], *products]
-        search = Search(rows, view.noise, view.prior_scale, largest, progress)
-        return search, search.best(growing, others, products)
+        return Search(rows, view.noise, view.prior_scale, largest, progress).best(growing, others, products)
 
     def _features(
         self, solved: SolvedCalibration, problem: CalibrationProblem
@@ -209,18 +209,18 @@ class HybridCalibrator:
         return growing, others
 
 
-def _kept_sentence(search: Search, chosen: Fitted, trained: str) -> str:
+def _kept_sentence(choice: Choice, trained: str) -> str:
     """What was kept, and how much better left-out rows are predicted with it."""
-    share = [trial.left_out for trial in search.trials if trial.kept][-1]
+    share = [trial.left_out for trial in choice.trials if trial.kept][-1]
     return (
-        f"A joint correction was kept ({chosen.name}): left-out rows are predicted with {share:.2f} "
+        f"A joint correction was kept ({choice.best.name}): left-out rows are predicted with {share:.2f} "
         f"times the error of the geometric calibration. {trained}".rstrip()
     )
 
 
-def _geometric_alone(solved: SolvedCalibration, search: Search, verdict: str) -> HybridResult:
+def _geometric_alone(solved: SolvedCalibration, choice: Choice, verdict: str) -> HybridResult:
     """The geometric calibration, with the uncertainty of its positions."""
     geometry = identified_geometry(solved.setup, solved.solution.linearisation.point)
-    first = search.geometry
-    uncertainty = position_uncertainty(search.rows, first.design, first.regression, first.posterior, geometry)
-    return HybridResult(solved.result(), None, uncertainty, tuple(search.trials), verdict)
+    first = choice.geometry
+    uncertainty = position_uncertainty(choice.rows, first.design, first.regression, first.posterior, geometry)
+    return HybridResult(solved.result(), None, uncertainty, choice.trials, verdict)

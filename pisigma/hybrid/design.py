@@ -178,7 +178,7 @@ class Rows:
         kept = [sensor.select(slice(0, 0)) if sensor.certain else sensor for sensor in rows.values]
         return replace(rows, values=tuple(kept))
 
-    def folds(self, count: int, most_groups: int) -> tuple[Int64[Tensor, " groups"], ...]:
+    def folds(self, count: int, most_groups: int) -> tuple[Int64[Tensor, " _groups"], ...]:
         """Numbers of the groups of every fold, drawn at random but always the same.
 
         Args:

@@ -56,8 +56,8 @@ class GaussianPrior:
 
         As the rule comes near to its fixed point from one side, in ever shorter steps, these are lengthened.
         """
-        sizes = (square / determined.clamp(min=1e-12)).sqrt().clamp(min=SMALLEST_SIZE)
-        sizes = self.sizes * (sizes / self.sizes) ** RELAXATION
+        sizes = (square / determined.clamp(min=1e-12)).sqrt()
+        sizes = (self.sizes * (sizes / self.sizes) ** RELAXATION).clamp(min=SMALLEST_SIZE)
         stands = (determined <= 1e-9) | (torch.arange(len(sizes), device=sizes.device) < self.classes)
         return replace(self, sizes=torch.where(stands, self.sizes, sizes))
 
@@ -142,7 +142,7 @@ class LeftOut:
             counts: of the sensors.
         """
         factor, failed = torch.linalg.cholesky_ex(M)
-        if len(M) and (failed or float(factor.diagonal().min()) < SINGULAR):
+        if len(M) and (failed or float(factor.diagonal().min()) ** 2 < SINGULAR):
             values, vectors = torch.linalg.eigh(M)
             certain = values > SINGULAR
             inverse = (vectors * torch.where(certain, 1 / values, 0.0)) @ vectors.t()
@@ -191,7 +191,7 @@ class AbstractRegression(ABC):
         """The same without the values of some groups of rows, see `Rows.group`; values that are certain stay."""
 
     @abstractmethod
-    def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " groups"]]) -> LeftOut:
+    def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]) -> LeftOut:
         """Leave out one fold after the other and predict it, with the prior sizes and the noise of a posterior.
 
         Args:
@@ -200,7 +200,7 @@ class AbstractRegression(ABC):
         """
 
     def left_out_anew(
-        self, posterior: Posterior, folds: Sequence[Int64[Tensor, " groups"]], updates: int
+        self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]], updates: int
     ) -> LeftOut:
         """The same with so many updates of noise and prior sizes for every fold: few rows leave these uncertain."""
         parts = []
@@ -231,10 +231,11 @@ class AbstractRegression(ABC):
 
     def renewed_noise(self, posterior: Posterior) -> tuple[float, ...]:
         """Noise of every sensor from its misfit and the values that the unknowns use up (Förstner 1979)."""
-        noise = []
-        for sensor, misfit, used in zip(self.sensors, posterior.misfit, posterior.used, strict=True):
-            sigma = 1.0 if sensor.exact else math.sqrt(misfit / max(sensor.values - used, 1.0))
-            noise.append(max(sigma, 1.0 if sensor.stated else SMALLEST_NOISE))
+        noise = list(posterior.noise)
+        for k, sensor in enumerate(self.sensors):
+            if not sensor.exact and sensor.values > 0.5:  # without values it stays as it is
+                sigma = math.sqrt(posterior.misfit[k] / max(sensor.values - posterior.used[k], 1.0))
+                noise[k] = max(sigma, 1.0 if sensor.stated else SMALLEST_NOISE)
         return tuple(noise)
 
     def maximise_evidence(

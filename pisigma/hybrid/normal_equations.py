@@ -72,7 +72,7 @@ class NormalEquations(AbstractRegression):
             sensors=tuple(replace(a, values=a.values - b.values) for a, b in counts),
         )
 
-    def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " groups"]]) -> LeftOut:
+    def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]) -> LeftOut:
         """See `AbstractRegression.left_out`."""
         scale, factor, x = self._solved(posterior.prior, posterior.noise)
         parts = []
@@ -194,7 +194,8 @@ def factored(normal: Float64[Tensor, "unknowns unknowns"]) -> tuple[Tensor, Tens
 
 
 def _inverse(scale: Tensor, factor: Tensor) -> Tensor:
-    return torch.cholesky_inverse(factor).mul_(scale).mul_(scale[:, None])
+    inverse: Tensor = torch.cholesky_inverse(factor).mT  # symmetric, and so stored row by row
+    return inverse.mul_(scale).mul_(scale[:, None])
 
 
 def _sensor_sums(design: Design, sensor: SensorValues) -> tuple[Tensor, Tensor, float]:

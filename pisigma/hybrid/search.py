@@ -23,7 +23,8 @@ ROUGHLY = 1.0
 MOST_GROUPS = 400
 """So many groups of rows are held out at most."""
 FEW_GROUPS = 200
-"""Up to so many, every group is a fold."""
+"""Up to so many there are more folds."""
+FOLDS_OF_FEW = 20
 FAILURES = 3
 """Sizes that do not help before no larger ones are tried."""
 
@@ -71,6 +72,23 @@ class Fitted:
         return " + ".join(chosen.label for chosen in self.design.features) or "geometry"
 
 
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """What a search came to.
+
+    Attributes:
+        rows: on which features were chosen.
+        geometry: without features.
+        best: with the features that were kept.
+        trials: what was tried, in order.
+    """
+
+    rows: Rows
+    geometry: Fitted
+    best: Fitted
+    trials: tuple[Trial, ...]
+
+
 class Search:
     """Tries one choice of features after the other on the same rows."""
 
@@ -96,7 +114,7 @@ class Search:
         self.progress = progress
         self.rows = rows
         self._regression = regression(Design(rows.problem, tuple(largest)), rows)
-        self._folds = rows.folds(FOLDS if rows.groups > FEW_GROUPS else rows.groups, MOST_GROUPS)
+        self._folds = rows.folds(FOLDS if rows.groups > FEW_GROUPS else FOLDS_OF_FEW, MOST_GROUPS)
         self._unit = self._least = 1.0
         began = time.monotonic()
         self.geometry = self.fitted(())
@@ -131,7 +149,7 @@ class Search:
         growing: Sequence[AbstractFeature],
         others: Sequence[AbstractFeature],
         last: Sequence[AbstractFeature] = (),
-    ) -> Fitted:
+    ) -> Choice:
         """Geometry alone, then other features, then ever larger ones, as long as it gets better.
 
         Args:
@@ -156,7 +174,7 @@ class Search:
             gain, sizes = self._regression.first_sizes(best.posterior, best.design, chosen)
             if gain > CLEARLY / 2:
                 best = self._tried([*best.design.features, chosen], best, sizes)
-        return best
+        return Choice(self.rows, self.geometry, best, tuple(self.trials))
 
     def _tried(
         self, features: Sequence[AbstractFeature], best: Fitted, sizes: Tensor | None = None

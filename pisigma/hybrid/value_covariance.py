@@ -84,9 +84,10 @@ class ValueCovariance(AbstractRegression):
         """See `AbstractRegression.without`."""
         kept = (~torch.isin(self.group, groups)).nonzero()[:, 0]
         sensor = self.sensor[kept]
-        share = torch.bincount(sensor, minlength=len(self.sensors)) / torch.bincount(
-            self.sensor, minlength=len(self.sensors)
-        ).clamp(min=1)
+        left, all_ = (
+            torch.bincount(rows, minlength=len(self.sensors)).double() for rows in (sensor, self.sensor)
+        )
+        share = left / all_.clamp(min=1)
         counts = zip(self.sensors, share.tolist(), strict=True)
         return replace(
             self,
@@ -94,18 +95,18 @@ class ValueCovariance(AbstractRegression):
             y=self.y[kept],
             sensor=sensor,
             group=self.group[kept],
-            K=self.K[:, (torch.isin(self._triangle, kept)).all(0)],
+            K=self.K[:, torch.isin(torch.tril_indices(len(self.y), len(self.y)), kept).all(0)],
             sensors=tuple(replace(one, values=one.values * part) for one, part in counts),
         )
 
-    def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " groups"]]) -> LeftOut:
+    def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]) -> LeftOut:
         """See `AbstractRegression.left_out`; `noise² P` is `I - X C X^T`, and `noise² P y` the residual."""
         sigma = self.y.new_tensor(posterior.noise)[self.sensor]
         P = self._projection(posterior.prior, posterior.noise)[0].mul_(sigma).mul_(sigma[:, None])
         residual = P @ (self.y / sigma)
         parts = []
         for groups in folds:
-            chosen = torch.isin(self.group, groups).nonzero()[:, 0]
+            chosen = torch.cat([self._values_of_groups[k] for k in groups.tolist()])
             parts.append(
                 LeftOut.of(P[chosen][:, chosen], residual[chosen], self.sensor[chosen], self.sensors)
             )
@@ -124,9 +125,8 @@ class ValueCovariance(AbstractRegression):
         own[:active] = 1 - precision[:active] * covariance.diagonal()
         determined = prior.of_groups(own)
         size = prior.sizes[prior.classes :].square()
-        row, column = self._triangle
-        twice = torch.where(row == column, 1.0, 2.0)
-        by_group = self.K @ torch.stack([P[row, column] * twice, alpha[row] * alpha[column] * twice], 1)
+        both = torch.stack([P, alpha[:, None] * alpha]).flatten(1).index_select(1, self._pairs)
+        by_group = self.K @ (both * self._counts).t()
         determined[prior.classes :] = size * by_group[:, 0]
         square[prior.classes :] = size.square() * by_group[:, 1]
         held = precision[:active]
@@ -141,6 +141,7 @@ class ValueCovariance(AbstractRegression):
         prior, active = posterior.prior, self.design.active
         P, _, own, _ = self._projection(prior, posterior.noise)
         V = self._covariance(prior, posterior.noise)
+        V = V + V.tril(-1).t()
         scaled = self.X[:, active:] / prior.precision[active:]
         covariance = -scaled.t() @ (P @ scaled)
         covariance.diagonal().add_(1 / prior.precision[active:])
@@ -148,18 +149,29 @@ class ValueCovariance(AbstractRegression):
         return torch.cat([torch.cat([own, cross], 1), torch.cat([cross.t(), covariance], 1)])
 
     def _covariance(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Tensor:
-        """V."""
-        row, column = self._triangle
+        """The lower triangle of V."""
         V = self.y.new_zeros((len(self.y), len(self.y)))
-        V[row, column] = prior.sizes[prior.classes :].square() @ self.K
-        V = V + V.tril(-1).t()
+        V.view(-1)[self._pairs] = prior.sizes[prior.classes :].square() @ self.K
         V.diagonal().add_(self.y.new_tensor(noise).square()[self.sensor])
         return V
 
     @cached_property
-    def _triangle(self) -> Int64[Tensor, "2 pairs"]:
-        """Row and column of the values' pairs."""
-        return torch.tril_indices(len(self.y), len(self.y), device=self.y.device)
+    def _pairs(self) -> Int64[Tensor, " pairs"]:
+        """Where the values' pairs stand in a matrix that is stored row by row."""
+        return _lower_triangle(len(self.y))
+
+    @cached_property
+    def _counts(self) -> Float64[Tensor, " pairs"]:
+        """How often a pair stands in a symmetric matrix."""
+        return torch.where(self._pairs % (len(self.y) + 1) == 0, 1.0, 2.0).to(self.y)
+
+    @cached_property
+    def _values_of_groups(self) -> tuple[Tensor, ...]:
+        """Numbers of the values of every group of rows."""
+        measured = (self.group >= 0).nonzero()[:, 0]
+        group = self.group[measured]
+        counts = torch.bincount(group, minlength=int(group.max()) + 1).tolist()
+        return measured[group.argsort(stable=True)].split(counts)
 
     def _projection(
         self, prior: GaussianPrior, noise: tuple[float, ...]
@@ -192,8 +204,13 @@ def _gram(X: Tensor, prior: GaussianPrior, group: int, active: int) -> Tensor:
     columns = (prior.group == group).nonzero()[:, 0]
     columns = columns[columns >= active]
     Z = X[:, columns] * prior.base[columns].rsqrt()
-    row, column = torch.tril_indices(len(X), len(X), device=X.device)
-    return (Z @ Z.t())[row, column]
+    return (Z @ Z.t()).flatten()[_lower_triangle(len(X))]
+
+
+def _lower_triangle(size: int) -> Int64[Tensor, " pairs"]:
+    """Where the lower triangle stands in a matrix that is stored row by row."""
+    row, column = torch.tril_indices(size, size)
+    return row * size + column
 
 
 def _stacked(K: list[Tensor], y: Tensor) -> Tensor:

@@ -73,7 +73,10 @@ def held_out_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
         group = whole
         for column in names:
             group = _joined(group, column)
-        if measurements.rows and int(group.max()) + 1 >= FEWEST_GROUPS:
+        named = torch.tensor(
+            [bool(one or other) for one, other in zip(*names, strict=True)], dtype=torch.bool
+        )
+        if len(group[named].unique()) >= FEWEST_GROUPS:
             return group
     return whole
 
@@ -134,7 +137,9 @@ def _joined(group: Int64[Tensor, " rows"], names: Sequence[str]) -> Int64[Tensor
     for row, name in enumerate(names):
         if name:
             leader[lead(numbers[row])] = lead(numbers[first.setdefault(name, row)])
-    return _numbered(torch.tensor([lead(number) for number in numbers], device=group.device))
+    return _numbered(
+        torch.tensor([lead(number) for number in numbers], dtype=torch.int64, device=group.device)
+    )
 
 
 def _numbered(label: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:

@@ -1,8 +1,8 @@
 """The hybrid on measured robots; data of P. Jacobi 2025 and D. Burakov 2020."""
 
+import math
 from pathlib import Path
 
-import pytest
 import torch
 from testing.models import no_type_checker
 
@@ -22,17 +22,17 @@ def calibrator(robot: Robot) -> HybridCalibrator:
     return HybridCalibrator(robot, harmonics=(8, 24), products=False)
 
 
-@pytest.mark.parametrize(
-    ("joint", "upper"),
-    [(1, False), (3, True), (0, False)],
-)
-def test_ur5_beyond_half_of_a_joints_range(shared_data: Path, joint: int, upper: bool) -> None:
+def test_ur5_beyond_half_of_a_joints_range(shared_data: Path) -> None:
+    """Trained where a joint is below its median, judged above: the posterior's mean is the best guess there too."""
     data, robot = Measurements.read_csv(shared_data / "ur5" / "grid.csv"), Robot.load("ur5")
-    half = (data.q[:, joint] < data.q[:, joint].median()) ^ upper
+    ratios = []
     with no_type_checker():
-        result = calibrator(robot).fit(data.select(half))
-        rest = data.select(~half)
-        assert rms(result, rest) < 1.05 * rms(result.geometric, rest)
+        for joint in (0, 1, 3):
+            half = data.q[:, joint] < data.q[:, joint].median()
+            result, rest = HybridCalibrator(robot).fit(data.select(half)), data.select(~half)
+            ratios.append(rms(result, rest) / rms(result.geometric, rest))
+    assert max(ratios) < 1.15
+    assert math.prod(ratios) ** (1 / 3) < 0.75
 
 
 def test_ur5_with_100_poses(shared_data: Path) -> None:

@@ -125,11 +125,16 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """The same without a prior."""
         return replace(self, precision=torch.zeros_like(self.precision))
 
+    def with_partners(self, rows: Int64[Tensor, " chosen"]) -> Int64[Tensor, " _rows"]:
+        """Some rows and, of pairs, the other ones; in ascending order where there are pairs."""
+        if not self.pairs:
+            return rows
+        partner = torch.where(rows < 2 * self.pairs, rows ^ 1, rows)
+        return torch.unique(torch.cat([rows, partner]))
+
     def select(self, rows: Int64[Tensor, " chosen"]) -> "CalibrationProblem":
         """Some of the rows; of a pair both."""
-        if self.pairs:
-            partner = torch.where(rows < 2 * self.pairs, rows ^ 1, rows)
-            rows = torch.unique(torch.cat([rows, partner]))
+        rows = self.with_partners(rows)
         return replace(
             self,
             q=self.q[rows],
