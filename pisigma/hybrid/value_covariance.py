@@ -171,7 +171,7 @@ class ValueCovariance(AbstractRegression):
         measured = (self.group >= 0).nonzero()[:, 0]
         group = self.group[measured]
         counts = torch.bincount(group, minlength=int(group.max()) + 1).tolist()
-        return measured[group.argsort(stable=True)].split(counts)
+        return torch.split(measured[group.argsort(stable=True)], counts)
 
     def _projection(
         self, prior: GaussianPrior, noise: tuple[float, ...]
@@ -209,8 +209,8 @@ def _gram(X: Tensor, prior: GaussianPrior, group: int, active: int) -> Tensor:
 
 def _lower_triangle(size: int) -> Int64[Tensor, " pairs"]:
     """Where the lower triangle stands in a matrix that is stored row by row."""
-    row, column = torch.tril_indices(size, size)
-    return row * size + column
+    pairs: Tensor = torch.tril_indices(size, size)
+    return pairs[0] * size + pairs[1]
 
 
 def _stacked(K: list[Tensor], y: Tensor) -> Tensor:

@@ -76,7 +76,7 @@ def held_out_groups(measurements: Measurements) -> Int64[Tensor, " rows"]:
         named = torch.tensor(
             [bool(one or other) for one, other in zip(*names, strict=True)], dtype=torch.bool
         )
-        if len(group[named].unique()) >= FEWEST_GROUPS:
+        if len(torch.unique(group[named])) >= FEWEST_GROUPS:
             return group
     return whole
 

@@ -130,7 +130,8 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         if not self.pairs:
             return rows
         partner = torch.where(rows < 2 * self.pairs, rows ^ 1, rows)
-        return torch.unique(torch.cat([rows, partner]))
+        both: Tensor = torch.unique(torch.cat([rows, partner]))
+        return both
 
     def select(self, rows: Int64[Tensor, " chosen"]) -> "CalibrationProblem":
         """Some of the rows; of a pair both."""
