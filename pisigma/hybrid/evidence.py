@@ -56,7 +56,7 @@ class GaussianPrior:
 
         As the rule comes near to its fixed point from one side, in ever shorter steps, these are lengthened.
         """
-        sizes = (square / determined.clamp(min=1e-12)).sqrt()
+        sizes = (square.clamp(min=0.0) / determined.clamp(min=1e-12)).sqrt()
         sizes = (self.sizes * (sizes / self.sizes) ** RELAXATION).clamp(min=SMALLEST_SIZE)
         stands = (determined <= 1e-9) | (torch.arange(len(sizes), device=sizes.device) < self.classes)
         return replace(self, sizes=torch.where(stands, self.sizes, sizes))

@@ -35,6 +35,7 @@ class ValueCovariance(AbstractRegression):
         prior: whose groups and base the matrices K are of; its sizes do not matter.
         K: of every group of weights, the lower triangle.
         sensors: how many values there are.
+        groups: how many groups of rows there are.
     """
 
     design: Design
@@ -45,6 +46,7 @@ class ValueCovariance(AbstractRegression):
     prior: GaussianPrior
     K: Float64[Tensor, "groups pairs"]
     sensors: tuple[SensorCount, ...]
+    groups: int
 
     @staticmethod
     def of(design: Design, rows: Rows) -> "ValueCovariance":
@@ -66,7 +68,7 @@ class ValueCovariance(AbstractRegression):
         X, y, number, group = (torch.cat(column) for column in zip(*parts, strict=True))
         prior = design.prior((1.0,) * design.classes)
         K = [_gram(X, prior, g, design.active) for g in range(prior.classes, len(prior.sizes))]
-        return ValueCovariance(design, X, y, number, group, prior, _stacked(K, y), rows.sensors)
+        return ValueCovariance(design, X, y, number, group, prior, _stacked(K, y), rows.sensors, rows.groups)
 
     def select(self, design: Design) -> "ValueCovariance":
         """See `AbstractRegression.select`."""
@@ -106,7 +108,7 @@ class ValueCovariance(AbstractRegression):
         residual = P @ (self.y / sigma)
         parts = []
         for groups in folds:
-            chosen = torch.cat([self._values_of_groups[k] for k in groups.tolist()])
+            chosen = torch.cat([self._values_of_groups[k] for k in groups.tolist()]).sort().values
             parts.append(
                 LeftOut.of(P[chosen][:, chosen], residual[chosen], self.sensor[chosen], self.sensors)
             )
@@ -170,7 +172,7 @@ class ValueCovariance(AbstractRegression):
         """Numbers of the values of every group of rows."""
         measured = (self.group >= 0).nonzero()[:, 0]
         group = self.group[measured]
-        counts = torch.bincount(group, minlength=int(group.max()) + 1).tolist()
+        counts = torch.bincount(group, minlength=self.groups).tolist()
         return torch.split(measured[group.argsort(stable=True)], counts)
 
     def _projection(

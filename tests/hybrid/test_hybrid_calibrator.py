@@ -202,13 +202,13 @@ def test_choosing_on_a_part_of_the_rows_takes_pairs_with_both_rows(monkeypatch: 
     made = calibrator(true_robot().nominal, features=("joints",))
     solved = made.geometric.solve(join([touch_data(), pair_data(40)]))
     group = held_out_groups(solved.setup.measurements)
-    search, _ = made._chosen(solved, group, lambda what: None)
-    q = search.rows.problem.q
+    choice = made._chosen(solved, group, lambda what: None)
+    q = choice.rows.problem.q
     assert 60 < len(q) < solved.problem.q.shape[0]
-    assert len(search.rows.group) == len(q)
+    assert len(choice.rows.group) == len(q)
     place = torch.cdist(q, solved.problem.q).argmin(1)
     together = group[place][:, None] == group[place]
-    assert torch.equal(search.rows.group[:, None] == search.rows.group, together)
+    assert torch.equal(choice.rows.group[:, None] == choice.rows.group, together)
 
 
 @pytest.mark.parametrize("features", [("sin_cos",), ("joints", "series"), ("pose",), ()])

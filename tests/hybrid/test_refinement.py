@@ -30,8 +30,8 @@ def refined(request: pytest.FixtureRequest) -> Refined:
     calibrator = HybridCalibrator(GeometricCalibrator(ROBOT), harmonics=(2,), products=request.param)
     solved = calibrator.geometric.solve(tracker_data(ROBOT, q, delta, 3e-5))
     group = held_out_groups(solved.setup.measurements)
-    search, chosen = calibrator._chosen(solved, group, lambda what: None)
-    return refine(solved.problem, group, search.rows, chosen)
+    choice = calibrator._chosen(solved, group, lambda what: None)
+    return refine(solved.problem, group, choice.rows, choice.best)
 
 
 def test_residuals_at_the_solution_are_those_of_the_nonlinear_model(refined: Refined) -> None:
