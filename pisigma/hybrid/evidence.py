@@ -4,14 +4,20 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.identification.problem.noise import SMALLEST_NOISE
+if TYPE_CHECKING:
+    from pisigma.hybrid.design import Design
+    from pisigma.joint_correction.feature import AbstractFeature
 
+
+SMALLEST_NOISE = 1e-8
+"""[m or rad] Floor of the estimated noise: far below what instruments resolve, and not too small beside errors of a
+millimetre for the covariance of the values."""
 SMALLEST_SIZE = 1e-9
 """Prior size [rad] below which a group of weights is off."""
 FIRST_SIZE = 2e-5
@@ -183,7 +189,7 @@ class AbstractRegression(ABC):
         """Covariance of the unknowns."""
 
     @abstractmethod
-    def select(self, design: Any) -> "AbstractRegression":
+    def select(self, design: "Design") -> "AbstractRegression":
         """The same for the unknowns of a design that has some of the features, or smaller ones."""
 
     @abstractmethod
@@ -210,7 +216,7 @@ class AbstractRegression(ABC):
         return LeftOut.joined(parts)
 
     def first_sizes(
-        self, posterior: Posterior, design: Any, features: Any
+        self, posterior: Posterior, design: "Design", features: "AbstractFeature"
     ) -> tuple[float, Float64[Tensor, " groups"] | None]:
         """By how much more features raise the log evidence with all other prior sizes and the noise fixed.
 
@@ -252,7 +258,7 @@ class AbstractRegression(ABC):
         Returns:
             The posterior of the last update.
         """
-        posterior = self.solve(prior, noise)
+        posterior = self.solve(prior, tuple(max(sigma, SMALLEST_NOISE) for sigma in noise))
         for _ in range(iterations):
             prior = posterior.prior.updated(posterior.square, posterior.determined)
             following = self.solve(prior, self.renewed_noise(posterior))
