@@ -117,9 +117,9 @@ class HybridCalibrator:
         progress("solving for everything")
         trained = ""
         if batches is None:
-            refined = refine(solved.problem, group, choice.rows, choice.best)
+            refined = refine(solved.problem, group, choice)
         else:
-            few = refine(choice.rows.problem, choice.rows.group, choice.rows, choice.best)
+            few = refine(choice.rows.problem, choice.rows.group, choice)
             refined, trained = refine_in_batches(
                 solved, few, group, batches=batches, progress=progress, checkpoints=kept
             )
@@ -129,13 +129,14 @@ class HybridCalibrator:
                 "stands; measure more poses."
             )
             return _geometric_alone(solved, choice, verdict)
+        verdict, trials = _kept_sentence(choice, trained), choice.trials
+        del choice  # its regression is not needed any more, and large
         learned = self._learned(solved, refined)
         progress("looking at left-out rows")
         uncertainty = position_uncertainty(
             refined.rows, refined.design, refined.regression, refined.posterior, learned.geometry
         )
-        verdict = _kept_sentence(choice, trained)
-        return HybridResult(solved.result(), learned, uncertainty, choice.trials, verdict)
+        return HybridResult(solved.result(), learned, uncertainty, trials, verdict)
 
     def _learned(self, solved: SolvedCalibration, refined: Refined) -> LearnedPart:
         """The correction with the geometry that belongs to it, and where it was measured."""
@@ -222,5 +223,6 @@ def _geometric_alone(solved: SolvedCalibration, choice: Choice, verdict: str) ->
     """The geometric calibration, with the uncertainty of its positions."""
     geometry = identified_geometry(solved.setup, solved.solution.linearisation.point)
     first = choice.geometry
-    uncertainty = position_uncertainty(choice.rows, first.design, first.regression, first.posterior, geometry)
+    fit = regression(first.design, choice.rows)
+    uncertainty = position_uncertainty(choice.rows, first.design, fit, first.posterior, geometry)
     return HybridResult(solved.result(), None, uncertainty, choice.trials, verdict)

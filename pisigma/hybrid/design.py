@@ -16,7 +16,7 @@ from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.conditions import JointState
 
-CHUNK = 2_048
+CHUNK = 512
 """Rows whose columns are in memory at a time."""
 FOLDS = 4
 

@@ -42,20 +42,21 @@ class NormalEquations(AbstractRegression):
         The columns of a joint's weights are its features times the derivative by its value, `J_j f_jm`. So for two
         joints `X_j^T X_i = f_j^T diag(J_j^T J_i) f_i`: the components of a value are summed before the products.
         """
-        sums = [_sensor_sums(design, sensor) for sensor in rows.values]
-        return NormalEquations(
-            design=design,
-            rows=rows,
-            normal=torch.stack([normal for normal, _, _ in sums]),
-            descent=torch.stack([descent for _, descent, _ in sums]),
-            square=tuple(square for _, _, square in sums),
-            sensors=rows.sensors,
-        )
+        size = design.unknowns
+        normal = design.problem.q.new_zeros((len(rows.values), size, size))
+        descent, square = normal.new_zeros((len(rows.values), size)), []
+        for k, sensor in enumerate(rows.values):
+            square.append(_add_sums(design, sensor, normal[k], descent[k]))
+        return NormalEquations(design, rows, normal, descent, tuple(square), rows.sensors)
 
     def select(self, design: Design) -> "NormalEquations":
         """See `AbstractRegression.select`."""
+        if design.unknowns == self.design.unknowns and design.features == self.design.features:
+            return self
         columns = self.design.indices(design.features)
-        normal = torch.stack([N[columns][:, columns] for N in self.normal])
+        normal = self.normal.new_empty((len(self.normal), len(columns), len(columns)))
+        for whole, part in zip(self.normal, normal, strict=True):
+            torch.index_select(whole[columns], 1, columns, out=part)
         return replace(self, design=design, normal=normal, descent=self.descent[:, columns])
 
     def without(self, groups: Int64[Tensor, " groups"]) -> "NormalEquations":
@@ -95,13 +96,13 @@ class NormalEquations(AbstractRegression):
         """Solve `(Σ_s N_s / noise_s² + precision) x = Σ_s b_s / noise_s²` by Cholesky with column scaling."""
         precision = prior.precision
         scale, factor, x = self._solved(prior, noise)
+        log_det = 2 * float(factor.diagonal().log().sum()) - 2 * float(scale.log().sum())
         covariance = _inverse(scale, factor)
         used = [
             float(torch.dot(N.flatten(), covariance.flatten())) / sigma**2
             for N, sigma in zip(self.normal, noise, strict=True)
         ]
         misfit = self._misfits(x)
-        log_det = 2 * float(factor.diagonal().log().sum()) - 2 * float(scale.log().sum())
         log_prior = float(precision[precision > 0].log().sum())
         fit = sum(total / sigma**2 for total, sigma in zip(misfit, noise, strict=True))
         evidence = fit + float((x.square() * precision).sum()) + log_det - log_prior
@@ -194,12 +195,13 @@ def factored(normal: Float64[Tensor, "unknowns unknowns"]) -> tuple[Tensor, Tens
 
 
 def _inverse(scale: Tensor, factor: Tensor) -> Tensor:
-    inverse: Tensor = torch.cholesky_inverse(factor).mT  # symmetric, and so stored row by row
+    """Inverse of the matrix, in the place of its factor."""
+    inverse: Tensor = torch.cholesky_inverse(factor, out=factor).mT  # symmetric, and so stored row by row
     return inverse.mul_(scale).mul_(scale[:, None])
 
 
-def _sensor_sums(design: Design, sensor: SensorValues) -> tuple[Tensor, Tensor, float]:
-    """Normal matrix, right side and square of one sensor's values."""
+def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> float:
+    """Fill in normal matrix and right side of one sensor's values; their square is returned."""
     active, dof = design.active, sensor.joints.shape[-1]
     count = sum(chosen.count for chosen in design.features)
     size = active + dof * count
@@ -225,9 +227,11 @@ def _sensor_sums(design: Design, sensor: SensorValues) -> tuple[Tensor, Tensor, 
                     blocks = f[j].t() @ (g[j:] * shared[:, j, j:].t()[..., None])
                     own = slice(active + j * count, active + (j + 1) * count)
                     normal[own, active + j * count :] += blocks.transpose(0, 1).reshape(count, -1)
-    normal = normal.triu() + normal.triu(1).t()
     order = torch.cat([torch.arange(active), active + _places(design, dof, count)])
-    return normal[order][:, order], descent[order], square
+    normal.triu_().add_(normal.triu(1).t())
+    N.copy_(normal[order[:, None], order])
+    b.copy_(descent[order])
+    return square
 
 
 def _feature_columns(design: Design, row: Tensor) -> Float64[Tensor, "dof rows columns"]:

@@ -10,7 +10,7 @@ from torch import Tensor
 from pisigma.hybrid.design import Design, Rows, weigh
 from pisigma.hybrid.evidence import AbstractRegression, Posterior
 from pisigma.hybrid.regression import regression
-from pisigma.hybrid.search import Fitted
+from pisigma.hybrid.search import Choice
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.identification.identifiability.sufficiency import floating_frames
 from pisigma.identification.prediction import predicted_poses
@@ -52,16 +52,16 @@ class Refined:
     rounds: int
 
 
-def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], rows: Rows, chosen: Fitted) -> Refined:
+def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: Choice) -> Refined:
     """Fit the chosen features to all rows.
 
     Args:
         problem: of all rows.
         group: see `Rows.group`.
-        rows: on which they were chosen.
-        chosen: as fitted to those.
+        choice: of the features, as fitted to some of the rows or all.
     """
-    design, posterior, fit = Design(problem, chosen.design.features), chosen.posterior, chosen.regression
+    design, posterior = Design(problem, choice.best.design.features), choice.best.posterior
+    rows, fit = choice.rows, choice.regression
     rounds = 1
     while rounds < MOST_ROUNDS:
         there = linearised(design, posterior.x, posterior.effective, group)

@@ -58,12 +58,10 @@ class Fitted:
 
     Attributes:
         design: the unknowns.
-        regression: of the rows on them.
         posterior: of them.
     """
 
     design: Design
-    regression: AbstractRegression
     posterior: Posterior
 
     @property
@@ -80,12 +78,14 @@ class Choice:
         rows: on which features were chosen.
         geometry: without features.
         best: with the features that were kept.
+        regression: of the rows on its unknowns.
         trials: what was tried, in order.
     """
 
     rows: Rows
     geometry: Fitted
     best: Fitted
+    regression: AbstractRegression
     trials: tuple[Trial, ...]
 
 
@@ -132,11 +132,11 @@ class Search:
         if sizes is not None:
             prior = replace(prior, sizes=torch.cat([prior.sizes[: -len(sizes)], sizes]))
         chosen = self._regression.select(design)
-        return Fitted(design, chosen, chosen.maximise_evidence(prior, noise, tolerance=ROUGHLY))
+        return Fitted(design, chosen.maximise_evidence(prior, noise, tolerance=ROUGHLY))
 
     def _left_out(self, tried: Fitted) -> float:
         """RMS of left-out values over the noise of the geometric calibration."""
-        errors = tried.regression.left_out(tried.posterior, self._folds)
+        errors = self._regression.select(tried.design).left_out(tried.posterior, self._folds)
         return errors.rms(tried.posterior.noise, self.noise)
 
     def _note(self, tried: Fitted, share: float, began: float, kept: bool) -> None:
@@ -174,7 +174,9 @@ class Search:
             gain, sizes = self._regression.first_sizes(best.posterior, best.design, chosen)
             if gain > CLEARLY / 2:
                 best = self._tried([*best.design.features, chosen], best, sizes)
-        return Choice(self.rows, self.geometry, best, tuple(self.trials))
+        return Choice(
+            self.rows, self.geometry, best, self._regression.select(best.design), tuple(self.trials)
+        )
 
     def _tried(
         self, features: Sequence[AbstractFeature], best: Fitted, sizes: Tensor | None = None
@@ -187,7 +189,7 @@ class Search:
         better = (
             tried.posterior.log_evidence - best.posterior.log_evidence > CLEARLY
             and left_out < self._least * LEVEL
-            and tried.regression.effective_share(tried.posterior) < LARGEST_EFFECTIVE_SHARE
+            and self._regression.effective_share(tried.posterior) < LARGEST_EFFECTIVE_SHARE
         )
         self._note(tried, left_out / self._unit, began, better)
         if better:

@@ -102,9 +102,9 @@ def covariance_root(
         change: d(user's parameters) / d(free parameters).
     """
     scale = covariance.diagonal().clamp(min=1e-300).sqrt()
-    scaled = covariance / scale / scale[:, None]
+    scaled = (covariance / scale).div_(scale[:, None])
     scaled.diagonal().add_(1e-12)
-    root = scale[:, None] * torch.linalg.cholesky(scaled)
+    root = torch.linalg.cholesky(scaled, out=scaled).mul_(scale[:, None])
     active = change.shape[1]
     return torch.cat([change @ root[:active], root[active:]])
 
@@ -145,15 +145,6 @@ def left_out_scale(errors: LeftOut) -> float:
     return math.exp(high)
 
 
-def degrees_of_freedom_factor(fit: AbstractRegression, posterior: Posterior) -> float:
-    """`n / (n - determined)` with n values of which the unknowns use up `determined`.
-
-    Features, prior sizes and noise are chosen on the same rows, which makes the posterior a little too sure; new rows
-    err by about so much more (as in generalised cross-validation, Craven and Wahba 1979).
-    """
-    return 1 / max(1 - fit.effective_share(posterior), 0.2)
-
-
 def position_uncertainty(
     rows: Rows, design: Design, fit: AbstractRegression, posterior: Posterior, geometry: IdentifiedGeometry
 ) -> PositionUncertainty:
@@ -171,10 +162,10 @@ def position_uncertainty(
         missed = fit.left_out_anew(posterior, folds, FOLD_UPDATES)
     else:
         missed = fit.left_out(posterior, folds)
-    prior_scale = max(left_out_scale(missed), degrees_of_freedom_factor(fit, posterior))
+    prior_scale = left_out_scale(missed)
     space = design.problem.space
     active = design.problem.active.cpu()
     covariance = fit.covariance(posterior)
-    covariance = covariance + covariance_of_sizes(posterior, covariance)
-    root = covariance_root(prior_scale * covariance.cpu(), geometry.change[:, active])
+    covariance.add_(covariance_of_sizes(posterior, covariance)).mul_(prior_scale)
+    root = covariance_root(covariance.cpu(), geometry.change[:, active])
     return PositionUncertainty(space, geometry, design.features, root, prior_scale)

@@ -8,8 +8,9 @@ from testing.closeness import assert_close
 from testing.linearised import drawn_joints, tracker_data
 
 from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.hybrid.design import Rows
 from pisigma.hybrid.refinement import Refined, linearised, refine, refined_at
-from pisigma.hybrid.search import Fitted
+from pisigma.hybrid.search import Choice, Fitted
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.conditions import JointState
@@ -31,7 +32,7 @@ def refined(request: pytest.FixtureRequest) -> Refined:
     solved = calibrator.geometric.solve(tracker_data(ROBOT, q, delta, 3e-5))
     group = held_out_groups(solved.setup.measurements)
     choice = calibrator._chosen(solved, group, lambda what: None)
-    return refine(solved.problem, group, choice.rows, choice.best)
+    return refine(solved.problem, group, choice)
 
 
 def test_residuals_at_the_solution_are_those_of_the_nonlinear_model(refined: Refined) -> None:
@@ -64,9 +65,14 @@ def test_the_network_predicts_what_the_design_does(refined: Refined) -> None:
     assert bool(orders) == any(chosen.name == "products" for chosen in design.features)
 
 
+def chosen_as(refined: Refined, rows: Rows) -> Choice:
+    """A choice that came to a solution on some rows."""
+    fitted = Fitted(refined.design, refined.posterior)
+    return Choice(rows, fitted, fitted, refined.regression, ())
+
+
 def test_a_solution_that_has_settled_is_not_linearised_again(refined: Refined) -> None:
-    chosen = Fitted(refined.design, refined.regression, refined.posterior)
-    again = refine(refined.rows.problem, refined.rows.group, refined.rows, chosen)
+    again = refine(refined.rows.problem, refined.rows.group, chosen_as(refined, refined.rows))
     assert again.rounds == 1
     assert again.rows is refined.rows
     assert again.regression is refined.regression
@@ -83,8 +89,7 @@ def test_rows_on_which_nothing_was_chosen_are_fitted_as_well(refined: Refined) -
         10.0,
         torch.arange(ROWS // 2),
     )
-    chosen = Fitted(refined.design, refined.regression, refined.posterior)
-    found = refine(problem, refined.rows.group, rows, chosen)
+    found = refine(problem, refined.rows.group, chosen_as(refined, rows))
     assert found.rounds >= 2
     assert len(found.rows.values[0].row) == len(refined.rows.values[0].row)
 

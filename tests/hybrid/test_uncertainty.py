@@ -12,6 +12,7 @@ from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_
 from torch import Tensor
 
 from pisigma.hybrid.evidence import GaussianPrior, LeftOut
+from pisigma.hybrid.normal_equations import NormalEquations
 from pisigma.hybrid.search import Fitted
 from pisigma.hybrid.uncertainty import (
     LARGEST_SCALE,
@@ -19,7 +20,6 @@ from pisigma.hybrid.uncertainty import (
     PositionUncertainty,
     covariance_of_sizes,
     covariance_root,
-    degrees_of_freedom_factor,
     left_out_scale,
     position_uncertainty,
 )
@@ -108,20 +108,6 @@ def test_errors_as_small_as_predicted_widen_nothing_and_there_is_a_limit() -> No
     assert_close(hopeless, LARGEST_SCALE, rtol=1e-9)
 
 
-def test_values_that_the_unknowns_use_up_widen() -> None:
-    fit, prior = small_problem()
-    posterior = fit.solve(prior, (0.4,))
-    covariance = fit.covariance(posterior)
-    told = float((1 - prior.precision * covariance.diagonal()).sum())
-    assert 8 < told < 10
-    assert_close(degrees_of_freedom_factor(fit, posterior), 60 / (60 - told), rtol=1e-12)
-    (count,) = fit.sensors
-    few = replace(fit, sensors=(replace(count, values=10.0),))
-    assert_close(degrees_of_freedom_factor(few, posterior), 5.0, rtol=1e-12)
-    certain = replace(fit, sensors=(count, replace(count, values=40.0, exact=True)))
-    assert_close(degrees_of_freedom_factor(certain, posterior), 60 / (60 - told), rtol=1e-12)
-
-
 @pytest.fixture(scope="module")
 def arm() -> LinearisedArm:
     """Poses of a robot with a sliding joint and one that counts backwards, in two frames with two targets."""
@@ -136,7 +122,9 @@ def uncertainty(arm: LinearisedArm) -> tuple[PositionUncertainty, Fitted, JointC
     problem = arm.rows.problem
     point = problem.nominal.index_add(0, problem.active, fitted.posterior.x[: fitted.design.active])
     known = identified_geometry(arm.setup, point)
-    found = position_uncertainty(arm.rows, fitted.design, fitted.regression, fitted.posterior, known)
+    found = position_uncertainty(
+        arm.rows, fitted.design, NormalEquations.of(fitted.design, arm.rows), fitted.posterior, known
+    )
     correction = JointCorrection(robot, fitted.design.features).requires_grad_(False)
     for k, chosen in enumerate(fitted.design.features):
         correction.linear[k][chosen.used] = fitted.posterior.x[fitted.design.stretch(k)]
@@ -190,7 +178,7 @@ def test_deviation_is_that_of_the_derivative_by_all_unknowns(arm: LinearisedArm)
 def test_deviation_is_that_of_drawn_calibrations(arm: LinearisedArm) -> None:
     """The covariance of positions at the training rows, as their columns give it, widened."""
     found, fitted, correction = uncertainty(arm)
-    C = fitted.regression.covariance(fitted.posterior)
+    C = NormalEquations.of(fitted.design, arm.rows).covariance(fitted.posterior)
     C = C + covariance_of_sizes(fitted.posterior, C)
     values = arm.rows.values[0].select(torch.arange(10))
     X = fitted.design.columns(values, slice(None))

@@ -89,9 +89,7 @@ class LinearisedArm:
         """Geometry and a unit of order 1, prior sizes and noise by the evidence."""
         design = Design(self.rows.problem, tuple(features))
         sums = NormalEquations.of(design, self.rows)
-        return Fitted(
-            design, sums, sums.maximise_evidence(design.prior(self.prior_scale), self.noise, iterations)
-        )
+        return Fitted(design, sums.maximise_evidence(design.prior(self.prior_scale), self.noise, iterations))
 
 
 def linearised(robot: Robot, measurements: Measurements, **options: object) -> LinearisedArm:
