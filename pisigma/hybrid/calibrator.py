@@ -10,19 +10,20 @@ from torch import Tensor
 
 from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.hybrid.arm import JointCoverage
-from pisigma.hybrid.design import Design
+from pisigma.hybrid.design import Design, Rows, weigh
 from pisigma.hybrid.mini_batches import MANY_ROWS, MiniBatches, batch_checkpoints, refine_in_batches
 from pisigma.hybrid.refinement import Refined, linearised, refine, with_frames_of
 from pisigma.hybrid.regression import regression
 from pisigma.hybrid.result import HybridResult, LearnedPart
 from pisigma.hybrid.search import LARGEST_EFFECTIVE_SHARE, Choice, Search
+from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.initial_guess.initial_guess import chosen_rows
 from pisigma.identification.problem.noise import renumbered, view_of
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.setup import identified_geometry
-from pisigma.identification.result import SolvedCalibration
+from pisigma.identification.result import Outlier, SolvedCalibration, outliers_of
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.registry import FEATURES, feature_named
@@ -33,6 +34,8 @@ from pisigma.robot.description import Robot
 
 SEARCHED_ROWS = 4_000
 """Features are chosen on so many rows at most; everything is fitted to all in the end."""
+GROSS = 50.0
+"""[standard deviations of the geometric calibration] Rows that are farther off take no part in the first model."""
 FIRST_SIZES = 3
 """Rows are first weighted by a model of all features, one that comes in several sizes in the third of them."""
 
@@ -149,6 +152,7 @@ class HybridCalibrator:
             unknowns=refined.design.unknowns,
             effective=refined.posterior.effective,
             rounds=refined.rounds,
+            outliers=_outliers(solved, refined),
         )
 
     def _batches(self, rows: int) -> MiniBatches | None:
@@ -163,17 +167,19 @@ class HybridCalibrator:
     ) -> Choice:
         """Features, chosen on at most `SEARCHED_ROWS` rows.
 
-        What a geometric calibration does not explain is not for that reason wrong: rows are weighted by their distance
-        from a first hybrid model.
+        What a geometric calibration does not explain is not for that reason wrong: a first hybrid model is fitted to
+        all rows but those that are beyond any robot's errors, and rows are weighted by their distance from that.
         """
         problem, view = solved.problem, view_of(solved.solution.linearisation)
         if problem.q.shape[0] > SEARCHED_ROWS:
             chosen = chosen_rows(problem.q.shape[0], SEARCHED_ROWS).to(problem.q.device)
             chosen = problem.with_partners(chosen)
             problem, group = problem.select(chosen), renumbered(group[chosen])
-        design = Design(problem, ())
-        x = (solved.solution.linearisation.point - problem.nominal)[problem.active]
-        rows = linearised(design, x, float(len(x)), group)
+        design, point = Design(problem, ()), solved.solution.linearisation.point
+        values = sensor_values(problem, point)
+        distances = [one.residual.norm(dim=1) * one.root / view.scale(k) for k, one in enumerate(values)]
+        weights = [(distance < GROSS).to(distance) for distance in distances]
+        rows = Rows.linearised(design, (point - problem.nominal)[problem.active], values, weights, group)
         growing, others = self._features(solved, problem)
         first = Design(problem, (*others, *growing[:FIRST_SIZES][-1:]))
         posterior = regression(first, rows).maximise_evidence(first.prior(view.prior_scale), view.noise)
@@ -208,6 +214,18 @@ class HybridCalibrator:
             else:
                 growing += tried
         return growing, others
+
+
+def _outliers(solved: SolvedCalibration, refined: Refined) -> tuple[Outlier, ...]:
+    """Rows that count for less than half by their distance from what the hybrid predicts, the worst first."""
+    problem, found = solved.problem, []
+    values = sensor_values(problem, refined.point, refined.correction)
+    weights = weigh(problem, values, refined.posterior.effective)
+    for number, (one, weight) in enumerate(zip(values, weights, strict=True)):
+        length = one.residual.norm(dim=1)
+        deviations = length * one.root / refined.posterior.noise[number]
+        found += outliers_of(solved, problem.sensors[number], one.row, length, deviations, weight)
+    return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
 
 
 def _kept_sentence(choice: Choice, trained: str) -> str:

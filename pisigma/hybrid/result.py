@@ -11,7 +11,7 @@ from pisigma.hybrid.search import Trial
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.prediction import predicted_poses
 from pisigma.identification.problem.setup import IdentifiedGeometry
-from pisigma.identification.result import CalibrationResult
+from pisigma.identification.result import CalibrationResult, Outlier
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
 from pisigma.sensors.registry import measured_errors
@@ -29,6 +29,7 @@ class LearnedPart:
         unknowns: number of parameters and weights.
         effective: how many of them the data determine (the rest the prior holds).
         rounds: linearisations made.
+        outliers: rows that counted for less than half, the worst first.
     """
 
     geometry: IdentifiedGeometry
@@ -38,6 +39,7 @@ class LearnedPart:
     unknowns: int
     effective: float
     rounds: int
+    outliers: tuple[Outlier, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,6 +59,11 @@ class HybridResult:
     uncertainty: PositionUncertainty
     trials: tuple[Trial, ...]
     verdict: str
+
+    @property
+    def outliers(self) -> tuple[Outlier, ...]:
+        """Rows that counted for less than half in the calibration that holds, the worst first."""
+        return self.geometric.outliers if self.learned is None else self.learned.outliers
 
     def arm(self) -> HybridArm | None:
         """The arm with the correction, base of the first frame and tool of the first target; None without one."""

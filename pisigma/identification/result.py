@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.identification.identifiability.observability import (
@@ -34,6 +34,7 @@ from pisigma.identification.problem.setup import CalibrationSetup, IdentifiedGeo
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.sensors.registry import measured_errors
+from pisigma.sensors.sensor import AbstractSensor
 
 DISAGREEING = 10.0
 """Angles whose variance had to be enlarged by more are worth a warning."""
@@ -352,20 +353,40 @@ def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows
 
 
 def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
-    measurements, setup, problem = solved.measurements, solved.setup, solved.problem
-    outliers = []
+    found = []
     view = view_of(solved.refined)
-    for number, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
+    for number, (sensor, sums) in enumerate(zip(solved.problem.sensors, view.sums, strict=True)):
         deviations = sums.distance / view.scale(number)
-        for k in (
-            (problem.loss_of(sensor).weight(deviations, sensor.components) < 0.5).nonzero()[:, 0].tolist()
-        ):
-            row = int(setup.rows[k])
-            length = float(sums.residual[:, k].norm())
-            outliers.append(
-                Outlier(row, measurements.place(row), sensor.name, length, float(deviations[k]), sensor.unit)
-            )
-    return tuple(sorted(outliers, key=lambda outlier: -outlier.deviations))
+        weight = solved.problem.loss_of(sensor).weight(deviations, sensor.components)
+        rows = torch.arange(len(weight))
+        found += outliers_of(solved, sensor, rows, sums.residual.norm(dim=0), deviations, weight)
+    return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
+
+
+def outliers_of(
+    solved: SolvedCalibration,
+    sensor: AbstractSensor,
+    rows: Int64[Tensor, " values"],
+    length: Float64[Tensor, " values"],
+    deviations: Float64[Tensor, " values"],
+    weight: Float64[Tensor, " values"],
+) -> list[Outlier]:
+    """Name the rows of a sensor that count for less than half.
+
+    Args:
+        solved: whose problem the rows are of.
+        sensor: that saw them.
+        rows: their numbers in the problem.
+        length: of their residuals [m or rad].
+        deviations: the same in standard deviations of one value.
+        weight: how much they count.
+    """
+    outliers = []
+    for k in (weight < 0.5).nonzero()[:, 0].tolist():
+        row = int(solved.setup.rows[rows[k]])
+        where = solved.measurements.place(row)
+        outliers.append(Outlier(row, where, sensor.name, float(length[k]), float(deviations[k]), sensor.unit))
+    return outliers
 
 
 def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:

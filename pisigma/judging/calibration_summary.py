@@ -6,13 +6,14 @@ finite value is None.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import asdict
 from typing import Any
 
 from pydantic import JsonValue
 
 from pisigma.hybrid.result import HybridResult, LearnedPart
-from pisigma.identification.result import CalibrationResult
+from pisigma.identification.result import CalibrationResult, Outlier
 from pisigma.judging.summary import AbstractSummary
 from pisigma.judging.trained_calibrations import Result, geometric_result
 from pisigma.judging.validation_figures import LearningPoint, ValidationFigures
@@ -269,7 +270,7 @@ def summarise(result: Result) -> CalibrationSummary:
             pairwise_kept=tuple(pairwise.kept),
         ),
         weak_directions=geometric.weak_directions,
-        outliers=_outliers(geometric),
+        outliers=_outliers(result.outliers),
         warnings=geometric.warnings,
         rmse_mm=tuple(value * 1e3 for value in geometric.rms_path),
     )
@@ -287,9 +288,9 @@ def _parameters(result: CalibrationResult) -> tuple[ParameterFigures, ...]:
     return tuple(rows)
 
 
-def _outliers(result: CalibrationResult) -> tuple[OutlierFigures, ...]:
+def _outliers(outliers: Sequence[Outlier]) -> tuple[OutlierFigures, ...]:
     rows = []
-    for outlier in result.outliers:
+    for outlier in outliers:
         unit, factor = _UNITS[outlier.unit]
         figures = {"deviations": outlier.deviations, f"residual_{unit}": outlier.residual * factor}
         rows.append(OutlierFigures(row=outlier.row, place=outlier.place, sensor=outlier.sensor, **figures))
