@@ -20,10 +20,11 @@ from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.initial_guess.initial_guess import chosen_rows
+from pisigma.identification.outliers import Outlier, outliers_of
 from pisigma.identification.problem.noise import renumbered, view_of
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.setup import identified_geometry
-from pisigma.identification.result import Outlier, SolvedCalibration, outliers_of
+from pisigma.identification.result import SolvedCalibration
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.registry import FEATURES, feature_named
@@ -218,13 +219,15 @@ class HybridCalibrator:
 
 def _outliers(solved: SolvedCalibration, refined: Refined) -> tuple[Outlier, ...]:
     """Rows that count for less than half by their distance from what the hybrid predicts, the worst first."""
-    problem, found = solved.problem, []
+    problem, setup, found = solved.problem, solved.setup, []
     values = sensor_values(problem, refined.point, refined.correction)
     weights = weigh(problem, values, refined.posterior.effective)
     for number, (one, weight) in enumerate(zip(values, weights, strict=True)):
         length = one.residual.norm(dim=1)
         deviations = length * one.root / refined.posterior.noise[number]
-        found += outliers_of(solved, problem.sensors[number], one.row, length, deviations, weight)
+        found += outliers_of(
+            solved.setup, solved.measurements, problem.sensors[number], one.row, length, deviations, weight
+        )
     return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
 
 

@@ -9,9 +9,10 @@ from torch import Tensor
 from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.hybrid.search import Trial
 from pisigma.hybrid.uncertainty import PositionUncertainty
+from pisigma.identification.outliers import Outlier
 from pisigma.identification.prediction import predicted_poses
 from pisigma.identification.problem.setup import IdentifiedGeometry
-from pisigma.identification.result import CalibrationResult, Outlier
+from pisigma.identification.result import CalibrationResult
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
 from pisigma.sensors.registry import measured_errors

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.identification.identifiability.observability import (
@@ -19,6 +19,7 @@ from pisigma.identification.identifiability.pairwise import PairwiseRedundancy, 
 from pisigma.identification.identifiability.plausibility import misfitting_frames
 from pisigma.identification.identifiability.redundancy import Findings, Redundancy
 from pisigma.identification.identifiability.sufficiency import what_to_measure
+from pisigma.identification.outliers import Outlier, outliers_of
 from pisigma.identification.parameter_table import ParameterEstimate, parameter_table
 from pisigma.identification.posterior import ParameterPosterior
 from pisigma.identification.prediction import predicted_poses
@@ -34,7 +35,6 @@ from pisigma.identification.problem.setup import CalibrationSetup, IdentifiedGeo
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.sensors.registry import measured_errors
-from pisigma.sensors.sensor import AbstractSensor
 
 DISAGREEING = 10.0
 """Angles whose variance had to be enlarged by more are worth a warning."""
@@ -68,27 +68,6 @@ class SensorNoise:
     rms: float
     quantity: Literal["m", "rad"]
     components: int
-
-
-@dataclass(frozen=True)
-class Outlier:
-    """A row that counted for less than half.
-
-    Attributes:
-        row: its number in the measurements, from 0.
-        place: file and line, or source and row, as complaints name the row.
-        sensor: which value of the row.
-        residual: length of the residual [m or rad].
-        deviations: the same in standard deviations of one value.
-        unit: "m" or "rad".
-    """
-
-    row: int
-    place: str
-    sensor: str
-    residual: float
-    deviations: float
-    unit: Literal["m", "rad"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -359,34 +338,10 @@ def _outliers(solved: SolvedCalibration) -> tuple[Outlier, ...]:
         deviations = sums.distance / view.scale(number)
         weight = solved.problem.loss_of(sensor).weight(deviations, sensor.components)
         rows = torch.arange(len(weight))
-        found += outliers_of(solved, sensor, rows, sums.residual.norm(dim=0), deviations, weight)
+        found += outliers_of(
+            solved.setup, solved.measurements, sensor, rows, sums.residual.norm(dim=0), deviations, weight
+        )
     return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
-
-
-def outliers_of(
-    solved: SolvedCalibration,
-    sensor: AbstractSensor,
-    rows: Int64[Tensor, " values"],
-    length: Float64[Tensor, " values"],
-    deviations: Float64[Tensor, " values"],
-    weight: Float64[Tensor, " values"],
-) -> list[Outlier]:
-    """Name the rows of a sensor that count for less than half.
-
-    Args:
-        solved: whose problem the rows are of.
-        sensor: that saw them.
-        rows: their numbers in the problem.
-        length: of their residuals [m or rad].
-        deviations: the same in standard deviations of one value.
-        weight: how much they count.
-    """
-    outliers = []
-    for k in (weight < 0.5).nonzero()[:, 0].tolist():
-        row = int(solved.setup.rows[rows[k]])
-        where = solved.measurements.place(row)
-        outliers.append(Outlier(row, where, sensor.name, float(length[k]), float(deviations[k]), sensor.unit))
-    return outliers
 
 
 def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:

@@ -13,7 +13,8 @@ from typing import Any
 from pydantic import JsonValue
 
 from pisigma.hybrid.result import HybridResult, LearnedPart
-from pisigma.identification.result import CalibrationResult, Outlier
+from pisigma.identification.outliers import Outlier
+from pisigma.identification.result import CalibrationResult
 from pisigma.judging.summary import AbstractSummary
 from pisigma.judging.trained_calibrations import Result, geometric_result
 from pisigma.judging.validation_figures import LearningPoint, ValidationFigures
