@@ -223,11 +223,9 @@ def _outliers(solved: SolvedCalibration, refined: Refined) -> tuple[Outlier, ...
     values = sensor_values(problem, refined.point, refined.correction)
     weights = weigh(problem, values, refined.posterior.effective)
     for number, (one, weight) in enumerate(zip(values, weights, strict=True)):
-        length = one.residual.norm(dim=1)
+        length, sensor = one.residual.norm(dim=1), problem.sensors[number]
         deviations = length * one.root / refined.posterior.noise[number]
-        found += outliers_of(
-            solved.setup, solved.measurements, problem.sensors[number], one.row, length, deviations, weight
-        )
+        found += outliers_of(setup, solved.measurements, sensor, one.row, length, deviations, weight)
     return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
 
 
