@@ -81,7 +81,8 @@ def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
         folder: to upgrade.
 
     Raises:
-        ModelError: the folder holds no model, or it is truncated, was edited or is of a newer format.
+        ModelError: the folder holds no model, it is truncated, was edited or is of a newer format, or it is a hybrid
+            with product units of an earlier version.
         OutputError: the folder cannot be written.
     """
     path = Path(folder)
@@ -93,7 +94,7 @@ def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
         return Upgrade(load_model(path).name, before, FORMAT)
     document["metrics"] = _metrics(str(document.get("kind")), _renamed(document["metrics"]))
     if "uncertainty" in document:
-        document["uncertainty"] = _renamed(document["uncertainty"])
+        document["uncertainty"] = _without_turns(_renamed(document["uncertainty"]), path)
     changes = (*_without_fade(document), *_with_measured_conditions(document))
     with staged_folder(path) as scratch:
         shutil.copytree(path, scratch, dirs_exist_ok=True)
@@ -115,6 +116,20 @@ def _without_fade(document: dict[str, Any]) -> tuple[str, ...]:
     learned = (document["metrics"].get("hybrid") or {}).get("learned") or {}
     learned.pop("fades_over_deg", None)
     return () if document.get("learned", {}).pop("fade_rad", None) is None else (_NO_FADE,)
+
+
+def _without_turns(uncertainty: dict[str, Any], path: Path) -> dict[str, Any]:
+    """Say that there are no products of inputs, where up to format 3 the factors of product units were named.
+
+    Raises:
+        ModelError: there are such factors, whose uncertainty is not that of products.
+    """
+    if uncertainty.pop("turns", []):
+        raise ModelError(
+            f"{path}: a joint correction without product units was wanted, but this one has them from an earlier "
+            "version, whose uncertainty cannot be converted; calibrate again."
+        )
+    return {"products": False, **uncertainty}
 
 
 def _with_measured_conditions(document: Mapping[str, Any]) -> tuple[str, ...]:

@@ -1,6 +1,7 @@
 """Folders of earlier versions are made new, whole or not at all."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,8 +41,8 @@ def old(values: Any, names: dict[str, str] = OLD) -> Any:
     return [old(value, names) for value in values] if isinstance(values, list) else values
 
 
-def write_old(model: CalibratedModel, folder: Path) -> dict[str, bytes]:
-    """Write a model folder as the earlier version did; gives its files."""
+def write_old(model: CalibratedModel, folder: Path, turns: Sequence[int] = ()) -> dict[str, bytes]:
+    """Write a model folder as the earlier version did, with factors of product units by turns; gives its files."""
     folder.mkdir()
     save_model(model, folder)
     path = folder / "model.yaml"
@@ -50,6 +51,8 @@ def write_old(model: CalibratedModel, folder: Path) -> dict[str, bytes]:
     if "uncertainty" in document:
         document["uncertainty"] = old(document["uncertainty"], {"prior_scale": "widening"})
         document["uncertainty"]["unexplained_m"] = 1e-4
+        del document["uncertainty"]["products"]
+        document["uncertainty"]["turns"] = list(turns)
     if "learned" in document:
         document["learned"]["fade_rad"] = 0.17
         for feature in document["learned"]["features"]:
@@ -81,6 +84,14 @@ def test_a_hybrid_calibration_comes_back_with_all_figures(tmp_path):
     before = (tmp_path / "arm" / "model.yaml").read_bytes()
     assert upgrade_folder(tmp_path / "arm") == Upgrade("arm", 4, 4)
     assert (tmp_path / "arm" / "model.yaml").read_bytes() == before
+
+
+def test_product_units_of_an_earlier_version_are_refused_and_nothing_is_changed(tmp_path):
+    _, model = hybrid_under_test()
+    files = write_old(model, tmp_path / "arm", turns=(11,))
+    with pytest.raises(ModelError, match="cannot be converted; calibrate again"):
+        upgrade_folder(tmp_path / "arm")
+    assert {entry.name: entry.read_bytes() for entry in (tmp_path / "arm").iterdir()} == files
 
 
 def test_measured_conditions_are_about_the_mean_where_a_folder_does_not_say(tmp_path):
