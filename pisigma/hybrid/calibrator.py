@@ -37,23 +37,23 @@ SEARCHED_ROWS = 4_000
 """Features are chosen on so many rows at most; everything is fitted to all in the end."""
 GROSS = 50.0
 """[standard deviations of the geometric calibration] Rows that are farther off take no part in the first model."""
-FIRST_SIZES = 3
-"""Rows are first weighted by a model of all features, one that comes in several sizes in the third of them."""
+FIRST_MODEL_SIZES = 3
+"""The first model has all features, one that comes in several sizes in the last of so many."""
 
 
 @dataclass(frozen=True)
 class HybridCalibrator:
     """Fits `T(q) = base · Π A_i(q_i + Δ_i(q); dh_i + ε_i) · tool` to measurements, Δ a Pi-Sigma network.
 
-    All unknowns are normal with means at nominal and prior sizes that maximise the evidence. Whatever does not
-    raise the evidence, or predicts left-out rows no better, is left out; if nothing is left the result is that of
-    the geometric calibration.
+    All unknowns are normal with means at nominal. The prior sizes of weights maximise the evidence, those of geometric
+    errors are the geometric calibration's. Whatever does not raise the evidence, or predicts left-out rows worse, is
+    left out; if nothing is left the result is that of the geometric calibration.
 
     Attributes:
         robot: the nominal robot; or its geometric calibrator, where that needs other settings than its defaults.
-        features: of the unit of order 1 that are tried, by the names of `joint_correction.registry.FEATURES`.
+        features: that are tried, by the names of `joint_correction.registry.FEATURES`.
         harmonics: of the Fourier series, tried in this order.
-        products: whether product units are tried; without them the correction is additive.
+        products: whether product units are tried, which need two joints; without them the correction is additive.
         gravity: direction in which things fall, in the frame of the robot's first row.
         mini_batches: whether the unknowns of the chosen model are trained on mini-batches instead of with the
             normal equations of all rows: True or False; how; or "auto", which does so from `MANY_ROWS` rows on.
@@ -179,13 +179,15 @@ class HybridCalibrator:
         design, point = Design(problem, ()), solved.solution.linearisation.point
         values = sensor_values(problem, point)
         distances = [one.residual.norm(dim=1) * one.root / view.scale(k) for k, one in enumerate(values)]
-        weights = [(distance < GROSS).to(distance) for distance in distances]
+        pairs = zip(distances, values, strict=True)
+        weights = [((distance < GROSS) | one.certain).to(distance) for distance, one in pairs]
         rows = Rows.linearised(design, (point - problem.nominal)[problem.active], values, weights, group)
         growing, others = self._features(solved, problem)
-        first = Design(problem, (*others, *growing[:FIRST_SIZES][-1:]))
+        first = Design(problem, (*others, *growing[:FIRST_MODEL_SIZES][-1:]))
         posterior = regression(first, rows).maximise_evidence(first.prior(view.prior_scale), view.noise)
         rows = linearised(first, posterior.x, posterior.effective, group)
-        products = [InputProducts(self.geometric.robot)] if self.products else []
+        several = self.products and self.geometric.robot.dof > 1
+        products = [InputProducts(self.geometric.robot)] if several else []
         largest = [*others, *growing[-1:], *products]
         return Search(rows, view.noise, view.prior_scale, largest, progress).best(growing, others, products)
 

@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.errors import IdentificationError
 from pisigma.hybrid.evidence import FIRST_SIZE, GaussianPrior, SensorCount
 from pisigma.hybrid.sensor_values import SensorValues
 from pisigma.identification.problem.loss import SquaredLoss
@@ -216,7 +217,7 @@ class Rows:
             rows.append(replace(one, residual=one.residual + design.moved(one, x)))
         return Rows(problem, tuple(rows), group)
 
-    def agrees(
+    def difference(
         self, other: "Rows", x: Float64[Tensor, " unknowns"], design: Design, noise: Sequence[float]
     ) -> float:
         """Sum of the squared differences between weighted residuals, over the noise; infinite for other rows.
@@ -251,12 +252,20 @@ def weigh(
         problem: how far-off rows of a sensor count; the scale is automatic.
         values: not weighted.
         effective: number of unknowns that the data determine.
+
+    Raises:
+        IdentificationError: a residual is not finite.
     """
     weights = []
     counts = [0.0 if sensor.certain else float(sensor.residual.numel()) for sensor in values]
     for number, sensor in enumerate(values):
         loss = problem.loss_of(problem.sensors[number])
         distance = sensor.residual.norm(dim=1) * sensor.root
+        if not bool(torch.isfinite(distance).all()):
+            raise IdentificationError(
+                f"the joint correction predicts no finite value of the sensor '{sensor.name}'; calibrate the geometry "
+                "alone, and look for values without limit in the measurements."
+            )
         if sensor.certain or isinstance(loss, SquaredLoss):
             weights.append(torch.ones_like(distance))
             continue

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
 
 
 SMALLEST_NOISE = 1e-8
-"""[m or rad] Floor of the estimated noise: far below what instruments resolve, and not too small beside errors of a
-millimetre for the covariance of the values."""
+"""[m or rad] Floor of the estimated noise: far below what instruments resolve."""
 SMALLEST_SIZE = 1e-9
 """Prior size [rad] below which a group of weights is off."""
 FIRST_SIZE = 2e-5

@@ -96,8 +96,8 @@ class NormalEquations(AbstractRegression):
         """Solve `(Σ_s N_s / noise_s² + precision) x = Σ_s b_s / noise_s²` by Cholesky with column scaling."""
         precision = prior.precision
         scale, factor, x = self._solved(prior, noise)
-        log_det = 2 * float(factor.diagonal().log().sum()) - 2 * float(scale.log().sum())
-        covariance = _inverse(scale, factor)
+        log_det = log_determinant(scale, factor)
+        covariance = inverted(scale, factor)
         used = [
             float(torch.dot(N.flatten(), covariance.flatten())) / sigma**2
             for N, sigma in zip(self.normal, noise, strict=True)
@@ -146,7 +146,7 @@ class NormalEquations(AbstractRegression):
     def covariance(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
         """See `AbstractRegression.covariance`."""
         scale, factor, _ = self._solved(posterior.prior, posterior.noise)
-        return _inverse(scale, factor)
+        return inverted(scale, factor)
 
     def _solved(self, prior: GaussianPrior, noise: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """Column scale and Cholesky factor of the matrix, and the most probable values."""
@@ -194,8 +194,13 @@ def factored(normal: Float64[Tensor, "unknowns unknowns"]) -> tuple[Tensor, Tens
         jitter *= 10
 
 
-def _inverse(scale: Tensor, factor: Tensor) -> Tensor:
-    """Inverse of the matrix, in the place of its factor."""
+def log_determinant(scale: Tensor, factor: Tensor) -> float:
+    """Of a matrix from what `factored` gives."""
+    return 2 * float(factor.diagonal().log().sum()) - 2 * float(scale.log().sum())
+
+
+def inverted(scale: Tensor, factor: Tensor) -> Float64[Tensor, "unknowns unknowns"]:
+    """Inverse of a matrix from what `factored` gives, in the place of the factor."""
     inverse: Tensor = torch.cholesky_inverse(factor, out=factor).mT  # symmetric, and so stored row by row
     return inverse.mul_(scale).mul_(scale[:, None])
 

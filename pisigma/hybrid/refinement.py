@@ -65,7 +65,7 @@ def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: C
     rounds = 1
     while rounds < MOST_ROUNDS:
         there = linearised(design, posterior.x, posterior.effective, group)
-        differs = there.agrees(rows, posterior.x, design, posterior.noise)
+        differs = there.difference(rows, posterior.x, design, posterior.noise)
         if differs < SETTLED * posterior.effective:
             break
         rows, fit = there, regression(design, there)

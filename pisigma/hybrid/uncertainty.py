@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pisigma.hybrid.design import FOLDS, Design, Rows
 from pisigma.hybrid.evidence import AbstractRegression, LeftOut, Posterior
+from pisigma.hybrid.normal_equations import factored
 from pisigma.hybrid.sensor_values import joint_columns, weight_columns
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.problem.setup import IdentifiedGeometry
@@ -98,13 +99,11 @@ def covariance_root(
     """Root of the covariance of all parameters in the user's coordinates and of the weights.
 
     Args:
-        covariance: of the free parameters and the weights.
+        covariance: of the free parameters and the weights; changed in place.
         change: d(user's parameters) / d(free parameters).
     """
-    scale = covariance.diagonal().clamp(min=1e-300).sqrt()
-    scaled = (covariance / scale).div_(scale[:, None])
-    scaled.diagonal().add_(1e-12)
-    root = torch.linalg.cholesky(scaled, out=scaled).mul_(scale[:, None])
+    scale, factor = factored(covariance)
+    root = factor.div_(scale[:, None])
     active = change.shape[1]
     return torch.cat([change @ root[:active], root[active:]])
 

@@ -10,7 +10,10 @@ from torch import Tensor
 
 from pisigma.hybrid.design import Design, Rows
 from pisigma.hybrid.evidence import AbstractRegression, GaussianPrior, LeftOut, Posterior, SensorCount
-from pisigma.hybrid.normal_equations import factored, log_noise
+from pisigma.hybrid.normal_equations import NormalEquations, factored, inverted, log_determinant, log_noise
+
+LARGEST_RATIO = 1e6
+"""Sum of the values' variances by the prior over that of the noise up to which traces of P are right to 1e-4."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +31,7 @@ class ValueCovariance(AbstractRegression):
 
     Attributes:
         design: the unknowns.
+        rows: linearised values.
         X: weighted columns, the parameters first.
         y: weighted values.
         sensor: number of every value's sensor.
@@ -39,6 +43,7 @@ class ValueCovariance(AbstractRegression):
     """
 
     design: Design
+    rows: Rows
     X: Float64[Tensor, "values unknowns"]
     y: Float64[Tensor, " values"]
     sensor: Int64[Tensor, " values"]
@@ -68,7 +73,9 @@ class ValueCovariance(AbstractRegression):
         X, y, number, group = (torch.cat(column) for column in zip(*parts, strict=True))
         prior = design.prior((1.0,) * design.classes)
         K = [_gram(X, prior, g, design.active) for g in range(prior.classes, len(prior.sizes))]
-        return ValueCovariance(design, X, y, number, group, prior, _stacked(K, y), rows.sensors, rows.groups)
+        return ValueCovariance(
+            design, rows, X, y, number, group, prior, _stacked(K, y), rows.sensors, rows.groups
+        )
 
     def select(self, design: Design) -> "ValueCovariance":
         """See `AbstractRegression.select`."""
@@ -77,8 +84,9 @@ class ValueCovariance(AbstractRegression):
         before = self.prior.group[columns]
         K = []
         for g in range(prior.classes, len(prior.sizes)):
-            other = int(before[(prior.group == g).nonzero()[0, 0]])
-            whole = int((prior.group == g).sum()) == int((self.prior.group == other).sum())
+            members = (prior.group == g).nonzero()[:, 0]
+            other = int(before[members[0]]) if len(members) else prior.classes
+            whole = 0 < len(members) == int((self.prior.group == other).sum())
             K.append(self.K[other - prior.classes] if whole else _gram(X, prior, g, design.active))
         return replace(self, design=design, X=X, prior=prior, K=_stacked(K, self.y))
 
@@ -103,6 +111,8 @@ class ValueCovariance(AbstractRegression):
 
     def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]) -> LeftOut:
         """See `AbstractRegression.left_out`; `noise² P` is `I - X C X^T`, and `noise² P y` the residual."""
+        if self._is_ill(posterior.prior, posterior.noise):
+            return self.normal_equations.left_out(posterior, folds)
         sigma = self.y.new_tensor(posterior.noise)[self.sensor]
         P = self._projection(posterior.prior, posterior.noise)[0].mul_(sigma).mul_(sigma[:, None])
         residual = P @ (self.y / sigma)
@@ -116,6 +126,8 @@ class ValueCovariance(AbstractRegression):
 
     def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
         """See `AbstractRegression.solve`."""
+        if self._is_ill(prior, noise):
+            return self.normal_equations.solve(prior, noise)
         P, parameters, covariance, log_det = self._projection(prior, noise)
         active, precision = self.design.active, prior.precision
         variance = self.y.new_tensor(noise).square()[self.sensor]
@@ -139,16 +151,29 @@ class ValueCovariance(AbstractRegression):
         return Posterior(x, -0.5 * evidence, prior, noise, square, determined, misfit, used)
 
     def covariance(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
-        """See `AbstractRegression.covariance`."""
-        prior, active = posterior.prior, self.design.active
-        P, _, own, _ = self._projection(prior, posterior.noise)
-        V = self._covariance(prior, posterior.noise)
-        V = V + V.tril(-1).t()
-        scaled = self.X[:, active:] / prior.precision[active:]
-        covariance = -scaled.t() @ (P @ scaled)
-        covariance.diagonal().add_(1 / prior.precision[active:])
-        cross = -own @ torch.linalg.solve(V, self.X[:, :active]).t() @ scaled
-        return torch.cat([torch.cat([own, cross], 1), torch.cat([cross.t(), covariance], 1)])
+        """See `AbstractRegression.covariance`; not from P, which loses what is small beside the prior."""
+        return self.normal_equations.covariance(posterior)
+
+    @cached_property
+    def normal_equations(self) -> NormalEquations:
+        """The same values as normal equations."""
+        parts = [
+            (self.X[rows], self.y[rows]) for rows in (self.sensor == k for k in range(len(self.sensors)))
+        ]
+        return NormalEquations(
+            design=self.design,
+            rows=self.rows,
+            normal=torch.stack([X.t() @ X for X, _ in parts]),
+            descent=torch.stack([X.t() @ y for X, y in parts]),
+            square=tuple(float(y @ y) for _, y in parts),
+            sensors=self.sensors,
+        )
+
+    def _is_ill(self, prior: GaussianPrior, noise: tuple[float, ...]) -> bool:
+        """Whether the noise is so small beside the values that traces of P cancel; then normal equations are right."""
+        diagonal = torch.arange(len(self.y)).add(1).cumsum(0) - 1
+        trace = float(prior.sizes[prior.classes :].square() @ self.K[:, diagonal].sum(1))
+        return trace > LARGEST_RATIO * min(noise) ** 2
 
     def _covariance(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Tensor:
         """The lower triangle of V."""
@@ -180,19 +205,16 @@ class ValueCovariance(AbstractRegression):
     ) -> tuple[Tensor, Tensor, Tensor, float]:
         """P, the parameters and their covariance, and `log |V| + log |G^T V^-1 G + Λ|`."""
         active = self.design.active
-        scale, factor = factored(self._covariance(prior, noise))
-        G = self.X[:, :active]
-        inverse = torch.cholesky_inverse(factor).mul_(scale).mul_(scale[:, None])
+        factor = factored(self._covariance(prior, noise))
+        log_det = log_determinant(*factor)
+        inverse, G = inverted(*factor), self.X[:, :active]
         along = inverse @ G
         normal = G.t() @ along
         normal.diagonal().add_(prior.precision[:active])
-        own_scale, own_factor = factored(normal)
-        covariance = torch.cholesky_inverse(own_factor).mul_(own_scale).mul_(own_scale[:, None])
+        factor = factored(normal)
+        log_det += log_determinant(*factor)
+        covariance = inverted(*factor)
         parameters = covariance @ (along.t() @ self.y)
-        log_det = sum(
-            2 * float(f.diagonal().log().sum()) - 2 * float(s.log().sum())
-            for s, f in ((scale, factor), (own_scale, own_factor))
-        )
         return inverse - along @ covariance @ along.t(), parameters, covariance, log_det
 
     def _by_sensor(self, values: Tensor) -> tuple[float, ...]:

@@ -3,10 +3,13 @@
 import functools
 import itertools
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
+from testing.linearised import drawn_joints, tracker_data
 from testing.models import no_type_checker
 from testing.rb5_with_all_errors import NOISE, SimulatedTracker, simulated_tracker
 from testing.sensors import pair_data, socket_data, touch_data, true_robot
@@ -297,3 +300,37 @@ def test_sockets_alone_with_nothing_but_geometry_are_the_geometric_calibration()
     result = HybridCalibrator(geometric, harmonics=(8,), products=False).fit(data)
     assert result.learned is None
     assert bool(torch.isfinite(result.deviation(data)).all())
+
+
+@pytest.mark.parametrize("rows", [60, 400])
+def test_without_noise_errors_and_their_deviations_vanish(rows: int) -> None:
+    """With few rows as with many; the noise is then far too small for the covariance of the values."""
+    robot = Robot.load("kiro3")
+    q, test = (drawn_joints(robot, count, seed, widest=2.0) for seed, count in enumerate((rows, 100)))
+    delta = 3e-4 * torch.sin(2 * q), 3e-4 * torch.sin(2 * test)
+    with no_type_checker():
+        result = HybridCalibrator(robot, harmonics=(8, 24)).fit(tracker_data(robot, q, delta[0]))
+        unseen = tracker_data(robot, test, delta[1])
+        assert rms(result.geometric, unseen) > 3e-5
+        assert rms(result, unseen) < 3e-7
+        assert float(result.deviation(unseen).max()) < 3e-6
+
+
+@pytest.mark.parametrize("rows", [60, 400])
+def test_a_single_joint_is_calibrated_without_products(rows: int, tmp_path: Path) -> None:
+    """A turntable: there are no two joints for products."""
+    urdf = (
+        '<robot name="table"><link name="a"/><link name="b"/><joint name="turn" type="revolute"><parent link="a"/>'
+        '<child link="b"/><origin xyz="0 0 0.3"/><axis xyz="0 0 1"/>'
+        '<limit lower="-2" upper="2" effort="1" velocity="1"/></joint></robot>'
+    )
+    (tmp_path / "table.urdf").write_text(urdf)
+    robot = Robot.load(tmp_path / "table.urdf")
+    held = robot.with_geometry(tool=np.array([0.5, 0.1, 0.2, 0.0, 0.0, 0.0]))
+    q, test = (drawn_joints(robot, count, seed, widest=1.8) for seed, count in enumerate((rows, 100)))
+    with no_type_checker():
+        result = HybridCalibrator(robot, harmonics=(8,)).fit(
+            tracker_data(held, q, 2e-4 * torch.sin(3 * q), 3e-5)
+        )
+        unseen = tracker_data(held, test, 2e-4 * torch.sin(3 * test))
+        assert rms(result, unseen) < 0.3 * rms(result.geometric, unseen)

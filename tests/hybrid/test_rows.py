@@ -81,7 +81,7 @@ def test_residuals_are_counted_from_nominal_and_no_correction(arm: LinearisedArm
         left = sensor.residual - design.columns(sensor, slice(None)) @ x
         assert_close(left, there.residual, atol=1e-15)
     with_network = linearised(design, x, 10.0, arm.rows.group)
-    assert with_network.agrees(with_network, x, design, (1e-5, 1e-4)) == 0.0
+    assert with_network.difference(with_network, x, design, (1e-5, 1e-4)) == 0.0
 
 
 def test_rows_agree_as_far_as_their_weighted_residuals_are_equal(arm: LinearisedArm) -> None:
@@ -90,13 +90,13 @@ def test_rows_agree_as_far_as_their_weighted_residuals_are_equal(arm: Linearised
     first, second = arm.rows.values
     off = replace(arm.rows, values=(replace(first, residual=first.residual + 2e-5), second))
     expected = float((first.root.square() * 3 * 4e-10).sum()) / 1e-10
-    assert_close(off.agrees(arm.rows, x, design, (1e-5, 1e-4)), expected, rtol=1e-9)
+    assert_close(off.difference(arm.rows, x, design, (1e-5, 1e-4)), expected, rtol=1e-9)
     heavier = replace(arm.rows, values=(replace(first, root=2 * first.root), second))
     left = (first.residual - first.geometry @ x) * first.root[:, None]
     expected = float(left.square().sum()) / 1e-10
-    assert_close(heavier.agrees(arm.rows, x, design, (1e-5, 1e-4)), expected, rtol=1e-9)
+    assert_close(heavier.difference(arm.rows, x, design, (1e-5, 1e-4)), expected, rtol=1e-9)
     fewer = arm.rows.of(torch.arange(39))
-    assert fewer.agrees(arm.rows, x, design, (1e-5, 1e-4)) == math.inf
+    assert fewer.difference(arm.rows, x, design, (1e-5, 1e-4)) == math.inf
 
 
 def test_far_off_rows_count_less_and_squared_loss_counts_all_alike(arm: LinearisedArm) -> None:

@@ -1,6 +1,7 @@
 """The regression by the values' covariance against normal equations and the dense problem."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,3 +81,18 @@ def test_values_that_are_not_finite_are_refused() -> None:
     found.X[3] = torch.nan
     with pytest.raises(IdentificationError, match="not finite"):
         found.solve(case.prior, case.noise)
+
+
+def test_noise_that_is_small_beside_the_values_is_left_to_normal_equations() -> None:
+    """Traces of P cancel there; what comes back is that of the normal equations to the last bit."""
+    case = few_values()
+    noise = tuple(1e-4 * sigma for sigma in case.noise)
+    prior = replace(case.prior, sizes=case.prior.sizes * 10)
+    dual, normal = ValueCovariance.of(case.design, case.rows), NormalEquations.of(case.design, case.rows)
+    here, there = dual.solve(prior, noise), dual.normal_equations.solve(prior, noise)
+    assert torch.equal(here.x, there.x)
+    assert here.log_evidence == there.log_evidence
+    expected = normal.solve(prior, noise)
+    assert_close(here.determined, expected.determined, atol=1e-3)
+    errors, wanted = dual.left_out(here, case.folds), normal.left_out(expected, case.folds)
+    assert_close(errors.error, wanted.error, rtol=1e-3, atol=1e-3 * float(wanted.error.abs().max()))

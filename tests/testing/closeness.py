@@ -2,10 +2,14 @@
 
 import numpy as np
 import torch
+from torch import Tensor
+
+from pisigma.robot import Robot
+from pisigma.se3 import wrap_to_pi
 
 
 def _to_numpy(value: object) -> np.ndarray:
-    return value.detach().cpu().numpy() if isinstance(value, torch.Tensor) else np.asarray(value)
+    return value.detach().cpu().numpy() if isinstance(value, Tensor) else np.asarray(value)
 
 
 def assert_close(actual: object, expected: object, *, atol: float = 0.0, rtol: float = 0.0) -> None:
@@ -15,3 +19,9 @@ def assert_close(actual: object, expected: object, *, atol: float = 0.0, rtol: f
     assert not np.isnan(a).any(), f"{int(np.isnan(a).sum())} actual values are NaN"
     assert not np.isnan(e).any(), "an expected value is NaN"
     np.testing.assert_allclose(a, np.broadcast_to(e, a.shape), atol=atol, rtol=rtol)
+
+
+def joint_distance(robot: Robot, a: Tensor, b: Tensor) -> Tensor:
+    """Largest difference of two sets of joint values [rad or m], full turns of revolute joints not counted."""
+    difference = torch.where(torch.tensor(robot.revolute), wrap_to_pi(a - b), a - b)
+    return difference.abs().amax(-1)

@@ -1,5 +1,6 @@
 """Running a recipe: its model folder, and the result that the page is made of."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +10,7 @@ from jig_run import run_jigs_recipe
 from markdown_text import command_of
 from pisigma.export.output_file import write_whole
 from pisigma.identification.result import CalibrationResult
+from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.staging import check_replaceable
 from pisigma.recipes.data import simulate
 from pisigma.recipes.reader import read_recipe
@@ -38,7 +40,8 @@ def run_recipe(folder: Path, name: str, data: Path | None, out: Path | None) -> 
     else:
         check_replaceable(out)
         path = folder / f"{name}.yaml"
-        training = train(path, data, TrainSettings(show_progress=True))
+        rows = None if data is None else replace(Measurements.read_csv(data), source=data.name)
+        training = train(path, rows, TrainSettings(show_progress=True))
         training.save(out, name, command_of(name))
         result = {"model": str(out), **figures_of(training), **extra_figures(folder, name, training)}
     (folder / RESULTS).mkdir(exist_ok=True)
