@@ -28,7 +28,6 @@ DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
 FILES = {"ur5": "ur5/grid.csv", "ur10": "ur10/series_c_train.csv"}
 HALVED = {"ur5": (1, 2, 3, 4, 5), "ur10": (1, 3, 5)}
 FEW = (300, 100, 50, 30)
-PARTS = ("folds", "few", "boxes", "halves")
 
 
 @dataclass(frozen=True)
@@ -81,6 +80,9 @@ def halves(name: str, robot: Robot, data: Measurements) -> Iterator[Case]:
             yield Case(f"{name} joint {joint} {side}", robot, train, test)
 
 
+PARTS = {"folds": folds, "few": few, "boxes": boxes, "halves": halves}
+
+
 def judged(case: Case) -> Judged:
     """Fit and judge."""
     began = time.perf_counter()
@@ -106,7 +108,7 @@ def print_line(name: str, one: Judged, more: str) -> None:
 def main() -> None:
     """Print one line a fit, and a line for what belongs together."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("parts", nargs="*", default=PARTS)
+    parser.add_argument("parts", nargs="*", default=list(PARTS), metavar="PART")
     parser.add_argument("--robot", choices=FILES, action="append")
     arguments = parser.parse_args()
     print(f"{'case':20s} {'geom.':>7s} {'hybrid':>7s} {'ratio':>6s} {'95 %':>6s}")
@@ -116,7 +118,7 @@ def main() -> None:
             robot = Robot.load(name)
             data = Measurements.read_csv(DATA / FILES[name], robot)
             groups: dict[str, list[Judged]] = {}
-            for case in globals()[part](name, robot, data):
+            for case in PARTS[part](name, robot, data):
                 groups.setdefault(case.name.rsplit(" fold")[0], []).append(judged(case))
             for group, cases in groups.items():
                 together = Judged(
