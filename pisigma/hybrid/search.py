@@ -115,7 +115,6 @@ class Search:
         self.rows = rows
         self._regression = regression(Design(rows.problem, tuple(largest)), rows)
         self._folds = rows.folds(FOLDS if rows.groups > FEW_GROUPS else FOLDS_OF_FEW, MOST_GROUPS)
-        self._unit = self._least = 1.0
         began = time.monotonic()
         self.geometry = self.fitted(())
         self._unit = self._least = self._left_out(self.geometry)

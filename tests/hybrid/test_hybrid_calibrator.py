@@ -310,10 +310,10 @@ def test_without_noise_errors_and_their_deviations_vanish(rows: int) -> None:
     delta = 3e-4 * torch.sin(2 * q), 3e-4 * torch.sin(2 * test)
     with no_type_checker():
         result = HybridCalibrator(robot, harmonics=(8, 24)).fit(tracker_data(robot, q, delta[0]))
-        unseen = tracker_data(robot, test, delta[1])
-        assert rms(result.geometric, unseen) > 3e-5
-        assert rms(result, unseen) < 3e-7
-        assert float(result.deviation(unseen).max()) < 3e-6
+        held_out = tracker_data(robot, test, delta[1])
+        assert rms(result.geometric, held_out) > 3e-5
+        assert rms(result, held_out) < 3e-7
+        assert float(result.deviation(held_out).max()) < 3e-6
 
 
 @pytest.mark.parametrize("rows", [60, 400])
@@ -332,5 +332,5 @@ def test_a_single_joint_is_calibrated_without_products(rows: int, tmp_path: Path
         result = HybridCalibrator(robot, harmonics=(8,)).fit(
             tracker_data(held, q, 2e-4 * torch.sin(3 * q), 3e-5)
         )
-        unseen = tracker_data(held, test, 2e-4 * torch.sin(3 * test))
-        assert rms(result, unseen) < 0.3 * rms(result.geometric, unseen)
+        held_out = tracker_data(held, test, 2e-4 * torch.sin(3 * test))
+        assert rms(result, held_out) < 0.3 * rms(result.geometric, held_out)
