@@ -11,6 +11,7 @@ from torch import Tensor
 from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.hybrid.arm import JointCoverage
 from pisigma.hybrid.design import Design, Rows, weigh
+from pisigma.hybrid.evidence import SMALLEST_NOISE
 from pisigma.hybrid.mini_batches import MANY_ROWS, MiniBatches, batch_checkpoints, refine_in_batches
 from pisigma.hybrid.refinement import Refined, linearised, refine, with_frames_of
 from pisigma.hybrid.regression import regression
@@ -179,9 +180,15 @@ class HybridCalibrator:
         design, point = Design(problem, ()), solved.solution.linearisation.point
         values = sensor_values(problem, point)
         distances = [one.residual.norm(dim=1) * one.root / view.scale(k) for k, one in enumerate(values)]
-        pairs = zip(distances, values, strict=True)
-        weights = [((distance < GROSS) | one.certain).to(distance) for distance, one in pairs]
+        weights = [
+            ((distance < GROSS) | one.certain).to(distance)
+            for distance, one in zip(distances, values, strict=True)
+        ]
         rows = Rows.linearised(design, (point - problem.nominal)[problem.active], values, weights, group)
+        pairs = zip(view.noise, values, strict=True)
+        if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.certain):
+            # The geometry leaves nothing to learn; features would fit the errors of the linearisation.
+            return Search(rows, view.noise, view.prior_scale, [], progress).best([], [])
         growing, others = self._features(solved, problem)
         first = Design(problem, (*others, *growing[:FIRST_MODEL_SIZES][-1:]))
         posterior = regression(first, rows).maximise_evidence(first.prior(view.prior_scale), view.noise)
