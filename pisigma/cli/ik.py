@@ -129,7 +129,15 @@ def _check_options(
 
 
 def _transform(pose: Pose) -> "np.ndarray":
-    """The wanted pose T_base_tool as a batch of one."""
+    """The wanted pose T_base_tool as a batch of one; values that no pose has are refused."""
+    from pisigma.errors import PoseError
     from pisigma.kernels.array_kinematics import transform_of
+    from pisigma.robot.row import FRAME_COLUMNS, LARGEST
+
+    for name, value in zip(FRAME_COLUMNS, pose, strict=True):
+        if abs(value) > LARGEST:
+            raise PoseError(
+                f"--pose: {name} {value:g} is no length [mm] or angle [deg] that a pose has; give X Y Z ROLL PITCH YAW."
+            )
 
     return transform_of([*(value / 1e3 for value in pose[:3]), *map(math.radians, pose[3:])])[None]

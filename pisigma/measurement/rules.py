@@ -18,6 +18,8 @@ AXES = ("x", "y", "z")
 SPLITS = ("train", "test")
 SMALLEST_SIGMA = 1e-12
 """[m or rad] Nothing is measured more exactly."""
+TEMPERATURES = (-50.0, 150.0)
+"""[deg C] Outside these no robot works; 293 is a room in kelvins, and -400 lies below absolute zero."""
 
 _PARTIAL = ("anchor_place", "approach")  # a row may have some of their values without the others
 _ROTATION_TOLERANCE = 1e-6
@@ -163,16 +165,18 @@ def rows_where(bad: Bool[np.ndarray, " rows"]) -> list[int]:
 
 def _value_faults(data: MeasuredFields, labels: Labels) -> Iterator[Fault]:
     """Rows with values that cannot be: of standard deviations, payloads, directions of approach, and sets."""
-    for name, least in (
-        ("sigma_position", SMALLEST_SIGMA),
-        ("sigma_rotation", SMALLEST_SIGMA),
-        ("payload", 0.0),
+    for name, least, most in (
+        ("sigma_position", SMALLEST_SIGMA, math.inf),
+        ("sigma_rotation", SMALLEST_SIGMA, math.inf),
+        ("payload", 0.0, math.inf),
+        ("temperature", *TEMPERATURES),
     ):
         values = data.array(name)
-        for row in rows_where(values < least):
+        wanted = f"{labels.shown(name, least)} {'or more' if most == math.inf else f'to {most:g} deg C'}"
+        for row in rows_where((values < least) | (values > most)):
             what = (
-                f"{labels(name)}: {labels.shown(name, values[row])} stands where {labels.shown(name, least)} or more "
-                "was wanted; correct it or leave it empty"
+                f"{labels(name)}: {labels.shown(name, values[row])} stands where {wanted} was wanted; correct it"
+                f"{'' if most == math.inf else ' (deg C = K - 273.15 = (deg F - 32) / 1.8)'} or leave it empty"
             )
             yield row, what
     if "approach" in data.numbers:

@@ -12,6 +12,7 @@ from pisigma.errors import ModelError
 from pisigma.joint_correction.conditions import ConditionFeatures, at_conditions, learned_conditions
 from pisigma.measurement.conditions import conditions_of
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.rules import TEMPERATURES
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
 
@@ -51,8 +52,9 @@ def under_stated_conditions(
                 f"model '{model.name}' did not learn what {name} does; it knows {knows}. Calibrate with rows "
                 f"measured at several values of {name} (a column of that name)."
             )
-        if not math.isfinite(value) or (name == "payload_kg" and value < 0):
-            wanted = "a mass of 0 or more" if name == "payload_kg" else "a temperature"
+        low, high = TEMPERATURES if name == "temperature_c" else (0.0, math.inf)
+        if not math.isfinite(value) or not low <= value <= high:
+            wanted = "a mass of 0 or more" if high == math.inf else f"a temperature of {low:g} to {high:g}"
             raise ModelError(f"model '{model.name}': {name}={value:g} was stated; give {wanted}.")
     assert arm is not None
     assert learned is not None

@@ -15,6 +15,9 @@ DH_COLUMNS = ("theta", "d", "a", "alpha", "beta")
 FRAME_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
 """Order of the parameters of base and tool, everywhere; x, y, z [m], roll, pitch, yaw [rad]."""
 
+LARGEST = 1e9
+"""[mm, deg, or as a file states it] No robot, pose or measurement has a larger value."""
+
 _LENGTHS = frozenset(("d", "a", "x", "y", "z"))
 
 

@@ -121,6 +121,21 @@ ROWS = {
         f"q1_deg,{POSITION},payload_kg\n1,1,2,3,-1\n",
         (2, "column 'payload_kg'", "0 or more"),
     ),
+    "kelvins": (
+        None,
+        f"q1_deg,{POSITION},temperature_c\n1,1,2,3,293.2\n",
+        (2, "column 'temperature_c'", "293.2", "-50 to 150 deg C", "K - 273.15"),
+    ),
+    "below absolute zero": (
+        None,
+        f"q1_deg,{POSITION},temperature_c\n1,1,2,3,20\n2,1,2,3,-400\n",
+        (3, "column 'temperature_c'", "-400"),
+    ),
+    "a joint value that a spreadsheet could not calculate": (
+        None,
+        f"q1_deg,{POSITION}\n# a note, with, some, commas\n1,1,2,3\n #N/A ,1,2,3\n",
+        (4, "column 'q1_deg'", "'#N/A' is no finite number"),
+    ),
     "an approach that is none": (
         None,
         f"q1_deg,{POSITION},approach1\n1,1,2,3,0\n",

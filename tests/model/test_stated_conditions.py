@@ -167,6 +167,7 @@ def test_rows_beyond_the_measured_conditions_are_counted_by_all_that_judge(tmp_p
         ({"payload_kg": -0.5}, r"payload_kg=-0\.5 was stated; give a mass of 0 or more"),
         ({"payload_kg": float("inf")}, "payload_kg=inf was stated"),
         ({"temperature_c": float("nan")}, "temperature_c=nan was stated; give a temperature"),
+        ({"temperature_c": 293.0}, "temperature_c=293 was stated; give a temperature of -50 to 150"),
     ],
 )
 def test_conditions_that_make_no_sense_are_refused(given: dict[str, float], complaint: str) -> None:

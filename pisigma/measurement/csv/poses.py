@@ -18,6 +18,7 @@ from pisigma.measurement.csv.rows import QUATERNION_TOLERANCE
 from pisigma.measurement.csv.table import content_lines, header_names, split_line
 from pisigma.measurement.fields import LeftOut
 from pisigma.measurement.readings import to_si
+from pisigma.robot.row import LARGEST
 from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy, transform
 
 CHUNK_ROWS = 20_000
@@ -140,7 +141,7 @@ class _Layout:
                 except ValueError:
                     pass
                 else:
-                    if np.isfinite(numbers).all():
+                    if np.abs(numbers).max(initial=0.0) <= LARGEST:  # no NaN either
                         return numbers, {}
         return self._checked_values(lines)
 
@@ -167,9 +168,11 @@ class _Layout:
                 "decimal point, not a comma)"
             )
         for name, cell in zip(self.names, fields, strict=True):
+            shown = cell.strip()[:_LONGEST_CELL]
             if not np.isfinite(_number(cell)):
-                shown = cell.strip()[:_LONGEST_CELL]
                 return f"column '{name}': '{shown}' is no finite number; write one such as -12.5"
+            if abs(_number(cell)) > LARGEST:
+                return f"column '{name}': {shown} is more than any pose has; correct it"
         return ""
 
     def poses(

@@ -13,9 +13,8 @@ from pisigma.measurement.csv.table import Faults, Table
 from pisigma.measurement.readings import READINGS, from_si, to_si
 from pisigma.measurement.rules import rows_where
 from pisigma.robot import Robot, Row
+from pisigma.robot.row import LARGEST
 
-LARGEST = 1e9
-"""In the file's units: nothing that is measured is larger."""
 QUATERNION_TOLERANCE = 1e-3
 """How far the norm of a quaternion may be from 1."""
 

@@ -11,6 +11,11 @@ from jaxtyping import Bool
 
 from pisigma.errors import MeasurementError
 
+SPREADSHEET_ERRORS = frozenset(
+    ("#N/A", "#NV", "#REF!", "#VALUE!", "#DIV/0!", "#NAME?", "#NUM!", "#NULL!", "#SPILL!", "#CALC!")
+)
+"""What spreadsheets write into cells that they cannot calculate."""
+
 
 @dataclass(frozen=True, eq=False)
 class Table:
@@ -65,16 +70,24 @@ def read_table(path: str | os.PathLike[str]) -> Table:
 def content_lines(lines: Iterable[str], source: str) -> Iterator[tuple[int, str]]:
     """The lines that are neither blank nor begin with #, the header first, each with its number.
 
+    A line with as many fields as the header whose first one is an error of a spreadsheet is a row.
+
     Raises:
         MeasurementError: there is none.
     """
-    empty = True
+    columns = 0
     for number, line in enumerate(lines, start=1):
-        if (start := line.lstrip()) and not start.startswith("#"):
-            empty = False
+        if (start := line.lstrip()) and (not start.startswith("#") or _is_failed_row(start, columns)):
+            columns = columns or len(split_line(line)[0])
             yield number, line
-    if empty:
+    if not columns:
         raise MeasurementError(f"{source}: the file is empty; a header and at least one row were wanted.")
+
+
+def _is_failed_row(line: str, columns: int) -> bool:
+    """Whether a line that begins with # is a row whose first cell a spreadsheet could not calculate."""
+    fields = split_line(line)[0]
+    return len(fields) == columns and fields[0].strip() in SPREADSHEET_ERRORS
 
 
 def header_names(line: str, place: str) -> tuple[str, ...]:

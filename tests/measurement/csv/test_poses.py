@@ -57,6 +57,8 @@ def test_quaternions_metres_and_any_order_of_columns(tmp_path):
         ([RPY, "1,2,three,4,5,6"], "line 2, column 'z_mm': 'three' is no finite number"),
         ([RPY, "1,2,nan,4,5,6"], "'nan' is no finite number"),
         ([RPY, "1,2,3,4,5,inf"], "'inf' is no finite number"),
+        ([RPY, "1,2,3,1e300,5,6"], "line 2, column 'roll_deg': 1e300 is more than any pose has"),
+        ([RPY, "1,2,3,4,5,6", "#REF!,2,3,4,5,6"], "line 3, column 'x_mm': '#REF!' is no finite number"),
         ([RPY, "1,2,,4,5,6"], "column 'z_mm': '' is no finite number"),
         ([RPY, "1,2,1_000,4,5,6"], "'1_000' is no finite number"),
         (

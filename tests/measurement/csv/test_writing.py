@@ -13,6 +13,7 @@ from testing.closeness import assert_close
 
 from pisigma.errors import MeasurementError, OutputError
 from pisigma.measurement import Measurements
+from pisigma.measurement.rules import TEMPERATURES
 from pisigma.robot import Robot
 from pisigma.se3 import rotation_from_quaternion, rotation_from_rpy
 
@@ -46,8 +47,10 @@ def written_fields(draw: st.DrawFn, rows: int, dof: int) -> dict[str, object]:
     def numbers(count: int, low: float = -1e3, high: float = 1e3) -> torch.Tensor:
         return tensor(each_row(st.lists(st.floats(low, high), min_size=count, max_size=count)))
 
-    def optional(low: float) -> torch.Tensor | None:
-        return with_gaps(numbers(1, low)[:, 0], each_row(st.booleans())) if draw(st.booleans()) else None
+    def optional(low: float, high: float = 1e3) -> torch.Tensor | None:
+        return (
+            with_gaps(numbers(1, low, high)[:, 0], each_row(st.booleans())) if draw(st.booleans()) else None
+        )
 
     unseen = each_row(st.sampled_from(["position", "rotation", ""])) if draw(st.booleans()) else None
     quaternion = numbers(4, -1, 1)
@@ -62,7 +65,7 @@ def written_fields(draw: st.DrawFn, rows: int, dof: int) -> dict[str, object]:
         "sigma_rotation": optional(1e-9),
         "split": draw(st.none() | st.just(("train", "test", "train", "train", "test")[:rows])),
         "payload": optional(0.0),
-        "temperature": optional(-100.0),
+        "temperature": optional(*TEMPERATURES),
         "approach": draw(st.none() | st.just(True)) and tensor(each_row(approaches(dof))),
     }
 
