@@ -50,7 +50,7 @@ class OutputError(PisigmaError, ValueError):
 
 
 class AcceptanceError(PisigmaError, ValueError):
-    """A model does not meet the limits that were set for it."""
+    """A model does not meet the limits that were set for it, or must not be trusted."""
 
 
 class TrainingError(PisigmaError, RuntimeError):

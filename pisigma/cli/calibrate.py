@@ -1,5 +1,7 @@
 """`pisigma calibrate`: geometric or hybrid calibration of measured data."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -7,10 +9,11 @@ import typer
 
 from pisigma.cli.arguments import AsJson, complete_robot
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
-from pisigma.errors import IdentificationError
+from pisigma.errors import AcceptanceError, IdentificationError
 
 if TYPE_CHECKING:
     from pisigma.judging.calibration_summary import CalibrationSummary
+    from pisigma.workflow.result import AbstractModelResult
 
 RobotName = Annotated[
     str,
@@ -64,6 +67,13 @@ Base = Annotated[str | None, typer.Option(help="Of a URDF file: link that is the
 Tip = Annotated[
     str | None, typer.Option(help="Of a URDF file: link that is the tool. [default: its only leaf]")
 ]
+AcceptImplausible = Annotated[
+    bool,
+    typer.Option(
+        "--accept-implausible",
+        help="Write the model also where the result must not be trusted; its card says why.",
+    ),
+]
 Verbose = Annotated[bool, typer.Option("--verbose", help="Print all parameters.")]
 
 
@@ -86,12 +96,14 @@ def calibrate(
     socket_distance: SocketDistance = None,
     base: Base = None,
     tip: Tip = None,
+    accept_implausible: AcceptImplausible = False,
     verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
     """Calibrate a robot from measurements and write it as a model folder with card and figures.
 
-    Geometry, base and tool, and with them a correction of the joints where it predicts left-out rows better.
+    Geometry, base and tool, and with them a correction of the joints where it predicts left-out rows better. Exit
+    status 3, and no folder, where the result must not be trusted.
     """
     from pisigma.model.folder.staging import check_replaceable
     from pisigma.robot.description import Robot
@@ -110,21 +122,44 @@ def calibrate(
     nominal = Robot.load(robot, base, tip)
     with progress_of("calibrate") as progress:
         calibration = workflow.calibrate(nominal, data, settings, progress)
-    calibration.save(out, command=command_line(context))
-    if as_json:
-        print_json({"model": str(out), **calibration.to_json()})
-    else:
-        print_calibration(calibration.summary, out, calibration.seconds, verbose)
+    with saved(calibration, out, accept_implausible, command=command_line(context)) as folder:
+        if as_json:
+            print_json({"model": folder and str(folder), **calibration.to_json()})
+        else:
+            print_calibration(calibration.summary, folder, calibration.seconds, verbose)
+
+
+@contextmanager
+def saved(
+    result: "AbstractModelResult", folder: Path, accept_implausible: bool, **texts: str
+) -> Iterator[Path | None]:
+    """Write a result as a model folder; while it is printed, give where it was written, None where it was not.
+
+    Args:
+        result: with its diagnostics.
+        folder: to write.
+        accept_implausible: write it also where it must not be trusted.
+        texts: name and command, see `AbstractModelResult.save`.
+
+    Raises:
+        AcceptanceError: at the end, where it must not be trusted.
+    """
+    try:
+        result.save(folder, accept_implausible=accept_implausible, **texts)
+    except AcceptanceError:
+        yield None
+        raise
+    yield folder
 
 
 def print_calibration(
-    summary: "CalibrationSummary", folder: Path, seconds: float, verbose: bool = False
+    summary: "CalibrationSummary", folder: Path | None, seconds: float, verbose: bool = False
 ) -> None:
     """Print for people what a calibration gave: accuracy and verdict first, then parameters.
 
     Args:
         summary: its figures.
-        folder: where the model was written.
+        folder: where the model was written; None where it was not.
         seconds: time it took [s].
         verbose: print all parameters, not only those that were estimated.
     """
@@ -133,6 +168,7 @@ def print_calibration(
     _print_accuracy(summary)
     if summary.hybrid is not None:
         print_lines(tables.learned_lines(summary.hybrid))
+    print_lines(f"Implausible: {line}" for line in tables.implausible_lines(summary))
     print_lines(f"Warning: {line}" for line in tables.warning_lines(summary))
     if summary.learning_curve is not None:
         print_table(
@@ -149,11 +185,12 @@ def print_calibration(
     count = len(summary.outliers)
     worst = f"; the worst is {summary.outliers[0].place}" if count else ""
     print_lines([f"Rank {summary.rank}, {summary.iterations} iterations, {count} outliers{worst}."])
-    print_lines([f"Model written to {folder} in {seconds:.1f} s; read its README.md."])
+    if folder is not None:
+        print_lines([f"Model written to {folder} in {seconds:.1f} s; read its README.md."])
 
 
 def _print_accuracy(summary: "CalibrationSummary") -> None:
-    """Print the errors of rows that were not calibrated with."""
+    """Print the errors of held-out rows, and then of those that were calibrated with."""
     from pisigma.reporting.calibration_tables import coverage_line, folds_text, held_out_lines
     from pisigma.reporting.tables import pose_rows
 
@@ -161,6 +198,7 @@ def _print_accuracy(summary: "CalibrationSummary") -> None:
         (summary.held_out, "pose errors of {rows} other simulated rows"),
         (summary.cross_validation, "pose errors of {rows} held-out rows ({how})"),
         (summary.test, "pose errors of the {rows} rows of the set 'test', which were kept apart"),
+        (summary.calibrated, "pose errors of the {rows} rows that were calibrated with"),
     ):
         if figures is not None:
             print_table(title.format(rows=figures.rows, how=folds_text(figures)), *pose_rows(figures.models))

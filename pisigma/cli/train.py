@@ -4,13 +4,14 @@ import shlex
 import shutil
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pisigma.cli.arguments import AsJson
-from pisigma.cli.calibrate import print_calibration
+from pisigma.cli.calibrate import AcceptImplausible, print_calibration, saved
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:
@@ -34,9 +35,13 @@ def train(
         Path | None,
         typer.Option(help="Folder for metrics.csv of every epoch, and TensorBoard's events if it is there."),
     ] = None,
+    accept_implausible: AcceptImplausible = False,
     as_json: AsJson = False,
 ) -> None:
-    """Train the model of a recipe and write it as a model folder with card and figures."""
+    """Train the model of a recipe and write it as a model folder with card and figures.
+
+    Exit status 3, and no folder, where a calibration must not be trusted.
+    """
     started = time.perf_counter()
     from pisigma.model.folder.staging import check_replaceable
     from pisigma.recipes.reader import read_recipe
@@ -52,17 +57,18 @@ def train(
     with progress_of("training") as progress:
         training = train_recipe(recipe, data, settings, progress)
     command = ["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])]
-    model = training.save(folder, name, shlex.join(command))
-    shutil.rmtree(checkpoints, ignore_errors=True)
-    seconds = time.perf_counter() - started
-    if as_json:
-        print_json({"model": str(folder), "seconds": round(seconds, 3), **model.metrics})
-    elif isinstance(training, InverseTraining):
-        _print_training(training.summary)
-        typer.echo(f"Model written to {folder} in {seconds:.1f} s; read its README.md.")
-    else:
-        _print_redundancy(training.summary)
-        print_calibration(training.summary, folder, seconds)
+    texts = {"name": name, "command": shlex.join(command)}
+    with saved(training, folder, accept_implausible, **texts) as written:
+        shutil.rmtree(checkpoints, ignore_errors=True)
+        training = replace(training, seconds=time.perf_counter() - started)
+        if as_json:
+            print_json({"model": written and str(written), **training.to_json(), "command": texts["command"]})
+        elif isinstance(training, InverseTraining):
+            _print_training(training.summary)
+            typer.echo(f"Model written to {folder} in {training.seconds:.1f} s; read its README.md.")
+        else:
+            _print_redundancy(training.summary)
+            print_calibration(training.summary, written, training.seconds)
 
 
 def _next_free(name: str) -> Path:

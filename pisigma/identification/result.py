@@ -38,10 +38,22 @@ from pisigma.sensors.registry import measured_errors
 
 DISAGREEING = 10.0
 """Angles whose variance had to be enlarged by more are worth a warning."""
-UNUSUAL = 4.0
-"""Errors that are surely more than so many times as large as the prior says are worth a warning. Healthy
-robots have up to 4.6 times the default prior of 1 mrad. The estimate from n parameters has a relative standard
-deviation of about `1 / sqrt(2 n)`, so `exp(-sqrt(2 / n))` times the estimate is two of these below it."""
+
+
+@dataclass(frozen=True)
+class PriorRatio:
+    """How many times as large as the prior says the errors of some parameters are.
+
+    Attributes:
+        kind: "length" or "angle".
+        value: of the group of parameters where it is largest.
+        at_least: two standard deviations below it. The estimate from n effective parameters has a relative standard
+            deviation of about `1 / sqrt(2 n)`, so this is `exp(-sqrt(2 / n))` times the estimate.
+    """
+
+    kind: Literal["length", "angle"]
+    value: float
+    at_least: float
 
 
 @dataclass(frozen=True)
@@ -239,6 +251,28 @@ class CalibrationResult:
             *_warnings(self.solved),
         )
 
+    @cached_property
+    def prior_ratios(self) -> tuple[PriorRatio, ...]:
+        """How many times as large as the prior says the errors are, of lengths and of angles that have a prior."""
+        problem, view = self.solved.problem, view_of(self.solved.refined)
+        precision, group = problem.precision[problem.active], problem.prior_group
+        covariance = covariance_of(self.solved.refined.normal)
+        effective = effective_parameters(precision, group, view, covariance)
+        units = [problem.space.parameters[i].unit for i in problem.active[precision > 0].tolist()]
+        groups = set(zip(group[precision > 0].tolist(), units, strict=True))
+        kinds: dict[str, Literal["length", "angle"]] = {"m": "length", "rad": "angle"}
+        ratios = [
+            PriorRatio(kinds[unit], scale, scale * math.exp(-((2 / effective[number]) ** 0.5)))
+            for number, unit in sorted(groups)
+            if effective[number] > 0
+            for scale in [view.prior_scale[number]]
+        ]
+        return tuple(
+            max(of_kind, key=lambda ratio: ratio.at_least)
+            for kind in kinds.values()
+            if (of_kind := [ratio for ratio in ratios if ratio.kind == kind])
+        )
+
     @property
     def rank(self) -> int:
         """How many independent combinations of the parameters the data determine, at the nominal geometry.
@@ -286,34 +320,16 @@ class CalibrationResult:
 
 
 def _warnings(solved: SolvedCalibration) -> tuple[str, ...]:
-    """Sentences on the search, on errors far larger than the prior, and on frames that do not fit."""
-    problem, here, status = solved.problem, solved.refined, solved.solution.status
-    sentences = [] if status.good else [f"the search {status.value}."]
-    view, group = view_of(here), problem.prior_group
-    precision = problem.precision[problem.active]
-    effective = effective_parameters(precision, group, view, covariance_of(here.normal))
-    units = [problem.space.parameters[i].unit for i in problem.active[precision > 0].tolist()]
-    groups = set(zip(group[precision > 0].tolist(), units, strict=True))
-    for kind, unit in (("length", "m"), ("angle", "rad")):
-        factors = [
-            view.prior_scale[number]
-            for number, of in groups
-            if of == unit and effective[number] > 0
-            if view.prior_scale[number] * math.exp(-((2 / effective[number]) ** 0.5)) > UNUSUAL
-        ]
-        if factors:
-            sentences.append(
-                f"the {kind} errors are about {max(factors):.2g} times as large as the prior says, so their size was "
-                "taken from the data; check the nominal geometry and the robot, or give a wider prior."
-            )
-    disagreement = max(view.disagreement)
+    """Sentences on angles that disagree with lengths, and on frames that do not fit."""
+    disagreement = max(view_of(solved.refined).disagreement)
+    sentences = []
     if disagreement > DISAGREEING:
         sentences.append(
             "the measured angles disagree with the measured lengths by far more than their noise, so they count with "
             f"1/{disagreement:.2g} of their weight; look for a wrist that wobbles, or for an orientation error of "
             "the sensor that depends on the pose."
         )
-    return (*sentences, *misfitting_frames(problem, here))
+    return (*sentences, *misfitting_frames(solved.problem, solved.refined))
 
 
 def _residuals(solved: SolvedCalibration) -> dict[str, Float64[np.ndarray, "rows components"]]:

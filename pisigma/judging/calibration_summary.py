@@ -200,6 +200,7 @@ class CalibrationSummary(AbstractSummary):
         rmse_mm: RMS of the first sensor's residuals at every iteration, the initial guess first.
         hybrid: what a hybrid calibration found beyond the geometry.
         cross_validation: errors of rows that were held out in turn.
+        calibrated: errors of the rows that were calibrated with.
         test: errors of the rows that the file marks as test.
         held_out: errors of other simulated rows.
         held_out_rows: hashes of the file with every held-out row.
@@ -227,6 +228,7 @@ class CalibrationSummary(AbstractSummary):
     warnings: tuple[str, ...]
     rmse_mm: tuple[float, ...]
     hybrid: HybridFigures | None = None
+    calibrated: ValidationFigures | None = None
     cross_validation: ValidationFigures | None = None
     test: ValidationFigures | None = None
     held_out: ValidationFigures | None = None

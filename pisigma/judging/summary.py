@@ -5,6 +5,7 @@ from typing import Any, ClassVar, TypeVar
 from pydantic import ValidationError
 
 from pisigma.errors import ModelError
+from pisigma.judging.diagnostic import Diagnostic
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.yaml_file import Section
 
@@ -17,10 +18,12 @@ class AbstractSummary(Section):
     Attributes:
         kinds: of the models whose metrics these figures are.
         command: what made the model: a command line or a call.
+        diagnostics: what is wrong with the result, those first that make it implausible.
     """
 
     kinds: ClassVar[tuple[str, ...]]
     command: str = ""
+    diagnostics: tuple[Diagnostic, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Give everything that is set as JSON values, by name."""

@@ -51,6 +51,11 @@ def warning_lines(summary: CalibrationSummary) -> list[str]:
     return [_sentence(line) for line in summary.warnings]
 
 
+def implausible_lines(summary: CalibrationSummary) -> list[str]:
+    """Why the calibration must not be trusted, a sentence each."""
+    return [one.sentence for one in summary.diagnostics if one.severity == "implausible"]
+
+
 def trial_table(hybrid: HybridFigures) -> Table:
     """One row per joint correction that was tried, in order."""
     rows = [

@@ -19,13 +19,15 @@ from pisigma.judging.calibration_summary import CalibrationSummary, summarise
 from pisigma.judging.calibration_validation import CalibrationValidation, judge, validate_repeatedly
 from pisigma.judging.held_out_rows import HELD_OUT_CSV, HeldOutRows
 from pisigma.judging.progress import Progress, stage
-from pisigma.judging.trained_calibrations import Calibrator, Result, fit
+from pisigma.judging.trained_calibrations import Calibrator, Result, fit, geometric_of, trained
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import SplitBy, TrainTest, draw_rows, holdout, repeats, with_fewer
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
+from pisigma.verification.checks.check import CheckedCalibration
+from pisigma.verification.checks.registry import diagnostics_of
 from pisigma.workflow.result import AbstractModelResult
 
 FOLDS = 5
@@ -219,12 +221,12 @@ def calibrate(
         _description(settings.model, nominal),
         "Judged on rows of the same measurement only, not on other days, payloads or temperatures.",
     )
-    calibration = compose(nominal, result, rows, summary, texts, validation, test, training)
+    calibration = compose(calibrator, result, rows, summary, texts, validation, test, training)
     return replace(calibration, settings=settings, seconds=time.perf_counter() - started)
 
 
 def compose(
-    nominal: Robot,
+    calibrator: Calibrator,
     result: Result,
     rows: Measurements,
     summary: CalibrationSummary,
@@ -234,10 +236,10 @@ def compose(
     held_out: Measurements | None = None,
     recipe: tuple[str, str] = ("", ""),
 ) -> Calibration:
-    """Make a model of a calibration and put everything together.
+    """Check a calibration, make a model of it, and put everything together.
 
     Args:
-        nominal: the robot as drawn.
+        calibrator: what calibrated.
         result: the calibration.
         rows: what it was calibrated with.
         summary: all figures.
@@ -246,7 +248,18 @@ def compose(
         test: errors of rows that were kept apart.
         held_out: the rows of the validation, where the folder is to keep their errors.
         recipe: name and SHA-256 of the recipe, where there was one.
+
+    Raises:
+        IdentificationError: the measurements cannot be of this robot at all.
     """
+    checked = CheckedCalibration(
+        geometric_of(calibrator), rows, trained(calibrator, rows, result=result), validation
+    )
+    diagnostics, nominal = diagnostics_of(checked), checked.robot
+    warnings = tuple(one.sentence for one in diagnostics if one.severity == "warning")
+    summary = summary.having(
+        calibrated=checked.figures, diagnostics=diagnostics, warnings=summary.warnings + warnings
+    )
     name = recipe[0] or nominal.name
     if isinstance(result, HybridResult):
         model = model_of_hybrid(name, nominal, result, rows, recipe)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from pisigma.errors import AcceptanceError
 from pisigma.judging.summary import AbstractSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
@@ -29,8 +30,17 @@ class AbstractModelResult(ABC):
         """Give all figures as JSON values, in mm and deg."""
         return {"seconds": round(self.seconds, 3), **self.summary.to_json()}
 
+    @property
+    def trusted(self) -> bool:
+        """Whether no check found the result implausible."""
+        return not any(one.severity == "implausible" for one in self.summary.diagnostics)
+
     def save(
-        self, folder: str | os.PathLike[str], name: str | None = None, command: str | None = None
+        self,
+        folder: str | os.PathLike[str],
+        name: str | None = None,
+        command: str | None = None,
+        accept_implausible: bool = False,
     ) -> CalibratedModel:
         """Write the model folder with card and figures, whole or not at all; a model that is there is replaced.
 
@@ -38,13 +48,20 @@ class AbstractModelResult(ABC):
             folder: to write.
             name: of the model; None for the name of the folder.
             command: what made the model, for the card; None for the call.
+            accept_implausible: write also what a check found implausible; the card says why.
 
         Returns:
             The model as written.
 
         Raises:
+            AcceptanceError: a check found the result implausible.
             OutputError: the folder holds something that is no model, or cannot be written.
         """
+        if not (self.trusted or accept_implausible):
+            raise AcceptanceError(
+                f"{folder} was not written, because the result must not be trusted; correct what the diagnostics "
+                "name, or accept implausible results explicitly (accept_implausible, --accept-implausible)."
+            )
         summary = self.summary.having(command=command)
         name = name or Path(folder).resolve().name
         model = replace(self.model, name=name, metrics=summary.to_json())

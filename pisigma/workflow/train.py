@@ -129,7 +129,8 @@ def _train_geometric(
     if settings.resume:
         _refuse_resume(recipe)
     rows, held_out = data.simulations[0]
-    result = recipe.calibration.calibrator(data.robot).fit(rows)
+    calibrator = recipe.calibration.calibrator(data.robot)
+    result = calibrator.fit(rows)
     errors = errors_under(result, held_out).figures
     summary = summarise(result).having(
         command=_call(recipe),
@@ -140,7 +141,7 @@ def _train_geometric(
         paper=recipe.model_dump(mode="json")["paper"] or None,
     )
     texts = CardTexts(recipe.description, recipe.not_validated)
-    return compose(data.robot, result, rows, summary, texts, recipe=(recipe.name, sha256))
+    return compose(calibrator, result, rows, summary, texts, recipe=(recipe.name, sha256))
 
 
 def _train_hybrid(
@@ -176,7 +177,7 @@ def _train_hybrid(
     )
     texts = CardTexts(recipe.description, recipe.not_validated)
     return compose(
-        data.robot,
+        calibrator,
         result,
         rows,
         summary,

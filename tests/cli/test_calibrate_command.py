@@ -333,3 +333,27 @@ def test_geometric_recipes_write_their_measurements(run, repository, tmp_path):
         read = Measurements.read_csv(tmp_path / "rows.csv", Robot.load("rb5"))
         assert read.rows == rows
         assert read.kinds == {"position"}
+
+
+def test_an_implausible_calibration_is_written_on_demand_only(run, tmp_path):
+    """A UR10 that was taken for a UR5: figures and reasons are printed, and the card says it."""
+    with no_type_checker():
+        rows = write(tmp_path / "ur10.csv", simulate("ur10", rows=40, noise=5e-5).measurements)
+    command = ["calibrate", "ur5", rows, "--out", tmp_path / "arm", "--model", "geometric", "--folds", 0]
+    result = run(*command, "--json")
+    assert (result.exit_code, (tmp_path / "arm").exists()) == (3, False)
+    printed = json.loads(result.stdout)
+    (worst, *_) = printed["diagnostics"]
+    assert (printed["model"], worst["severity"]) == (None, "implausible")
+    assert "must not be trusted" in result.stderr
+    result = run(*command)
+    assert result.exit_code == 3
+    assert "pose errors of the 40 rows that were calibrated with" in result.stdout
+    assert "Implausible: The length errors are about" in result.stdout
+    assert "Model written" not in result.stdout
+    accepted = run(*command, "--accept-implausible")
+    assert accepted.exit_code == 0, accepted.output
+    card = (tmp_path / "arm" / "README.md").read_text()
+    assert "## Not to be trusted" in card
+    assert worst["sentence"] in card
+    assert load_model(tmp_path / "arm").metrics["diagnostics"] == printed["diagnostics"]

@@ -193,7 +193,7 @@ def covariance_of(normal: Float64[Tensor, "active active"]) -> Float64[Tensor, "
     scales = scale * scale[:, None]
     scaled = normal * scales
     factor, failed = torch.linalg.cholesky_ex(scaled)
-    if not failed and float(factor.diagonal().min()) > 1e-6:
+    if not failed and bool((factor.diagonal() > 1e-6).all()):
         inverse = torch.cholesky_inverse(factor)
     else:
         inverse = torch.linalg.pinv(scaled, rtol=1e-12, hermitian=True)

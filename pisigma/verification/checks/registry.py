@@ -1,0 +1,19 @@
+"""All checks; a new one is a file and a line here."""
+
+from pisigma.judging.diagnostic import Diagnostic
+from pisigma.verification.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.verification.checks.prior_ratio import PriorRatioCheck
+from pisigma.verification.checks.search import SearchCheck
+
+CHECKS: tuple[AbstractCheck, ...] = (SearchCheck(), PriorRatioCheck())
+"""In the order in which their diagnostics are printed."""
+
+
+def diagnostics_of(checked: CheckedCalibration) -> tuple[Diagnostic, ...]:
+    """Run all checks: those that make the calibration implausible first.
+
+    Raises:
+        IdentificationError: the measurements cannot be of this robot at all.
+    """
+    diagnostics = [diagnostic for check in CHECKS for diagnostic in check.diagnose(checked)]
+    return tuple(sorted(diagnostics, key=lambda diagnostic: diagnostic.severity != "implausible"))
