@@ -59,6 +59,13 @@ PriorMrad = Annotated[
     float, typer.Option(help="Prior standard deviation of angle errors [mrad]; 0 for no prior.")
 ]
 Robust = Annotated[bool, typer.Option(help="Let rows that are far off count less.")]
+Gravity = Annotated[
+    str | None,
+    typer.Option(
+        help="Direction in which things fall, in the robot's base frame, such as 0,0,-1. [default: the axis that the "
+        "data show]"
+    ),
+]
 SocketDistance = Annotated[
     str | None,
     typer.Option(help="Known distance of two sockets as A,B,MM; */0,*/1,50 states that of every placement."),
@@ -93,6 +100,7 @@ def calibrate(
     prior_mm: PriorMm = 1.0,
     prior_mrad: PriorMrad = 1.0,
     robust: Robust = True,
+    gravity: Gravity = None,
     socket_distance: SocketDistance = None,
     base: Base = None,
     tip: Tip = None,
@@ -116,6 +124,7 @@ def calibrate(
         free=_free(free),
         prior_length=prior_mm / 1e3,
         prior_angle=prior_mrad / 1e3,
+        gravity=_gravity(gravity),
         socket_distances=_socket_distances(socket_distance),
         **stated,
     )
@@ -210,6 +219,19 @@ def _free(stated: str) -> Any:
     if stated in ("identifiable", "joint_offsets"):
         return stated
     return tuple(name.strip() for name in stated.split(","))
+
+
+def _gravity(stated: str | None) -> Any:
+    """Direction of gravity, from "X,Y,Z"."""
+    try:
+        direction = None if stated is None else tuple(map(float, stated.split(",")))
+    except ValueError:
+        direction = ()
+    if direction is not None and len(direction) != 3:
+        raise IdentificationError(
+            f"the direction of gravity as X,Y,Z was wanted, such as 0,0,-1, got '{stated}'."
+        )
+    return direction
 
 
 def _socket_distances(stated: str | None) -> dict[tuple[str, str], float]:

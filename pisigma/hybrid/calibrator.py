@@ -1,5 +1,6 @@
 """The hybrid calibrator: geometry, base, tool, sensor unknowns and a Pi-Sigma joint correction together."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.hybrid.arm import JointCoverage
 from pisigma.hybrid.design import Design, Rows, weigh
 from pisigma.hybrid.evidence import SMALLEST_NOISE
+from pisigma.hybrid.gravity import gravity_by_evidence, gravity_sentence, in_first_row
 from pisigma.hybrid.mini_batches import MANY_ROWS, MiniBatches, batch_checkpoints, refine_in_batches
 from pisigma.hybrid.refinement import Refined, linearised, refine, with_frames_of
 from pisigma.hybrid.regression import regression
@@ -27,6 +29,7 @@ from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.setup import identified_geometry
 from pisigma.identification.result import SolvedCalibration
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions
+from pisigma.joint_correction.gravity_torques import Direction
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.registry import FEATURES, feature_named
 from pisigma.measurement.conditions import stated_conditions
@@ -55,7 +58,8 @@ class HybridCalibrator:
         features: that are tried, by the names of `joint_correction.registry.FEATURES`.
         harmonics: of the Fourier series, tried in this order.
         products: whether product units are tried, which need two joints; without them the correction is additive.
-        gravity: direction in which things fall, in the frame of the robot's first row.
+        gravity: direction in which things fall, in the frame of the robot's base; None for the axis of the base that
+            has the highest evidence.
         mini_batches: whether the unknowns of the chosen model are trained on mini-batches instead of with the
             normal equations of all rows: True or False; how; or "auto", which does so from `MANY_ROWS` rows on.
     """
@@ -64,7 +68,7 @@ class HybridCalibrator:
     features: tuple[str, ...] = ("gravity", "conditions", "backlash", "series")
     harmonics: tuple[int, ...] = (8, 24, 56, 110, 160)
     products: bool = True
-    gravity: tuple[float, float, float] = (0.0, 0.0, -1.0)
+    gravity: tuple[float, float, float] | None = None
     mini_batches: MiniBatches | bool | Literal["auto"] = "auto"
 
     def __post_init__(self) -> None:
@@ -74,6 +78,10 @@ class HybridCalibrator:
                 raise IdentificationError(
                     f"features: '{name}' is no choice; {nearest_choice(name, FEATURES)}"
                 )
+        if self.gravity is not None and not 0 < math.hypot(*self.gravity) < math.inf:
+            raise IdentificationError(
+                f"gravity={self.gravity}: a direction in the frame of the robot's base was wanted, such as (0, 0, -1)."
+            )
         if "series" in self.features and (not self.harmonics or min(self.harmonics) < 1):
             raise IdentificationError(
                 f"harmonics={self.harmonics}: whole numbers of at least 1 were wanted for the series; leave "
@@ -134,7 +142,8 @@ class HybridCalibrator:
                 "stands; measure more poses."
             )
             return _geometric_alone(solved, choice, verdict)
-        verdict, trials = _kept_sentence(choice, trained), choice.trials
+        falling = gravity_sentence(self.geometric.robot, choice.best.design.features)
+        verdict, trials = " ".join(filter(None, (_kept_sentence(choice), falling, trained))), choice.trials
         del choice  # its regression is not needed any more, and large
         learned = self._learned(solved, refined)
         progress("looking at left-out rows")
@@ -189,17 +198,19 @@ class HybridCalibrator:
         if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.certain):
             # The geometry leaves nothing to learn; features would fit the errors of the linearisation.
             return Search(rows, view.noise, view.prior_scale, [], progress).best([], [])
-        growing, others = self._features(solved, problem)
+        robot = self.geometric.robot
+        gravity = self.gravity or gravity_by_evidence(robot, rows, view.noise, view.prior_scale)
+        growing, others = self._features(solved, problem, in_first_row(robot, gravity))
         first = Design(problem, (*others, *growing[:FIRST_MODEL_SIZES][-1:]))
         posterior = regression(first, rows).maximise_evidence(first.prior(view.prior_scale), view.noise)
         rows = linearised(first, posterior.x, posterior.effective, group)
-        several = self.products and self.geometric.robot.dof > 1
-        products = [InputProducts(self.geometric.robot)] if several else []
+        several = self.products and robot.dof > 1
+        products = [InputProducts(robot)] if several else []
         largest = [*others, *growing[-1:], *products]
         return Search(rows, view.noise, view.prior_scale, largest, progress).best(growing, others, products)
 
     def _features(
-        self, solved: SolvedCalibration, problem: CalibrationProblem
+        self, solved: SolvedCalibration, problem: CalibrationProblem, gravity: Direction
     ) -> tuple[list[AbstractFeature], list[AbstractFeature]]:
         """What is tried: ever larger features of one name, and one feature each of the other names.
 
@@ -208,7 +219,7 @@ class HybridCalibrator:
         """
         varying = stated_conditions(solved.setup.measurements)
         options = FeatureOptions(
-            self.harmonics, self.gravity, int(groups_of_equal_joints(problem.q).max()) + 1, varying
+            self.harmonics, gravity, int(groups_of_equal_joints(problem.q).max()) + 1, varying
         )
         growing: list[AbstractFeature] = []
         others: list[AbstractFeature] = []
@@ -238,12 +249,12 @@ def _outliers(solved: SolvedCalibration, refined: Refined) -> tuple[Outlier, ...
     return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
 
 
-def _kept_sentence(choice: Choice, trained: str) -> str:
+def _kept_sentence(choice: Choice) -> str:
     """What was kept, and how much better left-out rows are predicted with it."""
     share = [trial.left_out for trial in choice.trials if trial.kept][-1]
     return (
-        f"A joint correction was kept ({choice.best.name}): left-out rows are predicted with {share:.2f} "
-        f"times the error of the geometric calibration. {trained}".rstrip()
+        f"A joint correction was kept ({choice.best.name}): left-out rows are predicted with {share:.2f} times the "
+        "error of the geometric calibration."
     )
 
 

@@ -182,7 +182,7 @@ class HybridSection(Section):
         features: of the unit of order 1 that are tried.
         harmonics: of the Fourier series, tried in this order.
         products: whether product units are tried.
-        gravity: direction in which things fall, in the frame of the robot's first row.
+        gravity: direction in which things fall, in the frame of the robot's base; without it, by evidence.
         mini_batches: whether the unknowns are trained on mini-batches: true, false, or "auto" for many rows only; or
             their `batch_rows`, `epochs`, `learning_rate` and `seed`.
     """
@@ -190,7 +190,7 @@ class HybridSection(Section):
     features: tuple[str, ...] = HybridCalibrator.features
     harmonics: tuple[int, ...] = HybridCalibrator.harmonics
     products: bool = HybridCalibrator.products
-    gravity: tuple[float, float, float] = HybridCalibrator.gravity
+    gravity: tuple[float, float, float] | None = HybridCalibrator.gravity
     mini_batches: MiniBatches | bool | Literal["auto"] = HybridCalibrator.mini_batches
 
     def calibrator(self, geometric: GeometricCalibrator) -> HybridCalibrator:

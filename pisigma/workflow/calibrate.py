@@ -52,6 +52,8 @@ class CalibrationSettings:
         prior_length: prior standard deviation of length errors [m]; 0 for no prior.
         prior_angle: prior standard deviation of angle errors [rad]; 0 for no prior.
         robust: whether rows that are far off count less.
+        gravity: direction in which things fall, in the frame of the robot's base; None for the axis of the base that
+            the data show.
         socket_distances: by the names of two sockets their known distance [m]. A * in both names stands for the same
             text, so that ("*/0", "*/1") means a/0 and a/1, b/0 and b/1 and so on.
 
@@ -71,6 +73,7 @@ class CalibrationSettings:
     prior_length: float = 1e-3
     prior_angle: float = 1e-3
     robust: bool = True
+    gravity: tuple[float, float, float] | None = None
     socket_distances: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -115,7 +118,7 @@ class CalibrationSettings:
             loss=HampelLoss() if self.robust else SquaredLoss(),
             socket_distances=_matching_sockets(self.socket_distances, sockets),
         )
-        return HybridCalibrator(geometric) if self.model == "hybrid" else geometric
+        return HybridCalibrator(geometric, gravity=self.gravity) if self.model == "hybrid" else geometric
 
     def splits(self, measurements: Measurements) -> Sequence[Sequence[TrainTest]]:
         """Give training and test rows of every fold, per repeat; nothing without a validation.
