@@ -6,11 +6,39 @@ defect of ours.
 """
 
 import difflib
+import re
 from collections.abc import Iterable
+
+LONGEST_WORD = 200
+"""Letters of a word of a file or a command line that a message quotes."""
+
+LONGEST_TEXT = 2000
+"""Letters of a message."""
+
+_UNPRINTABLE = re.compile(
+    r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]"
+)
+_LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
+
+
+def printable(text: str) -> str:
+    r"""Give a text as it may stand on a terminal, whatever a file has put into it.
+
+    Control characters, marks of the direction of writing and halves of characters are written as `\x1b`, so that
+    nothing moves the cursor, sets colours or hides what follows. Of words of more than `LONGEST_WORD` letters the begin
+    and the length are given, and of texts of more than `LONGEST_TEXT` letters the begin and the end.
+    """
+    text = _LONG_WORD.sub(lambda match: f"{match[0][:40]}... ({len(match[0]):,} characters)", text)
+    if len(text) > LONGEST_TEXT:
+        text = f"{text[: LONGEST_TEXT - 500]} ... {text[-400:]}"
+    return _UNPRINTABLE.sub(lambda match: ascii(match[0])[1:-1], text)
 
 
 class PisigmaError(Exception):
-    """Base of every error that pisigma raises on purpose."""
+    """Base of every error that pisigma raises on purpose; its sentence is `printable`."""
+
+    def __init__(self, sentence: str = ""):
+        super().__init__(printable(sentence))
 
 
 class RobotError(PisigmaError, ValueError):

@@ -6,7 +6,6 @@ import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Annotated, Any, TypeVar, Union
 
 import yaml
@@ -22,6 +21,7 @@ from pydantic import (
 from pydantic_core import CoreSchema, core_schema
 
 from pisigma.errors import PisigmaError, nearest_choice
+from pisigma.files.input_file import read_text
 
 MAXIMUM_NODES = 1_000_000
 """Values that a file may hold, aliases written out."""
@@ -138,7 +138,7 @@ def read_yaml(path: str | os.PathLike[str], document: type[Document], error: typ
     Raises:
         error: the file is missing, no YAML, or does not fit; the message names file, line and key.
     """
-    return parse_yaml(_read_text(path, error), document, error, source=str(path))
+    return parse_yaml(read_text(path, error, "YAML"), document, error, source=str(path))
 
 
 def parse_yaml(text: str, document: type[Document], error: type[PisigmaError], source: str) -> Document:
@@ -163,17 +163,8 @@ def line_of(path: str | os.PathLike[str], keys: _Path) -> int:
 
     For complaints about values that only other things than the file's form can judge.
     """
-    node, _ = _load(_read_text(path, PisigmaError), PisigmaError, str(path))
+    node, _ = _load(read_text(path, PisigmaError, "YAML"), PisigmaError, str(path))
     return _locate(node, keys)[0] if node else 1
-
-
-def _read_text(path: str | os.PathLike[str], error: type[PisigmaError]) -> str:
-    try:
-        return Path(path).read_text(encoding="utf-8")
-    except OSError as problem:
-        raise error(f"{path}: cannot be read ({problem.strerror}); check the path.") from None
-    except UnicodeDecodeError:
-        raise error(f"{path}: is not UTF-8 text; a YAML file was wanted.") from None
 
 
 def _load(text: str, error: type[PisigmaError], source: str) -> tuple[yaml.Node | None, Any]:

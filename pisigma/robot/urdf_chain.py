@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from pisigma.errors import RobotError, nearest_choice
+from pisigma.files.input_file import read_input
 from pisigma.robot.urdf_frames import Frame, frame_of
 
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
@@ -69,10 +70,7 @@ def parse_xml(path: str | os.PathLike[str], everything: bool = False) -> Any:
     """
     from lxml import etree
 
-    try:
-        content = Path(path).read_bytes()
-    except OSError as problem:
-        raise RobotError(f"{path}: cannot be read ({problem.strerror}); check the path.") from None
+    content = read_input(path, RobotError)
     gone = {"remove_comments": not everything, "remove_pis": not everything}
     parser = etree.XMLParser(resolve_entities=False, no_network=True, load_dtd=False, **gone)
     try:

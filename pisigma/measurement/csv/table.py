@@ -4,12 +4,12 @@ import csv
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool
 
 from pisigma.errors import MeasurementError
+from pisigma.files.input_file import read_text
 
 SPREADSHEET_ERRORS = frozenset(
     ("#N/A", "#NV", "#REF!", "#VALUE!", "#DIV/0!", "#NAME?", "#NUM!", "#NULL!", "#SPILL!", "#CALC!")
@@ -45,10 +45,11 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     goes on in the next line.
 
     Raises:
-        MeasurementError: the file is missing, not UTF-8, empty, or holds nothing but a header.
+        MeasurementError: the file cannot be read, is too large, not UTF-8, empty, or holds nothing but a header.
     """
     source = str(path)
-    lines = content_lines(_read_text(path, source).split("\n"), source)
+    text = read_text(path, MeasurementError, "CSV").replace("\r\n", "\n").replace("\r", "\n")
+    lines = content_lines(text.split("\n"), source)
     header_line, line = next(lines)
     header = header_names(line, f"{source}, line {header_line}")
     content = list(lines)
@@ -100,22 +101,6 @@ def header_names(line: str, place: str) -> tuple[str, ...]:
     if problem:
         raise MeasurementError(f"{place}: the header is no valid CSV ({problem}); check its quotes.")
     return tuple(name.strip() for name in names)
-
-
-def _read_text(path: str | os.PathLike[str], source: str) -> str:
-    """The text, whose lines end with a line feed whatever they ended with."""
-    try:
-        content = Path(path).read_bytes()
-    except OSError as problem:
-        raise MeasurementError(f"{source}: cannot be read ({problem.strerror}); check the path.") from None
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as problem:
-        line = content[: problem.start].count(b"\n") + 1
-        raise MeasurementError(
-            f"{source}, line {line}: is not UTF-8 text; save the file as CSV in UTF-8."
-        ) from None
-    return text.replace("\r\n", "\n").replace("\r", "\n")
 
 
 def split_line(line: str) -> tuple[list[str], str]:

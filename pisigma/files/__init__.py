@@ -1,0 +1,1 @@
+"""Files that come in and go out: inputs within bounds, outputs whole or not at all, and nothing lost for them."""
