@@ -184,8 +184,13 @@ class AbstractRegression(ABC):
         """The posterior under a prior and noise; the log evidence is that of MacKay 1992, eq. (4.9)."""
 
     @abstractmethod
+    def covariance_root(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
+        """R with `R R^T` the covariance of the unknowns."""
+
     def covariance(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
         """Covariance of the unknowns."""
+        root = self.covariance_root(posterior)
+        return root @ root.t()
 
     @abstractmethod
     def select(self, design: "Design") -> "AbstractRegression":

@@ -16,7 +16,6 @@ from pisigma.hybrid.design import Design
 from pisigma.hybrid.evidence import Posterior
 from pisigma.hybrid.refinement import Refined, network, refined_at
 from pisigma.hybrid.sensor_values import sensor_values
-from pisigma.hybrid.uncertainty import covariance_root
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.result import SolvedCalibration
 from pisigma.measurement.conditions import JointState
@@ -116,7 +115,7 @@ def refine_in_batches(
     posterior = replace(few.posterior, x=unknowns.values(z.to(solved.problem.q)).detach())
     progress("looking at all rows")
     refined = refined_at(replace(few.design, problem=solved.problem), posterior, group, schedule.epochs)
-    deviation = refined.regression.covariance(refined.posterior).diagonal().clamp(min=1e-300).sqrt()
+    deviation = refined.regression.covariance_root(refined.posterior).norm(dim=1)
     off = float(((refined.posterior.x - posterior.x) / deviation).square().mean().sqrt())
     sentence = f"Trained on mini-batches to within {off:.2g} standard deviations of the optimum."
     if not off <= SETTLED:
@@ -146,8 +145,7 @@ class WhitenedUnknowns:
     @staticmethod
     def around(few: Refined) -> "WhitenedUnknowns":
         """Around the solution of a part of the rows."""
-        covariance = few.regression.covariance(few.posterior)
-        root = covariance_root(covariance, torch.eye(few.design.active).to(covariance))
+        root = few.regression.covariance_root(few.posterior)
         return WhitenedUnknowns(few.design, few.posterior, root)
 
     @property

@@ -14,6 +14,9 @@ from pisigma.hybrid.evidence import AbstractRegression, GaussianPrior, LeftOut, 
 from pisigma.hybrid.sensor_values import SensorValues
 from pisigma.joint_correction.feature import AbstractFeature
 
+SMALL_BLOCK = 256
+"""Triangular matrices up to this size are inverted at once."""
+
 
 @dataclass(frozen=True, eq=False)
 class NormalEquations(AbstractRegression):
@@ -143,10 +146,12 @@ class NormalEquations(AbstractRegression):
         best = alone.maximise_evidence(prior, (1.0,))
         return best.log_evidence + rest / 2, best.prior.sizes
 
-    def covariance(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
-        """See `AbstractRegression.covariance`."""
+    def covariance_root(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
+        """See `AbstractRegression.covariance_root`; with `N = L L^T` it is `L^-T`."""
         scale, factor, _ = self._solved(posterior.prior, posterior.noise)
-        return inverted(scale, factor)
+        root = torch.zeros_like(factor)
+        _invert_triangle(factor, root)
+        return root.t().mul_(scale[:, None])
 
     def _solved(self, prior: GaussianPrior, noise: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """Column scale and Cholesky factor of the matrix, and the most probable values."""
@@ -203,6 +208,19 @@ def inverted(scale: Tensor, factor: Tensor) -> Float64[Tensor, "unknowns unknown
     """Inverse of a matrix from what `factored` gives, in the place of the factor."""
     inverse: Tensor = torch.cholesky_inverse(factor, out=factor).mT  # symmetric, and so stored row by row
     return inverse.mul_(scale).mul_(scale[:, None])
+
+
+def _invert_triangle(factor: Tensor, inverse: Tensor) -> None:
+    """Fill in the inverse of a lower triangular matrix: block by block, so that most of it are products."""
+    size = len(factor)
+    if size <= SMALL_BLOCK:
+        identity = torch.eye(size, dtype=factor.dtype, device=factor.device)
+        inverse.copy_(torch.linalg.solve_triangular(factor, identity, upper=False))
+        return
+    first, last = slice(0, size // 2), slice(size // 2, size)
+    for block in (first, last):
+        _invert_triangle(factor[block, block], inverse[block, block])
+    inverse[last, first] = -(inverse[last, last] @ factor[last, first]) @ inverse[first, first]
 
 
 def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> float:

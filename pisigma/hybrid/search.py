@@ -116,14 +116,18 @@ class Search:
         self._regression = regression(Design(rows.problem, tuple(largest)), rows)
         self._folds = rows.folds(FOLDS if rows.groups > FEW_GROUPS else FOLDS_OF_FEW, MOST_GROUPS)
         began = time.monotonic()
-        self.geometry = self.fitted(())
-        self._unit = self._least = self._left_out(self.geometry)
+        self.geometry, self._unit = self.fitted(())
+        self._least = self._unit
         self._note(self.geometry, 1.0, began, True)
 
     def fitted(
         self, features: Sequence[AbstractFeature], near: Fitted | None = None, sizes: Tensor | None = None
-    ) -> Fitted:
-        """Fit geometry and features, from the noise and the prior sizes of another fit; the last sizes may be given."""
+    ) -> tuple[Fitted, float]:
+        """Fit geometry and features, from the noise and the prior sizes of another fit; the last sizes may be given.
+
+        Returns:
+            The fit, and the root mean square of left-out values over the noise of the geometric calibration.
+        """
         design = Design(self.rows.problem, tuple(features))
         noise, prior = self.noise, design.prior(self.prior_scale)
         if near is not None:
@@ -131,12 +135,9 @@ class Search:
         if sizes is not None:
             prior = replace(prior, sizes=torch.cat([prior.sizes[: -len(sizes)], sizes]))
         chosen = self._regression.select(design)
-        return Fitted(design, chosen.maximise_evidence(prior, noise, tolerance=ROUGHLY))
-
-    def _left_out(self, tried: Fitted) -> float:
-        """RMS of left-out values over the noise of the geometric calibration."""
-        errors = self._regression.select(tried.design).left_out(tried.posterior, self._folds)
-        return errors.rms(tried.posterior.noise, self.noise)
+        posterior = chosen.maximise_evidence(prior, noise, tolerance=ROUGHLY)
+        errors = chosen.left_out(posterior, self._folds)
+        return Fitted(design, posterior), errors.rms(posterior.noise, self.noise)
 
     def _note(self, tried: Fitted, share: float, began: float, kept: bool) -> None:
         """Add a line to the table."""
@@ -183,8 +184,7 @@ class Search:
         """The better of new features and the best so far, by evidence and by left-out rows."""
         self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()
-        tried = self.fitted(features, best, sizes)
-        left_out = self._left_out(tried)
+        tried, left_out = self.fitted(features, best, sizes)
         better = (
             tried.posterior.log_evidence - best.posterior.log_evidence > CLEARLY
             and left_out < self._least * LEVEL

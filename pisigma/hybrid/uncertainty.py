@@ -9,7 +9,6 @@ from torch import Tensor
 
 from pisigma.hybrid.design import FOLDS, Design, Rows
 from pisigma.hybrid.evidence import AbstractRegression, LeftOut, Posterior
-from pisigma.hybrid.normal_equations import factored
 from pisigma.hybrid.sensor_values import joint_columns, weight_columns
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.problem.setup import IdentifiedGeometry
@@ -93,25 +92,10 @@ class PositionUncertainty:
         return torch.cat([joints[..., :0], *blocks], -1)
 
 
-def covariance_root(
-    covariance: Float64[Tensor, "unknowns unknowns"], change: Float64[Tensor, "parameters active"]
-) -> Float64[Tensor, "all_unknowns directions"]:
-    """Root of the covariance of all parameters in the user's coordinates and of the weights.
-
-    Args:
-        covariance: of the free parameters and the weights; changed in place.
-        change: d(user's parameters) / d(free parameters).
-    """
-    scale, factor = factored(covariance)
-    root = factor.div_(scale[:, None])
-    active = change.shape[1]
-    return torch.cat([change @ root[:active], root[active:]])
-
-
-def covariance_of_sizes(
-    posterior: Posterior, covariance: Float64[Tensor, "unknowns unknowns"]
-) -> Float64[Tensor, "unknowns unknowns"]:
-    """What the uncertainty of the prior's sizes adds to the covariance of the unknowns.
+def root_of_sizes(
+    posterior: Posterior, root: Float64[Tensor, "unknowns unknowns"]
+) -> Float64[Tensor, "unknowns groups"]:
+    """What the uncertainty of the prior's sizes adds to a root of the covariance C of the unknowns.
 
     With `dx / d log s_g = 2 C Λ_g x` for the unknowns of group g and `var(log s_g) = 1 / (2 n_g)`, where n_g of
     them are determined by the data (first order; Kass and Steffey 1989, J. Amer. Statist. Assoc. 84(407), 717-726).
@@ -120,9 +104,8 @@ def covariance_of_sizes(
     groups = torch.zeros(len(x), len(prior.sizes), dtype=x.dtype, device=x.device)
     groups[torch.arange(len(x)), prior.group] = 1.0
     certain = posterior.determined > LEAST_EFFECTIVE
-    moved = 2 * covariance @ (groups * (prior.precision * x)[:, None])[:, certain]
-    moved = moved * (2 * posterior.determined[certain]).rsqrt()
-    return moved @ moved.t()
+    moved = 2 * root @ (root.t() @ (groups * (prior.precision * x)[:, None])[:, certain])
+    return moved * (2 * posterior.determined[certain]).rsqrt()
 
 
 def left_out_scale(errors: LeftOut) -> float:
@@ -162,9 +145,8 @@ def position_uncertainty(
     else:
         missed = fit.left_out(posterior, folds)
     prior_scale = left_out_scale(missed)
-    space = design.problem.space
-    active = design.problem.active.cpu()
-    covariance = fit.covariance(posterior)
-    covariance.add_(covariance_of_sizes(posterior, covariance)).mul_(prior_scale)
-    root = covariance_root(covariance.cpu(), geometry.change[:, active])
-    return PositionUncertainty(space, geometry, design.features, root, prior_scale)
+    root = fit.covariance_root(posterior)
+    root = torch.cat([root, root_of_sizes(posterior, root)], 1).mul_(prior_scale**0.5).cpu()
+    change = geometry.change[:, design.problem.active.cpu()]
+    root = torch.cat([change @ root[: design.active], root[design.active :]])
+    return PositionUncertainty(design.problem.space, geometry, design.features, root, prior_scale)

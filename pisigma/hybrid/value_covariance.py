@@ -132,27 +132,23 @@ class ValueCovariance(AbstractRegression):
         active, precision = self.design.active, prior.precision
         variance = self.y.new_tensor(noise).square()[self.sensor]
         alpha = P @ self.y
-        x = torch.cat([parameters, (self.X[:, active:].t() @ alpha) / precision[active:]])
-        own = torch.zeros_like(x)
-        own[:active] = parameters.square() * prior.base[:active]
-        square = prior.of_groups(own)
-        own[:active] = 1 - precision[:active] * covariance.diagonal()
-        determined = prior.of_groups(own)
-        size = prior.sizes[prior.classes :].square()
-        both = torch.stack([P, alpha[:, None] * alpha]).flatten(1).index_select(1, self._pairs)
-        by_group = self.K @ (both * self._counts).t()
-        determined[prior.classes :] = size * by_group[:, 0]
-        square[prior.classes :] = size.square() * by_group[:, 1]
-        held = precision[:active]
-        evidence = float(self.y @ alpha) + log_det - float(held[held > 0].log().sum())
+        x = torch.cat([parameters, (self.X.t() @ alpha)[active:] / precision[active:]])
+        square = prior.of_groups(x.square() * prior.base)
+        held = torch.zeros_like(x)
+        held[:active] = 1 - precision[:active] * covariance.diagonal()
+        determined = prior.of_groups(held)
+        traces = self.K @ (P.flatten().index_select(0, self._pairs) * self._counts)
+        determined[prior.classes :] = prior.sizes[prior.classes :].square() * traces
+        stated = precision[:active]
+        evidence = float(self.y @ alpha) + log_det - float(stated[stated > 0].log().sum())
         evidence += log_noise(self.sensors, noise) - float(variance.log().sum())
         misfit = self._by_sensor((variance * alpha).square())
         used = self._by_sensor(1 - variance * P.diagonal())
         return Posterior(x, -0.5 * evidence, prior, noise, square, determined, misfit, used)
 
-    def covariance(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
-        """See `AbstractRegression.covariance`; not from P, which loses what is small beside the prior."""
-        return self.normal_equations.covariance(posterior)
+    def covariance_root(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
+        """See `AbstractRegression.covariance_root`; not from P, which loses what is small beside the prior."""
+        return self.normal_equations.covariance_root(posterior)
 
     @cached_property
     def normal_equations(self) -> NormalEquations:

@@ -18,10 +18,9 @@ from pisigma.hybrid.uncertainty import (
     LARGEST_SCALE,
     LEAST_EFFECTIVE,
     PositionUncertainty,
-    covariance_of_sizes,
-    covariance_root,
     left_out_scale,
     position_uncertainty,
+    root_of_sizes,
 )
 from pisigma.identification.prediction import predicted_poses
 from pisigma.identification.problem.setup import identified_geometry
@@ -33,16 +32,6 @@ from pisigma.robot import Robot
 
 def normal(*shape: int, seed: int) -> Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
-
-
-def test_root_is_of_the_covariance_in_the_users_coordinates() -> None:
-    A = normal(6, 6, seed=0) * torch.logspace(-8, 0, 6, dtype=torch.float64)[:, None]
-    covariance, change = A @ A.t(), normal(5, 4, seed=1)
-    root = covariance_root(covariance.clone(), change)
-    whole = torch.block_diag(change, torch.eye(2, dtype=torch.float64))
-    expected = whole @ covariance @ whole.t()
-    scale = expected.diagonal().sqrt()
-    assert_close(root @ root.t() / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-9)
 
 
 def small_problem() -> tuple[DenseRegression, GaussianPrior]:
@@ -75,17 +64,16 @@ def test_uncertain_sizes_add_what_the_unknowns_move_with_them() -> None:
         if told > LEAST_EFFECTIVE:
             expected += slope[:, None] * slope / (2 * told)
     assert told_at_all == [True, True, False]
-    assert_close(
-        covariance_of_sizes(posterior, covariance), expected, atol=1e-7 * float(expected.abs().max())
-    )
+    added = root_of_sizes(posterior, fit.covariance_root(posterior))
+    assert_close(added @ added.t(), expected, atol=1e-7 * float(expected.abs().max()))
 
 
 def test_sizes_of_unknowns_without_a_prior_add_nothing() -> None:
     fit, prior = small_problem()
     flat = replace(prior, base=torch.where(prior.group == 2, prior.base, 0.0))
     posterior = fit.solve(flat, (0.4,))
-    added = covariance_of_sizes(posterior, fit.covariance(posterior))
-    assert_close(added, torch.zeros(13, 13))
+    added = root_of_sizes(posterior, fit.covariance_root(posterior))
+    assert_close(added, torch.zeros_like(added))
 
 
 def missed(error: Tensor, spread: Tensor) -> LeftOut:
@@ -178,8 +166,9 @@ def test_deviation_is_that_of_the_derivative_by_all_unknowns(arm: LinearisedArm)
 def test_deviation_is_that_of_drawn_calibrations(arm: LinearisedArm) -> None:
     """The covariance of positions at the training rows, as their columns give it, widened."""
     found, fitted, correction = uncertainty(arm)
-    C = NormalEquations.of(fitted.design, arm.rows).covariance(fitted.posterior)
-    C = C + covariance_of_sizes(fitted.posterior, C)
+    root = NormalEquations.of(fitted.design, arm.rows).covariance_root(fitted.posterior)
+    root = torch.cat([root, root_of_sizes(fitted.posterior, root)], 1)
+    C = root @ root.t()
     values = arm.rows.values[0].select(torch.arange(10))
     X = fitted.design.columns(values, slice(None))
     draws = torch.linalg.cholesky(C) @ normal(len(C), 4000, seed=8)

@@ -66,7 +66,8 @@ class DenseRegression(AbstractRegression):
         log_det = 2 * float(R.diagonal().abs().log().sum()) - float(precision[precision > 0].log().sum())
         counts = zip(self.sensors, noise, strict=True)
         evidence = -0.5 * (fit + log_det + sum(2 * one.values * math.log(s) for one, s in counts))
-        covariance = self._covariance(R)
+        root = _inverse(R)
+        covariance = root @ root.t()
         used = ((self.X @ covariance) * self.X).sum(1) / sigma.square()
         return Posterior(
             x=x,
@@ -79,9 +80,9 @@ class DenseRegression(AbstractRegression):
             used=self._by_sensor(used),
         )
 
-    def covariance(self, posterior: Posterior) -> Tensor:
-        """Inverse of the precision of values and prior together."""
-        return self._covariance(self._factor(posterior.prior, posterior.noise)[0])
+    def covariance_root(self, posterior: Posterior) -> Tensor:
+        """Inverse of the triangular root of the precision of values and prior together."""
+        return _inverse(self._factor(posterior.prior, posterior.noise)[0])
 
     def select(self, design: Tensor) -> "DenseRegression":
         """Of some columns, by their numbers."""
@@ -140,12 +141,13 @@ class DenseRegression(AbstractRegression):
         Q, R = torch.linalg.qr(whole)
         return R, torch.linalg.solve_triangular(R, (Q.t() @ right)[:, None], upper=True)[:, 0]
 
-    def _covariance(self, R: Tensor) -> Tensor:
-        inverse = torch.linalg.solve_triangular(R, torch.eye(len(R)).double(), upper=True)
-        return inverse @ inverse.t()
-
     def _sigma(self, noise: Sequence[float]) -> Tensor:
         return torch.tensor(noise, dtype=torch.float64)[self.sensor]
 
     def _by_sensor(self, values: Tensor) -> tuple[float, ...]:
         return tuple(float(values[self.sensor == k].sum()) for k in range(len(self.sensors)))
+
+
+def _inverse(R: Tensor) -> Tensor:
+    """Of an upper triangular matrix."""
+    return torch.linalg.solve_triangular(R, torch.eye(len(R)).double(), upper=True)
