@@ -113,7 +113,7 @@ def calibrate(
     Geometry, base and tool, and with them a correction of the joints where it predicts left-out rows better. Exit
     status 3, and no folder, where the result must not be trusted.
     """
-    from pisigma.model.folder.staging import check_replaceable
+    from pisigma.files.output_folder import check_replaceable
     from pisigma.robot.description import Robot
     from pisigma.workflow import calibrate as workflow
 

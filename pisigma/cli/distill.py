@@ -62,7 +62,7 @@ def distill(
 
     Its error against the full solution, on poses that were not fitted to, is printed and on its card.
     """
-    from pisigma.model.folder.staging import check_replaceable
+    from pisigma.files.output_folder import check_replaceable
     from pisigma.workflow import distill as workflow
 
     check_replaceable(out)

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pisigma.cli.solutions import FAILURES, file_units
 from pisigma.errors import OutputError
-from pisigma.export.output_file import writing_whole
+from pisigma.files.output_file import writing_whole
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.inverse.path import PathSwitch
 from pisigma.inverse.solution import Solution

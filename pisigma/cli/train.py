@@ -43,7 +43,7 @@ def train(
     Exit status 3, and no folder, where a calibration must not be trusted.
     """
     started = time.perf_counter()
-    from pisigma.model.folder.staging import check_replaceable
+    from pisigma.files.output_folder import check_replaceable
     from pisigma.recipes.reader import read_recipe
     from pisigma.workflow.train import InverseTraining
     from pisigma.workflow.train import train as train_recipe

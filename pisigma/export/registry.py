@@ -4,7 +4,7 @@ from importlib import import_module
 
 from pisigma.errors import OutputError, nearest_choice
 from pisigma.export.export_format import OPTIONS, Exported, ExportFormat, ExportRequest
-from pisigma.export.output_file import check_output, write_whole
+from pisigma.files.output_file import check_output, write_whole
 
 BUILT_IN = {
     "urdf": ("pisigma.export.urdf", "calibrated geometry"),

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pisigma.errors import ModelError, PoseError
+from pisigma.files.model_files import COMPILED, folder_hash
 from pisigma.inverse.joint_input import Postures, as_array, checked_approach, pose_array
 from pisigma.kernels.array_kinematics import by_torch, is_tensor
-from pisigma.model.folder.folder_files import COMPILED, folder_hash
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import pytorch_kinematics

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import jinja2
 
-from pisigma.model.folder.folder_files import CARD
+from pisigma.files.model_files import CARD
 from pisigma.reporting.tables import figure_text, joint_table, markdown_table, percent_text, pose_table
 from pisigma.templates import template_environment
 

@@ -15,6 +15,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError, ModelError
+from pisigma.files.model_files import DESCRIPTION
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.joint_correction.conditions import learned_conditions
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -36,7 +37,6 @@ from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.domain import Domain
-from pisigma.model.folder.folder_files import DESCRIPTION
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.stored_starts import spread_rows
 from pisigma.reporting.distilled_card import write_distilled_card

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from pisigma.export.output_file import check_output, write_whole
+from pisigma.files.output_file import check_output, write_whole
 from pisigma.judging.progress import Progress
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from pisigma.errors import AcceptanceError
+from pisigma.files.output_folder import staged_folder
 from pisigma.judging.summary import AbstractSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
-from pisigma.model.folder.staging import staged_folder
 
 
 class AbstractModelResult(ABC):

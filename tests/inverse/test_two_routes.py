@@ -12,11 +12,11 @@ from testing.models import hand_made_model, joints_around, no_type_checker
 
 import pisigma
 from pisigma.errors import ModelError, PoseError
+from pisigma.files.model_files import COMPILED, DESCRIPTION, WEIGHTS, folder_hash
 from pisigma.inverse.corrected_ik import CorrectedIK, load
 from pisigma.inverse.solution import Solution
 from pisigma.kinematics.status import Status
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.folder_files import COMPILED, DESCRIPTION, WEIGHTS, folder_hash
 from pisigma.model.folder.model_folder import save_model
 from pisigma.robot import Robot
 

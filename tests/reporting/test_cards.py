@@ -3,8 +3,8 @@
 import pytest
 from testing.models import trained_run
 
+from pisigma.files.model_files import CARD
 from pisigma.judging.training_summary import summarise_training
-from pisigma.model.folder.folder_files import CARD
 from pisigma.reporting.cards import CardTexts, write_training_card
 from pisigma.reporting.tables import joint_table
 

@@ -1,7 +1,7 @@
 """Sentences and cards from templates."""
 
+from pisigma.files.model_files import CARD
 from pisigma.judging.calibration_summary import NoiseFigures, OutlierFigures
-from pisigma.model.folder.folder_files import CARD
 from pisigma.reporting.rendering import sentences, write_card
 
 

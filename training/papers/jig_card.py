@@ -16,8 +16,8 @@ from jig_figures import (
 )
 from jig_report import BOTH, DEFAULT, PLANNED, RANDOM, JigRun
 from jig_tables import Table, all_tables
+from pisigma.files.model_files import CARD
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.folder_files import CARD
 
 _SETUPS = {"nominal": "nominal", BOTH: "both", DEFAULT: "both, default"}
 

@@ -13,9 +13,9 @@ from jig_recipe import read_jig_recipe
 from jig_report import DEFAULT, report_jigs, run_jigs
 from jig_tables import all_tables
 from pisigma.cli.output import print_table
+from pisigma.files.output_folder import check_replaceable, staged_folder
 from pisigma.judging.calibration_summary import summarise
 from pisigma.model.folder.model_folder import save_model
-from pisigma.model.folder.staging import check_replaceable, staged_folder
 from pisigma.model.geometric_model import model_of_calibration
 from pisigma.recipes.reader import recipe_hash
 from pisigma.robot.description import Robot

@@ -8,10 +8,10 @@ from elimination_cases import report_correlations, report_eliminations
 from jig_recipe import JIGS
 from jig_run import run_jigs_recipe
 from markdown_text import command_of
-from pisigma.export.output_file import write_whole
+from pisigma.files.output_file import write_whole
+from pisigma.files.output_folder import check_replaceable
 from pisigma.identification.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
-from pisigma.model.folder.staging import check_replaceable
 from pisigma.recipes.data import simulate
 from pisigma.recipes.reader import read_recipe
 from pisigma.recipes.recipe import GeometricRecipe

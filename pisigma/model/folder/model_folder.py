@@ -15,11 +15,11 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from pisigma.errors import ModelError, PisigmaError, nearest_choice
+from pisigma.files.model_files import COMPILED, DESCRIPTION, WEIGHTS, folder_hash
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.compiled_model import save_compiled
 from pisigma.model.domain import Domain
-from pisigma.model.folder.folder_files import COMPILED, DESCRIPTION, WEIGHTS, folder_hash
 from pisigma.model.folder.hybrid_folder import (
     DTYPES,
     Shape,

@@ -12,11 +12,11 @@ from typing import Any
 import yaml
 
 from pisigma.errors import ModelError
+from pisigma.files.model_files import CARD, COMPILED, DESCRIPTION, folder_hash
+from pisigma.files.output_folder import staged_folder
 from pisigma.model.compiled_model import save_compiled
-from pisigma.model.folder.folder_files import CARD, COMPILED, DESCRIPTION, folder_hash
 from pisigma.model.folder.model_document import FORMAT, read_signed_text, stated_format, write_document
 from pisigma.model.folder.model_folder import load_model
-from pisigma.model.folder.staging import staged_folder
 
 _RENAMED = {
     "dealings": "repeats",

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from pisigma.errors import OutputError
-from pisigma.model.folder.folder_files import DESCRIPTION
+from pisigma.files.model_files import DESCRIPTION
 
 
 def check_replaceable(folder: str | os.PathLike[str]) -> None:

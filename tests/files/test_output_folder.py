@@ -10,9 +10,9 @@ import pytest
 from testing.models import hand_made_model
 
 from pisigma.errors import OutputError
-from pisigma.model.folder import staging
+from pisigma.files import output_folder as staging
+from pisigma.files.output_folder import check_replaceable, staged_folder
 from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.model.folder.staging import check_replaceable, staged_folder
 
 
 def write(folder: Path, name: str = "kiro3") -> None:
@@ -95,7 +95,7 @@ def test_a_killed_process_leaves_what_was_there(tmp_path, before):
     script = (
         "import os, signal, sys\n"
         "from pathlib import Path\n"
-        "from pisigma.model.folder.staging import staged_folder\n"
+        "from pisigma.files.output_folder import staged_folder\n"
         "with staged_folder(sys.argv[1]) as scratch:\n"
         "    (scratch / 'model.yaml').write_text('format: 1')\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from pisigma.errors import OutputError
-from pisigma.export.output_file import check_output, write_whole
+from pisigma.files.output_file import check_output, write_whole
 
 
 def test_a_file_is_replaced_whole(tmp_path):
