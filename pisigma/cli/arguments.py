@@ -34,6 +34,9 @@ ModelFolder = Annotated[Path, typer.Argument(help="Model folder.", autocompletio
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 """The option of all commands that programs call."""
 
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace the model that the folder holds.")]
+"""The option of commands that write a model folder."""
+
 PayloadKg = Annotated[
     float | None,
     typer.Option(help="Payload of the robot [kg], if the model learned what that does. [default: the usual]"),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pisigma.cli.arguments import AsJson, complete_robot
+from pisigma.cli.arguments import AsJson, Overwrite, complete_robot
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
 from pisigma.errors import AcceptanceError, IdentificationError
 
@@ -105,6 +105,7 @@ def calibrate(
     base: Base = None,
     tip: Tip = None,
     accept_implausible: AcceptImplausible = False,
+    overwrite: Overwrite = False,
     verbose: Verbose = False,
     as_json: AsJson = False,
 ) -> None:
@@ -113,11 +114,12 @@ def calibrate(
     Geometry, base and tool, and with them a correction of the joints where it predicts left-out rows better. Exit
     status 3, and no folder, where the result must not be trusted.
     """
-    from pisigma.files.output_folder import check_replaceable
+    from pisigma.files.output_folder import check_folder
     from pisigma.robot.description import Robot
+    from pisigma.robot.robot_file import robot_file
     from pisigma.workflow import calibrate as workflow
 
-    check_replaceable(out)
+    check_folder(out, overwrite, inputs=(robot_file(robot), data))
     stated: dict[str, Any] = {"model": model, "folds": folds, "hold_out": hold_out, "split": split}
     stated |= {"repeats": repeats, "seed": seed, "train_rows": train_rows, "robust": robust}
     settings = workflow.CalibrationSettings(
@@ -131,7 +133,7 @@ def calibrate(
     nominal = Robot.load(robot, base, tip)
     with progress_of("calibrate") as progress:
         calibration = workflow.calibrate(nominal, data, settings, progress)
-    with saved(calibration, out, accept_implausible, command=command_line(context)) as folder:
+    with saved(calibration, out, accept_implausible, overwrite, command=command_line(context)) as folder:
         if as_json:
             print_json({"model": folder and str(folder), **calibration.to_json()})
         else:
@@ -140,7 +142,7 @@ def calibrate(
 
 @contextmanager
 def saved(
-    result: "AbstractModelResult", folder: Path, accept_implausible: bool, **texts: str
+    result: "AbstractModelResult", folder: Path, accept_implausible: bool, overwrite: bool, **texts: str
 ) -> Iterator[Path | None]:
     """Write a result as a model folder; while it is printed, give where it was written, None where it was not.
 
@@ -148,13 +150,14 @@ def saved(
         result: with its diagnostics.
         folder: to write.
         accept_implausible: write it also where it must not be trusted.
+        overwrite: replace the model that the folder holds.
         texts: name and command, see `AbstractModelResult.save`.
 
     Raises:
         AcceptanceError: at the end, where it must not be trusted.
     """
     try:
-        result.save(folder, accept_implausible=accept_implausible, **texts)
+        result.save(folder, accept_implausible=accept_implausible, overwrite=overwrite, **texts)
     except AcceptanceError:
         yield None
         raise

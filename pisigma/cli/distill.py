@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, ModelFolder
+from pisigma.cli.arguments import AsJson, ModelFolder, Overwrite
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
 from pisigma.errors import PoseError, RecipeError
 
@@ -56,23 +56,24 @@ def distill(
     orders: Orders = None,
     harmonics: Harmonics = None,
     seed: Seed = 0,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Distil a calibrated model into a small network for controllers that can only add an offset.
 
     Its error against the full solution, on poses that were not fitted to, is printed and on its card.
     """
-    from pisigma.files.output_folder import check_replaceable
+    from pisigma.files.output_folder import check_folder
     from pisigma.workflow import distill as workflow
 
-    check_replaceable(out)
+    check_folder(out, overwrite, inputs=(model, joints))
     if not 0 <= seed < 2**63:
         raise RecipeError(f"--seed {seed}: a whole number from 0 to 2^63 - 1 was wanted.")
     size = _size(orders, harmonics)
     settings = workflow.DistillationSettings(_region(model, region, joints), poses, size, seed)
     with progress_of("distillation") as progress:
         distillation = workflow.distill(model, settings, progress)
-    distillation.save(out, command=command_line(context, ("out", "joints")))
+    distillation.save(out, command=command_line(context, ("out", "joints")), overwrite=overwrite)
     _print(distillation, out, as_json)
 
 

@@ -57,8 +57,11 @@ def ik(
     for name, given in (("--accuracy", accuracy), ("--path", path)):
         if given and poses is None:
             raise typer.BadParameter("it goes with --poses", param_hint=f"'{name}'")
+    from pisigma.files.output_file import check_output
     from pisigma.inverse.corrected_ik import load
 
+    if out is not None:
+        check_output(out, inputs=(model, poses))
     solver = load(model)
     stated = {"payload_kg": payload_kg, "temperature_c": temperature_c}
     if conditions := {name: value for name, value in stated.items() if value is not None}:

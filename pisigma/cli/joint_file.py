@@ -14,7 +14,6 @@ import torch
 from torch import Tensor
 
 from pisigma.cli.solutions import FAILURES, file_units
-from pisigma.errors import OutputError
 from pisigma.files.output_file import writing_whole
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.inverse.path import PathSwitch
@@ -126,10 +125,6 @@ def write_joint_file(
         OutputError: the file cannot be written there.
         PoseError: there is no such branch.
     """
-    if out.is_dir():
-        raise OutputError(f"{out}: cannot be written (Is a directory); choose another --out.")
-    if out.exists() and poses.exists() and out.samefile(poses):
-        raise OutputError(f"{out}: is the file of poses itself; choose another --out.")
     outcome, begun = Outcome(), time.monotonic()
     with writing_whole(out) as file:
         writer = csv.writer(file, lineterminator="\n")

@@ -26,7 +26,7 @@ def report(
     """Write a report as one HTML page: how accurate, where worst, what limits it, what to measure next."""
     from pisigma.workflow import report as workflow
 
-    workflow.check_report_outputs(out, figures)
+    workflow.check_report_outputs(out, figures, inputs=(model, data))
     with progress_of("report") as progress:
         result = workflow.report(model, data, progress)
         written = result.save(out, figures)

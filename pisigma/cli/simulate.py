@@ -18,10 +18,14 @@ def simulate(
     as_json: AsJson = False,
 ) -> None:
     """Write the simulated measurements of a recipe as a CSV file."""
+    from pisigma.files.output_file import check_output
     from pisigma.recipes.data import simulate as simulate_recipe
     from pisigma.recipes.reader import read_recipe
+    from pisigma.robot.robot_file import robot_file
 
-    data = simulate_recipe(read_recipe(recipe))
+    read = read_recipe(recipe)
+    check_output(out, inputs=(recipe, robot_file(read.robot)))
+    data = simulate_recipe(read)
     rows = data.simulations[0][1 if held_out else 0]
     rows.write_csv(out, data.robot)
     if as_json:

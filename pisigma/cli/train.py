@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson
+from pisigma.cli.arguments import AsJson, Overwrite
 from pisigma.cli.calibrate import AcceptImplausible, print_calibration, saved
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of
 
@@ -36,6 +36,7 @@ def train(
         typer.Option(help="Folder for metrics.csv of every epoch, and TensorBoard's events if it is there."),
     ] = None,
     accept_implausible: AcceptImplausible = False,
+    overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Train the model of a recipe and write it as a model folder with card and figures.
@@ -43,22 +44,27 @@ def train(
     Exit status 3, and no folder, where a calibration must not be trusted.
     """
     started = time.perf_counter()
-    from pisigma.files.output_folder import check_replaceable
+    from pisigma.files.conflicts import check_apart
+    from pisigma.files.output_folder import check_folder
     from pisigma.recipes.reader import read_recipe
+    from pisigma.robot.robot_file import robot_file
     from pisigma.workflow.train import InverseTraining
     from pisigma.workflow.train import train as train_recipe
     from pisigma.workflow.train_networks import TrainSettings
 
-    name = read_recipe(recipe).name
-    folder = out or _next_free(name)
-    check_replaceable(folder)
+    read = read_recipe(recipe)
+    folder = out or _next_free(read.name)
+    inputs = (recipe, data, robot_file(read.robot))
+    check_folder(folder, overwrite, inputs)
+    if logs is not None:
+        check_apart(logs / "metrics.csv", inputs, "--logs")
     checkpoints = folder.parent / f".{folder.name}.training"
     settings = TrainSettings(checkpoints, resume, show_progress=True, logs=logs)
     with progress_of("training") as progress:
         training = train_recipe(recipe, data, settings, progress)
     command = ["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])]
-    texts = {"name": name, "command": shlex.join(command)}
-    with saved(training, folder, accept_implausible, **texts) as written:
+    texts = {"name": read.name, "command": shlex.join(command)}
+    with saved(training, folder, accept_implausible, overwrite, **texts) as written:
         shutil.rmtree(checkpoints, ignore_errors=True)
         training = replace(training, seconds=time.perf_counter() - started)
         if as_json:

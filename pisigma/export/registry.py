@@ -74,7 +74,7 @@ def export_model(name: str, request: ExportRequest) -> Exported:
                 f"--{option.replace('_', '-')} goes with --format {takers}, not with {name}; leave it out."
             )
     form.check(request)
-    check_output(request.out, form.suffixes, form.contents)
+    check_output(request.out, form.suffixes, form.contents, (request.model, request.like, request.poses))
     exported = form.write(request)
     write_whole(request.out, exported.content)
     return exported

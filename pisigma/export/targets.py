@@ -75,9 +75,7 @@ def _check(request: ExportRequest) -> None:
 
 def _check_options(request: ExportRequest) -> None:
     """Refuse options that do not go together."""
-    out, poses, kind = request.out, request.poses, request.targets
-    if poses is not None and out.exists() and poses.exists() and out.samefile(poses):
-        raise OutputError(f"{out}: is the file of poses itself; choose another --out.")
+    kind = request.targets
     if kind is not None and kind not in KINDS:
         raise OutputError(f"--targets '{kind}' is unknown; {nearest_choice(kind, KINDS)}")
     if request.as_csv:

@@ -13,14 +13,13 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import ModelError
+from pisigma.files.model_files import HELD_OUT_CSV
 from pisigma.judging.calibration_summary import CalibrationSummary, HeldOutFile
 from pisigma.judging.calibration_validation import CalibrationValidation
 from pisigma.judging.pose_statistics import PoseErrors
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
-
-HELD_OUT_CSV = "held_out.csv"
 
 _RESIDUAL = tuple(f"residual_{axis}_mm" for axis in "xyz")
 _DEGREES = float(np.rad2deg(1.0))

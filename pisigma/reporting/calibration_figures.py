@@ -20,13 +20,6 @@ from pisigma.judging.validation_figures import LearningPoint
 from pisigma.measurement.dataset import Measurements
 from pisigma.reporting.figures import save_figure
 
-RESIDUALS_PNG = "residuals.png"
-HELD_OUT_PNG = "held_out_errors.png"
-CORRELATION_PNG = "correlation.png"
-CORRECTIONS_PNG = "joint_corrections.png"
-CURVE_PNG = "learning_curve.png"
-SPREAD_PNG = "predicted_spread.png"
-
 _UNITS = {"position": ("mm", 1e3), "rotation": ("deg", float(np.rad2deg(1.0)))}
 JOINT_UNITS = {
     "revolute": ("deg", math.degrees(1.0), "mdeg", math.degrees(1e3)),

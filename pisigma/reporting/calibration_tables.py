@@ -17,8 +17,6 @@ from pisigma.judging.validation_figures import AbstractValidationFigures, Learni
 from pisigma.reporting.rendering import sentences
 from pisigma.reporting.tables import Table, figure_text
 
-PARAMETERS_CSV = "parameters.csv"
-CORRELATION_CSV = "correlation.csv"
 PARAMETER_COLUMNS = ("parameter", "unit", "nominal", "estimated", "change", "std. error", "remark")
 TRIAL_COLUMNS = ("tried", "unknowns", "log evidence", "left-out error", "seconds", "kept")
 _FIGURES = ("nominal", "estimated", "change", "standard_error")

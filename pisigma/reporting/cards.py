@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
+from pisigma.files import model_files
 from pisigma.hybrid.result import HybridResult
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.judging.calibration_validation import CalibrationValidation
@@ -45,30 +46,30 @@ def write_calibration_card(
         texts: description, and what was not validated.
         folder: where to write.
     """
-    tables.write_parameters(summary.parameters, folder / tables.PARAMETERS_CSV)
+    tables.write_parameters(summary.parameters, folder / model_files.PARAMETERS_CSV)
     geometric = geometric_result(result)
     correlations = (geometric.pairwise.lengths, geometric.pairwise.angles)
-    tables.write_correlations(correlations, folder / tables.CORRELATION_CSV)
-    figures.draw_correlations(correlations, folder / figures.CORRELATION_PNG)
+    tables.write_correlations(correlations, folder / model_files.CORRELATION_CSV)
+    figures.draw_correlations(correlations, folder / model_files.CORRELATION_PNG)
     figures.draw_residuals(
         geometric.residuals,
-        folder / figures.RESIDUALS_PNG,
+        folder / model_files.RESIDUALS_PNG,
         ", geometric" if isinstance(result, HybridResult) else "",
     )
     if validation is not None:
         lengths = {name: errors.position.numpy() for name, errors in validation.all_errors.items()}
-        figures.draw_held_out(lengths, folder / figures.HELD_OUT_PNG)
+        figures.draw_held_out(lengths, folder / model_files.HELD_OUT_PNG)
         spread = validation.all_spread
         if spread is not None and spread.values:
-            figures.draw_spread(spread, folder / figures.SPREAD_PNG)
+            figures.draw_spread(spread, folder / model_files.SPREAD_PNG)
     if isinstance(result, HybridResult) and result.learned is not None:
-        figures.draw_corrections(result.learned.correction, rows, folder / figures.CORRECTIONS_PNG)
+        figures.draw_corrections(result.learned.correction, rows, folder / model_files.CORRECTIONS_PNG)
     if summary.learning_curve is not None:
-        figures.draw_learning_curve(summary.learning_curve, folder / figures.CURVE_PNG)
+        figures.draw_learning_curve(summary.learning_curve, folder / model_files.CURVE_PNG)
     drawn = {entry.name for entry in folder.glob("*.png")}
     write_card(
         folder, "calibration_card.md.j2", model=model, result=geometric, summary=summary, texts=texts, drawn=drawn,
-        figures=figures, say=tables,
+        files=model_files, say=tables,
     )  # fmt: skip
 
 
@@ -85,8 +86,8 @@ def write_training_card(
         folder: where to write.
     """
     joints, energies = run.history.joints, run.history.energies
-    training_figures.write_energy_csv(joints, energies, folder / training_figures.ENERGY_CSV)
-    training_figures.draw_energy(joints, energies, folder / training_figures.ENERGY_PNG)
+    training_figures.write_energy_csv(joints, energies, folder / model_files.ENERGY_CSV)
+    training_figures.draw_energy(joints, energies, folder / model_files.ENERGY_PNG)
     shown = run.held_out or run.training
     robot = run.model.robot
     names = [joint.name for joint in robot.joints]
@@ -95,11 +96,11 @@ def write_training_card(
     scale = shown.before.new_tensor([math.degrees(1) if unit == "deg" else 1e3 for unit in units])
     before, after = shown.before[:, index] * scale, shown.after[:, index] * scale
     training_figures.draw_errors_over_workspace(
-        joints, units, shown.T[:, :3, 3], before, after, folder / training_figures.WORKSPACE_PNG
+        joints, units, shown.T[:, :3, 3], before, after, folder / model_files.WORKSPACE_PNG
     )
     groups = run.model.network.groups if run.model.network else ()
     inputs = dict.fromkeys(name for group in groups for name in group.inputs.names)
     write_card(
         folder, "training_card.md.j2", name=name, texts=texts, run=run, summary=summary, inputs=inputs,
-        figures=training_figures,
+        files=model_files,
     )  # fmt: skip

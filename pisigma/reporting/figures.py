@@ -11,10 +11,6 @@ from matplotlib.figure import Figure
 from PIL import Image
 from torch import Tensor
 
-ENERGY_CSV = "energy.csv"
-ENERGY_PNG = "energy.png"
-WORKSPACE_PNG = "errors_over_workspace.png"
-
 _LEAST_ENERGY = 1e-32
 """What 0 is drawn as on a logarithmic axis."""
 

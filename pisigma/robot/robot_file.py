@@ -123,6 +123,11 @@ def catalogue() -> tuple[str, ...]:
     return tuple(sorted(name.removesuffix(".yaml") for name in names if name.endswith(".yaml")))
 
 
+def robot_file(robot: str) -> Path | None:
+    """Give the file that `Robot.load` reads; None for a robot of the catalogue."""
+    return None if robot in catalogue() else Path(robot)
+
+
 def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None) -> Drawing:
     """Read a robot by catalogue name, from a YAML or from a URDF file. See `Robot.load`."""
     name = os.fspath(robot)

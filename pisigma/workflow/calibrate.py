@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from pisigma.errors import IdentificationError, MeasurementError, nearest_choice
+from pisigma.files.model_files import HELD_OUT_CSV
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
@@ -17,7 +18,7 @@ from pisigma.identification.problem.loss import HampelLoss, SquaredLoss
 from pisigma.identification.problem.parameters import Prior
 from pisigma.judging.calibration_summary import CalibrationSummary, summarise
 from pisigma.judging.calibration_validation import CalibrationValidation, judge, validate_repeatedly
-from pisigma.judging.held_out_rows import HELD_OUT_CSV, HeldOutRows
+from pisigma.judging.held_out_rows import HeldOutRows
 from pisigma.judging.progress import Progress, stage
 from pisigma.judging.trained_calibrations import Calibrator, Result, fit, geometric_of, trained
 from pisigma.measurement.dataset import Measurements

@@ -2,10 +2,12 @@
 
 import os
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pisigma.files.conflicts import Input
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.judging.progress import Progress
 from pisigma.measurement.dataset import Measurements
@@ -58,15 +60,24 @@ class Report:
         return () if figures is None else tuple(write_figures(self.figures.all, Path(figures)))
 
 
-def check_report_outputs(page: str | os.PathLike[str], figures: str | os.PathLike[str] | None = None) -> None:
+def check_report_outputs(
+    page: str | os.PathLike[str],
+    figures: str | os.PathLike[str] | None = None,
+    inputs: Sequence[Input] = (),
+) -> None:
     """Make sure that a report may be written: before the work, not after it.
 
+    Args:
+        page: file of the page.
+        figures: folder of the figures, if they are wanted.
+        inputs: files and folders that are read.
+
     Raises:
-        OutputError: the page is no .html file, or a file or folder cannot be written.
+        OutputError: the page is no .html file, a file or folder cannot be written, or lies in an input or a model.
     """
-    check_output(Path(page), (".html", ".htm"), "a report")
+    check_output(Path(page), (".html", ".htm"), "a report", inputs)
     if figures is not None:
-        check_figures(Path(figures))
+        check_figures(Path(figures), inputs)
 
 
 def report(

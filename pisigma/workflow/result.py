@@ -41,21 +41,24 @@ class AbstractModelResult(ABC):
         name: str | None = None,
         command: str | None = None,
         accept_implausible: bool = False,
+        overwrite: bool = False,
     ) -> CalibratedModel:
-        """Write the model folder with card and figures, whole or not at all; a model that is there is replaced.
+        """Write the model folder with card and figures, whole or not at all.
 
         Args:
             folder: to write.
             name: of the model; None for the name of the folder.
             command: what made the model, for the card; None for the call.
             accept_implausible: write also what a check found implausible; the card says why.
+            overwrite: whether a model that is there may be replaced.
 
         Returns:
             The model as written.
 
         Raises:
             AcceptanceError: a check found the result implausible.
-            OutputError: the folder holds something that is no model, or cannot be written.
+            OutputError: the folder holds a model and is not to be overwritten, it is none of ours (see
+                `pisigma.files.output_folder.check_folder`), or it cannot be written.
         """
         if not (self.trusted or accept_implausible):
             raise AcceptanceError(
@@ -65,7 +68,7 @@ class AbstractModelResult(ABC):
         summary = self.summary.having(command=command)
         name = name or Path(folder).resolve().name
         model = replace(self.model, name=name, metrics=summary.to_json())
-        with staged_folder(folder) as scratch:
+        with staged_folder(folder, overwrite) as scratch:
             save_model(model, scratch)
             self._describe(model, summary, scratch)
         return model

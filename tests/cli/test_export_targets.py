@@ -216,7 +216,7 @@ def test_a_pose_outside_the_domain(run, models, poses, tmp_path):
             "cell.txt: a table or program of targets goes into a .csv",
         ),
         (("--out", "cell.src", "--poses", "none.csv"), "none.csv: cannot be read"),
-        (("--out", "poses.csv", "--poses", "poses.csv"), "poses.csv: is the file of poses itself"),
+        (("--out", "poses.csv", "--poses", "poses.csv"), "poses.csv: is an input of this command"),
         (
             ("--out", "9 bad-name.ls", "--poses", "poses.csv"),
             "9 bad-name.ls: the program is called as its file",

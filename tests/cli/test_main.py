@@ -1,6 +1,8 @@
 """The command itself: quick, with the agreed exit status, JSON and nothing else on stdout."""
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 
@@ -9,7 +11,8 @@ from testing.models import small_recipe_text
 
 import pisigma
 from pisigma.cli.output import print_table
-from pisigma.robot import catalogue
+from pisigma.robot import Robot, catalogue
+from pisigma.robot.writing import robot_to_yaml
 
 HEAVY = ("torch", "numpy", "yaml", "lightning", "matplotlib", "scipy", "rich.table")
 START = "import sys; sys.argv = ['pisigma', *sys.argv[1:]]; from pisigma.cli.main import run; run()"
@@ -157,3 +160,54 @@ def test_a_missing_extra_is_named_in_one_sentence(tmp_path):
         '`pip install "pisigma[train]"`.\n'
     )
     assert [path.name for path in tmp_path.iterdir()] == ["kiro3.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (("simulate", "r.yaml", "--out", "r.yaml"), "r.yaml: is an input of this command"),
+        (("simulate", "r.yaml", "--out", "arm.yaml"), "arm.yaml: is an input of this command"),
+        (("simulate", "r.yaml", "--out", "m/rows.csv"), "m/rows.csv: lies in the model folder"),
+        (("train", "r.yaml", "--out", "m"), "m: holds a model already; replace it with --overwrite"),
+        (("train", "r.yaml", "--out", ".", "--overwrite"), ".: is the working directory"),
+        (("train", "r.yaml", "--out", "new", "--logs", "m"), "m/metrics.csv: lies in the model folder"),
+        (
+            ("calibrate", "arm.yaml", "poses.csv", "--out", "arm.yaml"),
+            "arm.yaml: is an input of this command",
+        ),
+        (
+            ("calibrate", "ur5", "poses.csv", "--out", "m"),
+            "m: holds a model already; replace it with --overwrite",
+        ),
+        (("distill", "m", "--out", "m", "--overwrite"), "m: is an input of this command"),
+        (("distill", "m", "--out", "m/small"), "m/small: lies in m, an input of this command"),
+        (("report", "m", "x.html", "--out", "x.html"), "x.html: is an input of this command"),
+        (
+            ("report", "m", "--out", "x.html", "--figures", "m"),
+            "m/figure.png: lies in m, an input of this command",
+        ),
+        (("ik", "m", "--poses", "poses.csv", "--out", "m/model.yaml"), "m/model.yaml: lies in m, an input"),
+        (("ik", "m", "--poses", "poses.csv", "--out", "link.csv"), "link.csv: is an input of this command"),
+        (("ik", "m", "--poses", "poses.csv", "--out", "pipe.csv"), "pipe.csv: is no regular file"),
+        (
+            ("export", "m", "--format", "dh", "--out", "m/dh.csv"),
+            "m/dh.csv: lies in m, an input of this command",
+        ),
+        (
+            ("export", "m", "--format", "urdf", "--like", "arm.urdf", "--out", "arm.urdf"),
+            "arm.urdf: is an input of this command",
+        ),
+    ],
+)
+def test_no_command_writes_over_what_it_reads(refuses, models, tmp_path, monkeypatch, arguments, complaint):
+    shutil.copytree(models / "kiro3", tmp_path / "m")
+    (tmp_path / "arm.yaml").write_text(robot_to_yaml(Robot.load("kiro3")))
+    (tmp_path / "r.yaml").write_text(small_recipe_text("kiro3").replace("robot: kiro3", "robot: arm.yaml"))
+    for name in ("x.html", "poses.csv", "arm.urdf"):
+        (tmp_path / name).write_text("mine")
+    (tmp_path / "link.csv").symlink_to("poses.csv")
+    os.mkfifo(tmp_path / "pipe.csv")
+    before = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
+    monkeypatch.chdir(tmp_path)
+    assert refuses(*arguments).startswith(complaint)
+    assert {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()} == before

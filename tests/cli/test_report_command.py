@@ -7,10 +7,9 @@ from testing.hybrid import joints_in
 from testing.models import hand_made_model, no_type_checker
 from testing.report import geometric_under_test, hybrid_under_test, measured
 
-from pisigma.judging.held_out_rows import HELD_OUT_CSV
+from pisigma.files.model_files import CORRELATION_CSV, HELD_OUT_CSV
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.reporting.calibration_tables import CORRELATION_CSV
 
 
 @pytest.fixture(scope="module")

@@ -10,13 +10,12 @@ import pytest
 from testing.models import hand_made_model
 
 from pisigma.errors import OutputError
-from pisigma.files import output_folder as staging
-from pisigma.files.output_folder import check_replaceable, staged_folder
+from pisigma.files.output_folder import check_folder, staged_folder
 from pisigma.model.folder.model_folder import load_model, save_model
 
 
 def write(folder: Path, name: str = "kiro3") -> None:
-    with staged_folder(folder) as scratch:
+    with staged_folder(folder, overwrite=True) as scratch:
         save_model(hand_made_model(name), scratch)
 
 
@@ -32,7 +31,7 @@ def test_a_folder_and_its_parents_are_made(tmp_path):
 
 def test_a_model_is_replaced_and_nothing_is_left_behind(tmp_path):
     write(tmp_path / "model")
-    (tmp_path / "model" / "stale.png").write_text("old")
+    (tmp_path / "model" / "residuals.png").write_text("old")
     write(tmp_path / "model", "kiro4")
     assert names(tmp_path) == ["model"]
     assert names(tmp_path / "model") == ["compiled.npz", "model.safetensors", "model.yaml"]
@@ -60,7 +59,7 @@ def test_an_interruption_leaves_what_was_there(tmp_path, before, end):
         write(tmp_path / "model", before)
 
     def interrupted() -> None:
-        with staged_folder(tmp_path / "model") as scratch:
+        with staged_folder(tmp_path / "model", overwrite=True) as scratch:
             save_model(hand_made_model("kiro4"), scratch)
             raise end
 
@@ -80,7 +79,7 @@ def test_a_failing_rename_brings_the_old_model_back(tmp_path, monkeypatch):
             raise OSError(28, "No space left on device")
         rename(source, target)
 
-    monkeypatch.setattr(staging.os, "replace", failing)
+    monkeypatch.setattr(os, "replace", failing)
     with pytest.raises(OutputError, match=r"model: cannot be written \(No space left on device\)"):
         write(tmp_path / "model", "kiro4")
     assert names(tmp_path) == ["model"]
@@ -96,15 +95,17 @@ def test_a_killed_process_leaves_what_was_there(tmp_path, before):
         "import os, signal, sys\n"
         "from pathlib import Path\n"
         "from pisigma.files.output_folder import staged_folder\n"
-        "with staged_folder(sys.argv[1]) as scratch:\n"
+        "with staged_folder(sys.argv[1], overwrite=True) as scratch:\n"
         "    (scratch / 'model.yaml').write_text('format: 1')\n"
         "    os.kill(os.getpid(), signal.SIGKILL)\n"
     )
     done = subprocess.run([sys.executable, "-c", script, str(tmp_path / "model")], check=False)
     assert done.returncode == -signal.SIGKILL
     assert (tmp_path / "model").exists() == bool(before)
+    assert any(name.endswith(".partial") for name in names(tmp_path))
     write(tmp_path / "model", "kiro4")
     assert load_model(tmp_path / "model").robot.name == "kiro4"
+    assert names(tmp_path) == ["model"]
 
 
 def test_what_is_no_model_is_not_touched(tmp_path):
@@ -120,6 +121,117 @@ def test_what_is_no_model_is_not_touched(tmp_path):
 def test_a_place_that_cannot_be_written_is_refused_before_the_work(tmp_path):
     (tmp_path / "file").write_text("mine")
     with pytest.raises(OutputError, match=r"model: cannot be written \(.+\); choose another --out"):
-        check_replaceable(tmp_path / "file" / "model")
-    check_replaceable(tmp_path / "new" / "model")
+        check_folder(tmp_path / "file" / "model", overwrite=False)
+    check_folder(tmp_path / "new" / "model", overwrite=False)
     assert names(tmp_path) == ["file"]
+
+
+def test_a_model_is_replaced_only_where_that_is_asked_for(tmp_path):
+    write(tmp_path / "model")
+    before = (tmp_path / "model" / "model.yaml").read_bytes()
+    with pytest.raises(OutputError, match="model: holds a model already; replace it with --overwrite"):
+        check_folder(tmp_path / "model", overwrite=False)
+    assert (tmp_path / "model" / "model.yaml").read_bytes() == before
+
+
+@pytest.mark.parametrize("other", ["notes.txt", ".git", "data.csv", "photo.png"])
+def test_a_folder_that_holds_more_than_a_model_is_refused(tmp_path, other):
+    write(tmp_path / "model")
+    (tmp_path / "model" / other).mkdir()
+    with pytest.raises(
+        OutputError, match=f"holds a model, but also '{other}', which pisigma does not write there"
+    ):
+        write(tmp_path / "model")
+    assert (tmp_path / "model" / other).is_dir()
+
+
+def test_a_card_alone_is_no_model(tmp_path):
+    """As in somebody's project, of which even `model.yaml` may be a file."""
+    for name in ("README.md", "model.yaml"):
+        (tmp_path / name).write_text("layers: 4\n")
+        with pytest.raises(OutputError, match="exists and is no model folder"):
+            check_folder(tmp_path, overwrite=True)
+
+
+def test_the_working_directory_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "project" / "work").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "project" / "work")
+    for folder in (".", "..", tmp_path / "project", "/"):
+        with pytest.raises(
+            OutputError, match="is the working directory, or the working directory lies in it"
+        ):
+            check_folder(folder, overwrite=True)
+
+
+def test_a_folder_that_has_to_do_with_an_input_is_refused(tmp_path):
+    write(tmp_path / "model")
+    data = tmp_path / "model" / "held_out.csv"
+    data.write_text("q1_deg")
+    (tmp_path / "link").symlink_to(tmp_path / "model")
+    for folder, source, complaint in (
+        ("model", "model", "model: is an input of this command"),
+        ("link", "model", "link: is an input of this command"),
+        ("model", "model/held_out.csv", "model: holds .*held_out.csv, an input"),
+        ("model/new", "link", "new: lies in .*link, an input"),
+        ("link/new", "missing.csv", "new: lies in the model folder .*model"),
+    ):
+        with pytest.raises(OutputError, match=complaint):
+            check_folder(tmp_path / folder, overwrite=True, inputs=(None, tmp_path / source))
+    assert data.read_text() == "q1_deg"
+
+
+def killed_between_renames(folder: Path) -> None:
+    script = (
+        "import os, signal, sys\n"
+        "from pathlib import Path\n"
+        "from pisigma.files.output_folder import staged_folder\n"
+        "rename = os.replace\n"
+        "def once(source, target):\n"
+        "    rename(source, target)\n"
+        "    os.kill(os.getpid(), signal.SIGKILL)\n"
+        "os.replace = once\n"
+        "with staged_folder(sys.argv[1], overwrite=True) as scratch:\n"
+        "    (scratch / 'model.yaml').write_text('format: 1')\n"
+    )
+    done = subprocess.run([sys.executable, "-c", script, str(folder)], check=False)
+    assert done.returncode == -signal.SIGKILL
+
+
+def test_a_model_that_a_kill_left_aside_comes_back(tmp_path):
+    write(tmp_path / "model")
+    killed_between_renames(tmp_path / "model")
+    assert not (tmp_path / "model").exists()
+    assert {Path(name).suffix for name in names(tmp_path)} == {".old", ".partial"}
+    with pytest.raises(OutputError, match="holds a model already"):
+        check_folder(tmp_path / "model", overwrite=False)
+    assert names(tmp_path) == ["model"]
+    assert load_model(tmp_path / "model").robot.name == "kiro3"
+
+
+def test_what_a_living_process_writes_is_not_swept(tmp_path):
+    with staged_folder(tmp_path / "model") as scratch:
+        write(tmp_path / "model")
+        assert scratch.is_dir()
+        (tmp_path / "model" / "model.yaml").unlink()
+        (tmp_path / "model" / "model.safetensors").unlink()
+        (tmp_path / "model" / "compiled.npz").unlink()
+        save_model(hand_made_model("kiro4"), scratch)
+    assert load_model(tmp_path / "model").robot.name == "kiro4"
+
+
+def test_only_scratch_of_ours_is_swept(tmp_path):
+    others = {".model.partial", ".model.a.b.partial", ".other.abc.partial", "model.abc.old", ".model.abc.txt"}
+    for name in others:
+        (tmp_path / name).mkdir()
+    (tmp_path / ".model.abcdefgh.partial").mkdir()
+    (tmp_path / ".model.abcdefgh.part").write_text("")
+    write(tmp_path / "model")
+    assert set(names(tmp_path)) == {"model", *others}
+
+
+def test_a_file_that_could_not_be_replaced_later_is_a_defect(tmp_path):
+    with (
+        pytest.raises(AssertionError, match=r"plan.csv.* could not be replaced later"),
+        staged_folder(tmp_path / "m") as scratch,
+    ):
+        (scratch / "plan.csv").write_text("")

@@ -12,8 +12,9 @@ from testing.models import hand_made_model
 from testing.report import bare_summary
 
 from pisigma.errors import ModelError
+from pisigma.files.model_files import HELD_OUT_CSV
 from pisigma.judging.calibration_validation import CalibrationValidation
-from pisigma.judging.held_out_rows import HELD_OUT_CSV, HeldOutRows, read_held_out
+from pisigma.judging.held_out_rows import HeldOutRows, read_held_out
 from pisigma.judging.pose_statistics import PoseErrors
 from pisigma.judging.predicted_spread import PredictedSpread
 from pisigma.measurement.dataset import Measurements

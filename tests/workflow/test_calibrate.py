@@ -50,7 +50,7 @@ def test_it_writes_a_folder_that_says_the_same(calibration, tmp_path):
         "pisigma.calibrate('kiro4', 'rows.csv', CalibrationSettings(model='geometric', folds=2, repeats=1))"
     )
     assert f"Made by `{call}`, on 40 rows" in (tmp_path / "arm" / "README.md").read_text()
-    calibration.save(tmp_path / "arm", command="pisigma calibrate kiro4 rows.csv")
+    calibration.save(tmp_path / "arm", command="pisigma calibrate kiro4 rows.csv", overwrite=True)
     assert CalibrationSummary.read(load_model(tmp_path / "arm")).command == "pisigma calibrate kiro4 rows.csv"
 
 

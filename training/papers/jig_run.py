@@ -9,16 +9,20 @@ from typing import Any
 from rich.console import Console
 
 from jig_card import write_jig_card
+from jig_figures import ERRORS_PNG, LINES_PNG, SEEDS_PNG, TOUCHES_PNG
 from jig_recipe import read_jig_recipe
 from jig_report import DEFAULT, report_jigs, run_jigs
 from jig_tables import all_tables
 from pisigma.cli.output import print_table
-from pisigma.files.output_folder import check_replaceable, staged_folder
+from pisigma.files.model_files import MODEL_FILES
+from pisigma.files.output_folder import check_folder, staged_folder
 from pisigma.judging.calibration_summary import summarise
 from pisigma.model.folder.model_folder import save_model
 from pisigma.model.geometric_model import model_of_calibration
 from pisigma.recipes.reader import recipe_hash
 from pisigma.robot.description import Robot
+
+_FILES = MODEL_FILES | {ERRORS_PNG, LINES_PNG, SEEDS_PNG, TOUCHES_PNG}
 
 
 def run_jigs_recipe(path: Path, out: Path) -> dict[str, Any]:
@@ -36,7 +40,7 @@ def run_jigs_recipe(path: Path, out: Path) -> dict[str, Any]:
     """
     started = time.perf_counter()
     recipe = read_jig_recipe(path)
-    check_replaceable(out)
+    check_folder(out, overwrite=True, names=_FILES)
     with Console(stderr=True).status("touching") as status:
         run = run_jigs(recipe, status.update)
     report = report_jigs(run)
@@ -51,7 +55,7 @@ def run_jigs_recipe(path: Path, out: Path) -> dict[str, Any]:
         "command": shlex.join(["python", "training/papers", "run", path.stem]),
         "not_validated": recipe.not_validated,
     }
-    with staged_folder(out) as scratch:
+    with staged_folder(out, overwrite=True, names=_FILES) as scratch:
         save_model(replace(model, metrics=summarise(result).to_json()), scratch)
         write_jig_card(model, run, report, texts, scratch)
     for table in all_tables(report):

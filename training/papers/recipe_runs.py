@@ -9,7 +9,7 @@ from jig_recipe import JIGS
 from jig_run import run_jigs_recipe
 from markdown_text import command_of
 from pisigma.files.output_file import write_whole
-from pisigma.files.output_folder import check_replaceable
+from pisigma.files.output_folder import check_folder
 from pisigma.identification.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.recipes.data import simulate
@@ -38,11 +38,11 @@ def run_recipe(folder: Path, name: str, data: Path | None, out: Path | None) -> 
     if name == JIGS.stem:
         result = run_jigs_recipe(folder / JIGS, out)
     else:
-        check_replaceable(out)
+        check_folder(out, overwrite=True)
         path = folder / f"{name}.yaml"
         rows = None if data is None else replace(Measurements.read_csv(data), source=data.name)
         training = train(path, rows, TrainSettings(show_progress=True))
-        training.save(out, name, command_of(name))
+        training.save(out, name, command_of(name), overwrite=True)
         result = {"model": str(out), **figures_of(training), **extra_figures(folder, name, training)}
     (folder / RESULTS).mkdir(exist_ok=True)
     write_whole(folder / RESULTS / f"{name}.json", result_text(result))

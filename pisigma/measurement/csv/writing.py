@@ -11,7 +11,8 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import MeasurementError, OutputError
+from pisigma.errors import MeasurementError
+from pisigma.files.output_file import write_whole
 from pisigma.measurement.csv.columns import number_fields
 from pisigma.measurement.csv.rows import first_of_equal_rows
 from pisigma.measurement.fields import KINDS, TEXTS, MeasuredFields
@@ -43,7 +44,7 @@ def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: S
         ["" if number != number else number for number in values.tolist()] for values in numbers.values()
     ]
     writer.writerows(zip(*cells, *texts.values(), strict=True))
-    _put(Path(path), text.getvalue())
+    write_whole(Path(path), text.getvalue())
 
 
 def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float64[np.ndarray, " rows"]]:
@@ -130,22 +131,3 @@ def _fits_cell(text: str) -> bool:
     except UnicodeEncodeError:
         return False
     return text == text.strip() and not set(text) & {"\n", "\r", "\0"}
-
-
-def _put(path: Path, text: str) -> None:
-    """Write a file beside `path` and move it there in one step."""
-    path = Path(os.path.realpath(path))
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        try:
-            with temporary.open("w", encoding="utf-8", newline="") as file:
-                file.write(text)
-                file.flush()
-                os.fsync(file.fileno())
-            os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
-    except OSError as problem:
-        raise OutputError(
-            f"{path}: cannot be written ({problem.strerror}); check the folder and its rights."
-        ) from None

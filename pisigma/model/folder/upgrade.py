@@ -96,7 +96,7 @@ def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
     if "uncertainty" in document:
         document["uncertainty"] = _without_turns(_renamed(document["uncertainty"]), path)
     changes = (*_without_fade(document), *_with_measured_conditions(document))
-    with staged_folder(path) as scratch:
+    with staged_folder(path, overwrite=True) as scratch:
         shutil.copytree(path, scratch, dirs_exist_ok=True)
         (scratch / COMPILED).unlink(missing_ok=True)
         if changes and (card := scratch / CARD).is_file():

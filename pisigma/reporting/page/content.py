@@ -5,13 +5,12 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from pisigma.files.model_files import CORRELATION_CSV, CORRELATION_PNG
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.judging.held_out_rows import read_held_out
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting.calibration_figures import CORRELATION_PNG
 from pisigma.reporting.calibration_tables import (
-    CORRELATION_CSV,
     coverage_line,
     learned_lines,
     undetermined_lines,

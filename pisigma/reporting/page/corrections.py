@@ -10,12 +10,12 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
+from pisigma.files.model_files import CORRELATION_CSV
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.tolerances import MEASURED_ROUNDING
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.calibration_figures import JOINT_UNITS
-from pisigma.reporting.calibration_tables import CORRELATION_CSV
 from pisigma.robot.description import Robot
 
 POINTS = 1_500

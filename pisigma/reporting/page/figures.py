@@ -4,7 +4,7 @@ import io
 import os
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,6 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter, NullLocator
 
 from pisigma.errors import OutputError
+from pisigma.files.conflicts import Input, check_apart
+from pisigma.files.output_file import write_whole
 from pisigma.judging.validation_figures import LearningPoint
 from pisigma.reporting.calibration_figures import STYLES, show_correlations
 from pisigma.reporting.page.content import ReportContent
@@ -118,12 +120,13 @@ def drawing_style() -> Iterator[None]:
         yield
 
 
-def check_figures(folder: Path) -> None:
+def check_figures(folder: Path, inputs: Iterable[Input] = ()) -> None:
     """Make sure that figures may be written into a folder: before the work, not after it.
 
     Raises:
-        OutputError: it is a file, or it cannot be made or written to.
+        OutputError: it is a file, lies in a model folder or an input, or it cannot be made or written to.
     """
+    check_apart(folder / "figure.png", inputs, "--figures")
     if folder.exists() and not folder.is_dir():
         raise OutputError(f"{folder}: is a file; choose another folder for --figures.")
     if not folder.exists() and not folder.parent.is_dir():
@@ -150,8 +153,8 @@ def write_figures(drawings: Sequence[Drawing], folder: Path) -> list[Path]:
         for drawing in drawings:
             stem = folder / (re.sub(r"[^\w.-]", "_", drawing.key) or "figure")
             svg, png = Path(f"{stem}.svg"), Path(f"{stem}.png")
-            svg.write_text(drawing.svg(), encoding="utf-8")
-            png.write_bytes(drawing.png())
+            write_whole(svg, drawing.svg())
+            write_whole(png, drawing.png())
             written += [png, svg]
     except OSError as problem:
         raise OutputError(

@@ -196,7 +196,7 @@ def test_the_new_file_takes_the_place_of_the_old_one_in_one_step(tmp_path: Path)
 
 
 def test_refuses_a_folder_that_is_not_there(tmp_path: Path):
-    with pytest.raises(OutputError, match=r"cannot be written .*; check the folder"):
+    with pytest.raises(OutputError, match=r"there is no folder .*nowhere; make it or choose another --out"):
         make().write_csv(tmp_path / "nowhere" / "data.csv")
 
 
