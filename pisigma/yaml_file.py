@@ -33,6 +33,10 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
 
+Seed = Annotated[int, Field(ge=0, lt=2**63)]
+"""Of a generator of random numbers."""
+
+
 @dataclass(frozen=True, eq=False)
 class OneOf:
     """Annotates a value as a section of a registry, chosen by its `kind`; sections may be registered later.

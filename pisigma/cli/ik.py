@@ -138,7 +138,7 @@ def _transform(pose: Pose) -> "np.ndarray":
     from pisigma.robot.row import FRAME_COLUMNS, LARGEST
 
     for name, value in zip(FRAME_COLUMNS, pose, strict=True):
-        if abs(value) > LARGEST:
+        if not abs(value) <= LARGEST:
             raise PoseError(
                 f"--pose: {name} {value:g} is no length [mm] or angle [deg] that a pose has; give X Y Z ROLL PITCH YAW."
             )

@@ -9,6 +9,7 @@ from pisigma.errors import MeasurementError
 
 STATISTICS = ("mean", "rms", "p95")
 """Statistics that have an interval; the maximum has none, as no resample exceeds what was measured."""
+MOST_RESAMPLES = 1_000_000
 QUANTILE = 0.95
 """Of the statistic "p95"."""
 
@@ -48,10 +49,10 @@ class Bootstrap:
 
     def __post_init__(self) -> None:
         """Refuse settings that give no interval."""
-        if self.resamples < 2 or not 0 < self.confidence < 1:
+        if not 2 <= self.resamples <= MOST_RESAMPLES or not 0 < self.confidence < 1 or self.seed < 0:
             raise MeasurementError(
-                f"bootstrap: 2 resamples or more and a confidence between 0 and 1 were wanted, got {self.resamples} "
-                f"and {self.confidence:g}."
+                f"bootstrap: 2 resamples or more and a confidence between 0 and 1 were wanted, a seed from 0 and up to "
+                f"{MOST_RESAMPLES:,} resamples, got {self.resamples}, {self.confidence:g} and seed {self.seed}."
             )
 
     def intervals(

@@ -13,8 +13,8 @@ from pisigma.judging.training_summary import BeforeAfter
 from pisigma.robot.description import Robot
 from pisigma.simulation.measure import SimulatedMeasurements
 from pisigma.simulation.true_robot import ErrorSource
-from pisigma.training.sections import FitSection, NetworkSection, Seed
-from pisigma.yaml_file import Section
+from pisigma.training.sections import FitSection, NetworkSection
+from pisigma.yaml_file import Section, Seed
 
 
 class AbstractRecipe(Section):

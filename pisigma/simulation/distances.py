@@ -14,7 +14,7 @@ from pisigma.simulation.commanded import AbstractCommanded, BranchSection, joint
 from pisigma.simulation.noise import SensorNoise, draw_noise, row_sigma
 from pisigma.simulation.poses import OrientationSection
 from pisigma.simulation.true_robot import TrueRobot
-from pisigma.yaml_file import Section
+from pisigma.yaml_file import Section, Seed
 
 
 class SocketSection(Section):
@@ -46,7 +46,7 @@ class SimulatedSockets(Section):
     sockets: tuple[SocketSection, ...] = Field(min_length=1)
     poses_per_socket: int = Field(ge=1)
     orientation: OrientationSection
-    seed: int = Field(ge=0)
+    seed: Seed
     branch: BranchSection
     noise: SensorNoise | None = None
 

@@ -8,7 +8,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pisigma.se3 import rotation_from_vector, transform
-from pisigma.yaml_file import Section
+from pisigma.yaml_file import Section, Seed
 
 
 class MeasurementNoise(Section):
@@ -29,7 +29,7 @@ class MeasurementNoise(Section):
 
     position_mm: float = Field(default=0.0, ge=0)
     orientation_deg: float = Field(default=0.0, ge=0)
-    seed: int = Field(ge=0)
+    seed: Seed
 
     @property
     def sigma_position(self) -> float:
@@ -82,7 +82,7 @@ class SensorNoise(Section):
 
     sensor_mm: float = Field(default=0.0, ge=0)
     repeatability_mm: float = Field(default=0.0, ge=0)
-    seed: int = Field(ge=0)
+    seed: Seed
 
     def draw(self, rows: int) -> NoiseDraws:
         """The deviations of so many rows; the same at every call."""

@@ -13,7 +13,7 @@ from pisigma.errors import RecipeError
 from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_from_rpy, transform
 from pisigma.simulation.errors.source import stated_joints
-from pisigma.yaml_file import Section
+from pisigma.yaml_file import Section, Seed
 
 Triple = tuple[float, float, float]
 
@@ -87,7 +87,7 @@ class JointsRandom(Section):
 
     kind: Literal["joints_random"]
     count: int = Field(ge=1)
-    seed: int = Field(ge=0)
+    seed: Seed
     share: float = Field(default=1.0, gt=0, le=1)
     range_deg: dict[str, Range] = Field(default_factory=dict)
     range_mm: dict[str, Range] = Field(default_factory=dict)
@@ -127,7 +127,6 @@ class JointsRandom(Section):
 
 
 Count = Annotated[int, Field(ge=1)]
-Seed = Annotated[int, Field(ge=0)]
 
 
 class AbstractPoses(Section, ABC):

@@ -10,9 +10,8 @@ from pydantic import AfterValidator, Field, PositiveFloat, PositiveInt
 from torch import Tensor, nn
 
 from pisigma.errors import RecipeError
-from pisigma.yaml_file import Section
+from pisigma.yaml_file import Section, Seed
 
-Seed = Annotated[int, Field(ge=0, lt=2**63)]
 Epochs = Annotated[int, Field(ge=1, le=1_000_000)]
 
 _Row = tuple[float, float, float]

@@ -34,6 +34,8 @@ from pisigma.workflow.result import AbstractModelResult
 FOLDS = 5
 """Of a cross-validation that is not by placement."""
 
+LARGEST_REPEATS = 1000
+
 ModelKind = Literal["hybrid", "geometric"]
 
 
@@ -93,6 +95,11 @@ class CalibrationSettings:
         if self.hold_out is not None and self.folds is not None:
             raise MeasurementError(
                 f"folds {self.folds} and hold-out {self.hold_out:g} exclude each other; leave one out."
+            )
+        if not 0 <= self.seed < 2**63 or (self.repeats or 0) > LARGEST_REPEATS:
+            raise MeasurementError(
+                f"a seed from 0 to 2^63 - 1 and at most {LARGEST_REPEATS:,} repeats were wanted, got {self.seed} and "
+                f"{self.repeats or 'the usual'}."
             )
         prior = (self.prior_length, self.prior_angle)
         if not all(map(math.isfinite, prior)) or min(prior) < 0 or (prior[0] == 0) != (prior[1] == 0):

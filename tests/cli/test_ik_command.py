@@ -325,7 +325,8 @@ def test_other_things_at_fault(refuses, models, tmp_path):
     assert "did you mean 'elbow_positive'?" in refuses(
         "ik", models / "kiro3", *pose, "--branch", "elbow_positiv"
     )
-    assert "finite numbers" in refuses("ik", models / "kiro3", "--pose", "nan", 0, 0, 0, 0, 0)
+    assert "x nan is no" in refuses("ik", models / "kiro3", "--pose", "nan", 0, 0, 0, 0, 0)
+    assert "pitch inf is no" in refuses("ik", models / "kiro3", "--pose", 300, 250, 300, 0, "inf", 0)
     assert "roll 1e+300 is no" in refuses("ik", models / "kiro3", "--pose", 300, 250, 300, 1e300, 0, 0)
     out = ("--out", tmp_path / "joints.csv")
     assert "cannot be read" in refuses("ik", models / "kiro3", "--poses", tmp_path / "no.csv", *out)

@@ -87,7 +87,10 @@ def test_a_single_configuration_has_no_interval():
     assert np.isnan(found.difference).all()
 
 
-@pytest.mark.parametrize(("resamples", "confidence"), [(1, 0.95), (100, 0.0), (100, 1.0)])
-def test_refuses_settings_that_give_no_interval(resamples: int, confidence: float):
+@pytest.mark.parametrize(
+    ("resamples", "seed", "confidence"),
+    [(1, 0, 0.95), (100, 0, 0.0), (100, 0, 1.0), (100, -1, 0.95), (10**10, 0, 0.95)],
+)
+def test_refuses_settings_that_give_no_interval(resamples: int, seed: int, confidence: float):
     with pytest.raises(MeasurementError, match="2 resamples or more and a confidence between 0 and 1"):
-        Bootstrap(resamples, confidence=confidence)
+        Bootstrap(resamples, seed, confidence)

@@ -79,6 +79,8 @@ def test_metrics_of_an_earlier_version_are_refused(calibration):
         ({"folds": 0, "repeats": 2}, "repeats 2: only folds can be repeated"),
         ({"prior_length": 0.0}, "both 0 for none, got 0 mm and 1 mrad"),
         ({"prior_angle": float("nan")}, "got 1 mm and nan mrad"),
+        ({"seed": -1}, "got -1 and the usual"),
+        ({"repeats": 10**9}, "at most 1,000 repeats were wanted, got 0 and 1000000000"),
     ],
 )
 @pytest.mark.usefixtures("without_type_checker")

@@ -8,6 +8,7 @@ from pydantic import Field
 
 from pisigma.robot.description import Robot
 from pisigma.simulation.errors.source import AbstractPlaySource, joint_values
+from pisigma.yaml_file import Seed
 
 
 class Backlash(AbstractPlaySource):
@@ -30,7 +31,7 @@ class Backlash(AbstractPlaySource):
     kind: Literal["backlash"]
     play_deg: dict[str, Annotated[float, Field(ge=0)]] = Field(default_factory=dict)
     play_mm: dict[str, Annotated[float, Field(ge=0)]] = Field(default_factory=dict)
-    seed: int = Field(default=0, ge=0)
+    seed: Seed = 0
 
     def half_play(self, robot: Robot, place: str) -> Float64[np.ndarray, " dof"]:
         """See `AbstractPlaySource.half_play`."""

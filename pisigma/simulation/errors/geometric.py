@@ -10,6 +10,7 @@ from pydantic import Field
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection, ParameterSection
 from pisigma.simulation.errors.source import AbstractGeometrySource, GeometryChange, row_index
+from pisigma.yaml_file import Seed
 
 
 class GeometricDeviation(AbstractGeometrySource):
@@ -73,7 +74,7 @@ class RandomGeometricDeviation(AbstractGeometrySource):
 
     kind: Literal["geometric_random"]
     distribution: Literal["uniform", "normal"]
-    seed: int = Field(ge=0)
+    seed: Seed
     length_mm: float = Field(ge=0)
     angle_deg: float = Field(ge=0)
     base_length_mm: float = Field(default=0.0, ge=0)
