@@ -1,0 +1,43 @@
+"""All kinds of hostile inputs, and how often each is drawn."""
+
+from pathlib import Path
+
+import numpy as np
+from hostile.case import Case, Generator
+from hostile.clean import Clean
+from hostile.documents import drawn_robot, wrong_recipe, wrong_robot
+from hostile.folders import wrong_model
+from hostile.healthy import healthy_robot, measured_robot
+from hostile.options import wrong_calibrate, wrong_ik, wrong_judging
+from hostile.tables import another_robot, damaged_measurements, wrong_measurements, wrong_poses
+from hostile.urdfs import wrong_urdf
+
+KINDS: dict[str, tuple[Generator, int]] = {
+    "healthy robots": (healthy_robot, 6),
+    "clean measurements": (measured_robot, 3),
+    "damaged measurements": (damaged_measurements, 26),
+    "wrong measurements": (wrong_measurements, 20),
+    "another robot": (another_robot, 3),
+    "poses": (wrong_poses, 12),
+    "robots": (wrong_robot, 14),
+    "drawn robots": (drawn_robot, 4),
+    "urdfs": (wrong_urdf, 14),
+    "recipes": (wrong_recipe, 14),
+    "models": (wrong_model, 12),
+    "options of calibrate": (wrong_calibrate, 8),
+    "options of ik": (wrong_ik, 8),
+    "options of others": (wrong_judging, 8),
+}
+"""By kind its generator and its share."""
+
+
+def make(kind: str, seed: int, number: int, clean: Clean, folder: Path) -> Case:
+    """Write the hostile input of a kind, a seed and a number into an empty folder; the same each time."""
+    rng = np.random.default_rng([list(KINDS).index(kind), seed, number])
+    return KINDS[kind][0](rng, clean, folder)
+
+
+def shares(count: int, kinds: tuple[str, ...] = tuple(KINDS)) -> dict[str, int]:
+    """How many inputs of every kind make up so many, one at least of each."""
+    whole = sum(KINDS[kind][1] for kind in kinds)
+    return {kind: max(1, -(-count * KINDS[kind][1] // whole)) for kind in kinds}
