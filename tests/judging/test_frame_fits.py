@@ -46,7 +46,7 @@ def test_exact_data_give_the_transforms_back(T, turned):
     tool = TOOL.clone() if turned else transform(torch.eye(3).double(), TOOL[:3, 3])
     assert_close(best_base(T, measured_as(BASE @ T, turned)), BASE, atol=1e-12)
     assert_close(best_tool(T, measured_as(T @ tool, turned)), tool, atol=1e-12)
-    base, behind = best_base_and_tool(T, measured_as(BASE @ T @ tool, turned), reach=1.0)
+    base, behind = best_base_and_tool(T, measured_as(BASE @ T @ tool, turned))
     assert_close(base, BASE, atol=1e-9)
     assert_close(behind, tool, atol=1e-9)
 
