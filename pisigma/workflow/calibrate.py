@@ -29,6 +29,7 @@ from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
 from pisigma.verification.checks.check import CheckedCalibration
 from pisigma.verification.checks.registry import diagnostics_of
+from pisigma.verification.checks.setup_fault import explained
 from pisigma.workflow.result import AbstractModelResult
 
 FOLDS = 5
@@ -217,7 +218,10 @@ def calibrate(
     if settings.train_rows is not None:
         rows = training.select(draw_rows(training, settings.train_rows, settings.seed))
     calibrator = settings.calibrator(nominal, training.socket or ())
-    result = fit(calibrator, rows, stage(progress, "calibration"))
+    try:
+        result = fit(calibrator, rows, stage(progress, "calibration"))
+    except IdentificationError as refusal:
+        raise explained(refusal, nominal, rows) from refusal
     validation = None
     if splits:
         validation = validate_repeatedly(calibrator, training, splits, stage(progress, "cross-validation"))

@@ -18,7 +18,8 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.stated_conditions import condition_warnings
-from pisigma.verification.setup_faults import PLAUSIBLE_SHARE, SetupFault, find_setup_faults, length_text
+from pisigma.verification.cause import length_text
+from pisigma.verification.setup_faults import PLAUSIBLE_SHARE, SetupFault, find_setup_faults
 from pisigma.workflow.evaluate import test_rows
 
 FEWEST_CONFIGURATIONS = 6

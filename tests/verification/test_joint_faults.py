@@ -6,6 +6,7 @@ from testing.closeness import assert_close
 from pisigma.robot import Robot
 from pisigma.verification.joint_faults import (
     JointMaps,
+    coupled_joints,
     moved_zeros,
     other_orders,
     other_units,
@@ -17,10 +18,9 @@ from pisigma.verification.joint_faults import (
 def test_joint_maps(generator):
     q = torch.rand(5, 4, generator=generator, dtype=torch.float64)
     assert_close(JointMaps.unchanged(2, 4).of(q), q.expand(2, 5, 4), atol=0.0)
-    maps = JointMaps(
-        torch.tensor([[1, 0, 2, 3]]), torch.tensor([[1.0, -1, 2, 1]]).double(), torch.ones(1, 4).double()
-    )
-    expected = torch.stack([q[:, 1] + 1, -q[:, 0] + 1, 2 * q[:, 2] + 1, q[:, 3] + 1], -1)
+    matrix = torch.tensor([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 2, 0], [0, 0, -1, 1]]).double()
+    maps = JointMaps(matrix[None], torch.ones(1, 4).double())
+    expected = torch.stack([q[:, 1] + 1, -q[:, 0] + 1, 2 * q[:, 2] + 1, q[:, 3] - q[:, 2] + 1], -1)
     assert_close(maps.of(q)[0], expected, atol=1e-15)
     assert_close(
         moved_zeros(torch.tensor([2]), torch.tensor([0.5]).double(), 4).of(q)[0, :, 2], q[:, 2] + 0.5
@@ -33,14 +33,15 @@ def test_every_fault_stands_once_and_changes_something():
         "signs": (reversed_signs(6), 2**6 - 1),
         "orders": (other_orders(6), 719),
         "orders of many": (other_orders(8), 28),
-        "units": (other_units(arm), 2 * (2**6 - 1)),
-        "units with a sliding joint": (other_units(scara), 2 * (2**3 - 1) + 2),
+        "pairs": (coupled_joints(6), 2 * 6 * 5),
+        "units": (other_units(arm), 2 * (2**6 - 1) + 2),
+        "units with a sliding joint": (other_units(scara), 2 * (2**3 - 1) + 2 + 2),
         "zeros": (quarter_turned_zeros(arm), 4**6 - 1),
     }
     for name, (maps, count) in counts.items():
-        rows = torch.cat([maps.order.double(), maps.factor, maps.offset], 1)
+        rows = torch.cat([maps.matrix.flatten(1), maps.offset], 1)
         assert len(rows) == count, name
         assert len(torch.unique(rows, dim=0)) == count, name
-        unchanged = JointMaps.unchanged(1, maps.order.shape[1])
-        same = torch.cat([unchanged.order.double(), unchanged.factor, unchanged.offset], 1)
+        unchanged = JointMaps.unchanged(1, maps.offset.shape[1])
+        same = torch.cat([unchanged.matrix.flatten(1), unchanged.offset], 1)
         assert not bool((rows == same).all(1).any()), name

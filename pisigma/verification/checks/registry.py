@@ -4,8 +4,9 @@ from pisigma.judging.diagnostic import Diagnostic
 from pisigma.verification.checks.check import AbstractCheck, CheckedCalibration
 from pisigma.verification.checks.prior_ratio import PriorRatioCheck
 from pisigma.verification.checks.search import SearchCheck
+from pisigma.verification.checks.setup_fault import SetupFaultCheck
 
-CHECKS: tuple[AbstractCheck, ...] = (SearchCheck(), PriorRatioCheck())
+CHECKS: tuple[AbstractCheck, ...] = (SetupFaultCheck(), SearchCheck(), PriorRatioCheck())
 """In the order in which their diagnostics are printed."""
 
 

@@ -1,0 +1,39 @@
+"""Whether a mistake in the setup or in the file explains errors that no robot of this drawing has."""
+
+import math
+from collections.abc import Iterator
+
+from pisigma.errors import IdentificationError
+from pisigma.judging.diagnostic import Diagnostic, Severity
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+from pisigma.verification.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.verification.checks.prior_ratio import IMPLAUSIBLE
+from pisigma.verification.setup_faults import UNRELATED, USUAL, are_unrelated, either, find_faults_as_drawn
+
+
+class SetupFaultCheck(AbstractCheck):
+    """Looks for setup faults under which the errors of the robot as drawn collapse; see `find_faults_as_drawn`.
+
+    A fault makes the calibration implausible, as it may be absorbed by parameters that then are wrong elsewhere. The
+    zero of a joint is a parameter: where it has moved, a calibration is right, so up to the size that the prior
+    ratio allows it is a warning.
+    """
+
+    def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
+        """See `AbstractCheck.diagnose`."""
+        faults = find_faults_as_drawn(checked.robot, checked.rows)
+        if faults:
+            fault, largest = either(faults), IMPLAUSIBLE * USUAL * math.sqrt(checked.robot.dof)
+            severity: Severity = "implausible" if fault.moved > largest else "warning"
+            yield Diagnostic(kind="setup_fault", severity=severity, sentence=fault.sentence)
+        elif are_unrelated(checked.robot, checked.rows):
+            yield Diagnostic(kind="setup_fault", severity="implausible", sentence=UNRELATED)
+
+
+def explained(refusal: IdentificationError, robot: Robot, rows: Measurements) -> IdentificationError:
+    """Name the cause of a refusal where setup faults explain the errors; else return the refusal as it is."""
+    faults = find_faults_as_drawn(robot, rows)
+    if faults:
+        return IdentificationError(f"{rows.source}: {either(faults).sentence}")
+    return IdentificationError(f"{rows.source}: {UNRELATED}") if are_unrelated(robot, rows) else refusal

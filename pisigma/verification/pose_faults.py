@@ -1,0 +1,98 @@
+"""Setup faults of measured poses: units, handedness, and conventions of orientations."""
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from scipy.spatial.transform import Rotation
+from torch import Tensor
+
+from pisigma.judging.frame_fits import MeasuredPoses
+from pisigma.verification.cause import Cause
+
+UNITS = (
+    (1e-3, "millimetres", "metres"),
+    (1e3, "metres", "millimetres"),
+    (10.0, "centimetres", "millimetres"),
+    (25.4, "inches", "millimetres"),
+)
+"""Factors on positions, what they are, and what they are named."""
+EULER_ORDERS = ("ZYX", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYZ", "ZXZ", "XYX", "XZX", "YXY", "YZY")
+READ_ORDER = EULER_ORDERS[0]
+"""Order of the turns roll, pitch and yaw in measurement files."""
+_MIRROR = torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))
+_MIRRORED = "{} mirrored, as in a left-handed frame (an axis has the wrong sign, or two are swapped)"
+
+
+def units_and_frames(measured: MeasuredPoses) -> Iterator[tuple[MeasuredPoses, Cause]]:
+    """Go through positions in other units, mirrored positions and orientations, and inverse poses."""
+    for factor, are, named in UNITS:
+        clause = f"x, y and z are {are} that are named {named}"
+        yield (
+            replace(measured, position=measured.position * factor),
+            Cause("position_unit", clause, "correct the unit in the column names", 1.0),
+        )
+    advice = "check the order and the directions of the sensor's axes"
+    positions = replace(measured, position=measured.position @ _MIRROR)
+    what = "the measured positions are"
+    if bool(measured.has_rotation.any()):
+        rotations = replace(measured, rotation=_MIRROR @ measured.rotation @ _MIRROR)
+        yield rotations, Cause("handedness", _MIRRORED.format("the measured orientations are"), advice, 1.0)
+        both = replace(positions, rotation=rotations.rotation)
+        yield both, Cause("handedness", _MIRRORED.format("the measured poses are"), advice, 1.0)
+        turned_back = measured.rotation.mT
+        place = -(turned_back @ measured.position[..., None])[..., 0]
+        clause = "the measured poses are those of the sensor in the target's frame (inverse poses)"
+        inverse = replace(measured, position=place, rotation=turned_back)
+        yield inverse, Cause("rotation", clause, "write the target's pose in the sensor's frame", 1.0)
+        what += ", other than the orientations,"
+    yield positions, Cause("handedness", _MIRRORED.format(what), advice, 1.0)
+
+
+def other_conventions(
+    rotation: Float64[Tensor, "rows 3 3"],
+) -> Iterator[tuple[Float64[Tensor, "rows 3 3"], str]]:
+    """Go through what measured orientations are where they were written in another convention, and say which."""
+    read = Rotation.from_matrix(rotation.numpy())
+    quaternion = read.as_quat()
+    wxyz = Rotation.from_quat(np.roll(quaternion, -1, 1))
+    angles = read.as_euler(READ_ORDER)
+    inverse = "the orientations are inverse (a conjugate quaternion, or a transposed matrix)"
+    scalar = "the quaternions stand in the order qw, qx, qy, qz (the scalar part first)"
+    yield from (
+        (_matrices(read.inv()), inverse),
+        (_matrices(wxyz), scalar),
+        (_matrices(wxyz.inv()), f"{scalar} and are conjugate"),
+    )
+    for columns in (("roll", "pitch", "yaw"), ("yaw", "pitch", "roll")):
+        vector = _as_rotation_vector(angles)
+        turned, vector = (a if columns[0] == "roll" else a[:, ::-1] for a in (angles, vector))
+        clause = f"{', '.join(columns)} hold the x, y and z of a rotation vector (axis times angle)"
+        yield _matrices(Rotation.from_rotvec(vector)), clause
+        for order in EULER_ORDERS:
+            product = " · ".join(f"Rot{axis}({name})" for axis, name in zip(order, columns, strict=True))
+            for factor, unit in ((1.0, ""), (180 / np.pi, " in radians that are named degrees")):
+                if (order, columns[0], factor) == (READ_ORDER, "roll", 1.0):
+                    continue
+                clause = (
+                    f"roll, pitch and yaw are angles of another order, the Euler angles of {product}{unit}"
+                )
+                yield _matrices(Rotation.from_euler(order, factor * turned)), clause
+
+
+def _as_rotation_vector(angles: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:
+    """Of the two ways to write a rotation in roll, pitch and yaw, take the shorter one as a vector.
+
+    A vector that was read as angles may have had a second component beyond a quarter turn, which is read otherwise.
+    """
+    roll, pitch, yaw = angles.T
+    half = np.pi * np.stack([-np.sign(roll), np.sign(pitch), -np.sign(yaw)], 1)
+    other = np.stack([roll, -pitch, yaw], 1) + half
+    longer = np.linalg.norm(angles, axis=1) > np.linalg.norm(other, axis=1)
+    return np.where(longer[:, None], other, angles)
+
+
+def _matrices(rotation: Rotation) -> Float64[Tensor, "rows 3 3"]:
+    return torch.from_numpy(rotation.as_matrix())
