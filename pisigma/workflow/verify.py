@@ -19,7 +19,9 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.verification.cause import length_text
-from pisigma.verification.setup_faults import PLAUSIBLE_SHARE, SetupFault, find_setup_faults
+from pisigma.verification.explanations import PLAUSIBLE_SHARE
+from pisigma.verification.setup_fault import SetupFault
+from pisigma.verification.setup_faults import find_setup_faults
 from pisigma.workflow.evaluate import test_rows
 
 FEWEST_CONFIGURATIONS = 6

@@ -9,7 +9,13 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.verification.checks.check import AbstractCheck, CheckedCalibration
 from pisigma.verification.checks.prior_ratio import IMPLAUSIBLE
-from pisigma.verification.setup_faults import UNRELATED, USUAL, are_unrelated, either, find_faults_as_drawn
+from pisigma.verification.faults_as_drawn import USUAL, are_unrelated, find_faults_as_drawn
+from pisigma.verification.setup_fault import either
+
+UNRELATED = (
+    "The measured positions have nothing to do with the joint values of their rows, so that rows of one side belong to "
+    "other rows of the other; look for a side that was sorted, or that is of another program."
+)
 
 
 class SetupFaultCheck(AbstractCheck):

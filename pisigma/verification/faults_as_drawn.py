@@ -1,0 +1,151 @@
+"""Setup faults that show with the robot as drawn, base and tool being fitted under every hypothesis."""
+
+from collections import Counter
+from collections.abc import Iterable
+from dataclasses import replace
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.judging.frame_fits import LEVER_SHARE, MeasuredPoses
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.parameter_jacobian import identification_jacobian
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+from pisigma.verification.arm import PredictingArm
+from pisigma.verification.cause import Cause
+from pisigma.verification.explanations import hypotheses, in_frames, simplest
+from pisigma.verification.free_joint import freed_joints
+from pisigma.verification.hypothesis import Hypothesis
+from pisigma.verification.row_faults import MARGIN, explains_nothing, shifted_rows
+from pisigma.verification.setup_fault import SetupFault, fault_of
+from pisigma.verification.target_faults import better_labellings, fitted_poses
+
+MOST_ROWS = 1_000
+"""Rows that explanations are tried on, spread over all of them."""
+MOST_ROWS_AS_DRAWN = 150
+"""The same of the robot as drawn, where base and tool are fitted to them under every hypothesis."""
+FEWEST_ROWS_AS_DRAWN = 24
+"""Base and tool, as 39 unknowns of an affine fit, leave too few of the values of fewer rows."""
+USUAL = 1e-3
+"""Usual prior standard deviation of geometric errors [m and rad]."""
+
+
+def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[SetupFault, ...]:
+    """Find what makes the errors of the robot as drawn collapse to a quarter or less, the simplest first.
+
+    Base and tool are fitted to the rows as they are and under every hypothesis: those of `find_setup_faults`, rows
+    shifted from one row on, several targets under one name, and a joint whose logged values are not those that it
+    had. They are tried where the errors are larger than geometric errors of the usual prior (1 mm, 1 mrad) make those
+    of the robot as drawn. There a true explanation leaves these usual errors, a tenth or less of what faults make.
+
+    Args:
+        robot: as drawn.
+        measurements: rows; those with positions in the frame and of the target that most are of are judged.
+
+    Returns:
+        Nothing where the errors are usual, or where nothing explains them.
+    """
+    rows = largest_group(measurements)
+    if rows.rows < FEWEST_ROWS_AS_DRAWN:
+        return ()
+    chosen = spread(torch.arange(MARGIN, rows.rows - MARGIN), MOST_ROWS_AS_DRAWN)
+    some, arm = rows.select(chosen), PredictingArm(robot)
+    measured = MeasuredPoses.of(some, LEVER_SHARE * robot.reach)
+    raw = Hypothesis(some.q, arm.poses(some), measured)
+    here, usual = next(in_frames(arm, some, raw)), usual_error(robot, some.q)
+    if len(set(measurements.target)) > 1:
+        named = _named_otherwise(robot, measurements, usual)
+        if named or not here.error > usual:
+            return named
+    if not here.error > usual:
+        return ()
+    tried = [*hypotheses(arm, some, raw), *_with_joints(arm, shifted_rows(arm, rows, chosen, measured))]
+    faults = simplest(here, tried, robot.reach)
+    if not faults:
+        freed = ((q, measured, cause) for q, cause in freed_joints(arm, some, measured))
+        faults = simplest(here, _with_joints(arm, freed, values=1) + _labelled(robot, rows), robot.reach)
+    return tuple(fault_of(here, other, float("nan")) for other in faults)
+
+
+def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> tuple[SetupFault, ...]:
+    """Find better names for the targets of the frame that most rows are of, where errors are larger than usual [m]."""
+    rows = largest_group(measurements, by_target=False)
+    here = Hypothesis(rows.q, fitted_poses(robot, rows), MeasuredPoses.of(rows, LEVER_SHARE * robot.reach))
+    if not here.error > usual:
+        return ()
+    return tuple(
+        fault_of(here, other, float("nan")) for other in simplest(here, _labelled(robot, rows), robot.reach)
+    )
+
+
+def _labelled(robot: Robot, rows: Measurements) -> list[Hypothesis]:
+    """Make hypotheses of other names of targets."""
+    some = rows.select(spread(torch.arange(rows.rows), MOST_ROWS))
+    measured = MeasuredPoses.of(some, LEVER_SHARE * robot.reach)
+    return [
+        Hypothesis(some.q, one.T, measured, (one.cause,), 3 * one.targets)
+        for one in better_labellings(robot, some)
+    ]
+
+
+def _with_joints(
+    arm: PredictingArm,
+    tried: Iterable[tuple[Float64[Tensor, "rows dof"], MeasuredPoses, Cause]],
+    values: int = 0,
+) -> list[Hypothesis]:
+    """Make hypotheses of joint values of the robot as drawn, of which every row has some values of its own."""
+    return [
+        other
+        for q, measured, cause in tried
+        for rows in [Measurements(q=q)]
+        for other in in_frames(arm, rows, Hypothesis(q, arm.poses(rows), measured, (cause,), values * len(q)))
+    ]
+
+
+def are_unrelated(robot: Robot, measurements: Measurements) -> bool:
+    """Say whether positions have nothing to do with the joint values of their rows, as where one side was sorted."""
+    rows = largest_group(measurements)
+    if rows.rows < FEWEST_ROWS_AS_DRAWN:
+        return False
+    assert rows.position is not None
+    spread_out = float((rows.position - rows.position.mean(0)).square().sum(1).mean().sqrt())
+    return spread_out > usual_error(robot, rows.q) and explains_nothing(
+        forward_kinematics(robot, rows.q), rows.position
+    )
+
+
+def usual_error(robot: Robot, q: Float64[Tensor, "rows dof"]) -> float:
+    """Compute the root mean square of the position errors [m] that geometric errors of 1 mm and 1 mrad make.
+
+    Their covariance is `J P J^T` for the derivative `J` of the position by the parameters of all rows and the prior
+    covariance `P`; that base and tool take a part of it is left out.
+    """
+    J = identification_jacobian(robot, q)[1][:, :3, : 5 * len(robot.rows)]
+    return USUAL * float(J.square().sum((1, 2)).mean().sqrt())
+
+
+def measured_rows(measurements: Measurements) -> Int64[Tensor, " rows"]:
+    """List the rows with a position."""
+    assert measurements.position is not None
+    return torch.isfinite(measurements.position).all(-1).nonzero()[:, 0]
+
+
+def largest_group(measurements: Measurements, by_target: bool = True) -> Measurements:
+    """Select the rows with positions of the frame (and target) that most are of; none where none was measured."""
+    if measurements.position is None:
+        return measurements.select(torch.arange(0))
+    rows = measured_rows(measurements)
+    names = [
+        (measurements.frame[row], measurements.target[row] if by_target else "") for row in rows.tolist()
+    ]
+    most = Counter(names).most_common(1)[:1]
+    group = measurements.select(rows[torch.tensor([name == most[0][0] for name in names], dtype=torch.bool)])
+    return replace(group, pair=None, distance=None)
+
+
+def spread(rows: Int64[Tensor, " rows"], most: int) -> Int64[Tensor, " chosen"]:
+    """Choose some of the rows, spread over them."""
+    count = min(len(rows), most)
+    return rows[torch.linspace(0, len(rows) - 1, count).round().long()]
