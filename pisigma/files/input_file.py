@@ -26,11 +26,9 @@ def read_input(path: str | os.PathLike[str], error: type[PisigmaError], most: in
     """
     content = bytearray()
     try:
-        with open(path, "rb", buffering=0, opener=_without_waiting) as file:
-            state = os.fstat(file.fileno())
-            while max(len(content), state.st_size) <= most:
-                if not stat.S_ISREG(state.st_mode) and not select.select([file], [], [], LONGEST_WAIT)[0]:
-                    raise TimeoutError(0, f"nothing came through it in {LONGEST_WAIT:g} s")
+        with open(path, "rb", buffering=0, opener=open_input) as file:
+            size = os.fstat(file.fileno()).st_size
+            while max(len(content), size) <= most:
                 chunk = file.read(_CHUNK)
                 if not chunk:
                     return bytes(content)
@@ -42,9 +40,19 @@ def read_input(path: str | os.PathLike[str], error: type[PisigmaError], most: in
     raise error(f"{path}: has more than {most / 1e6:,.0f} MB, which no file of its kind has; check the path.")
 
 
-def _without_waiting(path: str, flags: int) -> int:
-    """Open a pipe although nobody has opened its other end yet."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+def open_input(path: str, flags: int) -> int:
+    """Open a file for Python's `open`, which would wait for ever for somebody who writes into a pipe.
+
+    Raises:
+        TimeoutError: it is a pipe or a device from which nothing comes.
+    """
+    handle = os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+    if not stat.S_ISREG(os.fstat(handle).st_mode):
+        if not select.select([handle], [], [], LONGEST_WAIT)[0]:
+            os.close(handle)
+            raise TimeoutError(0, f"nothing came through it in {LONGEST_WAIT:g} s")
+        os.set_blocking(handle, True)
+    return handle
 
 
 def read_text(path: str | os.PathLike[str], error: type[PisigmaError], kind: str) -> str:

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from pisigma.errors import PoseError, RobotError, nearest_choice
 from pisigma.robot.robot_file import read_robot
-from pisigma.robot.row import JointType, Row
+from pisigma.robot.row import LARGEST, MOST_ROWS, JointType, Row
 
 if TYPE_CHECKING:
     import pytorch_kinematics
@@ -47,13 +47,17 @@ class Robot:
             values = np.array(getattr(self, name), dtype=np.float64)
             if values.shape != shape:
                 raise RobotError(f"{robot}: {name} of shape {shape} was wanted, got {values.shape}.")
-            if not np.isfinite(values).all():
-                raise RobotError(f"{robot}: {name} has an entry that is not finite; correct it.")
+            if not (np.abs(values) <= LARGEST / 1e3).all():
+                raise RobotError(
+                    f"{robot}: {name} has an entry that is not finite or over {LARGEST / 1e3:.0e} m or rad; correct it."
+                )
             values.setflags(write=False)
             object.__setattr__(self, name, values)
         if self.dof == 0:
             raise RobotError(f"{robot}: it has no joint that moves; add a revolute or prismatic one.")
         names = [row.name for row in self.rows]
+        if len(names) > MOST_ROWS:
+            raise RobotError(f"{robot}: it has {len(names):,} rows; {MOST_ROWS:,} at most were wanted.")
         if twice := sorted({name for name in names if names.count(name) > 1}):
             raise RobotError(f"{robot}: the row name '{twice[0]}' stands twice; names must differ.")
         for row in self.rows:
@@ -63,6 +67,11 @@ class Robot:
                 raise RobotError(f"{place}: the type cannot be '{row.type}'; {hint}")
             if row.direction not in (1, -1):
                 raise RobotError(f"{place}: direction is +1 or -1, got {row.direction}.")
+            stroke = [bound for bound in (row.lower, row.upper) if np.isfinite(bound)]
+            if row.type == "prismatic" and max(map(abs, stroke), default=0.0) > LARGEST / 1e3:
+                raise RobotError(
+                    f"{place}: a limit is above {LARGEST / 1e3:.0e} m; correct it or leave both out."
+                )
             if not row.lower < row.upper:
                 raise RobotError(
                     f"{place}: the lower limit {row.lower:g} is not below the upper limit {row.upper:g}; "

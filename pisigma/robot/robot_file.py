@@ -10,20 +10,21 @@ from jaxtyping import Float64
 from pydantic import Field, model_validator
 
 from pisigma.errors import RobotError, UnknownRobotError, nearest_choice
-from pisigma.robot.row import Drawing, JointType, Row
+from pisigma.robot.row import LARGEST, MOST_ROWS, Drawing, JointType, Row
 from pisigma.yaml_file import Section, parse_yaml, read_yaml
 
-Limits = Annotated[tuple[float, float], Field(description="lower and upper")]
+Bounded = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+Limits = Annotated[tuple[Bounded, Bounded], Field(description="lower and upper")]
 
 
 class ParameterSection(Section):
     """The parameters of a row. Angles in degrees, lengths in millimetres."""
 
-    theta_deg: float = 0.0
-    d_mm: float = 0.0
-    a_mm: float = 0.0
-    alpha_deg: float = 0.0
-    beta_deg: float = 0.0
+    theta_deg: Bounded = 0.0
+    d_mm: Bounded = 0.0
+    a_mm: Bounded = 0.0
+    alpha_deg: Bounded = 0.0
+    beta_deg: Bounded = 0.0
 
     def to_si(self) -> Float64[np.ndarray, " 5"]:
         """The parameters as `DH_COLUMNS` [rad or m]."""
@@ -71,12 +72,12 @@ class RowSection(ParameterSection):
 class FrameSection(Section):
     """Base or tool: `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`."""
 
-    x_mm: float = 0.0
-    y_mm: float = 0.0
-    z_mm: float = 0.0
-    roll_deg: float = 0.0
-    pitch_deg: float = 0.0
-    yaw_deg: float = 0.0
+    x_mm: Bounded = 0.0
+    y_mm: Bounded = 0.0
+    z_mm: Bounded = 0.0
+    roll_deg: Bounded = 0.0
+    pitch_deg: Bounded = 0.0
+    yaw_deg: Bounded = 0.0
 
     def to_si(self) -> np.ndarray:
         """x, y, z [m], roll, pitch, yaw [rad]."""
@@ -90,7 +91,7 @@ class RobotDocument(Section):
     name: str = Field(min_length=1)
     maker: str
     source: str
-    rows: tuple[RowSection, ...] = Field(min_length=1)
+    rows: tuple[RowSection, ...] = Field(min_length=1, max_length=MOST_ROWS)
     base: FrameSection = FrameSection()
     tool: FrameSection = FrameSection()
 

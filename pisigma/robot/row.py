@@ -18,6 +18,9 @@ FRAME_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
 LARGEST = 1e9
 """[mm, deg, or as a file states it] No robot, pose or measurement has a larger value."""
 
+MOST_ROWS = 1000
+"""Of a robot."""
+
 _LENGTHS = frozenset(("d", "a", "x", "y", "z"))
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Float64
 
 from pisigma.errors import RobotError, nearest_choice
 from pisigma.files.input_file import read_input
+from pisigma.robot.row import LARGEST
 from pisigma.robot.urdf_frames import Frame, frame_of
 
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
@@ -139,9 +140,12 @@ def _check_value(element: Any, tag: str, key: str, place: str) -> None:
         numbers = [float(word) for word in text.split()]
     except ValueError:
         numbers = []
-    if len(numbers) != count or not all(math.isfinite(number) for number in numbers):
+    most = LARGEST**2 if tag == "limit" else LARGEST / 1e3  # some write 1e16 for no limit
+    if len(numbers) != count or not all(abs(number) <= most for number in numbers):
         wanted = "three finite numbers with spaces between" if count == 3 else "a finite number"
-        raise RobotError(f'{place}: {key}="{text}" of <{tag}> is not {wanted}; correct it.')
+        raise RobotError(
+            f'{place}: {key}="{text}" of <{tag}> is not {wanted}, {most:.0e} at most; correct it.'
+        )
 
 
 def _parse_urdf(reduced: Any) -> Any:

@@ -72,6 +72,8 @@ def test_every_robot_of_the_catalogue_loads_and_survives_its_file(name):
         ("type: revolute", "type: revolut", "line 5: 'rows.0.type' cannot be 'revolut'; did you mean 'revolute'"),
         ("name: d_2", "name: theta_1", "the row name 'theta_1' stands twice"),
         ("d_mm: 100", "d_mm: '100'", "line 5: 'rows.0.d_mm': .*number, but got '100'"),
+        ("d_mm: 100", "d_mm: 1e300", "line 5: 'rows.0.d_mm': .*less than or equal to 1000000000"),
+        ("limits_mm: [0, 300]", "limits_mm: [0, 1e12]", "line 6: 'rows.1.limits_mm.1'"),
         ("d_mm: 100", "d_mm: yes", "line 5: 'rows.0.d_mm': .*number, but got 'yes'"),
         ("maker: nobody\n", "", "the key 'maker' is missing in 'the file'"),
         ("name: theta_1, ", "", "line 5: the key 'name' is missing in 'rows.0'"),
@@ -118,6 +120,9 @@ def test_one_limit_cannot_be_written():
     [
         ({"dh": np.zeros((2, 5))}, r"dh of shape \(3, 5\)"),
         ({"tool": np.array([np.nan, 0, 0, 0, 0, 0])}, "tool has an entry that is not finite"),
+        ({"dh": np.full((3, 5), 1e300)}, "dh has an entry that is not finite or over"),
+        ({"rows": tuple(Row(str(i), "revolute") for i in range(1001)), "dh": np.zeros((1001, 5))}, "1,001 rows; 1,000"),
+        ({"rows": (Row("a", "prismatic", 1, 0.0, 1e12), Row("b", "fixed"), Row("c", "fixed"))}, "a limit is above"),
         ({"rows": (Row("a", "fixed"), Row("b", "fixed"), Row("c", "fixed"))}, "no joint that moves"),
         ({"rows": (Row("a", "revolute"), Row("a", "fixed"), Row("c", "fixed"))}, "'a' stands twice"),
         ({"rows": (Row("a", "revolute", 0), Row("b", "fixed"), Row("c", "fixed"))}, "direction is"),

@@ -153,6 +153,7 @@ AXIS = '<axis xyz="0 0 -1"/>'
         (AXIS, '<axis xyz="0 0 1"/><axis xyz="0 0 1"/>', "has <axis> twice"),
         ('xyz="0.4 0 0"', 'xyz="0.4, 0, 0"', 'xyz="0.4, 0, 0" of <origin> is not three finite numbers with spaces'),
         ('xyz="0.4 0 0"', 'xyz="0.4 0 1e999"', "is not three finite numbers"),
+        ('xyz="0.4 0 0"', 'xyz="0.4 0 1e200"', "is not three finite numbers with spaces between, 1e+06 at most"),
         ('rpy="1.5707963267948966 0 0"', 'rpy="${pi/2} 0 0"', 'rpy="${pi/2} 0 0" of <origin> is not'),
         ('<parent link="upper_arm"/>', "", """name="elbow"|joint 'elbow': <parent link="..."/> is missing"""),
         ('<child link="camera"/>', "<child/>", """joint 'eye': <child link="..."/> is missing"""),

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import chain, islice
+from itertools import chain, count, islice
 from typing import TextIO
 
 import numpy as np
@@ -12,6 +12,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.files.input_file import open_input
 from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, Column, find_column, quoted
 from pisigma.measurement.csv.header import check_separators
 from pisigma.measurement.csv.rows import QUATERNION_TOLERANCE
@@ -26,7 +27,7 @@ CHUNK_ROWS = 20_000
 
 _RPY_COLUMNS = tuple(f"{name}_deg" for name in RPY)
 _POSITION_COLUMNS = tuple(f"{name}_mm" for name in POSITION)
-_LONGEST_CELL = 40
+_LONGEST_CELL, _LONGEST_LINE = 40, 10_000_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +78,7 @@ def read_pose_chunks(path: str | os.PathLike[str], rows: int = CHUNK_ROWS) -> It
         MeasurementError: the file cannot be read, its header cannot be used, or no row follows it.
     """
     try:
-        with open(path, encoding="utf-8-sig", errors="surrogateescape") as file:
+        with open(path, encoding="utf-8-sig", errors="surrogateescape", opener=open_input) as file:
             yield from _chunks(file, str(path), rows)
     except OSError as problem:
         raise MeasurementError(f"{path}: cannot be read ({problem.strerror}); check the path.") from None
@@ -85,7 +86,7 @@ def read_pose_chunks(path: str | os.PathLike[str], rows: int = CHUNK_ROWS) -> It
 
 def _chunks(file: TextIO, source: str, rows: int) -> Iterator[PoseChunk]:
     length = os.fstat(file.fileno()).st_size
-    content = content_lines(file, source)
+    content = content_lines(_bounded_lines(file, source), source)
     header_line, header = next(content)
     layout = _Layout.of(header, f"{source}, line {header_line}")
     any_row = False
@@ -103,6 +104,19 @@ def _chunks(file: TextIO, source: str, rows: int) -> Iterator[PoseChunk]:
         raise MeasurementError(
             f"{source}, line {header_line}: the file ends after its header; add one row per pose."
         )
+
+
+def _bounded_lines(file: TextIO, source: str) -> Iterator[str]:
+    """The lines of a file, none of them so long that it fills the memory."""
+    for number in count(1):
+        line = file.readline(_LONGEST_LINE)
+        if len(line) == _LONGEST_LINE:
+            raise MeasurementError(
+                f"{source}, line {number}: has more than {_LONGEST_LINE:,} characters; one line per pose was wanted."
+            )
+        if not line:
+            return
+        yield line
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,13 @@
 """Files of wanted poses: units from the names, every complaint with file, line and column."""
 
+import os
+
 import pytest
 import torch
 from testing.closeness import assert_close
 
 from pisigma.errors import MeasurementError
+from pisigma.files import input_file
 from pisigma.measurement.csv.poses import read_pose_chunks, read_poses
 from pisigma.se3 import transform_from_xyzrpy
 
@@ -142,3 +145,12 @@ def test_a_long_cell_is_cut(tmp_path):
     path.write_text(f"{QUATERNION}\n{'x' * 100_000},0,0,0,0,0,1\n")
     (chunk,) = read_pose_chunks(path)
     assert len(chunk.bad[0].reason) < 200
+
+
+def test_a_file_without_lines_or_a_silent_pipe_is_refused(tmp_path, monkeypatch):
+    with pytest.raises(MeasurementError, match="line 1: has more than 10,000,000 characters"):
+        read_poses("/dev/zero")
+    monkeypatch.setattr(input_file, "LONGEST_WAIT", 0.05)
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(MeasurementError, match="nothing came through it"):
+        read_poses(tmp_path / "pipe")
