@@ -114,15 +114,15 @@ def _all_sensors(folder: Path) -> CleanRows:
 def _measured(folder: Path) -> dict[str, CleanRows]:
     """A part of the files of measured robots, and the same number of other rows."""
     files = {
-        "ur5 measured": ("ur5", "ur5/grid.csv", 8),
-        "ur10 measured": ("ur10", "ur10/series_c_train.csv", 16),
+        "ur5 measured": ("ur5", "ur5/grid.csv", 12),
+        "ur10 measured": ("ur10", "ur10/series_c_train.csv", 24),
         "fanuc measured": ("fanuc_r2000", "fanuc_r2000/positions.csv", 1),
         "panda measured": ("panda", "panda_sockets/panda_3.csv", 2),
     }
     rows = {}
     for name, (robot, file, every) in files.items() if DATA.is_dir() else ():
         header, *lines = (DATA / file).read_text(encoding="utf-8").splitlines()
-        taken = lines[::every] if every > 1 else [line for i, line in enumerate(lines) if i // 3 % 5 < 2]
+        taken = lines[::every] if every > 1 else [line for i, line in enumerate(lines) if i // 3 % 5 < 1]
         path, others = folder / f"{robot}_measured.csv", folder / f"{robot}_others.csv"
         path.write_text("\n".join([header, *taken]) + "\n", encoding="utf-8")
         others.write_text("\n".join([header, *lines[every // 2 :: every]]) + "\n", encoding="utf-8")

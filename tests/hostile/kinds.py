@@ -13,18 +13,18 @@ from hostile.tables import another_robot, damaged_measurements, wrong_measuremen
 from hostile.urdfs import wrong_urdf
 
 KINDS: dict[str, tuple[Generator, int]] = {
-    "healthy robots": (healthy_robot, 6),
+    "healthy robots": (healthy_robot, 3),
     "clean measurements": (measured_robot, 3),
     "damaged measurements": (damaged_measurements, 26),
-    "wrong measurements": (wrong_measurements, 20),
+    "wrong measurements": (wrong_measurements, 16),
     "another robot": (another_robot, 3),
     "poses": (wrong_poses, 12),
     "robots": (wrong_robot, 14),
     "drawn robots": (drawn_robot, 4),
-    "urdfs": (wrong_urdf, 14),
+    "urdfs": (wrong_urdf, 18),
     "recipes": (wrong_recipe, 14),
-    "models": (wrong_model, 12),
-    "options of calibrate": (wrong_calibrate, 8),
+    "models": (wrong_model, 10),
+    "options of calibrate": (wrong_calibrate, 10),
     "options of ik": (wrong_ik, 8),
     "options of others": (wrong_judging, 8),
 }

@@ -106,7 +106,7 @@ def wrong_judging(rng: Rng, clean: Clean, folder: Path) -> Case:
     shutil.copy(rows, folder / "rows.csv")
     path = one_of(rng, _INPUTS)
     commands = (
-        ("evaluate", str(model), "rows.csv", f"--max-mean-mm={one_of(rng, _NUMBERS)}"),
+        ("evaluate", str(model), "rows.csv", "--resamples=20", f"--max-mean-mm={one_of(rng, _NUMBERS)}"),
         (
             "evaluate",
             str(model),
@@ -120,7 +120,7 @@ def wrong_judging(rng: Rng, clean: Clean, folder: Path) -> Case:
             *one_of(rng, (("nominal",), (str(model), "rows.csv"), (path, "rows.csv"), (path,))),
         ),
         ("evaluate", "nominal", "rows.csv"),
-        ("evaluate", str(model), "geometric", "rows.csv"),
+        ("evaluate", str(model), "geometric", "rows.csv", "--resamples=20"),
         ("verify", str(model), path),
         ("verify", path, "rows.csv"),
         ("export", str(model), "--format", one_of(rng, _WORDS), "--out", "x.csv"),

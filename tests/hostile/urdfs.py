@@ -58,9 +58,8 @@ def wrong_urdf(rng: Rng, clean: Clean, folder: Path) -> Case:
         what, content = _mutated(rng, path)
     (folder / "robot.urdf").write_bytes(content)
     ends = ((), (), (), ("--tip", "link_2"), ("--base", "link_1"), ("--tip", "nowhere"), ("--base", "tool0"))
-    return Case(
-        f"{name}: {what}", calibrate("robot.urdf", str(clean.rows[name].path), *one_of(rng, ends)), name
-    )
+    rows = clean.rows[name]
+    return Case(f"{name}: {what}", calibrate("robot.urdf", str(rows.path), *one_of(rng, ends)), rows)
 
 
 def _mutated(rng: Rng, path: Path) -> tuple[str, bytes]:
