@@ -21,15 +21,20 @@ _UNPRINTABLE = re.compile(
 _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
 
 
-def printable(text: str) -> str:
+def printable(text: str, cut: bool = True) -> str:
     r"""Give a text as it may stand on a terminal, whatever a file has put into it.
 
     Control characters, marks of the direction of writing and halves of characters are written as `\x1b`, so that
     nothing moves the cursor, sets colours or hides what follows. Of words of more than `LONGEST_WORD` letters the begin
     and the length are given, and of texts of more than `LONGEST_TEXT` letters the begin and the end.
+
+    Args:
+        text: whatever it holds.
+        cut: whether long words and texts are cut.
     """
-    text = _LONG_WORD.sub(lambda match: f"{match[0][:40]}... ({len(match[0]):,} characters)", text)
-    if len(text) > LONGEST_TEXT:
+    if cut:
+        text = _LONG_WORD.sub(lambda match: f"{match[0][:40]}... ({len(match[0]):,} characters)", text)
+    if cut and len(text) > LONGEST_TEXT:
         text = f"{text[: LONGEST_TEXT - 500]} ... {text[-400:]}"
     return _UNPRINTABLE.sub(lambda match: ascii(match[0])[1:-1], text)
 

@@ -8,6 +8,9 @@ from pathlib import Path
 # One thread: the tests' arrays are small, and threads that wait for each other on a busy machine cost minutes.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+# A defect shows where it is, instead of one line for users.
+os.environ.setdefault("PISIGMA_TRACEBACK", "1")
+
 import pytest
 import torch
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pisigma.cli.arguments import AsJson, Overwrite, complete_robot
-from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
+from pisigma.cli.output import command_line, print_json, print_line, print_lines, print_table, progress_of
 from pisigma.errors import AcceptanceError, IdentificationError
 
 if TYPE_CHECKING:
@@ -192,7 +192,7 @@ def print_calibration(
     rest = len(summary.parameters) - len(estimated)
     title = f"estimated parameters ({rest} others are nominal: --verbose)" if rest else "parameters"
     print_table(title, *tables.parameter_table(estimated))
-    typer.echo("What these data cannot determine:")
+    print_line("What these data cannot determine:")
     print_lines((f"- {line}" for line in tables.undetermined_lines(summary)), indent="  ")
     count = len(summary.outliers)
     worst = f"; the worst is {summary.outliers[0].place}" if count else ""

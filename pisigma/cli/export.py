@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder, PayloadKg, TemperatureC, complete_export
-from pisigma.cli.output import fail, print_json
+from pisigma.cli.endings import fail
+from pisigma.cli.output import print_json, print_line
 from pisigma.export.registry import BUILT_IN
 
 if TYPE_CHECKING:
@@ -86,14 +87,14 @@ def export(
 def _print(exported: "Exported", form: str, out: Path, contents: str, as_json: bool) -> None:
     """Say what was written, with what is in doubt on stderr."""
     for sentence in exported.doubts:
-        typer.echo(f"pisigma: {sentence}", err=True)
+        print_line(f"pisigma: {sentence}", to_stderr=True)
     if as_json:
         remarks = [*exported.remarks, *exported.doubts]
         print_json({"file": str(out), "format": form, **exported.facts, "remarks": remarks})
     else:
         for sentence in exported.remarks:
-            typer.echo(sentence)
+            print_line(sentence)
         what = exported.summary or contents[0].upper() + contents[1:]
-        typer.echo(f"{what} written to {out}{exported.details}.")
+        print_line(f"{what} written to {out}{exported.details}.")
     if exported.failure:
         fail(exported.failure)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder, PayloadKg, TemperatureC
-from pisigma.cli.output import fail, print_json, print_lines, progress_of
+from pisigma.cli.endings import fail
+from pisigma.cli.output import print_json, print_line, print_lines, progress_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -111,9 +112,9 @@ def _write_file(
         print_json({"file": str(out), **outcome.to_json(path), "warnings": solver.warnings})
     else:
         for line, switch in outcome.switches:
-            typer.echo(f"{poses}, line {line}: {switch.sentence}")
+            print_line(f"{poses}, line {line}: {switch.sentence}")
         counts = ", ".join(f"{count} {status}" for status, count in outcome.statuses.most_common())
-        typer.echo(f"{outcome.rows} rows written to {out}: {counts}.")
+        print_line(f"{outcome.rows} rows written to {out}: {counts}.")
         print_lines(f"Warning: {sentence}" for sentence in solver.warnings)
     if problem := outcome.problem(poses):
         fail(problem)

@@ -1,5 +1,7 @@
 """The `pisigma` command."""
 
+import io
+import sys
 from typing import Annotated
 
 import typer
@@ -7,10 +9,10 @@ import typer
 from pisigma import __version__
 from pisigma.cli.calibrate import calibrate
 from pisigma.cli.distill import distill
+from pisigma.cli.endings import end_with, tell_problems
 from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
 from pisigma.cli.ik import ik
-from pisigma.cli.output import tell_problems
 from pisigma.cli.report import report
 from pisigma.cli.robots import robots
 from pisigma.cli.simulate import simulate
@@ -46,4 +48,13 @@ def _options(
 
 def run() -> None:
     """Run the command line: exit status 0 done, 2 the user's input is at fault, 3 limits not met, 1 our defect."""
-    app()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # whatever letters a terminal knows, nothing fails for them
+            stream.reconfigure(errors="backslashreplace")
+    try:
+        try:
+            app()
+        except Exception as problem:  # of the command line itself, or of its help
+            end_with(problem)
+    except typer.Exit as end:
+        sys.exit(end.exit_code)

@@ -1,6 +1,8 @@
-"""What the commands print: tables and sentences for people on stdout, one JSON object, one line for a problem."""
+"""What the commands print: tables and sentences for people on stdout, or one JSON object.
 
-import functools
+What files hold reaches a terminal as text only: see `pisigma.errors.printable`.
+"""
+
 import json
 import shlex
 import textwrap
@@ -11,14 +13,10 @@ from typing import Any, Literal
 
 import typer
 
-from pisigma.errors import AcceptanceError, PisigmaError, missing_extra
+from pisigma.errors import printable
 
 WIDTH_WITHOUT_TERMINAL = 80
 
-NOT_ACCEPTED = 3
-"""Exit status of a model that does not meet its limits."""
-
-_INTERRUPTED = 130
 _ONLY_FOR_PRINTING = ("as_json", "verbose")
 
 
@@ -27,11 +25,19 @@ def print_json(result: Any) -> None:
     typer.echo(json.dumps(result, allow_nan=False))
 
 
+def print_line(line: str, to_stderr: bool = False) -> None:
+    """Print a line as it is, but for what would act on a terminal."""
+    typer.echo(printable(line, cut=False), err=to_stderr)
+
+
 def print_lines(lines: Iterable[str], indent: str = "") -> None:
     """Print sentences, each wrapped to the width of the screen; further lines of one are indented."""
     width = screen_width()
     for line in lines:
-        typer.echo(textwrap.fill(line, width, subsequent_indent=indent, break_long_words=False))
+        filled = textwrap.fill(
+            printable(line, cut=False), width, subsequent_indent=indent, break_long_words=False
+        )
+        typer.echo(filled)
 
 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
@@ -44,6 +50,7 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
     from rich.table import Table
     from rich.text import Text
 
+    rows = [[printable(cell, cut=False) for cell in row] for row in rows]
     cells = list(zip(*rows, strict=True)) or [()] * len(columns)
     width, gaps = screen_width(), 2 * len(columns)
     widest = sum(max(map(len, (column, *texts))) for column, texts in zip(columns, cells, strict=True))
@@ -61,20 +68,23 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
         table.add_row(*(Text(cell) for cell in row))
     console = Console(highlight=False)
     console.width = max(width, narrowest)
-    console.print(Text(title), soft_wrap=True)
-    console.print(table)
-    console.print()
+    with console.capture() as printed:
+        console.print(Text(printable(title, cut=False)), soft_wrap=True)
+        console.print(table)
+        console.print()
+    typer.echo(printed.get(), nl=False)
 
 
 @contextmanager
 def progress_of(title: str) -> Iterator[Callable[[str], None]]:
     """Show a line that changes; gives what to call with what is being done now."""
     from rich.console import Console
+    from rich.text import Text
 
-    status = Console(stderr=True).status(title)
+    status = Console(stderr=True).status(Text(title))
 
     def tell(what: str) -> None:
-        status.update(f"{title}: {what}")
+        status.update(Text(printable(f"{title}: {what}")))
         status.start()  # not before there is something to say: another bar may be drawn until then
 
     try:
@@ -112,37 +122,6 @@ def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> s
                 text = Path(str(value)).name if parameter.name in files else str(value)
                 words += [parameter.opts[0], text]
     return shlex.join(words)
-
-
-def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
-    """Make a command end with one line on stderr and a status that says whose fault it is.
-
-    2 where the user's input is at fault, 3 where a model does not meet the limits that were set.
-    """
-
-    @functools.wraps(command)
-    def guarded(*args: Any, **kwargs: Any) -> None:
-        try:
-            command(*args, **kwargs)
-        except AcceptanceError as problem:
-            fail(str(problem), NOT_ACCEPTED)
-        except PisigmaError as problem:
-            fail(str(problem))
-        except ImportError as problem:
-            if (missing := missing_extra(problem)) is None:
-                raise
-            fail(str(missing))
-        except KeyboardInterrupt:
-            typer.echo("pisigma: interrupted; nothing was left half written.", err=True)
-            raise typer.Exit(_INTERRUPTED) from None
-
-    return guarded
-
-
-def fail(sentence: str, status: int = 2) -> None:
-    """Say what is wrong in one line on stderr and end with an exit status."""
-    typer.echo(f"pisigma: {' '.join(sentence.split())}", err=True)
-    raise typer.Exit(status) from None
 
 
 def _is_number(cell: str) -> bool:

@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
-from pisigma.cli.output import print_json
+from pisigma.cli.output import print_json, print_line
 
 
 def simulate(
@@ -31,4 +31,4 @@ def simulate(
     if as_json:
         print_json({"file": str(out), "rows": rows.rows, "sha256": rows.content_hash()})
     else:
-        typer.echo(f"{rows.rows} measurements written to {out}.")
+        print_line(f"{rows.rows} measurements written to {out}.")

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from pisigma.cli.output import print_table
+from pisigma.cli.output import print_line, print_table
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.inverse.solution import Solution
 from pisigma.kinematics.status import Status
@@ -51,7 +51,7 @@ def print_solutions(solution: Solution, solver: CorrectedIK) -> None:
         ]
         title = f"{status.name.lower()}, branch {solution.branches[int(solution.branch[row])]}"
         print_table(title, ("joint", "corrected", "nominal", "correction", "unit"), lines)
-        print(status.sentence)
+        print_line(status.sentence)
 
 
 def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str | None:

@@ -12,7 +12,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson, Overwrite
 from pisigma.cli.calibrate import AcceptImplausible, print_calibration, saved
-from pisigma.cli.output import print_json, print_lines, print_table, progress_of
+from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:
     from pisigma.judging.calibration_summary import CalibrationSummary
@@ -71,7 +71,7 @@ def train(
             print_json({"model": written and str(written), **training.to_json(), "command": texts["command"]})
         elif isinstance(training, InverseTraining):
             _print_training(training.summary)
-            typer.echo(f"Model written to {folder} in {training.seconds:.1f} s; read its README.md.")
+            print_line(f"Model written to {folder} in {training.seconds:.1f} s; read its README.md.")
         else:
             _print_redundancy(training.summary)
             print_calibration(training.summary, written, training.seconds)

@@ -2,10 +2,8 @@
 
 from dataclasses import asdict
 
-import typer
-
 from pisigma.cli.arguments import AsJson, ModelFolder
-from pisigma.cli.output import print_json, print_lines
+from pisigma.cli.output import print_json, print_line, print_lines
 
 
 def upgrade(model: ModelFolder, as_json: AsJson = False) -> None:
@@ -16,6 +14,6 @@ def upgrade(model: ModelFolder, as_json: AsJson = False) -> None:
     if as_json:
         print_json({"model": str(model), **asdict(done)})
     elif done.before == done.after:
-        typer.echo(f"{model} has the newest format ({done.after}) already.")
+        print_line(f"{model} has the newest format ({done.after}) already.")
     else:
         print_lines([f"{model}: format {done.before} was upgraded to {done.after}.", *done.changes])

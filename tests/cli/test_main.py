@@ -10,7 +10,8 @@ import pytest
 from testing.models import small_recipe_text
 
 import pisigma
-from pisigma.cli.output import print_table
+from pisigma.cli.endings import TRACEBACK
+from pisigma.cli.output import print_lines, print_table
 from pisigma.robot import Robot, catalogue
 from pisigma.robot.writing import robot_to_yaml
 
@@ -79,15 +80,118 @@ def test_problem_in_a_process_of_its_own(tmp_path):
     )
 
 
-def test_a_defect_of_ours_exits_1_with_its_traceback(tmp_path):
-    script = (
-        "import sys\n"
-        "import pisigma.robot\npisigma.robot.catalogue = lambda: 1 / 0\n"
-        "sys.argv = ['pisigma', 'robots']\nfrom pisigma.cli.main import run\nrun()\n"
+DEFECT = (
+    "import sys\nimport pisigma.robot\npisigma.robot.catalogue = lambda: 1 / 0\nsys.argv = ['pisigma', 'robots']\n"
+    "from pisigma.cli.main import run\nrun()\n"
+)
+
+
+def test_a_defect_of_ours_exits_1_with_one_line():
+    done = subprocess.run(
+        [sys.executable, "-c", DEFECT],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, TRACEBACK: ""},
     )
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    (line,) = done.stderr.splitlines()
+    assert line.startswith(
+        "pisigma: a defect of pisigma ended the command (ZeroDivisionError: division by zero; "
+    )
+    assert "Please report it" in line
+    assert f"{TRACEBACK}=1" in line
+
+
+def test_a_defect_of_ours_shows_its_traceback_on_demand():
+    done = subprocess.run(
+        [sys.executable, "-c", DEFECT],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, TRACEBACK: "1"},
+    )
     assert done.returncode == 1
+    assert "Traceback" in done.stderr
     assert "ZeroDivisionError" in done.stderr
+
+
+@pytest.mark.parametrize("arguments", [["robots"], ["robots", "--json"], ["--help"]])
+def test_a_full_disk_for_the_standard_output(arguments):
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            [sys.executable, "-c", START, *arguments],
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert done.stderr == (
+        "pisigma: the standard output cannot be written (No space left on device); print to another file.\n"
+    )
+
+
+def test_nobody_reads_what_is_printed():
+    reading, writing = os.pipe()
+    os.close(reading)
+    done = subprocess.run(
+        [sys.executable, "-c", START, "robots"],
+        stdout=writing,
+        stderr=subprocess.PIPE,
+        text=True,
+        check=False,
+    )
+    os.close(writing)
+    assert (done.returncode, done.stderr) == (141, "")
+
+
+def test_a_terminal_that_knows_few_letters():
+    done = subprocess.run(
+        [sys.executable, "-c", START, "robots"],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["x" * 5000, "x/" * 2500, "\udcff.yaml", "a\x1b[31m\nb.yaml"],
+    ids=["name", "path", "bytes", "control"],
+)
+def test_paths_that_no_file_can_have(refuses, models, tmp_path, monkeypatch, path):
+    monkeypatch.chdir(tmp_path)
+    model = str(models / "kiro3")
+    for arguments in (
+        ("simulate", path, "--out", "x.csv"),
+        ("calibrate", "ur5", path, "--out", "x"),
+        ("calibrate", path, "x.csv", "--out", "x"),
+        ("train", path, "--data", path),
+        ("evaluate", path, path),
+        ("verify", model, path),
+        ("report", path, "--out", "x.html"),
+        ("report", model, path),
+        ("ik", path, "--pose", 0, 0, 0, 0, 0, 0),
+        ("ik", model, "--poses", path, "--out", "x.csv"),
+        ("distill", path, "--out", "x"),
+        ("export", path, "--format", "dh", "--out", "x.csv"),
+        ("upgrade", path),
+    ):
+        sentence = refuses(*arguments)
+        assert sentence.isprintable()
+        assert len(sentence) < 1000
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_control_character_reaches_a_terminal(capsys):
+    print_table("t\x1b[2J", ("a\x07", "b"), [("\x1b]0;x\x07", "\u202e")])
+    print_lines(["one\x1b[31m", "two\r\x9b"])
+    out = capsys.readouterr().out
+    assert "\\x1b[2J" in out
+    assert all(letter.isprintable() or letter == "\n" for letter in out)
 
 
 def test_an_interruption_exits_130_with_one_line():

@@ -1,0 +1,94 @@
+"""How a command ends: its exit status, and one line on stderr for a problem."""
+
+import contextlib
+import errno
+import functools
+import os
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NoReturn
+
+import typer
+
+from pisigma.errors import AcceptanceError, PisigmaError, missing_extra, printable
+
+REFUSED = 2
+"""Exit status where the user's input is at fault."""
+NOT_ACCEPTED = 3
+"""Exit status of a model that does not meet its limits, or must not be trusted."""
+DEFECT = 1
+"""Exit status of a defect of ours."""
+TRACEBACK = "PISIGMA_TRACEBACK"
+"""Environment variable: where it is set, a defect ends with Python's traceback."""
+
+_INTERRUPTED = 130
+_NO_READER = 141
+"""As the shell reports a program that SIGPIPE ended, which `pisigma robots | head -1` does."""
+
+
+def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
+    """Make a command end with one line on stderr and a status that says whose fault it is; see `end_with`."""
+
+    @functools.wraps(command)
+    def guarded(*args: Any, **kwargs: Any) -> None:
+        try:
+            command(*args, **kwargs)
+        except (typer.BadParameter, typer.Exit):
+            raise  # the command line itself says these
+        except (Exception, KeyboardInterrupt) as problem:
+            end_with(problem)
+
+    return guarded
+
+
+def end_with(problem: BaseException) -> None:
+    """Say in one line what is wrong and end with the exit status that says whose fault it is.
+
+    2 where the user's input is at fault, 3 where a model does not meet its limits, 130 after an interruption, 141 where
+    nobody reads what is printed, and 1 for whatever else there is.
+    """
+    if isinstance(problem, AcceptanceError):
+        fail(str(problem), NOT_ACCEPTED)
+    if isinstance(problem, PisigmaError):
+        fail(str(problem))
+    if isinstance(problem, ImportError) and (missing := missing_extra(problem)) is not None:
+        fail(str(missing))
+    if isinstance(problem, KeyboardInterrupt):
+        fail("interrupted; nothing was left half written.", _INTERRUPTED)
+    if isinstance(problem, OSError) and problem.filename is not None:
+        fail(f"{problem.filename}: cannot be used ({problem.strerror}); check the path.")
+    if isinstance(problem, OSError) and problem.errno in (errno.EPIPE, errno.ENOSPC, errno.EIO, errno.EFBIG):
+        _print_no_more()
+        if problem.errno == errno.EPIPE:
+            raise typer.Exit(_NO_READER)
+        fail(f"the standard output cannot be written ({problem.strerror}); print to another file.")
+    if isinstance(problem, MemoryError):
+        fail("there is not enough memory for this; give fewer or smaller inputs.")
+    if os.environ.get(TRACEBACK):
+        raise problem
+    fail(_defect(problem), DEFECT)
+
+
+def fail(sentence: str, status: int = REFUSED) -> NoReturn:
+    """Say what is wrong in one line on stderr and end with an exit status."""
+    with contextlib.suppress(OSError):  # nobody can be told
+        typer.echo(f"pisigma: {printable(' '.join(sentence.split()))}", err=True)
+    raise typer.Exit(status) from None
+
+
+def _defect(problem: BaseException) -> str:
+    """What to say of a problem that nobody thought of."""
+    frame = traceback.extract_tb(problem.__traceback__)[-1]
+    return (
+        f"a defect of pisigma ended the command ({type(problem).__name__}: {problem}; {Path(frame.filename).name}, "
+        f"line {frame.lineno}). Nothing was left half written. Please report it with the command and its files; "
+        f"{TRACEBACK}=1 before the command prints where it happened."
+    )
+
+
+def _print_no_more() -> None:
+    """Let the rest of what was printed go nowhere: Python would complain once more when it ends."""
+    with contextlib.suppress(OSError, ValueError, AttributeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
