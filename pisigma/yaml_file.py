@@ -23,8 +23,11 @@ from pydantic_core import CoreSchema, core_schema
 from pisigma.errors import PisigmaError, nearest_choice
 from pisigma.files.input_file import read_text
 
-MAXIMUM_NODES = 1_000_000
-"""Values that a file may hold, aliases written out."""
+MOST_BYTES = 2**18
+"""Of a file that people write: reading it takes two seconds."""
+MOST_VALUES = 200_000
+"""Values that a file may hold, aliases written out; `LETTERS_OF_VALUE` of a text count as one."""
+LETTERS_OF_VALUE = 64
 
 
 class Section(BaseModel):
@@ -131,6 +134,30 @@ for _tag, _pattern, _first in (
     _PlainLoader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(_pattern), _first)
 
 
+class _QuotingDumper(yaml.SafeDumper):
+    """YAML's safe dumper, which puts texts into quotes that read as something else by YAML 1.1 or 1.2."""
+
+
+for _letter, _resolvers in _PlainLoader.yaml_implicit_resolvers.items():
+    for _tag, _regexp in _resolvers:
+        _QuotingDumper.add_implicit_resolver(_tag, _regexp, [_letter])
+
+
+def yaml_text(content: dict[str, Any]) -> str:
+    """Give plain values as YAML text that this and other readers read back as they are."""
+    text: str = yaml.dump(content, Dumper=_QuotingDumper, sort_keys=False, allow_unicode=True)
+    return text
+
+
+def plain_content(text: str, error: type[PisigmaError], source: str) -> Any:
+    """Give what YAML text holds, as plain values; for documents whose form has to be looked at first.
+
+    Raises:
+        error: it is no YAML, or holds too much.
+    """
+    return _load(text, error, source)[1]
+
+
 def read_yaml(path: str | os.PathLike[str], document: type[Document], error: type[PisigmaError]) -> Document:
     """Read a YAML file as a `document`.
 
@@ -142,7 +169,7 @@ def read_yaml(path: str | os.PathLike[str], document: type[Document], error: typ
     Raises:
         error: the file is missing, no YAML, or does not fit; the message names file, line and key.
     """
-    return parse_yaml(read_text(path, error, "YAML"), document, error, source=str(path))
+    return parse_yaml(read_text(path, error, "YAML", MOST_BYTES), document, error, source=str(path))
 
 
 def parse_yaml(text: str, document: type[Document], error: type[PisigmaError], source: str) -> Document:
@@ -167,7 +194,7 @@ def line_of(path: str | os.PathLike[str], keys: _Path) -> int:
 
     For complaints about values that only other things than the file's form can judge.
     """
-    node, _ = _load(read_text(path, PisigmaError, "YAML"), PisigmaError, str(path))
+    node, _ = _load(read_text(path, PisigmaError, "YAML", MOST_BYTES), PisigmaError, str(path))
     return _locate(node, keys)[0] if node else 1
 
 
@@ -176,9 +203,9 @@ def _load(text: str, error: type[PisigmaError], source: str) -> tuple[yaml.Node 
     try:
         loader = _PlainLoader(text)
         node = loader.get_single_node()
-        if node is not None and _count(node, {}) > MAXIMUM_NODES:
+        if node is not None and _count(node, {}) > MOST_VALUES:
             raise error(
-                f"{source}: holds more than {MAXIMUM_NODES} values; a file that people write was wanted."
+                f"{source}: holds more than {MOST_VALUES:,} values with its aliases written out; fewer were wanted."
             )
         return node, loader.construct_document(node) if node else None
     except yaml.YAMLError as problem:
@@ -191,14 +218,15 @@ def _load(text: str, error: type[PisigmaError], source: str) -> tuple[yaml.Node 
 
 
 def _count(node: yaml.Node, known: dict[int, int]) -> int:
-    """Number of values below a node, aliases counted wherever they stand."""
+    """Number of values at and below a node, long texts as several, and aliases wherever they stand."""
     if id(node) not in known:
         children: list[yaml.Node] = []
         if isinstance(node, yaml.MappingNode):
             children = [child for pair in node.value for child in pair]
         elif isinstance(node, yaml.SequenceNode):
             children = node.value
-        known[id(node)] = 1 + sum(_count(child, known) for child in children)
+        letters = len(node.value) if isinstance(node, yaml.ScalarNode) else 0
+        known[id(node)] = 1 + letters // LETTERS_OF_VALUE + sum(_count(child, known) for child in children)
     return known[id(node)]
 
 

@@ -3,10 +3,11 @@
 from typing import Annotated, Literal
 
 import pytest
+import yaml
 from pydantic import Field
 
 from pisigma.errors import RecipeError
-from pisigma.yaml_file import Section, line_of, parse_yaml, read_yaml
+from pisigma.yaml_file import Section, line_of, parse_yaml, read_yaml, yaml_text
 
 
 class Circle(Section):
@@ -94,7 +95,7 @@ def test_texts_stay_texts(text):
         ("name: " + 3000 * "[", "d.yaml: is nested too deeply"),
         ("name: &a [*a]", "d.yaml: is nested too deeply or within itself"),
         ("a: &a0 [x, x]\n" + "\n".join(f"b{i}: &a{i + 1} [{', '.join([f'*a{i}'] * 9)}]" for i in range(9)),
-         "d.yaml: holds more than 1000000 values"),
+         "d.yaml: holds more than 200,000 values"),
     ],
     ids=str,
 )  # fmt: skip
@@ -129,3 +130,26 @@ def test_the_line_of_a_value(tmp_path):
     assert line_of(path, ("shapes", 1)) == 5
     assert line_of(path, ("shapes", 1, "side_mm")) == 6
     assert line_of(path, ("shapes", 1, "nothing")) == 5
+
+
+def test_an_alias_bomb_of_long_texts_is_refused(tmp_path):
+    """80 kB that would take 3 GB."""
+    path = tmp_path / "d.yaml"
+    path.write_text(f"name: &a {'x' * 40_000}\nshapes: [{', '.join(['*a'] * 10_000)}]\n")
+    with pytest.raises(RecipeError, match="holds more than 200,000 values with its aliases written out"):
+        read_yaml(path, Drawing, RecipeError)
+
+
+def test_a_file_that_nobody_wrote_is_refused_before_it_is_parsed(tmp_path):
+    path = tmp_path / "d.yaml"
+    path.write_text(
+        "name: a\nsizes:\n" + "".join(f"  {i}: {{kind: circle, radius_mm: 1}}\n" for i in range(10_000))
+    )
+    with pytest.raises(RecipeError, match="MB, which no file of its kind has"):
+        read_yaml(path, Drawing, RecipeError)
+
+
+@pytest.mark.parametrize("text", ["1e3", "on", "0o7", "2024-01-31", "1_000", "null", "-", "x: y", " a"])
+def test_texts_are_written_so_that_they_come_back(text):
+    assert read(yaml_text({"name": text})).name == text
+    assert yaml.safe_load(yaml_text({"name": text})) == {"name": text}

@@ -34,6 +34,14 @@ MaxMeanDeg = Annotated[
 Resamples = Annotated[
     int, typer.Option(min=2, help="Resamples of the configurations, for confidence intervals.")
 ]
+Hashes = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--sha256",
+        help="SHA-256 of a model folder's model.yaml, as sha256sum prints it; another model is refused. Once for every "
+        "folder, in their order.",
+    ),
+]
 Seed = Annotated[int, typer.Option(help="Seed of the resamples.")]
 
 
@@ -46,6 +54,7 @@ def evaluate(
     fit_frame: FitFrame = False,
     resamples: Resamples = 2000,
     seed: Seed = 0,
+    sha256: Hashes = None,
     as_json: AsJson = False,
 ) -> None:
     """Compare models on measurements, with confidence intervals, and accept them or not.
@@ -53,11 +62,20 @@ def evaluate(
     Rows of the set "train" are left out where the file has a column "set". With a limit, every model folder has to
     meet it, else the exit status is 3.
     """
+    from pisigma.files.model_files import check_model_hash
     from pisigma.judging.bootstrap import Bootstrap
     from pisigma.workflow import evaluate as workflow
 
     if len(paths) < 2:
         raise typer.BadParameter("a model folder and, last, a file of measurements were wanted.")
+    folders = [path for path in paths[:-1] if path not in workflow.REFERENCES]
+    if sha256 and len(sha256) != len(folders):
+        raise typer.BadParameter(
+            f"one for each of the {len(folders)} model folders was wanted, got {len(sha256)}.",
+            param_hint="'--sha256'",
+        )
+    for folder, wanted in zip(folders, sha256 or (), strict=False):
+        check_model_hash(folder, wanted)
     limits = workflow.Limits(max_mean_mm, max_p95_mm, max_mm, max_mean_deg)
     settings = workflow.EvaluationSettings(limits, fit_frame, Bootstrap(resamples, seed))
     evaluation = workflow.evaluate(paths[:-1], paths[-1], settings)

@@ -15,6 +15,13 @@ if TYPE_CHECKING:
 FitFrame = Annotated[
     bool, typer.Option("--fit-frame", help="The sensor was moved since: fit its frame to these rows.")
 ]
+Hash = Annotated[
+    str | None,
+    typer.Option(
+        "--sha256",
+        help="SHA-256 of the model folder's model.yaml, as sha256sum prints it; another model is refused.",
+    ),
+]
 Data = Annotated[
     Path, typer.Argument(help="New measurements (CSV) at the joint values that the robot was commanded to.")
 ]
@@ -24,6 +31,7 @@ def verify(
     model: ModelFolder,
     data: Data,
     fit_frame: FitFrame = False,
+    sha256: Hash = None,
     as_json: AsJson = False,
 ) -> None:
     """Say whether new measurements are explained better by the corrected model than by the nominal robot.
@@ -32,7 +40,11 @@ def verify(
     signs or zeros of the joints, a correction that was applied twice or not at all. Rows of the set "train" are
     left out. Exit status 3 where the corrected model does not explain the measurements better.
     """
+    from pisigma.files.model_files import check_model_hash
     from pisigma.workflow import verify as workflow
+
+    if sha256 is not None:
+        check_model_hash(model, sha256)
 
     with progress_of(f"verifying {model}"):
         verification = workflow.verify(model, data, workflow.VerificationSettings(fit_frame))

@@ -4,7 +4,6 @@ from dataclasses import asdict, dataclass
 
 import numpy as np
 import torch
-import yaml
 from jaxtyping import Float64
 from torch import Tensor
 
@@ -26,6 +25,7 @@ from pisigma.se3 import (
     transform_from_xyzrpy,
     xyzrpy_from_transform,
 )
+from pisigma.yaml_file import yaml_text
 
 ITERATIONS = 50
 UNOBSERVABLE = 1e-6
@@ -291,7 +291,7 @@ def offsets_yaml(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
     document: dict[str, object] = {"robot": offsets.robot.name, "joints": _joints(offsets)}
     for part in ("base", "tool"):
         document[part] = in_file_units(FRAME_COLUMNS, getattr(offsets.robot, part))
-    body = yaml.safe_dump(document | offsets.departures(), sort_keys=False, allow_unicode=True)
+    body = yaml_text(document | offsets.departures())
     return head((*comments, *offset_sentences(offsets))) + body
 
 

@@ -1,6 +1,5 @@
 """A model's network or joint correction as an ONNX graph, for programs that run no Python."""
 
-import hashlib
 import json
 import math
 from collections.abc import Sequence
@@ -10,6 +9,7 @@ import numpy as np
 
 from pisigma.errors import ModelError
 from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
+from pisigma.files.model_files import model_hash
 from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.joint_correction.conditions import learned_conditions
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -273,7 +273,7 @@ def _units(model: CalibratedModel) -> str:
 
 def _write(request: ExportRequest) -> Exported:
     model = request.load()
-    content = export_onnx(model, hashlib.sha256((request.model / "model.yaml").read_bytes()).hexdigest())
+    content = export_onnx(model, model_hash(request.model))
     return Exported(content, model_facts(model), onnx_remarks(model))
 
 

@@ -55,18 +55,21 @@ def open_input(path: str, flags: int) -> int:
     return handle
 
 
-def read_text(path: str | os.PathLike[str], error: type[PisigmaError], kind: str) -> str:
+def read_text(
+    path: str | os.PathLike[str], error: type[PisigmaError], kind: str, most: int = MOST_BYTES
+) -> str:
     """Read a text in UTF-8, with or without a byte order mark; see `read_input`.
 
     Args:
         path: the file.
         error: the exception to raise.
         kind: what was wanted, for the complaint, such as "YAML".
+        most: bytes that the file may have.
 
     Raises:
         error: see `read_input`, or it is no UTF-8 text; the message names the line.
     """
-    content = read_input(path, error)
+    content = read_input(path, error, most)
     try:
         return content.decode("utf-8").removeprefix("\ufeff")
     except UnicodeDecodeError as problem:

@@ -1,8 +1,12 @@
 """The files of a model folder, known without torch."""
 
 import hashlib
+import os
 import re
 from pathlib import Path
+
+from pisigma.errors import ModelError
+from pisigma.files.input_file import MOST_BYTES, read_input
 
 DESCRIPTION = "model.yaml"
 """Robot, network, provenance, metrics."""
@@ -32,15 +36,67 @@ MODEL_FILES = frozenset(
 """All that pisigma writes into a model folder: whatever else lies in one is somebody's work."""
 
 
-def folder_hash(folder: Path) -> str | None:
-    """SHA-256 of description and weights one after the other; None where one cannot be read."""
-    result = hashlib.sha256()
+_MOST = {DESCRIPTION: 2**21, WEIGHTS: 2**28, HELD_OUT_CSV: 2**28}
+"""Bytes of files for which it is not `MOST_BYTES`."""
+
+_SIGNED = re.compile(rb"(.*\n)compiled_sha256: (\S+)\nsha256: ([0-9a-f]{64})\n", re.DOTALL)
+
+
+def read_model_file(folder: Path, name: str) -> bytes:
+    """Read a file of a model folder.
+
+    Raises:
+        ModelError: it is missing, no regular file, larger than one of its kind can be, or cannot be read.
+    """
+    path = folder / name
+    if path.exists() and not path.is_file():
+        raise ModelError(f"{path}: is a folder, a pipe or a device, no regular file; copy the model again.")
+    return read_input(path, ModelError, _MOST.get(name, MOST_BYTES))
+
+
+def model_hash(folder: str | os.PathLike[str]) -> str:
+    """SHA-256 of `model.yaml`, which holds those of the other files that `pisigma.load` reads.
+
+    Raises:
+        ModelError: it cannot be read.
+    """
+    return hashlib.sha256(read_model_file(Path(folder), DESCRIPTION)).hexdigest()
+
+
+def check_model_hash(folder: str | os.PathLike[str], sha256: str) -> None:
+    """Make sure that a model is the one that somebody means.
+
+    Args:
+        folder: of the model.
+        sha256: wanted `model_hash`, as `sha256sum` prints it.
+
+    Raises:
+        ModelError: the model is another one, or cannot be read.
+    """
+    if (came := model_hash(folder)) != sha256.strip().lower():
+        raise ModelError(
+            f"{folder}: a model whose {DESCRIPTION} has the SHA-256 {sha256} was wanted, but it is {came}; this "
+            "is another model, or it was changed."
+        )
+
+
+def content_hash(description: bytes, weights: bytes) -> str:
+    """SHA-256 of the description, without its last two lines, and the weights: what compiled arrays are made from."""
+    return hashlib.sha256(description + weights).hexdigest()
+
+
+def ready_hash(folder: Path) -> str | None:
+    """Give the `content_hash` of a folder whose `compiled.npz` is the one that its description states; else None."""
     try:
-        for name in (DESCRIPTION, WEIGHTS):
-            result.update((folder / name).read_bytes())
-    except OSError:
+        description, weights, compiled = (
+            read_model_file(folder, name) for name in (DESCRIPTION, WEIGHTS, COMPILED)
+        )
+    except ModelError:
         return None
-    return result.hexdigest()
+    signed = _SIGNED.fullmatch(description)
+    if signed is None or hashlib.sha256(compiled).hexdigest().encode() != signed[2]:
+        return None
+    return content_hash(signed[1], weights)
 
 
 def is_model(folder: Path) -> bool:

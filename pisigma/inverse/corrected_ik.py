@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pisigma.errors import ModelError, PoseError
-from pisigma.files.model_files import COMPILED, folder_hash
+from pisigma.files.model_files import COMPILED, model_hash, ready_hash
 from pisigma.inverse.joint_input import Postures, as_array, checked_approach, pose_array
 from pisigma.kernels.array_kinematics import by_torch, is_tensor
 
@@ -287,12 +287,12 @@ def load(folder: str | os.PathLike[str]) -> CorrectedIK:
         from pisigma.model.folder.model_folder import load_model
 
         return CorrectedIK(load_model(path))
-    stated = kernels.belongs_to
+    stated = model_hash(path)
 
     def read() -> "pisigma.model.calibrated_model.CalibratedModel":
         from pisigma.model.folder.model_folder import load_model
 
-        if folder_hash(path) != stated:
+        if model_hash(path) != stated:
             raise ModelError(f"{path}: was changed after it was loaded; load it again.")
         return load_model(path)
 
@@ -301,8 +301,8 @@ def load(folder: str | os.PathLike[str]) -> CorrectedIK:
 
 def _stored_kernels(path: Path) -> "pisigma.inverse.compiled_ik.CompiledIK | None":
     """What stands ready in a model folder; None where that is missing, damaged or of another state of the model."""
-    stated = folder_hash(path)
-    if stated is None or not (path / COMPILED).is_file():
+    stated = ready_hash(path)
+    if stated is None:
         return None
     from pisigma.inverse.compiled_ik import CompiledIK
 

@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import ModelError
-from pisigma.files.model_files import HELD_OUT_CSV
+from pisigma.files.model_files import HELD_OUT_CSV, read_model_file
 from pisigma.judging.calibration_summary import CalibrationSummary, HeldOutFile
 from pisigma.judging.calibration_validation import CalibrationValidation
 from pisigma.judging.pose_statistics import PoseErrors
@@ -105,10 +105,7 @@ def read_held_out(folder: Path, model: CalibratedModel) -> HeldOutRows | None:
         return None
     hashes = summary.held_out_rows
     path = folder / HELD_OUT_CSV
-    try:
-        content = path.read_bytes()
-    except OSError as problem:
-        raise ModelError(f"{path}: cannot be read ({problem.strerror}); copy the model again.") from None
+    content = read_model_file(folder, HELD_OUT_CSV)
     if hashlib.sha256(content).hexdigest() != hashes.sha256:
         raise ModelError(f"{path}: was changed since the model was written; copy the model again.")
     head, *rows = csv.reader(io.StringIO(content.decode(), newline=""))

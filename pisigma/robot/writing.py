@@ -6,7 +6,6 @@ from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-import yaml
 
 from pisigma.errors import OutputError, RobotError
 from pisigma.robot.description import Robot
@@ -14,10 +13,20 @@ from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, Drawing, Row, in_file_u
 from pisigma.robot.urdf_chain import Chain, origin_of, parse_xml, read_chain, read_urdf
 from pisigma.robot.urdf_frames import Frame, frame_of, inverse, row_frame, shift, turn, xyzrpy_of
 from pisigma.robot.urdf_rows import ChainRows, rows_of_chain
+from pisigma.yaml_file import yaml_text
 
 
 def robot_to_yaml(robot: Robot) -> str:
     """The robot as YAML text that `Robot.load` reads back, equal to within the rounding of the units.
+
+    Raises:
+        RobotError: a row has one limit only, which a file cannot hold.
+    """
+    return yaml_text(robot_document(robot))
+
+
+def robot_document(robot: Robot) -> dict[str, object]:
+    """The robot as the plain values of a YAML file.
 
     Raises:
         RobotError: a row has one limit only, which a file cannot hold.
@@ -33,7 +42,7 @@ def robot_to_yaml(robot: Robot) -> str:
         "rows": rows,
     }
     document |= {part: in_file_units(FRAME_COLUMNS, getattr(robot, part)) for part in ("base", "tool")}
-    return yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+    return document
 
 
 def _limits_entry(row: Row) -> dict[str, list[float]]:

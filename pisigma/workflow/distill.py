@@ -4,7 +4,6 @@ Jeong et al. 1998 learn `Δθ = θ_measured - θ_analytic` from measurements; he
 role of θ_measured, for poses of a region.
 """
 
-import hashlib
 import os
 import time
 from dataclasses import dataclass, replace
@@ -15,7 +14,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError, ModelError
-from pisigma.files.model_files import DESCRIPTION
+from pisigma.files.model_files import model_hash
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.joint_correction.conditions import learned_conditions
 from pisigma.joint_correction.fourier_series import FourierSeries
@@ -133,7 +132,7 @@ def distill(
         parent = model
     else:
         parent = load_model(model)
-        sha256 = hashlib.sha256((Path(model) / DESCRIPTION).read_bytes()).hexdigest()
+        sha256 = model_hash(model)
     _check_parent(parent)
     if settings.poses < FEWEST:
         raise IdentificationError(

@@ -12,7 +12,7 @@ from testing.models import hand_made_model, joints_around, no_type_checker
 
 import pisigma
 from pisigma.errors import ModelError, PoseError
-from pisigma.files.model_files import COMPILED, DESCRIPTION, WEIGHTS, folder_hash
+from pisigma.files.model_files import COMPILED, DESCRIPTION, WEIGHTS, ready_hash
 from pisigma.inverse.corrected_ik import CorrectedIK, load
 from pisigma.inverse.solution import Solution
 from pisigma.kinematics.status import Status
@@ -220,7 +220,7 @@ def test_what_stands_ready_belongs_to_the_model(folder, tmp_path, poses):
     (copy / COMPILED).unlink()
     assert_close(call(load(copy), poses.numpy()).q, call(load(folder), poses.numpy()).q, atol=1e-12)
     (copy / WEIGHTS).unlink()
-    assert folder_hash(copy) is None
+    assert ready_hash(copy) is None
     with pytest.raises(ModelError, match=f"{WEIGHTS} is missing"):
         load(copy)
 

@@ -4,6 +4,7 @@ Geometry stands in `model.yaml` in mm and deg, for people, and once more in the 
 predictions are the same to the last bit after reading. The root of the covariance is in float32.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -80,6 +81,27 @@ def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
         weights = range(len(known.space.parameters), known.root.shape[0])
         result["uncertainty.root"] = known.root[[*_free_rows(known), *weights]].float()
     return result
+
+
+def check_size(document: ModelDocument, robot: Robot, stored: int) -> None:
+    """Refuse a description that calls for more weights than a file holds: before they are allocated.
+
+    Args:
+        document: the description.
+        robot: that it describes.
+        stored: numbers in the weights file.
+
+    Raises:
+        ValueError: it does.
+    """
+    wanted = sum(sum(group.orders) * len(group.inputs) * len(group.joints) for group in document.network)
+    if (learned := document.learned) is not None:
+        harmonics = sum(getattr(section, "harmonics", 0) for section in learned.features)
+        wanted += robot.dof * (robot.dof * sum(learned.orders) + 2 * harmonics)
+    if document.uncertainty is not None and document.uncertainty.products:
+        wanted += robot.dof * math.comb(robot.dof, 2)
+    if wanted > stored:
+        raise ValueError(f"it calls for {wanted:,} weights or more, but the file holds {stored:,} numbers")
 
 
 def hybrid_shapes(document: ModelDocument, robot: Robot) -> dict[str, Shape]:

@@ -5,17 +5,19 @@ import re
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import yaml
-from pydantic import ConfigDict, Field, FiniteFloat, PlainValidator, PositiveInt
+from pydantic import ConfigDict, Field, FiniteFloat, PlainValidator
 
 from pisigma.errors import ModelError
+from pisigma.files.model_files import read_model_file
 from pisigma.joint_correction.feature import FeatureSection
 from pisigma.joint_correction.registry import feature_section
 from pisigma.robot.robot_file import RobotDocument
-from pisigma.yaml_file import Section, parse_yaml
+from pisigma.yaml_file import Section, parse_yaml, yaml_text
 
 FORMAT = 4
 """Of this version; folders of earlier formats are upgraded by `pisigma.model.folder.upgrade`."""
+MOST_FACTORS, MOST_UNITS = 100, 1000
+"""Of a product unit; of a network."""
 _CHECKSUM = re.compile(r"(.*^)sha256: ([0-9a-f]{64})\n", re.DOTALL | re.MULTILINE)
 
 _Vector = tuple[float, float, float]
@@ -29,7 +31,9 @@ class GroupSection(Section):
 
     joints: Annotated[tuple[str, ...], Field(min_length=1)]
     inputs: Annotated[tuple[str, ...], Field(min_length=1)]
-    orders: Annotated[tuple[PositiveInt, ...], Field(min_length=1)]
+    orders: Annotated[
+        tuple[Annotated[int, Field(ge=1, le=MOST_FACTORS)], ...], Field(min_length=1, max_length=MOST_UNITS)
+    ]
     reference: tuple[_Vector, _Vector, _Vector]
 
 
@@ -43,8 +47,8 @@ class LearnedSection(Section):
         tools: per target.
     """
 
-    features: tuple[_Feature, ...]
-    orders: tuple[Annotated[int, Field(ge=2, le=100)], ...]
+    features: Annotated[tuple[_Feature, ...], Field(max_length=MOST_UNITS)]
+    orders: Annotated[tuple[Annotated[int, Field(ge=2, le=MOST_FACTORS)], ...], Field(max_length=MOST_UNITS)]
     bases: dict[str, _Frame]
     tools: dict[str, _Frame]
 
@@ -105,6 +109,7 @@ class ModelDocument(Section):
     kind: str
     branches: tuple[str, ...]
     weights_sha256: str
+    compiled_sha256: str | None = None
     robot: RobotDocument
     calibrated: RobotDocument | None
     bases: dict[str, _Frame]
@@ -116,9 +121,20 @@ class ModelDocument(Section):
     metrics: dict[str, Any]
 
 
-def write_document(document: dict[str, Any], path: Path) -> None:
-    """Write the document, and as its last line the checksum of all before it."""
-    text = yaml.safe_dump({"format": FORMAT, **document}, sort_keys=False, allow_unicode=True)
+def document_text(document: dict[str, Any]) -> str:
+    """Give the text of a document, but for its last two lines: see `write_document`."""
+    return yaml_text({"format": FORMAT, **document})
+
+
+def write_document(text: str, compiled_sha256: str | None, path: Path) -> None:
+    """Write a document with the hash of `compiled.npz`, and as its last line the checksum of all before it.
+
+    Args:
+        text: from `document_text`.
+        compiled_sha256: None where there is no such file.
+        path: to write.
+    """
+    text = f"{text}compiled_sha256: {compiled_sha256 or 'null'}\n"
     path.write_text(f"{text}sha256: {_digest(text)}\n", encoding="utf-8", newline="\n")
 
 
@@ -144,10 +160,11 @@ def read_signed_text(path: Path) -> str:
         ModelError: the file cannot be read, is of a newer format, truncated, edited, or no model's.
     """
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as problem:
-        reason = problem.strerror if isinstance(problem, OSError) else "it is no UTF-8 text"
-        raise ModelError(f"{path}: cannot be read ({reason}); train or copy the model again.") from None
+        text = read_model_file(path.parent, path.name).decode("utf-8").replace("\r\n", "\n")
+    except UnicodeDecodeError:
+        raise ModelError(
+            f"{path}: cannot be read (it is no UTF-8 text); train or copy the model again."
+        ) from None
     stated = stated_format(text)
     if stated is not None and stated > FORMAT:
         raise ModelError(

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 import torch
-import yaml
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
 from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from pisigma.errors import ModelError, PisigmaError, nearest_choice
-from pisigma.files.model_files import COMPILED, DESCRIPTION, WEIGHTS, folder_hash
+from pisigma.files.model_files import COMPILED, DESCRIPTION, WEIGHTS, content_hash, read_model_file
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.compiled_model import save_compiled
@@ -23,17 +22,18 @@ from pisigma.model.domain import Domain
 from pisigma.model.folder.hybrid_folder import (
     DTYPES,
     Shape,
+    check_size,
     hybrid_sections,
     hybrid_shapes,
     hybrid_tensors,
     with_hybrid,
 )
-from pisigma.model.folder.model_document import ModelDocument, read_document, write_document
+from pisigma.model.folder.model_document import ModelDocument, document_text, read_document, write_document
 from pisigma.network.correction_network import CorrectionNetwork, JointGroup
 from pisigma.network.inputs import Inputs
 from pisigma.network.pi_sigma import PiSigma
 from pisigma.robot.description import Robot
-from pisigma.robot.writing import robot_to_yaml
+from pisigma.robot.writing import robot_document
 
 _PREFIX = "network."
 
@@ -66,8 +66,8 @@ def save_model(model: CalibratedModel, folder: Path) -> None:
         "kind": model.kind,
         "branches": list(model.branches),
         "weights_sha256": hashlib.sha256(weights).hexdigest(),
-        "robot": yaml.safe_load(robot_to_yaml(model.robot)),
-        "calibrated": yaml.safe_load(robot_to_yaml(model.calibrated)) if model.calibrated else None,
+        "robot": robot_document(model.robot),
+        "calibrated": robot_document(model.calibrated) if model.calibrated else None,
         "bases": {name: frame.tolist() for name, frame in model.bases.items()},
         "tools": {name: frame.tolist() for name, frame in model.tools.items()},
         "network": groups,
@@ -76,9 +76,22 @@ def save_model(model: CalibratedModel, folder: Path) -> None:
         "metrics": model.metrics,
     }
     (folder / WEIGHTS).write_bytes(weights)
-    write_document(document, folder / DESCRIPTION)
-    with suppress(ModelError):
-        save_compiled(model, folder / COMPILED, folder_hash(folder) or "")
+    describe(document_text(document), model, folder)
+
+
+def describe(text: str, model: CalibratedModel, folder: Path) -> None:
+    """Write the description of a model whose weights the folder holds, and what the compiled kernels read.
+
+    Args:
+        text: of the description, from `document_text`.
+        model: that it describes.
+        folder: with the weights file.
+    """
+    compiled, sha256 = folder / COMPILED, None
+    with suppress(ModelError):  # the kernels do not evaluate every kind of model
+        save_compiled(model, compiled, content_hash(text.encode(), (folder / WEIGHTS).read_bytes()))
+        sha256 = hashlib.sha256(compiled.read_bytes()).hexdigest()
+    write_document(text, sha256, folder / DESCRIPTION)
 
 
 def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:
@@ -94,7 +107,7 @@ def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:
             f"{path}: there is no such model folder; give a folder that `pisigma calibrate` or `pisigma train` wrote."
         )
     for name in (DESCRIPTION, WEIGHTS):
-        if not (path / name).is_file():
+        if not (path / name).exists():
             raise ModelError(
                 f"{path}: {name} is missing, so this is no whole model folder; train or copy it again."
             )
@@ -118,12 +131,7 @@ def _tensors(model: CalibratedModel) -> dict[str, Tensor]:
 
 
 def _read_weights(path: Path, sha256: str) -> dict[str, Tensor]:
-    try:
-        content = path.read_bytes()
-    except OSError as problem:
-        raise ModelError(
-            f"{path}: cannot be read ({problem.strerror}); train or copy the model again."
-        ) from None
+    content = read_model_file(path.parent, path.name)
     if hashlib.sha256(content).hexdigest() != sha256:
         raise ModelError(
             f"{path}: is truncated, changed or of another model (its hash is not the one in {DESCRIPTION}); "
@@ -150,6 +158,7 @@ def _build_model(document: ModelDocument, tensors: dict[str, Tensor]) -> Calibra
         ValueError: a tensor is missing, too many or of another shape or type; or a name or count is wrong.
     """
     robot = Robot(*document.robot.drawing())
+    check_size(document, robot, sum(value.numel() for value in tensors.values()))
     _check_branches(robot, document.branches)
     network = _empty_network(document, robot)
     samples = "domain.samples" in tensors

@@ -2,21 +2,23 @@
 
 import os
 import re
-import shutil
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from pisigma.errors import ModelError
-from pisigma.files.model_files import CARD, COMPILED, DESCRIPTION, folder_hash
+from pisigma.files.model_files import CARD, COMPILED, DESCRIPTION, MODEL_FILES, read_model_file
 from pisigma.files.output_folder import staged_folder
-from pisigma.model.compiled_model import save_compiled
-from pisigma.model.folder.model_document import FORMAT, read_signed_text, stated_format, write_document
-from pisigma.model.folder.model_folder import load_model
+from pisigma.model.folder.model_document import (
+    FORMAT,
+    document_text,
+    read_signed_text,
+    stated_format,
+    write_document,
+)
+from pisigma.model.folder.model_folder import describe, load_model
+from pisigma.yaml_file import plain_content
 
 _RENAMED = {
     "dealings": "repeats",
@@ -42,8 +44,8 @@ _LABELS = (
 )
 """What earlier versions said of a parameter, and the few words for it that newer ones keep beside."""
 
-_FADED = re.compile(r"beyond the measured joint values the correction fades to nothing over \d+ deg")
-_EXTRAPOLATED = "beyond the measured joint values the correction is an extrapolation"
+_FADED = re.compile(rb"beyond the measured joint values the correction fades to nothing over \d+ deg")
+_EXTRAPOLATED = b"beyond the measured joint values the correction is an extrapolation"
 """What a card said of the fade, and what it says instead."""
 _NO_FADE = (
     "The correction now holds at all joint values, and the predicted deviation says how well; up to format 3 it faded "
@@ -74,7 +76,7 @@ class Upgrade:
 def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
     """Rewrite a model folder of an earlier version in the form of this one, whole or not at all.
 
-    Tensors, figures and all other files stay as they are, and so does the card but for what is not true any more; the
+    Tensors, figures and tables stay as they are, and so does the card but for what is not true any more; the
     file for the compiled kernels is made again.
 
     Args:
@@ -87,7 +89,7 @@ def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
     """
     path = Path(folder)
     text = read_signed_text(path / DESCRIPTION)
-    before, document = stated_format(text), yaml.safe_load(text)
+    before, document = stated_format(text), plain_content(text, ModelError, str(path / DESCRIPTION))
     if before is None or not isinstance(document, dict) or not isinstance(document.get("metrics"), dict):
         raise ModelError(f"{path / DESCRIPTION}: does not describe a model; train or copy the model again.")
     if before == FORMAT:
@@ -97,16 +99,17 @@ def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
         document["uncertainty"] = _without_turns(_renamed(document["uncertainty"]), path)
     changes = (*_without_fade(document), *_with_measured_conditions(document))
     with staged_folder(path, overwrite=True) as scratch:
-        shutil.copytree(path, scratch, dirs_exist_ok=True)
-        (scratch / COMPILED).unlink(missing_ok=True)
+        for name in sorted(MODEL_FILES - {COMPILED}):
+            if (path / name).exists():
+                (scratch / name).write_bytes(read_model_file(path, name))
         if changes and (card := scratch / CARD).is_file():
-            card.write_text(_FADED.sub(_EXTRAPOLATED, card.read_text(encoding="utf-8")), encoding="utf-8")
-        write_document(
-            {key: value for key, value in document.items() if key != "format"}, scratch / DESCRIPTION
+            card.write_bytes(_FADED.sub(_EXTRAPOLATED, card.read_bytes()))
+        text = document_text(
+            {key: value for key, value in document.items() if key not in ("format", "compiled_sha256")}
         )
+        write_document(text, None, scratch / DESCRIPTION)
         model = load_model(scratch)
-        with suppress(ModelError):  # the kernels do not know every kind of model
-            save_compiled(model, scratch / COMPILED, folder_hash(scratch) or "")
+        describe(text, model, scratch)
     return Upgrade(model.name, before, FORMAT, changes)
 
 

@@ -1,6 +1,7 @@
 """What a calibration changed: geometric parameters with their doubts, and the correction of every joint."""
 
 import csv
+import io
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.files.model_files import CORRELATION_CSV
+from pisigma.files.model_files import CORRELATION_CSV, read_model_file
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.tolerances import MEASURED_ROUNDING
@@ -65,10 +66,10 @@ def read_correlations(path: Path) -> tuple[Correlations, ...]:
     kinds: dict[str, dict[tuple[str, str], float]] = {"lengths": {}, "angles": {}}
     tables = []
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file):
-                value = float(row["correlation"]) if row["correlation"] else np.nan
-                kinds[row["of"]][row["parameter"], row["with"]] = value
+        text = read_model_file(path.parent, path.name).decode()
+        for row in csv.DictReader(io.StringIO(text, newline="")):
+            value = float(row["correlation"]) if row["correlation"] else np.nan
+            kinds[row["of"]][row["parameter"], row["with"]] = value
         for cells in kinds.values():
             names = tuple(dict.fromkeys(name for name, _ in cells))
             values = np.array([[cells[a, b] for b in names] for a in names])

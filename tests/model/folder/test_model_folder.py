@@ -1,6 +1,7 @@
 """Model folders: what is written is read back, and everything else is refused in one sentence."""
 
 import hashlib
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from testing.closeness import assert_close
 from testing.models import HOMES, hand_made_model, joints_around
 
 from pisigma.errors import ModelError
+from pisigma.files.model_files import check_model_hash
 from pisigma.inverse.corrected_ik import load
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
@@ -251,3 +253,59 @@ def test_tensors_that_do_not_fit(folder, change, complaint):
 def test_an_unchanged_model_survives_the_editing_of_these_tests(folder):
     edit_tensors(folder, lambda tensors: None)
     assert isinstance(load_model(folder), CalibratedModel)
+
+
+@pytest.mark.parametrize("orders", [[10**8], [100] * 1000, [1] * 2_000])
+def test_more_weights_than_the_file_holds_are_not_allocated(folder, orders):
+    edit(folder, lambda document: document["network"][0].update(orders=orders))
+    assert any(word in refused(folder) for word in ("orders", "calls for"))
+
+
+def test_a_description_that_grows_when_it_is_read_is_refused(folder):
+    text = (folder / "model.yaml").read_text()
+    body, texts = text[: text.index("\nmetrics:") + 1], ", ".join(["*a"] * 10_000)
+    body += f"metrics: {{text: &a {'x' * 40_000}, texts: [{texts}]}}\n"
+    (folder / "model.yaml").write_text(f"{body}sha256: {hashlib.sha256(body.encode()).hexdigest()}\n")
+    assert "values with its aliases written out" in refused(folder)
+
+
+@pytest.mark.parametrize("name", ["model.yaml", "model.safetensors", "compiled.npz"])
+def test_pipes_and_endless_files_are_no_part_of_a_model(folder, name):
+    (folder / name).unlink()
+    os.mkfifo(folder / name)
+    if name != "compiled.npz":
+        assert "no regular file" in refused(folder)
+    assert "compiled" not in vars(load(folder)) if name == "compiled.npz" else True
+    (folder / name).unlink()
+    with (folder / name).open("wb") as file:
+        file.truncate(20 * 2**30)  # sparse
+    if name == "compiled.npz":
+        assert "compiled" not in vars(load(folder))
+    else:
+        assert "MB, which no file of its kind has" in refused(folder)
+
+
+def test_arrays_for_the_kernels_are_those_that_the_description_states(folder, tmp_path_factory):
+    """An exchanged file is not used, though it is a whole one by itself."""
+    assert "compiled" in vars(load(folder))
+    other = tmp_path_factory.mktemp("other")
+    save_model(hand_made_model("kiro3", scale=0.03), other)
+    (folder / "compiled.npz").write_bytes((other / "compiled.npz").read_bytes())
+    assert "compiled" not in vars(load(folder))
+
+
+def test_another_model_than_the_one_that_is_meant_is_refused(folder):
+    sha256 = hashlib.sha256((folder / "model.yaml").read_bytes()).hexdigest()
+    check_model_hash(folder, sha256)
+    check_model_hash(folder, sha256.upper() + "\n")
+    with pytest.raises(
+        ModelError, match=f"SHA-256 00ab was wanted, but it is {sha256}; this is another model"
+    ):
+        check_model_hash(folder, "00ab")
+
+
+@pytest.mark.parametrize("name", ["1e3", "no", "010", "1:30", "=", "~", "a: b"])
+def test_names_that_look_like_something_else_come_back(tmp_path, name):
+    model = hand_made_model("kiro3")
+    save_model(replace(model, bases={name: np.zeros(6)}), tmp_path)
+    assert list(load_model(tmp_path).bases) == [name]
