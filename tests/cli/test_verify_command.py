@@ -1,5 +1,6 @@
 """`pisigma verify`: exit status, figures, one JSON object."""
 
+import hashlib
 import json
 
 import pytest
@@ -88,3 +89,16 @@ def test_things_at_fault(refuses, models, files, tmp_path):
     assert "cannot be read" in refuses("verify", models / "kiro3", tmp_path / "no.csv")
     (tmp_path / "few.csv").write_text("q1_deg,x_mm,y_mm,z_mm\n1,2,3,4\n")
     refuses("verify", models / "kiro3", tmp_path / "few.csv")
+
+
+def test_the_model_that_is_meant(run, refuses, models, files):
+    sha256 = hashlib.sha256((models / "kiro3" / "model.yaml").read_bytes()).hexdigest()
+    for command in ("verify", "evaluate"):
+        assert run(command, models / "kiro3", files / "good.csv", "--sha256", sha256).exit_code == 0
+        assert "this is another model" in refuses(
+            command, models / "kiro4", files / "good.csv", "--sha256", sha256
+        )
+    several = models / "kiro3", "geometric", models / "kiro3", files / "good.csv"
+    result = run("evaluate", *several, "--sha256", sha256)
+    assert result.exit_code == 2
+    assert "one for each of the 2 model folders was wanted, got 1" in result.stderr
