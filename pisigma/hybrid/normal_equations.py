@@ -64,13 +64,11 @@ class NormalEquations(AbstractRegression):
 
     def without(self, groups: Int64[Tensor, " groups"]) -> "NormalEquations":
         """See `AbstractRegression.without`."""
-        return self._minus(NormalEquations.of(self.design, self.rows.held_out(groups)))
-
-    def _minus(self, other: "NormalEquations") -> "NormalEquations":
+        other = NormalEquations.of(self.design, self.rows.held_out(groups))
         counts = zip(self.sensors, other.sensors, strict=True)
         return replace(
             self,
-            normal=self.normal - other.normal,
+            normal=torch.sub(self.normal, other.normal, out=other.normal),
             descent=self.descent - other.descent,
             square=tuple(a - b for a, b in zip(self.square, other.square, strict=True)),
             sensors=tuple(replace(a, values=a.values - b.values) for a, b in counts),
