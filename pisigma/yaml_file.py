@@ -38,6 +38,9 @@ class Section(BaseModel):
 
 Seed = Annotated[int, Field(ge=0, lt=2**63)]
 """Of a generator of random numbers."""
+MOST_POSES = 100_000
+Count = Annotated[int, Field(ge=1, le=MOST_POSES)]
+"""Of poses or rows to simulate; more would take gigabytes."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -59,7 +59,7 @@ class MeasuredData(Section):
     """
 
     kind: Literal["measured"]
-    folds: Annotated[int, Field(ge=2)] = 5
+    folds: Annotated[int, Field(ge=2, le=1000)] = 5
     seed: Seed = 0
 
 
@@ -135,7 +135,7 @@ class CalibrationSection(Section):
     elimination: Literal["exact", "pairwise", "none"] = "exact"
     prior: PriorSection | None = PriorSection()
     robust: bool = True
-    maximum_iterations: PositiveInt = 100
+    maximum_iterations: Annotated[int, Field(ge=1, le=100_000)] = 100
 
     def calibrator(self, robot: Robot) -> GeometricCalibrator:
         """The calibrator for a robot."""
@@ -188,7 +188,7 @@ class HybridSection(Section):
     """
 
     features: tuple[str, ...] = HybridCalibrator.features
-    harmonics: tuple[int, ...] = HybridCalibrator.harmonics
+    harmonics: tuple[Annotated[int, Field(ge=1, le=1000)], ...] = HybridCalibrator.harmonics
     products: bool = HybridCalibrator.products
     gravity: tuple[float, float, float] | None = HybridCalibrator.gravity
     mini_batches: MiniBatches | bool | Literal["auto"] = HybridCalibrator.mini_batches
@@ -232,7 +232,7 @@ class HybridRecipe(AbstractRecipe):
 
     kind: Literal["hybrid_calibration"]
     data: Annotated[SimulatedData | MeasuredData, Field(discriminator="kind")]
-    repeats: PositiveInt = 1
+    repeats: Annotated[int, Field(ge=1, le=100)] = 1
     calibration: CalibrationSection = CalibrationSection()
     hybrid: HybridSection = HybridSection()
     learning_curve: LearningCurveSection | None = None

@@ -14,7 +14,7 @@ from pisigma.simulation.commanded import AbstractCommanded, BranchSection, joint
 from pisigma.simulation.noise import SensorNoise, draw_noise, row_sigma
 from pisigma.simulation.poses import OrientationSection
 from pisigma.simulation.true_robot import TrueRobot
-from pisigma.yaml_file import Section, Seed
+from pisigma.yaml_file import Count, Section, Seed
 
 
 class SocketSection(Section):
@@ -44,7 +44,7 @@ class SimulatedSockets(Section):
 
     kind: Literal["sockets"]
     sockets: tuple[SocketSection, ...] = Field(min_length=1)
-    poses_per_socket: int = Field(ge=1)
+    poses_per_socket: Count
     orientation: OrientationSection
     seed: Seed
     branch: BranchSection

@@ -1,5 +1,6 @@
 """Where to measure: wanted poses on grids or at random, or random joint values."""
 
+import math
 from abc import ABC, abstractmethod
 from typing import Annotated, Literal
 
@@ -13,7 +14,7 @@ from pisigma.errors import RecipeError
 from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_from_rpy, transform
 from pisigma.simulation.errors.source import stated_joints
-from pisigma.yaml_file import Section, Seed
+from pisigma.yaml_file import MOST_POSES, Count, Section, Seed
 
 Triple = tuple[float, float, float]
 
@@ -86,7 +87,7 @@ class JointsRandom(Section):
     """
 
     kind: Literal["joints_random"]
-    count: int = Field(ge=1)
+    count: Count
     seed: Seed
     share: float = Field(default=1.0, gt=0, le=1)
     range_deg: dict[str, Range] = Field(default_factory=dict)
@@ -126,7 +127,11 @@ class JointsRandom(Section):
         return bounds
 
 
-Count = Annotated[int, Field(ge=1)]
+def _check_count(count: int) -> None:
+    if count > MOST_POSES:
+        raise ValueError(
+            f"the grid has {count:,} poses, {MOST_POSES:,} at most were wanted; take fewer steps"
+        )
 
 
 class AbstractPoses(Section, ABC):
@@ -179,6 +184,11 @@ class PolarGrid(AbstractPoses):
     phi_steps: Count
     z_mm: float
 
+    @model_validator(mode="after")
+    def _not_too_many(self) -> "PolarGrid":
+        _check_count(self.r_steps * self.phi_steps)
+        return self
+
     def _positions(self, generator: torch.Generator | None) -> Float64[Tensor, "count 3"]:
         r = _linspace(self.r_mm, self.r_steps) / 1e3
         phi = torch.deg2rad(_linspace(self.phi_deg, self.phi_steps))
@@ -206,6 +216,11 @@ class CubeGrid(AbstractPoses):
     y_mm: Range
     z_mm: Range
     steps: tuple[Count, Count, Count]
+
+    @model_validator(mode="after")
+    def _not_too_many(self) -> "CubeGrid":
+        _check_count(math.prod(self.steps))
+        return self
 
     def _positions(self, generator: torch.Generator | None) -> Float64[Tensor, "count 3"]:
         ranges = (self.x_mm, self.y_mm, self.z_mm)

@@ -18,7 +18,7 @@ from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection
 from pisigma.se3 import invert, rotation_from_rpy, transform, transform_from_xyzrpy
 from pisigma.simulation.commanded import BranchSection
-from pisigma.yaml_file import Section, Seed
+from pisigma.yaml_file import Count, Section, Seed
 
 
 class JigPlacement(Section):
@@ -168,7 +168,7 @@ class TouchCandidatesSection(Section):
         branch: on which branch of the inverse kinematics the robot touches.
     """
 
-    count: int = Field(ge=1)
+    count: Count
     seed: Seed
     tilt_deg: float = Field(default=45.0, ge=0, le=90)
     least_lean_deg: float = Field(default=10.0, ge=0, lt=90)

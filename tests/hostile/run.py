@@ -45,6 +45,7 @@ def bounded(kind: str, seed: int, number: int, clean: Clean, folder: Path) -> tu
 def _answer(kind: str, seed: int, number: int, clean: Clean, folder: Path, answer: Path) -> None:
     """Write what came of it into a file and end this process."""
     try:
+        os.environ["PISIGMA_TRACEBACK"] = "1"
         sys.stdin = open(os.devnull)  # noqa: SIM115
         os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
         case = make(kind, seed, number, clean, folder)

@@ -20,15 +20,8 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Clean:
         return write_clean(tmp_path_factory.mktemp("clean"))
 
 
-WAITING = (
-    "wrong measurements",
-    "poses",
-    "models",
-    "options of calibrate",
-    "options of ik",
-    "options of others",
-)
-"""Kinds of which a few still end badly: models that are wrong without a word, long paths, files of 20 GB."""
+WAITING = ("wrong measurements",)
+"""Kinds of which a few still end badly: models that are wrong without a word."""
 
 
 @pytest.mark.parametrize(

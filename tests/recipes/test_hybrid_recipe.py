@@ -50,6 +50,8 @@ def test_every_error_source_is_on(repository):
         (HYBRID, "hybrid: {mini_batches: never}\n", "mini_batches"),
         (HYBRID, "hybrid: {product: true}\n", "unknown key 'product' in 'hybrid'; did you mean 'products'"),
         (HYBRID, "repeats: 0\n", "'repeats'"),
+        (HYBRID, "repeats: 1000000000\n", "'repeats'.*less than or equal to 100"),
+        ("count: 5000", "count: 1000000000", "'data.held_out.poses.count'.*less than or equal to 100000"),
         ("rows: [30, 50, 75, 100]", "rows: []", "'learning_curve.rows'"),
         ("rows: [30, 50, 75, 100]", "rows: [0]", "'learning_curve.rows"),
         ("joint: theta_1", "joint: theta_9", "'data.errors': .*theta_9"),

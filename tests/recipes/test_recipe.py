@@ -19,6 +19,7 @@ PAPER = "kiro3_paper"
         ("kind: transmission", "kind: transmision", "'data.errors.1.kind' .* did you mean 'transmission'"),
         ("inputs: [x, y]", "inputs: [x, Y]", r"'network.0.inputs': unknown network input 'Y'; .*Valid: cos"),
         ("inputs: [x, y]", "inputs: [x, x]", r"'network.0.inputs': .*are the same"),
+        ("r_steps: 10", "r_steps: 20000", "the grid has 200,000 poses, 100,000 at most were wanted"),
         ("inputs: [x, y]", "inputs: []", r"'network.0.inputs': .*at least 1 item"),
         ("orders: [3]", "orders: [0]", r"'network.0.orders.0': .*greater than or equal to 1"),
         ("orders: [3]", "orders: [3], reference: [[1, 0, 0], [0, 1, 0], [0, 0, 2]]", "'network.0.reference': .*no rotation"),  # noqa: E501
