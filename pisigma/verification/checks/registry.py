@@ -3,10 +3,11 @@
 from pisigma.judging.diagnostic import Diagnostic
 from pisigma.verification.checks.check import AbstractCheck, CheckedCalibration
 from pisigma.verification.checks.prior_ratio import PriorRatioCheck
+from pisigma.verification.checks.scale import ScaleCheck
 from pisigma.verification.checks.search import SearchCheck
 from pisigma.verification.checks.setup_fault import SetupFaultCheck
 
-CHECKS: tuple[AbstractCheck, ...] = (SetupFaultCheck(), SearchCheck(), PriorRatioCheck())
+CHECKS: tuple[AbstractCheck, ...] = (SetupFaultCheck(), SearchCheck(), ScaleCheck(), PriorRatioCheck())
 """In the order in which their diagnostics are printed."""
 
 

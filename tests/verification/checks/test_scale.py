@@ -1,0 +1,56 @@
+"""A common factor on all lengths is found and named, and healthy robots have none."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.checked import checked, kinds_of
+from testing.closeness import assert_close
+from testing.simulated_arm import simulate
+
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.judging.diagnostic import Diagnostic
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot import Robot
+from pisigma.verification.checks.scale import ScaleCheck, common_scale
+
+MEASURED = [
+    ("ur5", "ur5/grid.csv"),
+    ("ur10", "ur10/series_c_train.csv"),
+    ("fanuc_r2000", "fanuc_r2000/positions.csv"),
+]
+
+
+@pytest.mark.parametrize(
+    ("factor", "severity"), [(1.01, "warning"), (0.99, "warning"), (1.1, "implausible"), (0.9, "implausible")]
+)
+@pytest.mark.parametrize(("robot", "file"), MEASURED)
+def test_scaled_measurements_are_recognised(shared_data, robot, file, factor, severity):
+    rows = Measurements.read_csv(shared_data / file)
+    rows = rows.select(torch.arange(0, rows.rows, 6))
+    calibrator = GeometricCalibrator(Robot.load(robot))
+    diagnostics: list[Diagnostic] = list(ScaleCheck().diagnose(checked(calibrator, rows)))
+    assert diagnostics == []
+    rows = replace(rows, position=rows.position * factor)
+    scale = common_scale(calibrator.fit(rows))
+    assert_close(scale.factor, factor, atol=1.5e-3)
+    assert ("scale", severity) in kinds_of(calibrator, rows)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_errors_of_single_lengths_are_no_scale(seed):
+    arm = simulate("ur10", seed, rows=60, noise=5e-5)
+    assert common_scale(GeometricCalibrator(arm.nominal).fit(arm.measurements)).log_bayes_factor < 0
+
+
+def test_a_scale_is_recognised_without_a_prior_too():
+    arm = simulate("ur10", rows=60, noise=5e-5)
+    rows = replace(arm.measurements, position=arm.measurements.position * 1.1)
+    assert_close(
+        common_scale(GeometricCalibrator(arm.nominal, prior=None).fit(rows)).factor, 1.1, atol=1.5e-3
+    )
+
+
+def test_without_free_lengths_there_is_no_scale():
+    arm = simulate("ur10", rows=60, noise=5e-5)
+    assert common_scale(GeometricCalibrator(arm.nominal, free="joint_offsets").fit(arm.measurements)) is None
