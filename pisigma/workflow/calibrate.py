@@ -18,9 +18,10 @@ from pisigma.identification.problem.loss import HampelLoss, SquaredLoss
 from pisigma.identification.problem.parameters import Prior
 from pisigma.judging.calibration_summary import CalibrationSummary, summarise
 from pisigma.judging.calibration_validation import CalibrationValidation, judge, validate_repeatedly
+from pisigma.judging.few_rows import fit_where_it_helps
 from pisigma.judging.held_out_rows import HeldOutRows
 from pisigma.judging.progress import Progress, stage
-from pisigma.judging.trained_calibrations import Calibrator, Result, fit, geometric_of, trained
+from pisigma.judging.trained_calibrations import Calibrator, Result, geometric_of, trained
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import SplitBy, TrainTest, draw_rows, holdout, repeats, with_fewer
 from pisigma.model.calibrated_model import CalibratedModel
@@ -219,7 +220,7 @@ def calibrate(
         rows = training.select(draw_rows(training, settings.train_rows, settings.seed))
     calibrator = settings.calibrator(nominal, training.socket or ())
     try:
-        result = fit(calibrator, rows, stage(progress, "calibration"))
+        result = fit_where_it_helps(calibrator, rows, stage(progress, "calibration"))
     except IdentificationError as refusal:
         raise explained(refusal, nominal, rows) from refusal
     validation = None

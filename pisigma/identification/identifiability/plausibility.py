@@ -36,13 +36,14 @@ def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor],
         source: what complaints call the measurements.
 
     Raises:
-        IdentificationError: the median residual of the positions is more than 1 % of the reach, or a link is half
-            as long again as drawn, or less than half as long.
+        IdentificationError: the median residual of positions or balls in sockets is more than 1 % of the reach, or a
+            link is half as long again as drawn, or less than half as long.
     """
     _refuse_ruined_links(problem, here.point, source)
     robot = problem.space.robot
-    measured = [sensor.present for sensor in problem.sensors if sensor.name == "position"]
-    sizes = residual_sizes(problem, here)[measured[0]] if measured else problem.q.new_empty(0)
+    whole = [sensor.present for sensor in problem.sensors if sensor.unit == "m" and sensor.components == 3]
+    sizes = residual_sizes(problem, here)
+    sizes = sizes[torch.stack(whole).any(0)] if whole else sizes[:0]
     if not bool((problem.active < problem.space.arm_size).any()) or len(sizes) == 0 or robot.reach == 0:
         return
     typical = float(sizes.median())
@@ -50,27 +51,28 @@ def refuse_implausible(problem: CalibrationProblem, here: Linearisation[Tensor],
         raise IdentificationError(
             f"{source}: with the best fit a typical row is still {typical * 1e3:.3g} mm per axis from where robot "
             f"'{robot.name}' says, {typical / robot.reach:.1%} of its reach, which no calibration error explains; "
-            "check the units (millimetres in a _m column?), order and directions of the joints, and whether this robot "
-            "was measured."
+            "check the units (millimetres in a _m column?), stated distances, order and directions of the joints, and "
+            "whether this robot was measured."
         )
 
 
 def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str) -> None:
-    """Refuse an arm whose long links changed by half, as where metres stand in a column of millimetres.
+    """Refuse an arm whose long lengths changed by half, as where metres stand in a column of millimetres.
 
     Raises:
         IdentificationError: see above.
     """
     robot = problem.space.robot
-    drawn, fitted = robot.dh[:, 2], point.cpu().numpy()[: problem.space.arm_size].reshape(-1, 5)[:, 2]
-    long = np.abs(drawn) > LONG_SHARE * robot.reach
+    is_length = np.array([parameter.group in ("d", "a") for parameter in problem.space.parameters])
+    drawn, fitted = robot.dh.ravel(), point.cpu().numpy()[: problem.space.arm_size]
+    long = is_length[: len(drawn)] & (np.abs(drawn) > LONG_SHARE * robot.reach)
     ruined = long & (np.abs(fitted - drawn) > RUINED_SHARE * np.abs(drawn))
-    for row in np.flatnonzero(ruined)[:1].tolist():
+    for number in np.flatnonzero(ruined)[:1].tolist():
         raise IdentificationError(
-            f"{source}: the best fit makes {problem.space.names[5 * row + 2]} of robot '{robot.name}' "
-            f"{float(fitted[row]) * 1e3:.4g} mm instead of {float(drawn[row]) * 1e3:.4g} mm, which no calibration "
-            "error explains; check the units (metres in a _mm column?), order and directions of the joints, and "
-            "whether this robot was measured."
+            f"{source}: the best fit makes {problem.space.names[number]} of robot '{robot.name}' "
+            f"{float(fitted[number]) * 1e3:.4g} mm instead of {float(drawn[number]) * 1e3:.4g} mm, which no "
+            "calibration error explains; check the units (metres in a _mm column?), stated distances, order and "
+            "directions of the joints, and whether this robot was measured."
         )
 
 

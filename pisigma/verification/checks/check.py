@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 
+import torch
 from jaxtyping import Float64
 from torch import Tensor
 
@@ -67,10 +68,17 @@ class CheckedCalibration:
         return MappingProxyType({name: result.errors_of(self.rows) for name, result in self.results.items()})
 
     @property
-    def figures(self) -> ValidationFigures:
-        """Errors of the rows that were calibrated with, under every calibration."""
-        errors = {name: errors_under(result, self.rows).figures for name, result in self.results.items()}
-        return ValidationFigures(rows=self.rows.rows, **errors)
+    def final_errors(self) -> Mapping[str, Float64[Tensor, "rows components"]]:
+        """The same by sensor of the calibration that is kept: the last one."""
+        return list(self.errors.values())[-1]
+
+    @cached_property
+    def figures(self) -> ValidationFigures | None:
+        """Errors of the rows that were calibrated with, under every calibration; None where no length was measured."""
+        errors = {name: errors_under(result, self.rows) for name, result in self.results.items()}
+        if not any(bool(torch.isfinite(one.position).any()) for one in errors.values()):
+            return None
+        return ValidationFigures(rows=self.rows.rows, **{name: one.figures for name, one in errors.items()})
 
 
 class AbstractCheck(ABC):

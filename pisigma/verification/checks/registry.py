@@ -2,12 +2,27 @@
 
 from pisigma.judging.diagnostic import Diagnostic
 from pisigma.verification.checks.check import AbstractCheck, CheckedCalibration
+from pisigma.verification.checks.few_rows import FewRowsCheck
+from pisigma.verification.checks.other_robot import OtherRobotCheck
 from pisigma.verification.checks.prior_ratio import PriorRatioCheck
+from pisigma.verification.checks.residual import ResidualCheck
 from pisigma.verification.checks.scale import ScaleCheck
 from pisigma.verification.checks.search import SearchCheck
 from pisigma.verification.checks.setup_fault import SetupFaultCheck
+from pisigma.verification.checks.stated_noise import StatedNoiseCheck
+from pisigma.verification.checks.two_populations import TwoPopulationsCheck
 
-CHECKS: tuple[AbstractCheck, ...] = (SetupFaultCheck(), SearchCheck(), ScaleCheck(), PriorRatioCheck())
+CHECKS: tuple[AbstractCheck, ...] = (
+    OtherRobotCheck(),
+    SetupFaultCheck(),
+    ResidualCheck(),
+    ScaleCheck(),
+    PriorRatioCheck(),
+    SearchCheck(),
+    StatedNoiseCheck(),
+    TwoPopulationsCheck(),
+    FewRowsCheck(),
+)
 """In the order in which their diagnostics are printed."""
 
 
