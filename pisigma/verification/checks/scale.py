@@ -85,7 +85,8 @@ def common_scale(result: CalibrationResult) -> CommonScale | None:
     for size in PRIOR_SCALES:
         precision[drawn] = of_one / size**2
         normal = data + np.diag(precision)
-        column = 1 / np.sqrt(normal.diagonal())
+        diagonal = normal.diagonal()
+        column = 1 / np.sqrt(np.where(diagonal > 0, diagonal, 1.0))
         scaled_normal = normal * column * column[:, None]
         root = np.linalg.cholesky(scaled_normal + UNDETERMINED * np.eye(len(column)))
         pull = precision * lengths
