@@ -66,6 +66,14 @@ Gravity = Annotated[
         "data show]"
     ),
 ]
+NewFrameAt = Annotated[
+    list[int] | None,
+    typer.Option(
+        metavar="LINE",
+        help="Line of DATA from which on the rows are in a frame of their own, as the instrument was moved; may be "
+        "repeated.",
+    ),
+]
 SocketDistance = Annotated[
     str | None,
     typer.Option(help="Known distance of two sockets as A,B,MM; */0,*/1,50 states that of every placement."),
@@ -101,6 +109,7 @@ def calibrate(
     prior_mrad: PriorMrad = 1.0,
     robust: Robust = True,
     gravity: Gravity = None,
+    new_frame_at: NewFrameAt = None,
     socket_distance: SocketDistance = None,
     base: Base = None,
     tip: Tip = None,
@@ -127,6 +136,7 @@ def calibrate(
         prior_length=prior_mm / 1e3,
         prior_angle=prior_mrad / 1e3,
         gravity=_gravity(gravity),
+        new_frame_at=tuple(new_frame_at or ()),
         socket_distances=_socket_distances(socket_distance),
         **stated,
     )

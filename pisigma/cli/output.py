@@ -116,6 +116,8 @@ def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> s
         elif value != parameter.default and parameter.name not in _ONLY_FOR_PRINTING:
             if isinstance(value, bool):
                 words.append((parameter.opts if value else parameter.secondary_opts)[0])
+            elif getattr(parameter, "multiple", False):
+                words += [word for one in value or () for word in (parameter.opts[0], str(one))]
             elif isinstance(value, tuple):
                 words += [parameter.opts[0], *(f"{number:g}" for number in value)]
             else:

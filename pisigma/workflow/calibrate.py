@@ -23,6 +23,7 @@ from pisigma.judging.held_out_rows import HeldOutRows
 from pisigma.judging.progress import Progress, stage
 from pisigma.judging.trained_calibrations import Calibrator, Result, geometric_of, trained
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.new_frames import with_new_frames
 from pisigma.measurement.splits import SplitBy, TrainTest, draw_rows, holdout, repeats, with_fewer
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
@@ -59,6 +60,7 @@ class CalibrationSettings:
         robust: whether rows that are far off count less.
         gravity: direction in which things fall, in the frame of the robot's base; None for the axis of the base that
             the data show.
+        new_frame_at: lines of the file of measurements at which new frames begin, because the instrument was moved.
         socket_distances: by the names of two sockets their known distance [m]. A * in both names stands for the same
             text, so that ("*/0", "*/1") means a/0 and a/1, b/0 and b/1 and so on.
 
@@ -79,6 +81,7 @@ class CalibrationSettings:
     prior_angle: float = 1e-3
     robust: bool = True
     gravity: tuple[float, float, float] | None = None
+    new_frame_at: tuple[int, ...] = ()
     socket_distances: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -213,6 +216,7 @@ def calibrate(
     started = time.perf_counter()
     nominal = robot if isinstance(robot, Robot) else Robot.load(os.fspath(robot))
     measurements = data if isinstance(data, Measurements) else Measurements.read_csv(data, nominal)
+    measurements = with_new_frames(measurements, settings.new_frame_at)
     training, test_rows = measurements.split_sets()
     splits = settings.splits(training)
     rows = training

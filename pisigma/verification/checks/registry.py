@@ -6,6 +6,7 @@ from pisigma.verification.checks.few_rows import FewRowsCheck
 from pisigma.verification.checks.other_robot import OtherRobotCheck
 from pisigma.verification.checks.prior_ratio import PriorRatioCheck
 from pisigma.verification.checks.residual import ResidualCheck
+from pisigma.verification.checks.row_order import RowOrderCheck
 from pisigma.verification.checks.scale import ScaleCheck
 from pisigma.verification.checks.search import SearchCheck
 from pisigma.verification.checks.setup_fault import SetupFaultCheck
@@ -15,6 +16,7 @@ from pisigma.verification.checks.two_populations import TwoPopulationsCheck
 CHECKS: tuple[AbstractCheck, ...] = (
     OtherRobotCheck(),
     SetupFaultCheck(),
+    RowOrderCheck(),
     ResidualCheck(),
     ScaleCheck(),
     PriorRatioCheck(),
