@@ -123,7 +123,7 @@ def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> s
             else:
                 text = Path(str(value)).name if parameter.name in files else str(value)
                 words += [parameter.opts[0], text]
-    return shlex.join(words)
+    return printable(shlex.join(words), cut=False)
 
 
 def _is_number(cell: str) -> bool:

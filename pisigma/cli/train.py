@@ -13,6 +13,7 @@ import typer
 from pisigma.cli.arguments import AsJson, Overwrite
 from pisigma.cli.calibrate import AcceptImplausible, print_calibration, saved
 from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of
+from pisigma.errors import printable
 
 if TYPE_CHECKING:
     from pisigma.judging.calibration_summary import CalibrationSummary
@@ -63,7 +64,7 @@ def train(
     with progress_of("training") as progress:
         training = train_recipe(recipe, data, settings, progress)
     command = ["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])]
-    texts = {"name": read.name, "command": shlex.join(command)}
+    texts = {"name": read.name, "command": printable(shlex.join(command), cut=False)}
     with saved(training, folder, accept_implausible, overwrite, **texts) as written:
         shutil.rmtree(checkpoints, ignore_errors=True)
         training = replace(training, seconds=time.perf_counter() - started)

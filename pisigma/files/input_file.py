@@ -8,7 +8,7 @@ from pisigma.errors import PisigmaError
 
 MOST_BYTES = 2**26
 """A file that people or instruments write is smaller: half a million rows of measurements, say."""
-LONGEST_WAIT = 8.0
+LONGEST_WAIT = 4.0
 """[s] So long may a pipe or a terminal stay silent."""
 _CHUNK = 2**20
 

@@ -70,7 +70,7 @@ def writing_whole(path: Path) -> Iterator[TextIO]:
         target = Path(os.path.realpath(path))
         sweep(target)
         with scratch_beside(target, FILE) as scratch:
-            with scratch.open("w", newline="\n", encoding="utf-8") as file:
+            with scratch.open("w", newline="\n", encoding="utf-8", errors="backslashreplace") as file:
                 yield file
                 file.flush()
                 os.fsync(file.fileno())

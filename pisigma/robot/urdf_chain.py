@@ -12,12 +12,15 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.errors import RobotError, nearest_choice
+from pisigma.errors import RobotError, nearest_choice, printable
 from pisigma.files.input_file import read_input
 from pisigma.robot.row import LARGEST
 from pisigma.robot.urdf_frames import Frame, frame_of
 
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
+
+MOST_ELEMENTS = 10_000
+"""Links and joints of a file; a whole cell has some hundreds."""
 
 _KEPT = {"origin": ("xyz", "rpy"), "axis": ("xyz",), "parent": ("link",), "child": ("link",)}
 _KEPT |= {"limit": ("lower", "upper"), "mimic": ("joint",)}
@@ -51,6 +54,10 @@ def read_urdf(path: str | os.PathLike[str]) -> tuple[Any, Callable[[str], str]]:
                 f"{lines[kind, name]}; names must differ."
             )
         lines[kind, name] = element.sourceline
+        if len(lines) > MOST_ELEMENTS:
+            raise RobotError(
+                f"{path}: holds more than {MOST_ELEMENTS:,} links and joints; fewer were wanted."
+            )
         copied = etree.SubElement(reduced, kind, name=name)
         if kind == "joint":
             _copy_joint(element, copied, str(path))
@@ -236,7 +243,7 @@ def read_chain(path: str | os.PathLike[str], base: str | None = None, tip: str |
         raise RobotError(
             f"{path}: no joint moves between the links '{base}' and '{tip}'; choose others with base and tip."
         )
-    return Chain(urdf.name, base, tip, tuple(joints), origin, str(path))
+    return Chain(urdf.name, base, tip, tuple(joints), origin, printable(str(path), cut=False))
 
 
 def _check_tree(urdf: Any, place: _Place) -> None:

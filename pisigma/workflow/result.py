@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pisigma.errors import AcceptanceError
+from pisigma.errors import AcceptanceError, printable
 from pisigma.files.output_folder import staged_folder
 from pisigma.judging.summary import AbstractSummary
 from pisigma.model.calibrated_model import CalibratedModel
@@ -66,7 +66,7 @@ class AbstractModelResult(ABC):
                 "name, or accept implausible results explicitly (accept_implausible, --accept-implausible)."
             )
         summary = self.summary.having(command=command)
-        name = name or Path(folder).resolve().name
+        name = printable(name or Path(folder).resolve().name, cut=False)
         model = replace(self.model, name=name, metrics=summary.to_json())
         with staged_folder(folder, overwrite) as scratch:
             save_model(model, scratch)

@@ -1,6 +1,7 @@
 """`pisigma calibrate`, and `train`, `simulate` and `evaluate` with geometric calibrations."""
 
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -357,3 +358,15 @@ def test_an_implausible_calibration_is_written_on_demand_only(run, tmp_path):
     assert "## Not to be trusted" in card
     assert worst["sentence"] in card
     assert load_model(tmp_path / "arm").metrics["diagnostics"] == printed["diagnostics"]
+
+
+def test_names_that_are_no_text_do_not_matter(run, data, tmp_path):
+    """File names of an old system, which are no UTF-8, and one that would colour the terminal."""
+    rows, folder = tmp_path / "m\udcff\x1b[31m.csv", tmp_path / "\udcfe"
+    shutil.copy(data, rows)
+    result = run("calibrate", "kiro4", rows, "--model", "geometric", "--folds", 2, "--out", folder)
+    assert result.exit_code == 0, result.output
+    assert "\\udcfe" in result.stdout
+    model = load_model(folder)
+    assert (model.name, model.provenance.data_source) == ("\\udcfe", "m\\udcff\\x1b[31m.csv")
+    assert run("report", folder, rows, "--out", tmp_path / "\udcfd.html").exit_code == 0

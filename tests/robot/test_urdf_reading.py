@@ -269,3 +269,12 @@ def test_every_truncated_file_is_refused_and_every_damaged_one_refused_or_read(t
         except RobotError as problem:
             assert "\n" not in str(problem)  # noqa: PT017
     assert read
+
+
+def test_a_file_of_more_links_than_any_cell_has_is_refused_at_once(tmp_path):
+    path = tmp_path / "many.urdf"
+    path.write_text(
+        f'<robot name="r">{"".join(f"<link name={i!r}/>" for i in map(str, range(10_001)))}</robot>'
+    )
+    with pytest.raises(RobotError, match="holds more than 10,000 links and joints; fewer were wanted"):
+        Robot.load(path)

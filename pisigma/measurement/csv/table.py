@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool
 
-from pisigma.errors import MeasurementError
+from pisigma.errors import MeasurementError, printable
 from pisigma.files.input_file import read_text
 
 SPREADSHEET_ERRORS = frozenset(
@@ -47,7 +47,7 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     Raises:
         MeasurementError: the file cannot be read, is too large, not UTF-8, empty, or holds nothing but a header.
     """
-    source = str(path)
+    source = printable(str(path), cut=False)
     text = read_text(path, MeasurementError, "CSV").replace("\r\n", "\n").replace("\r", "\n")
     lines = content_lines(text.split("\n"), source)
     header_line, line = next(lines)
