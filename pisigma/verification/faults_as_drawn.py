@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import lru_cache
 
 import torch
 from jaxtyping import Float64, Int64
@@ -32,6 +33,7 @@ USUAL = 1e-3
 """Usual prior standard deviation of geometric errors [m and rad]."""
 
 
+@lru_cache(maxsize=1)  # the same rows are looked at before a calibration and after it
 def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[SetupFault, ...]:
     """Find what makes the errors of the robot as drawn collapse to a quarter or less, the simplest first.
 

@@ -31,13 +31,18 @@ from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
 from pisigma.verification.checks.check import CheckedCalibration
 from pisigma.verification.checks.registry import diagnostics_of
-from pisigma.verification.checks.setup_fault import explained
+from pisigma.verification.checks.setup_fault import explained, setup_diagnostics
 from pisigma.workflow.result import AbstractModelResult
 
 FOLDS = 5
 """Of a cross-validation that is not by placement."""
 
 LARGEST_REPEATS = 1000
+
+ONLY_GEOMETRY = (
+    "The geometry alone was calibrated, and nothing was cross-validated: errors that a fault of the setup or of the file "
+    "explains are not for a joint correction to learn."
+)
 
 ModelKind = Literal["hybrid", "geometric"]
 
@@ -223,6 +228,9 @@ def calibrate(
     if settings.train_rows is not None:
         rows = training.select(draw_rows(training, settings.train_rows, settings.seed))
     calibrator = settings.calibrator(nominal, training.socket or ())
+    faulty = any(one.severity == "implausible" for one in setup_diagnostics(nominal, rows))
+    if faulty:
+        calibrator, splits = geometric_of(calibrator), []
     try:
         result = fit_where_it_helps(calibrator, rows, stage(progress, "calibration"))
     except IdentificationError as refusal:
@@ -231,14 +239,17 @@ def calibrate(
     if splits:
         validation = validate_repeatedly(calibrator, training, splits, stage(progress, "cross-validation"))
     test = None if test_rows is None else judge(calibrator, result, rows, test_rows)
-    summary = summarise(result).having(
+    summary = summarise(result)
+    if faulty:
+        summary = summary.having(warnings=(*summary.warnings, ONLY_GEOMETRY))
+    summary = summary.having(
         command=_call(nominal, measurements, settings),
         rows=rows.rows,
         cross_validation=None if validation is None else validation.figures(),
         test=None if test is None else test.figures(),
     )
     texts = CardTexts(
-        _description(settings.model, nominal),
+        _description("geometric" if faulty else settings.model, nominal),
         "Judged on rows of the same measurement only, not on other days, payloads or temperatures.",
     )
     calibration = compose(calibrator, result, rows, summary, texts, validation, test, training)

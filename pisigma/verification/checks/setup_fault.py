@@ -28,18 +28,21 @@ class SetupFaultCheck(AbstractCheck):
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
         """See `AbstractCheck.diagnose`."""
-        faults = find_faults_as_drawn(checked.robot, checked.rows)
-        if faults:
-            fault, largest = either(faults), IMPLAUSIBLE * USUAL * math.sqrt(checked.robot.dof)
-            severity: Severity = "implausible" if fault.moved > largest else "warning"
-            yield Diagnostic(kind="setup_fault", severity=severity, sentence=fault.sentence)
-        elif are_unrelated(checked.robot, checked.rows):
-            yield Diagnostic(kind="setup_fault", severity="implausible", sentence=UNRELATED)
+        yield from setup_diagnostics(checked.robot, checked.rows)
+
+
+def setup_diagnostics(robot: Robot, rows: Measurements) -> list[Diagnostic]:
+    """Say which setup faults explain the errors of the robot as drawn; see `SetupFaultCheck`."""
+    if faults := find_faults_as_drawn(robot, rows):
+        fault, largest = either(faults), IMPLAUSIBLE * USUAL * math.sqrt(robot.dof)
+        severity: Severity = "implausible" if fault.moved > largest else "warning"
+        return [Diagnostic(kind="setup_fault", severity=severity, sentence=fault.sentence)]
+    if are_unrelated(robot, rows):
+        return [Diagnostic(kind="setup_fault", severity="implausible", sentence=UNRELATED)]
+    return []
 
 
 def explained(refusal: IdentificationError, robot: Robot, rows: Measurements) -> IdentificationError:
     """Name the cause of a refusal where setup faults explain the errors; else return the refusal as it is."""
-    faults = find_faults_as_drawn(robot, rows)
-    if faults:
-        return IdentificationError(f"{rows.source}: {either(faults).sentence}")
-    return IdentificationError(f"{rows.source}: {UNRELATED}") if are_unrelated(robot, rows) else refusal
+    causes = setup_diagnostics(robot, rows)
+    return IdentificationError(f"{rows.source}: {causes[0].sentence}") if causes else refusal
