@@ -60,7 +60,8 @@ def evaluate(
     """Compare models on measurements, with confidence intervals, and accept them or not.
 
     Rows of the set "train" are left out where the file has a column "set". With a limit, every model folder has to
-    meet it, else the exit status is 3.
+    meet it, else the exit status is 3; so it is where errors of positions or orientations are too large to be those of
+    a calibrated robot, and the usual setup faults that explain them are named.
     """
     from pisigma.files.model_files import check_model_hash
     from pisigma.judging.bootstrap import Bootstrap
@@ -84,7 +85,8 @@ def evaluate(
     else:
         _print(evaluation)
     if not evaluation.accepted:
-        raise AcceptanceError(f"not accepted: {'; '.join(evaluation.missed)}.")
+        missed = [f"not accepted: {'; '.join(evaluation.missed)}."] if evaluation.missed else []
+        raise AcceptanceError(" ".join([*missed, *(one.sentence for one in evaluation.diagnostics)]))
 
 
 def _print(evaluation: "Evaluation") -> None:
@@ -92,7 +94,7 @@ def _print(evaluation: "Evaluation") -> None:
     if stated and evaluation.accepted:
         limits = ", ".join(f"{name} {limit:g}" for name, limit in stated.items())
         print_lines([f"Accepted: every model stays within {limits}."])
-    elif stated:
+    elif evaluation.missed:
         print_lines([f"Not accepted: {'; '.join(evaluation.missed)}."])
     print_comparison(evaluation.comparison, evaluation.data)
-    print_lines(evaluation.warnings)
+    print_lines([*(one.sentence for one in evaluation.diagnostics), *evaluation.warnings])

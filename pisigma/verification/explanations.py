@@ -1,5 +1,6 @@
 """Everything that is tried to explain large errors, and which of it is believed."""
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
@@ -7,7 +8,14 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.judging.frame_fits import MeasuredPoses, best_base, best_base_and_tool, best_tool
+from pisigma.judging.frame_fits import (
+    LEVER_SHARE,
+    MeasuredPoses,
+    affine_error,
+    best_base,
+    best_base_and_tool,
+    best_tool,
+)
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.model.calibrated_model import CalibratedModel
@@ -15,16 +23,16 @@ from pisigma.model.row_poses import nominal_poses_of_rows
 from pisigma.se3 import rotation_vector
 from pisigma.verification.arm import PredictingArm
 from pisigma.verification.cause import Cause, length_text
-from pisigma.verification.hypothesis import Hypothesis
+from pisigma.verification.hypothesis import COLLAPSED, Hypothesis
 from pisigma.verification.joint_faults import NEAR_BEST, NOTICED, joint_causes, likely_maps
 from pisigma.verification.pose_faults import other_conventions, units_and_frames
 
 SMALL_SHARE = 2e-4
 """Share of the reach below which errors come from no fault of a joint column."""
-COLLAPSED = 0.25
-"""Share of the errors that is left, at most, where a setup fault explains them."""
 PLAUSIBLE_SHARE = 0.01
 """Share of the reach that the errors which are left may have, at most."""
+PLAUSIBLE_TURN = PLAUSIBLE_SHARE / LEVER_SHARE
+"""The same of errors of orientations [rad], which count like position errors at `LEVER_SHARE` of the reach."""
 AS_GOOD = 1.5
 """A simpler explanation is believed where its errors are not larger than the best by this factor."""
 MOST_CONVENTIONS = 4
@@ -42,10 +50,14 @@ _MOVED = {
 }
 
 
-def simplest(here: Hypothesis, hypotheses: Sequence[Hypothesis], reach: float) -> list[Hypothesis]:
-    """Choose the simplest of the hypotheses that explain the errors about equally well."""
-    least = min(COLLAPSED * here.error, PLAUSIBLE_SHARE * reach)
-    explaining = [other for other in hypotheses if other.error <= least]
+def largest_explained(here: Hypothesis, reach: float) -> float:
+    """Give the largest error [m] that an explanation of the errors may leave, of a robot of such a reach [m]."""
+    return min(COLLAPSED * here.error, PLAUSIBLE_SHARE * reach)
+
+
+def simplest(hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:
+    """Choose the simplest of the hypotheses that explain the errors, to `most` [m] at least, about equally well."""
+    explaining = [other for other in hypotheses if other.error <= most]
     best = min((other.error for other in explaining), default=0.0)
     explaining = [other for other in explaining if other.error <= AS_GOOD * best]
     simplest = min((other.size for other in explaining), default=0.0)
@@ -55,25 +67,25 @@ def simplest(here: Hypothesis, hypotheses: Sequence[Hypothesis], reach: float) -
     return list(chosen.values())
 
 
-def hypotheses(arm: PredictingArm, some: Measurements, here: Hypothesis) -> Iterator[Hypothesis]:
-    """Go through everything that may explain the errors; first that nothing is wrong, which explains none."""
-    yield from in_frames(arm, some, here)
+def hypotheses(arm: PredictingArm, some: Measurements, here: Hypothesis, most: float) -> Iterator[Hypothesis]:
+    """Go through everything that may explain the errors to `most` [m]; first that nothing is wrong."""
+    yield from in_frames(arm, some, here, most)
     for measured, cause in units_and_frames(here.measured):
-        yield from in_frames(arm, some, replace(here, measured=measured, causes=(cause,)))
+        yield from in_frames(arm, some, replace(here, measured=measured, causes=(cause,)), most)
     if arm.model is not None:
         for T, clause, advice in _other_corrections(arm.model, some, here.T):
             cause = Cause("correction", clause, advice, 1.0)
-            yield from in_frames(arm, some, here.with_cause(cause, T, fitted=0))
+            yield from in_frames(arm, some, here.with_cause(cause, T, fitted=0), most)
     if not here.error > SMALL_SHARE * arm.robot.reach:
         return
     for measured, cause in _likely_conventions(arm, here):
-        yield from in_frames(arm, some, replace(here, measured=measured, causes=(cause,)))
+        yield from in_frames(arm, some, replace(here, measured=measured, causes=(cause,)), most)
     maps = likely_maps(arm, some, here.measured)
     for number, q in enumerate(maps.of(some.q)):
         T = arm.poses(replace(some, q=q))
         if bool(torch.isfinite(T).all()):
             causes = joint_causes(maps, number, arm.robot)
-            yield from in_frames(arm, some, Hypothesis(q, T, here.measured, causes, 1))
+            yield from in_frames(arm, some, Hypothesis(q, T, here.measured, causes, 1), most)
 
 
 def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[MeasuredPoses, Cause]]:
@@ -114,11 +126,19 @@ def _other_corrections(
     )
 
 
-def in_frames(arm: PredictingArm, some: Measurements, here: Hypothesis) -> Iterator[Hypothesis]:
-    """Go on to the same hypothesis with another frame, another tool, and both; as drawn, both are fitted anyway."""
+def in_frames(
+    arm: PredictingArm, some: Measurements, here: Hypothesis, most: float = math.inf
+) -> Iterator[Hypothesis]:
+    """Go on to the same hypothesis with another frame, another tool, and both; as drawn, both are fitted anyway.
+
+    Both are fitted only where an affine fit, which leaves less, does not leave more than `most` [m].
+    """
+    rows = len(here.T)
+    bound = float(affine_error(here.T, here.measured)) * (1 - 13 / rows) if rows > 13 else 0.0
     if arm.model is None:
-        base, tool = best_base_and_tool(here.T, here.measured)
-        yield replace(here, T=base @ here.T @ tool)
+        if bound <= most**2:
+            base, tool = best_base_and_tool(here.T, here.measured)
+            yield replace(here, T=base @ here.T @ tool)
         return
     yield here
     frames, targets = numbers_of_names(some.frame), numbers_of_names(some.target)
@@ -127,7 +147,7 @@ def in_frames(arm: PredictingArm, some: Measurements, here: Hypothesis) -> Itera
     X, Y = _per_group(best_base, frames, here), _per_group(best_tool, targets, here)
     yield here.with_cause(_moved("frame", X), X @ here.T, 6 * count)
     yield here.with_cause(_moved("tool", Y), here.T @ Y, per_tool * tools)
-    if count == 1 and tools == 1:
+    if count == 1 and tools == 1 and bound <= most**2:
         base, tool = best_base_and_tool(here.T, here.measured)
         moved = here.with_cause(_moved("frame", base[None]), base @ here.T, 6)
         yield moved.with_cause(_moved("tool", tool[None]), base @ here.T @ tool, per_tool)

@@ -16,7 +16,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.verification.arm import PredictingArm
 from pisigma.verification.cause import Cause
-from pisigma.verification.explanations import hypotheses, in_frames, simplest
+from pisigma.verification.explanations import hypotheses, in_frames, largest_explained, simplest
 from pisigma.verification.free_joint import freed_joints
 from pisigma.verification.hypothesis import Hypothesis
 from pisigma.verification.row_faults import MARGIN, explains_nothing, shifted_rows
@@ -63,11 +63,15 @@ def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[Setu
             return named
     if not here.error > usual:
         return ()
-    tried = [*hypotheses(arm, some, raw), *_with_joints(arm, shifted_rows(arm, rows, chosen, measured))]
-    faults = simplest(here, tried, robot.reach)
-    if not faults:
+    most = largest_explained(here, robot.reach)
+    tried = [
+        *hypotheses(arm, some, raw, most),
+        *_with_joints(arm, shifted_rows(arm, rows, chosen, measured), most),
+    ]
+    faults = simplest(tried, most)
+    if not faults and not are_unrelated(robot, rows):
         freed = ((q, measured, cause) for q, cause in freed_joints(arm, some, measured))
-        faults = simplest(here, _with_joints(arm, freed, values=1) + _labelled(robot, rows), robot.reach)
+        faults = simplest(_with_joints(arm, freed, most, values=1) + _labelled(robot, rows), most)
     return tuple(fault_of(here, other, float("nan")) for other in faults)
 
 
@@ -77,9 +81,8 @@ def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> 
     here = Hypothesis(rows.q, fitted_poses(robot, rows), MeasuredPoses.of(rows, LEVER_SHARE * robot.reach))
     if not here.error > usual:
         return ()
-    return tuple(
-        fault_of(here, other, float("nan")) for other in simplest(here, _labelled(robot, rows), robot.reach)
-    )
+    named = simplest(_labelled(robot, rows), largest_explained(here, robot.reach))
+    return tuple(fault_of(here, other, float("nan")) for other in named)
 
 
 def _labelled(robot: Robot, rows: Measurements) -> list[Hypothesis]:
@@ -95,6 +98,7 @@ def _labelled(robot: Robot, rows: Measurements) -> list[Hypothesis]:
 def _with_joints(
     arm: PredictingArm,
     tried: Iterable[tuple[Float64[Tensor, "rows dof"], MeasuredPoses, Cause]],
+    most: float,
     values: int = 0,
 ) -> list[Hypothesis]:
     """Make hypotheses of joint values of the robot as drawn, of which every row has some values of its own."""
@@ -102,7 +106,9 @@ def _with_joints(
         other
         for q, measured, cause in tried
         for rows in [Measurements(q=q)]
-        for other in in_frames(arm, rows, Hypothesis(q, arm.poses(rows), measured, (cause,), values * len(q)))
+        for other in in_frames(
+            arm, rows, Hypothesis(q, arm.poses(rows), measured, (cause,), values * len(q)), most
+        )
     ]
 
 

@@ -10,6 +10,8 @@ from pisigma.judging.frame_fits import MeasuredPoses
 from pisigma.se3 import rotation_vector
 from pisigma.verification.cause import Cause
 
+COLLAPSED = 0.25
+"""Share of the errors that is left, at most, where a setup fault explains them."""
 FEWEST_SPARE = 6
 """Measured numbers that must be left over beyond what is fitted."""
 

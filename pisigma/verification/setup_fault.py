@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pisigma.verification.cause import length_text
-from pisigma.verification.hypothesis import Hypothesis
+from pisigma.verification.hypothesis import COLLAPSED, Hypothesis
 
 
 @dataclass(frozen=True)
@@ -35,6 +35,11 @@ class SetupFault:
     before_rotation: float
     after_rotation: float
     moved: float = math.inf
+
+    @property
+    def explains_orientation(self) -> bool:
+        """Whether the rotation errors are among what it explains."""
+        return self.after_rotation <= COLLAPSED * self.before_rotation
 
     @property
     def sentence(self) -> str:

@@ -2,22 +2,33 @@
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 
+from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.judging.frame_fits import LEVER_SHARE, MeasuredPoses
+from pisigma.judging.model_comparison import ModelFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.verification.arm import PredictingArm
-from pisigma.verification.explanations import hypotheses, in_frames, simplest
+from pisigma.verification.explanations import (
+    PLAUSIBLE_SHARE,
+    PLAUSIBLE_TURN,
+    hypotheses,
+    in_frames,
+    largest_explained,
+    simplest,
+)
 from pisigma.verification.faults_as_drawn import MOST_ROWS, find_faults_as_drawn, measured_rows, spread
 from pisigma.verification.hypothesis import Hypothesis
 from pisigma.verification.joint_faults import NOTICED
 from pisigma.verification.setup_fault import SetupFault, fault_of
 
 
+@torch.no_grad()
 def find_setup_faults(
-    model: CalibratedModel, nominal: CalibratedModel, measurements: Measurements
+    model: CalibratedModel, nominal: CalibratedModel, measurements: Measurements, fit_frame: bool = False
 ) -> tuple[SetupFault, ...]:
     """Find what makes the errors of a model collapse to a quarter or less, the simplest first.
 
@@ -33,10 +44,15 @@ def find_setup_faults(
         model: the model.
         nominal: the nominal robot with the base and tool that suit it best; only shows what its errors fall to.
         measurements: rows with positions in frames and of targets that the model has; limits do not matter.
+        fit_frame: the frames are fitted anew, so that any frame will do, and that one has moved is no fault.
 
     Returns:
         Nothing where errors are below 0.02 mm, or where nothing explains them.
     """
+    if not has_orientation(model):
+        measurements = replace(measurements, rotation=None, sigma_rotation=None)
+    if fit_frame:
+        measurements = replace(measurements, frame=(next(iter(model.bases), ""),) * measurements.rows)
     some = measurements.select(spread(measured_rows(measurements), MOST_ROWS))
     T = poses_of_rows(model, some)
     predicted = torch.isfinite(T).flatten(1).all(-1)
@@ -47,9 +63,11 @@ def find_setup_faults(
     if not here.error > NOTICED:
         return ()
     arm = PredictingArm(model.robot, model)
-    chosen = simplest(here, list(hypotheses(arm, some, here)), model.robot.reach)
+    most = largest_explained(here, model.robot.reach)
+    chosen = simplest(list(hypotheses(arm, some, here, most)), most)
     faults = tuple(fault_of(here, other, _nominal_error(nominal, some, other)) for other in chosen)
-    return faults or find_faults_as_drawn(model.robot, measurements)
+    faults = faults or find_faults_as_drawn(model.robot, measurements)
+    return tuple(fault for fault in faults if not (fit_frame and fault.kinds == ("frame",)))
 
 
 def _nominal_error(nominal: CalibratedModel, some: Measurements, other: Hypothesis) -> float:
@@ -61,3 +79,32 @@ def _nominal_error(nominal: CalibratedModel, some: Measurements, other: Hypothes
     tried = in_frames(PredictingArm(nominal.robot, nominal), some, Hypothesis(other.q, T, other.measured))
     wanted = kinds & {"frame", "tool"}
     return next(one.rms()[0] for one in tried if {cause.kind for cause in one.causes} == wanted)
+
+
+def is_implausible(figures: ModelFigures, model: CalibratedModel) -> bool:
+    """Say whether errors of positions or of orientations are too large to be those of a calibrated robot.
+
+    Args:
+        figures: of the model, or of another with its base and tool.
+        model: the model.
+    """
+    reach, orientation = model.robot.reach, figures.orientation if has_orientation(model) else None
+    turn = 0.0 if orientation is None else np.deg2rad(orientation.statistics["rms"])
+    return figures.position.statistics["rms"] * 1e-3 > PLAUSIBLE_SHARE * reach > 0 or turn > PLAUSIBLE_TURN
+
+
+def unexplained(model: CalibratedModel) -> str:
+    """Say of implausible errors of a model that no setup fault explains them, and what to check."""
+    limit, turn = PLAUSIBLE_SHARE * model.robot.reach * 1e3, np.rad2deg(PLAUSIBLE_TURN)
+    return (
+        f"Errors of more than {limit:.3g} mm or {turn:.2g} deg are no calibration errors, but no usual setup fault "
+        "(frame, tool, units, conventions of orientations, shifted rows, order, signs and zeros of the joints, "
+        "correction applied twice or not at all) explains them; check whether this robot was measured, and whether the "
+        "rows belong together."
+    )
+
+
+def has_orientation(model: CalibratedModel) -> bool:
+    """Say whether a model knows how its tools are turned; one that was calibrated without orientations does not."""
+    summary = CalibrationSummary.read(model)
+    return summary is None or any(noise.sensor == "rotation" for noise in summary.noise)

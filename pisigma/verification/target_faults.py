@@ -20,6 +20,8 @@ MOST_TARGETS = 4
 """Targets that are looked for under one name."""
 EXAMPLES = 3
 """Rows that are named, at most."""
+ITERATIONS = 10
+"""Of every fit of base and targets, at most."""
 ROUNDS = 8
 """Rounds of naming every row after the nearest target and fitting base and targets anew, at most."""
 
@@ -115,7 +117,7 @@ def _fitted(
 ) -> tuple[Float64[Tensor, "rows 3"], Float64[Tensor, "rows 4 4"]]:
     """Fit base and targets; returns where the measured points are behind the last row [m], and the predicted poses."""
     names = tuple(str(int(k)) for k in number)
-    fit = fit_base_and_tool(robot, replace(rows, target=names))
+    fit = fit_base_and_tool(robot, replace(rows, target=names), maximum_iterations=ITERATIONS)
     T = forward_kinematics(fit.robot.with_geometry(tool=np.zeros(6)), rows.q)
     assert rows.position is not None
     points = (T[:, :3, :3].mT @ (rows.position - T[:, :3, 3])[..., None])[..., 0]

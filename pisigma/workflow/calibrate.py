@@ -40,8 +40,8 @@ FOLDS = 5
 LARGEST_REPEATS = 1000
 
 ONLY_GEOMETRY = (
-    "The geometry alone was calibrated, and nothing was cross-validated: errors that a fault of the setup or of the file "
-    "explains are not for a joint correction to learn."
+    "The geometry alone was calibrated, and nothing was cross-validated: errors that a fault of the setup or of the "
+    "file explains are not for a joint correction to learn."
 )
 
 ModelKind = Literal["hybrid", "geometric"]

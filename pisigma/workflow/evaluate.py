@@ -3,7 +3,7 @@
 import math
 import os
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import torch
 
 from pisigma.errors import MeasurementError, ModelError
 from pisigma.judging.bootstrap import Bootstrap
+from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.frame_fits import FRAMES_FITTED
 from pisigma.judging.model_comparison import ModelComparison, ModelFigures, compare_models
 from pisigma.judging.reference_models import geometric_model, nominal_model
@@ -19,6 +20,8 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.reporting.tables import figure_text
+from pisigma.verification.setup_fault import either
+from pisigma.verification.setup_faults import find_setup_faults, is_implausible, unexplained
 
 REFERENCES = ("nominal", "geometric")
 """Names of what a model is compared with: the robot as drawn, and the geometry under a hybrid. Neither has to meet
@@ -131,6 +134,7 @@ class Evaluation:
         comparison: figures of every model, with confidence intervals and differences to the first.
         evaluated: by name in the comparison, what each model is; references are not among them.
         missed: limits that are missed, in sentences without their ends.
+        diagnostics: why errors of a model are not those of a calibrated robot, where they are not.
         warnings: what else should be known, in sentences.
         seconds: that it took.
     """
@@ -141,6 +145,7 @@ class Evaluation:
     comparison: ModelComparison
     evaluated: Mapping[str, EvaluatedModel]
     missed: tuple[str, ...]
+    diagnostics: tuple[Diagnostic, ...]
     warnings: tuple[str, ...]
     seconds: float
 
@@ -151,8 +156,8 @@ class Evaluation:
 
     @property
     def accepted(self) -> bool:
-        """Whether every model meets every limit; true where there is none."""
-        return not self.missed
+        """Whether every model meets every limit, and no errors are implausible."""
+        return not self.missed and not self.diagnostics
 
     def to_json(self) -> dict[str, object]:
         """Return everything as plain values: the result of `pisigma evaluate --json`."""
@@ -169,6 +174,7 @@ class Evaluation:
         }
         if stated := self.settings.limits.stated:
             values |= {"limits": stated, "accepted": self.accepted, "missed": list(self.missed)}
+        values["diagnostics"] = [one.model_dump() for one in self.diagnostics]
         return values | self._single() | {"warnings": list(self.warnings), "seconds": self.seconds}
 
     def _single(self) -> dict[str, object]:
@@ -228,6 +234,11 @@ def evaluate(
         comparison=comparison,
         evaluated=evaluated,
         missed=tuple(sentence for figures in judged for sentence in settings.limits.missed_by(figures)),
+        diagnostics=tuple(
+            diagnostic
+            for figures in judged
+            for diagnostic in _diagnostics(loaded[figures.name], figures, rows, settings.fit_frame)
+        ),
         warnings=(
             *_warnings(comparison, evaluated, settings.fit_frame),
             *(sentence for model in loaded.values() for sentence in condition_warnings(model, rows)),
@@ -300,6 +311,18 @@ def _with_references(
             model = nominal_model(first, turned) if label == "nominal" else geometric_model(identified)
         models[label] = model
     return models
+
+
+def _diagnostics(
+    model: CalibratedModel, figures: ModelFigures, rows: Measurements, fit_frame: bool
+) -> Iterator[Diagnostic]:
+    """Say why the errors of a model are too large to be those of a calibrated robot, where they are."""
+    if is_implausible(figures, model):
+        nominal = nominal_model(model, rows.rotation is not None)
+        faults = find_setup_faults(model, nominal, rows, fit_frame)
+        sentence = either(faults).sentence if faults else unexplained(model)
+        kind = "setup_fault" if faults else "implausible_errors"
+        yield Diagnostic(kind=kind, severity="implausible", sentence=f"{figures.name}: {sentence}")
 
 
 def _warnings(

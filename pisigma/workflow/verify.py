@@ -19,9 +19,8 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.verification.cause import length_text
-from pisigma.verification.explanations import PLAUSIBLE_SHARE
 from pisigma.verification.setup_fault import SetupFault
-from pisigma.verification.setup_faults import find_setup_faults
+from pisigma.verification.setup_faults import find_setup_faults, is_implausible, unexplained
 from pisigma.workflow.evaluate import test_rows
 
 FEWEST_CONFIGURATIONS = 6
@@ -158,7 +157,7 @@ def verify(
     models[CORRECTED] = loaded
     resamples = int(np.clip(MOST_DRAWN // max(rows.rows, 1), *RESAMPLES))
     comparison = compare_models(models, rows, Bootstrap(resamples, settings.seed), settings.fit_frame)
-    faults = _setup_faults(loaded, models[NOMINAL], rows, settings.fit_frame)
+    faults = find_setup_faults(loaded, models[NOMINAL], rows, settings.fit_frame)
     nominal, corrected = comparison.models[0].position, comparison.models[-1].position
     mean = nominal.statistics["mean"]
     ratio = corrected.statistics["mean"] / mean if mean > 0 else float("nan")
@@ -181,17 +180,6 @@ def verify(
     )
 
 
-@torch.no_grad()
-def _setup_faults(
-    model: CalibratedModel, nominal: CalibratedModel, rows: Measurements, fit_frame: bool
-) -> tuple[SetupFault, ...]:
-    """Find setup faults; a moved frame is none where frames are fitted anew."""
-    if fit_frame:
-        rows = replace(rows, frame=(next(iter(model.bases), ""),) * rows.rows)
-    faults = find_setup_faults(model, nominal, rows)
-    return tuple(fault for fault in faults if not (fit_frame and fault.kinds == ("frame",)))
-
-
 def _verdict(
     model: CalibratedModel,
     comparison: ModelComparison,
@@ -199,8 +187,7 @@ def _verdict(
     ratio: float,
     faults: Sequence[SetupFault],
 ) -> Verdict:
-    smaller = min(comparison.models[i].position.statistics["rms"] for i in (0, -1)) * 1e-3
-    too_large = smaller > PLAUSIBLE_SHARE * model.robot.reach > 0
+    too_large = all(is_implausible(comparison.models[i], model) for i in (0, -1))
     interval = difference.intervals["mean"]
     verdict: Verdict = "undecided"
     if comparison.configurations >= FEWEST_CONFIGURATIONS and interval is not None:
@@ -209,9 +196,18 @@ def _verdict(
             verdict = "better"
         elif low > 0 or low == high == 0:
             verdict = "not_better"
-    if faults and (too_large or (verdict != "not_better" and not ratio <= HALVED)):
+    turned = any(fault.explains_orientation for fault in faults) and not _turn_ratio(comparison) <= HALVED
+    if faults and (too_large or turned or (verdict != "not_better" and not ratio <= HALVED)):
         return "setup_fault"
     return "implausible" if too_large else verdict
+
+
+def _turn_ratio(comparison: ModelComparison) -> float:
+    """Divide the mean orientation error of the corrected model by that of the nominal robot; NaN without any."""
+    nominal, corrected = (comparison.models[i].orientation for i in (0, -1))
+    if nominal is None or corrected is None or not nominal.statistics["mean"] > 0:
+        return float("nan")
+    return corrected.statistics["mean"] / nominal.statistics["mean"]
 
 
 def _sentence(
@@ -226,6 +222,10 @@ def _sentence(
     figures = f"the mean error is {means[0]} instead of {means[1]}"
     if np.isfinite(ratio):
         figures += f" (ratio {ratio:.3g})"
+    turns = [comparison.models[i].orientation for i in (-1, 0)]
+    if verdict in ("setup_fault", "implausible") and None not in turns:
+        degrees = [turn.statistics["mean"] for turn in turns if turn is not None]
+        figures += f", that of orientations {degrees[0]:.3g} deg instead of {degrees[1]:.3g} deg"
     if verdict == "setup_fault":
         fault = next((fault for fault in faults if np.isfinite(fault.after_nominal)), None)
         if fault is not None:
@@ -270,11 +270,6 @@ def _warnings(
             f"{corrected.rows_not_predicted} rows lie so far outside the domain that nothing is predicted; they do "
             "not count."
         )
-    limit = PLAUSIBLE_SHARE * model.robot.reach
-    if not faults and corrected.position.statistics["rms"] * 1e-3 > limit:
-        warnings.append(
-            f"Errors of more than {limit * 1e3:.3g} mm are no calibration errors, but no usual setup fault (frame, "
-            "tool, units, order, signs and zeros of the joints, correction applied twice or not at all) explains them; "
-            "check whether this robot was measured, and whether the rows belong together."
-        )
+    if not faults and is_implausible(corrected, model):
+        warnings.append(unexplained(model))
     return warnings
