@@ -13,6 +13,7 @@ from pisigma.judging.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import numbers_of_names
 from pisigma.robot.description import Robot
 from pisigma.verification.arm import PredictingArm
 from pisigma.verification.cause import Cause
@@ -21,7 +22,7 @@ from pisigma.verification.free_joint import freed_joints
 from pisigma.verification.hypothesis import Hypothesis
 from pisigma.verification.row_faults import MARGIN, explains_nothing, shifted_rows
 from pisigma.verification.setup_fault import SetupFault, fault_of
-from pisigma.verification.target_faults import better_labellings, fitted_poses
+from pisigma.verification.target_faults import better_labellings, fit_targets
 
 MOST_ROWS = 1_000
 """Rows that explanations are tried on, spread over all of them."""
@@ -71,27 +72,29 @@ def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[Setu
     faults = simplest(tried, most)
     if not faults and not are_unrelated(robot, rows):
         freed = ((q, measured, cause) for q, cause in freed_joints(arm, some, measured))
-        faults = simplest(_with_joints(arm, freed, most, values=1) + _labelled(robot, rows), most)
+        faults = simplest(_with_joints(arm, freed, most, values=1) + _labelled(robot, some, measured), most)
     return tuple(fault_of(here, other, float("nan")) for other in faults)
 
 
 def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> tuple[SetupFault, ...]:
     """Find better names for the targets of the frame that most rows are of, where errors are larger than usual [m]."""
     rows = largest_group(measurements, by_target=False)
-    here = Hypothesis(rows.q, fitted_poses(robot, rows), MeasuredPoses.of(rows, LEVER_SHARE * robot.reach))
+    rows = rows.select(spread(torch.arange(rows.rows), MOST_ROWS))
+    measured, T = MeasuredPoses.of(rows, LEVER_SHARE * robot.reach), forward_kinematics(robot, rows.q)
+    here = Hypothesis(rows.q, fit_targets(T, measured, numbers_of_names(rows.target))[1], measured)
     if not here.error > usual:
         return ()
-    named = simplest(_labelled(robot, rows), largest_explained(here, robot.reach))
-    return tuple(fault_of(here, other, float("nan")) for other in named)
+    most = largest_explained(here, robot.reach)
+    return tuple(
+        fault_of(here, other, float("nan")) for other in simplest(_labelled(robot, rows, measured), most)
+    )
 
 
-def _labelled(robot: Robot, rows: Measurements) -> list[Hypothesis]:
+def _labelled(robot: Robot, rows: Measurements, measured: MeasuredPoses) -> list[Hypothesis]:
     """Make hypotheses of other names of targets."""
-    some = rows.select(spread(torch.arange(rows.rows), MOST_ROWS))
-    measured = MeasuredPoses.of(some, LEVER_SHARE * robot.reach)
     return [
-        Hypothesis(some.q, one.T, measured, (one.cause,), 3 * one.targets)
-        for one in better_labellings(robot, some)
+        Hypothesis(rows.q, one.T, measured, (one.cause,), 3 * one.targets)
+        for one in better_labellings(robot, rows, measured)
     ]
 
 

@@ -19,6 +19,8 @@ from pisigma.verification.arm import PredictingArm
 from pisigma.verification.cause import Cause
 
 ROUNDS = 30
+TRIED, HOPELESS = 8, 0.25
+"""After so many rounds the search is given up where this share of the cost is left."""
 SETTLED = 1e-3
 """The search ends when a step lowers the cost by less than this share."""
 STILL = 1e-3
@@ -57,19 +59,22 @@ def _freed(
         q[:, joint] = q[:, joint].median()
     frames = best_base_and_tool(arm.poses(replace(rows, q=q)), measured)
     cost, damping = torch.tensor(torch.inf).double(), torch.tensor(1e-3).double()
-    tried = q, frames
-    for _ in range(ROUNDS):
+    tried, first = (q, frames), cost
+    for number in range(ROUNDS):
         turned, free = _turned(arm, rows, joint, tried[0], tried[1], measured)
         T = arm.poses(replace(rows, q=turned))
         error = measured.squares(tried[1][0] @ T @ tried[1][1]).sum()
         if error < cost:
             settled = bool(cost - error < SETTLED * cost)
+            first = error if number == 0 else first
             q, frames, cost, damping = turned, tried[1], error, damping / 10
             here = T, free
             if settled:
                 break
         else:
             damping = damping * 10
+        if number >= TRIED and cost > HOPELESS * first:
+            break
         step = base_and_tool_step(here[0], measured, *frames, damping, here[1])
         tried = q, moved_base_and_tool(*frames, step)
     return q

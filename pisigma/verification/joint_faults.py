@@ -115,9 +115,15 @@ def other_units(robot: Robot) -> JointMaps:
     return JointMaps.scaled(torch.tensor(rows, dtype=torch.float64).reshape(len(rows), robot.dof))
 
 
-def quarter_turned_zeros(robot: Robot) -> JointMaps:
-    """List zeros moved by quarter turns of any joints that turn; of one joint at a time where these are too many."""
+def quarter_turned_zeros(robot: Robot, inner: bool = False) -> JointMaps:
+    """List zeros moved by quarter turns of any joints that turn; of one joint at a time where these are too many.
+
+    Args:
+        robot: with the joints.
+        inner: leave out the first and the last joint, whose zeros a base and a tool that are fitted take up.
+    """
     turning = [i for i, revolute in enumerate(robot.revolute) if revolute]
+    turning = [i for i in turning if not inner or 0 < i < robot.dof - 1]
     if 4 ** len(turning) <= MOST_ZEROS:
         choices = np.array(list(itertools.product((0, 1, 2, -1), repeat=len(turning)))[1:])
     else:
@@ -233,7 +239,7 @@ def likely_maps(arm: PredictingArm, measurements: Measurements, measured: Measur
         reversed_signs(robot.dof),
         other_orders(robot.dof),
         coupled_joints(robot.dof),
-        quarter_turned_zeros(robot),
+        quarter_turned_zeros(robot, inner=arm.model is None),
     )
     tried = [(maps, errors_of(maps)) for maps in kinds]
     unchanged = errors_of(JointMaps.unchanged(1, robot.dof))[:, 0].tolist()

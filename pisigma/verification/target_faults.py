@@ -1,27 +1,28 @@
 """Setup faults of targets: several reflectors under one name, or rows under the name of another one."""
 
+import math
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
-import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
+from pisigma.judging.frame_fits import MeasuredPoses, best_base_and_tool
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.robot.description import Robot
-from pisigma.se3 import transform_from_xyzrpy
 from pisigma.verification.cause import Cause, joined
 
 MOST_TARGETS = 4
 """Targets that are looked for under one name."""
 EXAMPLES = 3
 """Rows that are named, at most."""
-ITERATIONS = 10
-"""Of every fit of base and targets, at most."""
+TURNS = 20
+"""Turns of fitting base and targets, at most."""
+SETTLED = 1e-2
+"""They end where a turn lowers the mean square by less than this share."""
 ROUNDS = 8
 """Rounds of naming every row after the nearest target and fitting base and targets anew, at most."""
 
@@ -41,27 +42,58 @@ class Labelling:
     targets: int
 
 
-def better_labellings(robot: Robot, rows: Measurements) -> Iterator[Labelling]:
+def better_labellings(robot: Robot, rows: Measurements, measured: MeasuredPoses) -> Iterator[Labelling]:
     """Find targets from the measurements alone: points of the tool that the measured positions cluster about.
 
-    As k-means, but base and targets are fitted to all rows in every round (see `fit_base_and_tool`). With several
-    names there are as many targets, and each keeps the name that most of its rows have; with one name there are 2,
-    then 3, up to `MOST_TARGETS`.
+    As k-means, but base and targets are fitted to all rows in every round. With several names there are as many
+    targets, and each keeps the name that most of its rows have; with one name there are 2, then 3, up to
+    `MOST_TARGETS`.
 
     Args:
         robot: as drawn.
         rows: with positions, of one frame.
+        measured: their poses.
     """
     names = tuple(dict.fromkeys(rows.target))
+    T = forward_kinematics(robot, rows.q)
     for count in range(2, MOST_TARGETS + 1) if len(names) == 1 else (len(names),):
-        number, T = _clustered(robot, rows, count)
+        number, poses = _clustered(T, measured, count)
         cause = _one_name(rows, number) if len(names) == 1 else _other_names(rows, number, names)
-        yield Labelling(cause, T, count)
+        yield Labelling(cause, poses, count)
 
 
-def fitted_poses(robot: Robot, rows: Measurements) -> Float64[Tensor, "rows 4 4"]:
-    """Predict the poses of targets with base and tools fitted under the names of the file."""
-    return _fitted(robot, rows, numbers_of_names(rows.target))[1]
+def fit_targets(
+    T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses, number: Int64[Tensor, " rows"]
+) -> tuple[Float64[Tensor, "4 4"], Float64[Tensor, "rows 4 4"]]:
+    """Fit base and targets to measured poses by turns: base and the targets' mean, then every target's place.
+
+    Args:
+        T: predicted poses, with any base and tool.
+        measured: what was measured there.
+        number: of every row's target, 0 and up.
+
+    Returns:
+        The base, and the poses that are predicted with it.
+    """
+    places = torch.zeros(int(number.max()) + 1, 3).to(T)
+    last = math.inf
+    for _ in range(TURNS):
+        of_rows = T.clone()
+        of_rows[:, :3, 3] += (T[:, :3, :3] @ places[number][..., None])[..., 0]
+        base, tool = best_base_and_tool(of_rows, measured)
+        fitted = base @ of_rows @ tool
+        error = float(measured.squares(fitted).mean())
+        if error > (1 - SETTLED) * last:
+            break
+        last = error
+        points = _behind(base @ T, measured)
+        places = torch.stack([points[number == k].mean(0) for k in range(len(places))])
+    return base, fitted
+
+
+def _behind(T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses) -> Float64[Tensor, "rows 3"]:
+    """Give measured positions as predicted poses see them [m]."""
+    return (T[:, :3, :3].mT @ (measured.position - T[:, :3, 3])[..., None])[..., 0]
 
 
 def _one_name(rows: Measurements, number: Int64[Tensor, " rows"]) -> Cause:
@@ -69,7 +101,10 @@ def _one_name(rows: Measurements, number: Int64[Tensor, " rows"]) -> Cause:
     first = [_where(rows, int((number == k).nonzero()[0, 0])) for k in used]
     clause = f"the rows are of {len(used)} targets under one name ({joined(map(str, sizes.tolist()))} rows)"
     return Cause(
-        "target", clause, f"name the targets in a column 'target'; they begin at {joined(first)}", 2.0
+        "target",
+        clause,
+        f"name the targets in a column 'target'; they begin in {joined(first)}",
+        float(len(used)),
     )
 
 
@@ -92,33 +127,23 @@ def _where(rows: Measurements, row: int) -> str:
 
 
 def _clustered(
-    robot: Robot, rows: Measurements, count: int
+    T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses, count: int
 ) -> tuple[Int64[Tensor, " rows"], Float64[Tensor, "rows 4 4"]]:
     """Cluster the points of the tool that were measured; returns their numbers and the predicted poses."""
-    points, _ = _fitted(robot, rows, torch.zeros(rows.rows))
+    number = torch.zeros(len(T), dtype=torch.int64)
+    base, tool = best_base_and_tool(T, measured)
+    points, fitted = _behind(base @ T, measured), base @ T @ tool
     centres = points.median(0).values[None]
     for _ in range(count):
-        far = torch.cdist(points, centres).amin(1).topk(max(1, rows.rows // (4 * count))).indices
+        far = torch.cdist(points, centres).amin(1).topk(max(1, len(T) // (4 * count))).indices
         centres = torch.cat([centres, points[far].median(0).values[None]])
-    number = torch.cdist(points, centres[1:]).argmin(1)
+    centres = centres[1:]
     for _ in range(ROUNDS):
-        points, T = _fitted(robot, rows, number)
-        used, index = torch.unique(number, return_inverse=True)
-        centres = torch.stack([points[index == k].median(0).values for k in range(len(used))])
-        nearest = used[torch.cdist(points, centres).argmin(1)]
+        nearest = torch.cdist(points, centres).argmin(1)
         if bool((nearest == number).all()):
             break
-        number = nearest
-    return number, T
-
-
-def _fitted(
-    robot: Robot, rows: Measurements, number: Tensor
-) -> tuple[Float64[Tensor, "rows 3"], Float64[Tensor, "rows 4 4"]]:
-    """Fit base and targets; returns where the measured points are behind the last row [m], and the predicted poses."""
-    names = tuple(str(int(k)) for k in number)
-    fit = fit_base_and_tool(robot, replace(rows, target=names), maximum_iterations=ITERATIONS)
-    T = forward_kinematics(fit.robot.with_geometry(tool=np.zeros(6)), rows.q)
-    assert rows.position is not None
-    points = (T[:, :3, :3].mT @ (rows.position - T[:, :3, 3])[..., None])[..., 0]
-    return points, T @ transform_from_xyzrpy(torch.from_numpy(np.stack([fit.tools[name] for name in names])))
+        number = torch.unique(nearest, return_inverse=True)[1]
+        base, fitted = fit_targets(T, measured, number)
+        points = _behind(base @ T, measured)
+        centres = torch.stack([points[number == k].median(0).values for k in range(int(number.max()) + 1)])
+    return number, fitted
