@@ -20,6 +20,8 @@ on the pose."""
 SMALLEST_SHARE = 0.1
 """Of fewer rows the robust loss takes care, which names them as outliers."""
 ROUNDS = 200
+FLOOR = 1e-6
+"""Of a standard deviation, as a share of the largest residual."""
 
 
 @dataclass(frozen=True)
@@ -27,26 +29,29 @@ class Mixture:
     """Two normal populations of residuals.
 
     Attributes:
-        share: of the population that is farther off, or of the smaller one where both are equally far.
-        distance: between the means [m or rad].
-        sigma: standard deviations of a component, the smaller first [m or rad].
+        share: of the population that scatters more, or of the smaller one where both scatter alike.
+        off: RMS of that population's distance from the mean of the other, per component [m or rad].
+        scatter: RMS of the other's distance from its mean, per component [m or rad].
+        ratio: of the standard deviations, as a mean over all directions.
+        separation: distance between the means, in standard deviations of the population that scatters more.
         log_bayes_factor: against one population, by the Bayesian information criterion (Schwarz 1978, Annals of
             Statistics 6, 461-464).
     """
 
     share: float
-    distance: float
-    sigma: tuple[float, float]
+    off: float
+    scatter: float
+    ratio: float
+    separation: float
     log_bayes_factor: float
 
     @property
     def apart(self) -> bool:
         """Whether these are two populations, and not the shape of one."""
-        low, high = self.sigma
         return (
             self.log_bayes_factor > math.log(100.0)
             and min(self.share, 1 - self.share) >= SMALLEST_SHARE
-            and max(high / low, self.distance / high) > APART
+            and max(self.ratio, self.separation) > APART
         )
 
 
@@ -64,7 +69,7 @@ class TwoPopulationsCheck(AbstractCheck):
             if len(residuals) < FEWEST or not (fit := two_populations(residuals)).apart:
                 continue
             unit = "mm" if SENSORS[sensor].unit == "m" else "mrad"
-            size, scatter = max(fit.distance, fit.sigma[1]) * 1e3, fit.sigma[0] * 1e3
+            size, scatter = fit.off * 1e3, fit.scatter * 1e3
             yield Diagnostic(
                 kind="two_populations",
                 severity="warning",
@@ -75,39 +80,36 @@ class TwoPopulationsCheck(AbstractCheck):
 
 
 def two_populations(residuals: Float64[np.ndarray, "rows components"]) -> Mixture:
-    """Fit two isotropic normal populations by expectation maximisation, from the ends of the residuals' longest axis.
+    """Fit two normal populations by expectation maximisation, from the ends of the residuals' longest axis.
 
     Args:
         residuals: of one sensor [m or rad].
     """
     rows, components = residuals.shape
-    floor = 1e-12 * float(np.square(residuals).max()) + 1e-30
     centred = residuals - residuals.mean(0)
+    floor = (FLOOR * np.abs(centred).max() + 1e-15) ** 2 * np.eye(components)
     key = centred @ np.linalg.svd(centred, full_matrices=False)[2][0]
     weight = (key > np.median(key)).astype(float)
     for _ in range(ROUNDS):
-        shares = np.array([1 - weight.mean(), weight.mean()]).clip(1e-9)
         members = np.stack([1 - weight, weight])
         counts = members.sum(1).clip(1e-9)
         means = members @ residuals / counts[:, None]
-        squares = np.square(residuals - means[:, None]).sum(2)
-        variances = (members * squares).sum(1) / counts / components + floor
-        logs = (
-            np.log(shares)[:, None]
-            - components / 2 * np.log(variances)[:, None]
-            - squares / variances[:, None] / 2
-        )
+        off = residuals - means[:, None]
+        covariances = np.einsum("kn,kni,knj->kij", members, off, off) / counts[:, None, None] + floor
+        squares = np.einsum("kni,kij,knj->kn", off, np.linalg.inv(covariances), off)
+        determinants = np.linalg.slogdet(covariances)[1]
+        logs = (np.log(counts / rows) - determinants / 2)[:, None] - squares / 2
         weight = 1 / (1 + np.exp((logs[0] - logs[1]).clip(-500, 500)))
-    variance = np.square(centred).sum() / rows / components + floor
-    gain = np.logaddexp(*logs).sum() + rows * components / 2 * (np.log(variance) + 1)
-    far = (
-        int(variances[1] > variances[0])
-        if max(variances) > 2 * min(variances)
-        else int(shares[1] < shares[0])
-    )
+    alone = np.linalg.slogdet(centred.T @ centred / rows + floor)[1]
+    gain = np.logaddexp(*logs).sum() + rows / 2 * (alone + components)
+    ratio = math.exp(abs(determinants[1] - determinants[0]) / 2 / components)
+    far = int(np.argmax(determinants) if ratio > 2 else np.argmin(counts))
+    wide, apart = int(np.argmax(determinants)), means[1] - means[0]
     return Mixture(
-        float(shares[far]),
-        float(np.linalg.norm(means[1] - means[0])),
-        (float(min(variances)) ** 0.5, float(max(variances)) ** 0.5),
-        float(gain) - (components + 2) / 2 * math.log(rows),
+        share=float(counts[far] / rows),
+        off=float(np.average(np.square(off[1 - far]).mean(1), weights=members[far])) ** 0.5,
+        scatter=float(np.trace(covariances[1 - far]) / components) ** 0.5,
+        ratio=ratio,
+        separation=float(apart @ np.linalg.solve(covariances[wide], apart)) ** 0.5,
+        log_bayes_factor=float(gain) - (components + 1) * (components + 2) / 4 * math.log(rows),
     )
