@@ -81,7 +81,11 @@ def progress_of(title: str) -> Iterator[Callable[[str], None]]:
     from rich.console import Console
     from rich.text import Text
 
-    status = Console(stderr=True).status(Text(title))
+    console = Console(stderr=True)
+    if not console.is_terminal:  # nobody watches
+        yield lambda what: None
+        return
+    status = console.status(Text(title))
 
     def tell(what: str) -> None:
         status.update(Text(printable(f"{title}: {what}")))

@@ -132,6 +132,20 @@ def test_a_full_disk_for_the_standard_output(arguments):
     )
 
 
+def test_a_full_disk_for_the_standard_error(models, tmp_path):
+    with open("/dev/full", "w") as full:
+        arguments = ("export", models / "kiro3", "--format", "onnx", "--out", tmp_path / "x.onnx")
+        done = subprocess.run(
+            [sys.executable, "-c", START, *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=full,
+            text=True,
+            check=False,
+        )
+    assert (tmp_path / "x.onnx").is_file()
+    assert done.returncode == 0
+
+
 def test_nobody_reads_what_is_printed():
     reading, writing = os.pipe()
     os.close(reading)

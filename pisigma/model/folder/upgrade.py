@@ -76,7 +76,7 @@ class Upgrade:
 def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
     """Rewrite a model folder of an earlier version in the form of this one, whole or not at all.
 
-    Tensors, figures and tables stay as they are, and so does the card but for what is not true any more; the
+    Tensors, figures and all other files stay as they are, and so does the card but for what is not true any more; the
     file for the compiled kernels is made again.
 
     Args:
@@ -98,10 +98,10 @@ def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
     if "uncertainty" in document:
         document["uncertainty"] = _without_turns(_renamed(document["uncertainty"]), path)
     changes = (*_without_fade(document), *_with_measured_conditions(document))
-    with staged_folder(path, overwrite=True) as scratch:
-        for name in sorted(MODEL_FILES - {COMPILED}):
-            if (path / name).exists():
-                (scratch / name).write_bytes(read_model_file(path, name))
+    others = {entry.name for entry in path.iterdir() if entry.is_file()} - {COMPILED}
+    with staged_folder(path, overwrite=True, names=MODEL_FILES | others) as scratch:
+        for name in sorted(others):
+            (scratch / name).write_bytes(read_model_file(path, name))
         if changes and (card := scratch / CARD).is_file():
             card.write_bytes(_FADED.sub(_EXTRAPOLATED, card.read_bytes()))
         text = document_text(

@@ -12,7 +12,7 @@ from testing.identified import hybrid_model
 from testing.models import hand_made_model
 from testing.report import hybrid_under_test
 
-from pisigma.errors import ModelError
+from pisigma.errors import ModelError, OutputError
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
@@ -84,6 +84,18 @@ def test_a_hybrid_calibration_comes_back_with_all_figures(tmp_path):
     before = (tmp_path / "arm" / "model.yaml").read_bytes()
     assert upgrade_folder(tmp_path / "arm") == Upgrade("arm", 4, 4)
     assert (tmp_path / "arm" / "model.yaml").read_bytes() == before
+
+
+def test_what_else_lies_in_a_folder_is_kept(tmp_path):
+    _, model = hybrid_under_test()
+    write_old(model, tmp_path / "arm")
+    (tmp_path / "arm" / "notes.txt").write_text("mine")
+    (tmp_path / "arm" / ".git").mkdir()
+    with pytest.raises(OutputError, match=r"holds a model, but also '\.git'"):
+        upgrade_folder(tmp_path / "arm")
+    (tmp_path / "arm" / ".git").rmdir()
+    upgrade_folder(tmp_path / "arm")
+    assert (tmp_path / "arm" / "notes.txt").read_text() == "mine"
 
 
 def test_product_units_of_an_earlier_version_are_refused_and_nothing_is_changed(tmp_path):
