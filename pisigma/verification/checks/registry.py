@@ -11,6 +11,7 @@ from pisigma.verification.checks.scale import ScaleCheck
 from pisigma.verification.checks.search import SearchCheck
 from pisigma.verification.checks.setup_fault import SetupFaultCheck
 from pisigma.verification.checks.stated_noise import StatedNoiseCheck
+from pisigma.verification.checks.temperature import TemperatureCheck
 from pisigma.verification.checks.two_populations import TwoPopulationsCheck
 
 CHECKS: tuple[AbstractCheck, ...] = (
@@ -24,6 +25,7 @@ CHECKS: tuple[AbstractCheck, ...] = (
     StatedNoiseCheck(),
     TwoPopulationsCheck(),
     FewRowsCheck(),
+    TemperatureCheck(),
 )
 """In the order in which their diagnostics are printed."""
 
