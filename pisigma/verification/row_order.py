@@ -40,8 +40,8 @@ class Motion:
         rows: numbers of its rows in the measurements, in the order of the file.
         first: index in `rows` of the first row that moved; None where it moves slowly all the time.
         shift: mean shift of the measured points after the motion [m], in their frame, or of a tool in that of the
-            flange; of a slow motion the largest one.
-        turn: angle by which frame or tool are turned [rad]; of a slow motion the largest one.
+            flange; of a slow motion the largest one since the first row.
+        turn: angle by which frame or tool are turned [rad]; of a slow motion likewise.
         log_bayes_factor: logarithm of the odds of the motion against none, if both were as likely before.
         factor: how many times as large as without the motion the errors of the rows are.
     """
@@ -294,9 +294,8 @@ class _Search:
         left = (weight * fit.after[candidate.index] ** 2).sum(0) / np.maximum(weight.sum(0), 1e-300)
         parts = zip(_sensors(fit.shifts.var(0)[None]), _sensors(left[None]), strict=True)
         factor = max(math.sqrt(1 + added.sum() / max(rest.sum(), 1e-300)) for added, rest in parts)
-        whole = candidate.course @ fit.motion.reshape(
-            -1, candidate.full.shape[2]
-        )  # what every row has made of it
+        course = candidate.course - candidate.course[0]
+        whole = course @ fit.motion.reshape(-1, candidate.full.shape[2])  # what every row has made of it
         largest = whole[np.linalg.norm(candidate.full[:, :3] @ whole[..., None], axis=(1, 2)).argmax()]
         shift, turn = largest[:3], largest[:2:-1]  # about x, y, z, stored as roll, pitch, yaw
         names = self.rows.problem.space.targets
