@@ -75,6 +75,14 @@ class MeasuredPoses:
         """Number of independent numbers that were measured."""
         return 3 * len(self.position) + 3 * int(self.has_rotation.sum())
 
+    @property
+    def spread(self) -> float:
+        """Root mean square distance [m] from the mean pose, as `squares` measures it."""
+        off = (self.position - self.position.mean(0)).square().sum(-1).mean()
+        R = self.rotation[self.has_rotation]
+        turn = (3 - R.mean(0).square().sum()) / 2 if len(R) else torch.zeros(())
+        return float((off + self.lever**2 * turn * self.has_rotation.double().mean()).sqrt())
+
     def squares(self, T: Float64[Tensor, "*batch rows 4 4"]) -> Float64[Tensor, "*batch rows"]:
         """Compute squared errors `|dp|² + lever² |dR|² / 2` [m²] of poses; |dR|²/2 is about the angle squared."""
         off = (self.position - T[..., :3, 3]).square().sum(-1)

@@ -56,8 +56,13 @@ def largest_explained(here: Hypothesis, reach: float) -> float:
 
 
 def simplest(hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:
-    """Choose the simplest of the hypotheses that explain the errors, to `most` [m] at least, about equally well."""
-    explaining = [other for other in hypotheses if other.error <= most]
+    """Choose the simplest of the hypotheses that explain the errors, to `most` [m] at least, about equally well.
+
+    What is left must be small beside the spread of the poses too, which millimetres that are taken for metres shrink.
+    """
+    explaining = [
+        other for other in hypotheses if other.error <= min(most, COLLAPSED * other.measured.spread)
+    ]
     best = min((other.error for other in explaining), default=0.0)
     explaining = [other for other in explaining if other.error <= AS_GOOD * best]
     simplest = min((other.size for other in explaining), default=0.0)
