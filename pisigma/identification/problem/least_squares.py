@@ -16,6 +16,8 @@ Point = TypeVar("Point")
 START_DAMPING = 1e-3
 SMALLEST_DAMPING = 1e-9
 LARGEST_DAMPING = 1e12
+SWINGING = 50
+"""Steps after which the noise stays as it is: few rows may let it swing between two estimates for ever."""
 PATIENCE = 2
 """Steps that may raise the cost before the search goes back."""
 SHORTEST_STEP = 1e-3
@@ -138,7 +140,7 @@ def levenberg_marquardt(
         iterations += 1
         there = problem.linearise(problem.moved(here.point, step), best)
         if there.cost <= best.cost:
-            best, settled = problem.renewed(there)
+            best, settled = problem.renewed(there) if iterations <= SWINGING else (there, True)
             here, uphill, damping = best, 0, max(damping / 10, SMALLEST_DAMPING)
             path.append(best)
             if best.misfit <= best.rounding:

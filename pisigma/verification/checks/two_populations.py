@@ -14,9 +14,8 @@ from pisigma.verification.checks.check import AbstractCheck, CheckedCalibration
 FEWEST = 20
 """With fewer rows two populations of three components each are not told apart."""
 APART = 4.0
-"""Populations whose means are so many standard deviations apart, or whose standard deviations have this ratio, are two.
-What a calibration leaves of healthy robots is a mixture with ratios of up to 2.5, because the unexplained errors depend
-on the pose."""
+"""Rows that are so many times as far off as the others scatter are others. What a calibration leaves of healthy robots
+is a mixture with ratios of up to 2.5, because the unexplained errors depend on the pose."""
 SMALLEST_SHARE = 0.1
 """Of fewer rows the robust loss takes care, which names them as outliers."""
 ROUNDS = 200
@@ -32,8 +31,6 @@ class Mixture:
         share: of the population that scatters more, or of the smaller one where both scatter alike.
         off: RMS of that population's distance from the mean of the other, per component [m or rad].
         scatter: RMS of the other's distance from its mean, per component [m or rad].
-        ratio: of the standard deviations, as a mean over all directions.
-        separation: distance between the means, in standard deviations of the population that scatters more.
         log_bayes_factor: against one population, by the Bayesian information criterion (Schwarz 1978, Annals of
             Statistics 6, 461-464).
     """
@@ -41,8 +38,6 @@ class Mixture:
     share: float
     off: float
     scatter: float
-    ratio: float
-    separation: float
     log_bayes_factor: float
 
     @property
@@ -51,7 +46,7 @@ class Mixture:
         return (
             self.log_bayes_factor > math.log(100.0)
             and min(self.share, 1 - self.share) >= SMALLEST_SHARE
-            and max(self.ratio, self.separation) > APART
+            and self.off > APART * self.scatter
         )
 
 
@@ -102,14 +97,11 @@ def two_populations(residuals: Float64[np.ndarray, "rows components"]) -> Mixtur
         weight = 1 / (1 + np.exp((logs[0] - logs[1]).clip(-500, 500)))
     alone = np.linalg.slogdet(centred.T @ centred / rows + floor)[1]
     gain = np.logaddexp(*logs).sum() + rows / 2 * (alone + components)
-    ratio = math.exp(abs(determinants[1] - determinants[0]) / 2 / components)
-    far = int(np.argmax(determinants) if ratio > 2 else np.argmin(counts))
-    wide, apart = int(np.argmax(determinants)), means[1] - means[0]
+    alike = abs(determinants[1] - determinants[0]) < 2 * components * math.log(2.0)
+    far = int(np.argmin(counts) if alike else np.argmax(determinants))
     return Mixture(
         share=float(counts[far] / rows),
         off=float(np.average(np.square(off[1 - far]).mean(1), weights=members[far])) ** 0.5,
         scatter=float(np.trace(covariances[1 - far]) / components) ** 0.5,
-        ratio=ratio,
-        separation=float(apart @ np.linalg.solve(covariances[wide], apart)) ** 0.5,
         log_bayes_factor=float(gain) - (components + 1) * (components + 2) / 4 * math.log(rows),
     )

@@ -1,10 +1,11 @@
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pytest
 import torch
 from testing.closeness import assert_close
 
 from pisigma.identification.problem.least_squares import (
+    SWINGING,
     AbstractLeastSquares,
     Linearisation,
     SolutionStatus,
@@ -43,6 +44,30 @@ class Curve(AbstractLeastSquares[torch.Tensor]):
         return torch.ones(2, dtype=torch.float64)
 
 
+class Swinging(AbstractLeastSquares[torch.Tensor]):
+    """A length measured by two sensors, of which now one and now the other is believed."""
+
+    def linearise(
+        self, point: torch.Tensor, like: Linearisation[torch.Tensor] | None
+    ) -> Linearisation[torch.Tensor]:
+        believed = 1.0 if like is None else float(like.detail)
+        r = torch.stack([point[0] - believed, torch.ones(()).double()])
+        return Linearisation(
+            point, float(r @ r), -r[:1], torch.eye(1).double(), float(r @ r), 1e-10, believed
+        )
+
+    def renewed(self, linearisation: Linearisation[torch.Tensor]) -> tuple[Linearisation[torch.Tensor], bool]:
+        other = replace(linearisation, detail=-float(linearisation.detail))
+        return self.linearise(linearisation.point, other), False
+
+    def moved(self, point: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
+        return point + step
+
+    @property
+    def step_scale(self) -> torch.Tensor:
+        return torch.ones(1, dtype=torch.float64)
+
+
 START = torch.tensor([-1.2, 1.0], dtype=torch.float64)
 
 
@@ -73,6 +98,13 @@ def test_the_iteration_limit_is_said() -> None:
     assert solution.status is SolutionStatus.ITERATION_LIMIT
     assert not solution.status.good
     assert "iteration limit" in solution.status.value
+
+
+def test_a_noise_that_swings_is_taken_as_it_is_in_the_end() -> None:
+    solution = levenberg_marquardt(Swinging(), torch.zeros(1, dtype=torch.float64), maximum_iterations=100)
+    assert solution.status is SolutionStatus.CONVERGED
+    assert SWINGING < solution.iterations < SWINGING + 10
+    assert_close(solution.linearisation.point.abs(), torch.ones(1), atol=1e-3)
 
 
 def test_the_search_can_go_on_from_a_linearisation() -> None:
