@@ -9,11 +9,15 @@ import textwrap
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
 from pisigma.errors import printable
+
+if TYPE_CHECKING:
+    from rich.table import Table
+    from rich.text import Text
 
 WIDTH_WITHOUT_TERMINAL = 80
 
@@ -46,7 +50,6 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
     Numbers and words are never cut: a table of too long ones is wider than the screen.
     """
     from rich.box import SIMPLE_HEAD
-    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
@@ -66,13 +69,7 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[str]
         narrowest += longest
     for row in rows:
         table.add_row(*(Text(cell) for cell in row))
-    console = Console(highlight=False)
-    console.width = max(width, narrowest)
-    with console.capture() as printed:
-        console.print(Text(printable(title, cut=False)), soft_wrap=True)
-        console.print(table)
-        console.print()
-    typer.echo(printed.get(), nl=False)
+    _print_rich(Text(printable(title, cut=False)), table, max(width, narrowest))
 
 
 @contextmanager
@@ -128,6 +125,19 @@ def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> s
                 text = Path(str(value)).name if parameter.name in files else str(value)
                 words += [parameter.opts[0], text]
     return printable(shlex.join(words), cut=False)
+
+
+def _print_rich(title: "Text", table: "Table", width: int) -> None:
+    """Print by way of a text: rich's own printing ends the process where nobody reads."""
+    from rich.console import Console
+
+    console = Console(highlight=False)
+    console.width = width
+    with console.capture() as printed:
+        console.print(title, soft_wrap=True)
+        console.print(table)
+        console.print()
+    typer.echo(printed.get(), nl=False)
 
 
 def _is_number(cell: str) -> bool:

@@ -72,7 +72,8 @@ def _check_content(
         )
     if not overwrite:
         raise OutputError(
-            f"{folder}: holds a model already; replace it with --overwrite or choose another --out."
+            f"{folder}: holds a model already; replace it with --overwrite (overwrite=True in Python) or choose "
+            "another --out."
         )
 
 
@@ -102,6 +103,9 @@ def staged_folder(
             yield scratch
             strange = {entry.name for entry in scratch.iterdir()} - set(names)
             assert not strange, f"{sorted(strange)} could not be replaced later: name them in MODEL_FILES"
+            _check_content(
+                folder, target, overwrite, names
+            )  # somebody may have put something there meanwhile
             _replace(scratch, target)
     except OSError as problem:
         raise _not_writable(folder, problem) from None

@@ -50,7 +50,7 @@ def sweep(target: Path) -> None:
     Args:
         target: what is to be written; without links.
     """
-    ours = re.compile(rf"\.{re.escape(target.name)}\.\w+(\{FILE}|\{FOLDER}|\{ASIDE})")
+    ours = re.compile(rf"\.{re.escape(target.name)}\.[a-z0-9_]{{8}}(\{FILE}|\{FOLDER}|\{ASIDE})")
     with contextlib.suppress(OSError):  # of a folder that cannot be read, nothing can be swept
         for path in [path for path in target.parent.iterdir() if ours.fullmatch(path.name)]:
             with _owned(path) as owned:

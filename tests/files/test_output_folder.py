@@ -220,7 +220,13 @@ def test_what_a_living_process_writes_is_not_swept(tmp_path):
 
 
 def test_only_scratch_of_ours_is_swept(tmp_path):
-    others = {".model.partial", ".model.a.b.partial", ".other.abc.partial", "model.abc.old", ".model.abc.txt"}
+    others = {
+        ".model.partial",
+        ".model.a.b.partial",
+        ".other.abc.partial",
+        ".model.backup.old",
+        ".model.abc.txt",
+    }
     for name in others:
         (tmp_path / name).mkdir()
     (tmp_path / ".model.abcdefgh.partial").mkdir()
@@ -235,3 +241,18 @@ def test_a_file_that_could_not_be_replaced_later_is_a_defect(tmp_path):
         staged_folder(tmp_path / "m") as scratch,
     ):
         (scratch / "plan.csv").write_text("")
+
+
+def test_what_somebody_puts_there_meanwhile_is_not_replaced(tmp_path):
+    write(tmp_path / "model")
+
+    def disturbed() -> None:
+        with staged_folder(tmp_path / "model", overwrite=True) as scratch:
+            save_model(hand_made_model("kiro4"), scratch)
+            (tmp_path / "model" / "notes.txt").write_text("mine")
+
+    with pytest.raises(OutputError, match=r"holds a model, but also 'notes\.txt'"):
+        disturbed()
+    assert (tmp_path / "model" / "notes.txt").read_text() == "mine"
+    assert load_model(tmp_path / "model").robot.name == "kiro3"
+    assert names(tmp_path) == ["model"]
