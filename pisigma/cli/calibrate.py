@@ -198,10 +198,7 @@ def print_calibration(
         )
     if summary.hybrid is not None:
         print_table("what was tried beyond the geometry", *tables.trial_table(summary.hybrid))
-    estimated = [row for row in summary.parameters if verbose or row.standard_error is not None]
-    rest = len(summary.parameters) - len(estimated)
-    title = f"estimated parameters ({rest} others are nominal: --verbose)" if rest else "parameters"
-    print_table(title, *tables.parameter_table(estimated))
+    _print_parameters(summary, verbose)
     print_line("What these data cannot determine:")
     print_lines((f"- {line}" for line in tables.undetermined_lines(summary)), indent="  ")
     count = len(summary.outliers)
@@ -225,6 +222,16 @@ def _print_accuracy(summary: "CalibrationSummary") -> None:
         if figures is not None:
             print_table(title.format(rows=figures.rows, how=folds_text(figures)), *pose_rows(figures.models))
             print_lines([*held_out_lines(figures), *filter(None, [coverage_line(figures)])])
+
+
+def _print_parameters(summary: "CalibrationSummary", verbose: bool) -> None:
+    """Print the parameters that were estimated, or all."""
+    from pisigma.reporting.calibration_tables import parameter_table
+
+    estimated = [row for row in summary.parameters if verbose or row.standard_error is not None]
+    rest = len(summary.parameters) - len(estimated)
+    title = f"estimated parameters ({rest} others are nominal: --verbose)" if rest else "parameters"
+    print_table(title, *parameter_table(estimated))
 
 
 def _free(stated: str) -> Any:

@@ -8,6 +8,7 @@ from typing import Any
 
 from pisigma.errors import AcceptanceError, printable
 from pisigma.files.output_folder import staged_folder
+from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.summary import AbstractSummary
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
@@ -31,9 +32,14 @@ class AbstractModelResult(ABC):
         return {"seconds": round(self.seconds, 3), **self.summary.to_json()}
 
     @property
+    def diagnostics(self) -> tuple[Diagnostic, ...]:
+        """What is wrong with the result, those first that make it implausible."""
+        return self.summary.diagnostics
+
+    @property
     def trusted(self) -> bool:
         """Whether no check found the result implausible."""
-        return not any(one.severity == "implausible" for one in self.summary.diagnostics)
+        return not any(one.severity == "implausible" for one in self.diagnostics)
 
     def save(
         self,
