@@ -20,17 +20,7 @@ def clean(tmp_path_factory: pytest.TempPathFactory) -> Clean:
         return write_clean(tmp_path_factory.mktemp("clean"))
 
 
-WAITING = ("wrong measurements",)
-"""Kinds of which a few still end badly: models that are wrong without a word."""
-
-
-@pytest.mark.parametrize(
-    "kind",
-    [
-        pytest.param(kind, marks=pytest.mark.xfail(reason="being mended")) if kind in WAITING else kind
-        for kind in KINDS
-    ],
-)
+@pytest.mark.parametrize("kind", KINDS)
 def test_no_hostile_input_does_harm(kind: str, clean: Clean, tmp_path: Path):
     used = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     bad = []
