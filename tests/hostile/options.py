@@ -105,6 +105,7 @@ def wrong_judging(rng: Rng, clean: Clean, folder: Path) -> Case:
     model, rows = one_of(rng, list(clean.models.items()))
     shutil.copy(rows, folder / "rows.csv")
     path = one_of(rng, _INPUTS)
+    others = [name for name in _OUTPUTS if name != "rows.csv"]  # which an export may replace
     commands = (
         ("evaluate", str(model), "rows.csv", "--resamples=20", f"--max-mean-mm={one_of(rng, _NUMBERS)}"),
         (
@@ -124,7 +125,7 @@ def wrong_judging(rng: Rng, clean: Clean, folder: Path) -> Case:
         ("verify", str(model), path),
         ("verify", path, "rows.csv"),
         ("export", str(model), "--format", one_of(rng, _WORDS), "--out", "x.csv"),
-        ("export", str(model), "--format", one_of(rng, ("dh", "urdf")), "--out", one_of(rng, _OUTPUTS)),
+        ("export", str(model), "--format", one_of(rng, ("dh", "urdf")), "--out", one_of(rng, others)),
         ("export", path, "--format", "dh", "--out", "x.csv"),
         ("upgrade", path),
         ("simulate", path, "--out", "rows.csv"),
