@@ -10,6 +10,7 @@ from pisigma.robot.description import Robot
 from pisigma.verification.checks.check import AbstractCheck, CheckedCalibration
 from pisigma.verification.checks.prior_ratio import IMPLAUSIBLE
 from pisigma.verification.faults_as_drawn import USUAL, are_unrelated, find_faults_as_drawn
+from pisigma.verification.new_setup import new_setup
 from pisigma.verification.setup_fault import either
 
 UNRELATED = (
@@ -44,5 +45,7 @@ def setup_diagnostics(robot: Robot, rows: Measurements) -> list[Diagnostic]:
 
 def explained(refusal: IdentificationError, robot: Robot, rows: Measurements) -> IdentificationError:
     """Name the cause of a refusal where setup faults explain the errors; else return the refusal as it is."""
+    if moved := new_setup(robot, rows):
+        return IdentificationError(moved)
     causes = setup_diagnostics(robot, rows)
     return IdentificationError(f"{rows.source}: {causes[0].sentence}") if causes else refusal
