@@ -35,7 +35,7 @@ PLAUSIBLE_TURN = PLAUSIBLE_SHARE / LEVER_SHARE
 """The same of errors of orientations [rad], which count like position errors at `LEVER_SHARE` of the reach."""
 AS_GOOD = 1.5
 """A simpler explanation is believed where its errors are not larger than the best by this factor."""
-MOST_CONVENTIONS = 4
+MOST_CONVENTIONS = 8
 """Conventions of orientations that are looked at again, at most."""
 _MOVED = {
     "frame": (
@@ -100,14 +100,14 @@ def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[
         return
     eye = torch.eye(3).to(here.T)
     tried = list(other_conventions(here.measured.rotation))
-    R = torch.where(turned[:, None, None], torch.stack([rotation for rotation, _ in tried]), eye)
+    R = torch.where(turned[:, None, None], torch.stack([rotation for rotation, _, _ in tried]), eye)
     for errors in arm.errors_in_frames(here.T, replace(here.measured, rotation=R)):
         limit = max(NEAR_BEST**2 * float(errors.min()), NOTICED**2)
         for number in errors.argsort()[:MOST_CONVENTIONS].tolist():
             if float(errors[number]) <= limit:
                 advice = "write orientations as the documentation of measurement files says"
-                cause = Cause("rotation", tried[number][1], advice, 1.0)
-                yield replace(here.measured, rotation=R[number]), cause
+                _, clause, size = tried[number]
+                yield replace(here.measured, rotation=R[number]), Cause("rotation", clause, advice, size)
 
 
 def _other_corrections(

@@ -190,7 +190,7 @@ def _unit_causes(factor: list[float], robot: Robot) -> list[Cause]:
                 if GRADIANS <= abs(factor[wrong[0]]) <= 1 / GRADIANS:
                     named, are = ("degrees", "gradians") if too_large else ("gradians", "degrees")
                 clause = f"the values of {joints_text(wrong)} are {are} that are named {named}"
-                size = 1.0 if list(wrong) == joints else float(len(wrong))
+                size = 1.0 if list(wrong) == joints else len(wrong) + 0.5
                 causes.append(
                     Cause("joint_unit", clause, "correct the unit in the column names", size, wrong)
                 )

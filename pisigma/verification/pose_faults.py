@@ -1,5 +1,6 @@
 """Setup faults of measured poses: units, handedness, and conventions of orientations."""
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from pisigma.judging.frame_fits import MeasuredPoses
+from pisigma.measurement.csv.columns import RPY
 from pisigma.verification.cause import Cause
 
 UNITS = (
@@ -53,33 +55,37 @@ def units_and_frames(measured: MeasuredPoses) -> Iterator[tuple[MeasuredPoses, C
 
 def other_conventions(
     rotation: Float64[Tensor, "rows 3 3"],
-) -> Iterator[tuple[Float64[Tensor, "rows 3 3"], str]]:
-    """Go through what measured orientations are where they were written in another convention, and say which."""
+) -> Iterator[tuple[Float64[Tensor, "rows 3 3"], str, float]]:
+    """Go through what measured orientations are where they were written in another convention.
+
+    Returns:
+        The rotations, what is wrong with those of the file, and how much that assumes, see `Cause.size`.
+    """
     read = Rotation.from_matrix(rotation.numpy())
-    quaternion = read.as_quat()
-    wxyz = Rotation.from_quat(np.roll(quaternion, -1, 1))
-    angles = read.as_euler(READ_ORDER)
+    wxyz = Rotation.from_quat(np.roll(read.as_quat(), -1, 1))
     inverse = "the orientations are inverse (a conjugate quaternion, or a transposed matrix)"
     scalar = "the quaternions stand in the order qw, qx, qy, qz (the scalar part first)"
     yield from (
-        (_matrices(read.inv()), inverse),
-        (_matrices(wxyz), scalar),
-        (_matrices(wxyz.inv()), f"{scalar} and are conjugate"),
+        (_matrices(read.inv()), inverse, 1.0),
+        (_matrices(wxyz), scalar, 1.0),
+        (_matrices(wxyz.inv()), f"{scalar} and are conjugate", 1.25),
     )
-    for columns in (("roll", "pitch", "yaw"), ("yaw", "pitch", "roll")):
-        vector = _as_rotation_vector(angles)
-        turned, vector = (a if columns[0] == "roll" else a[:, ::-1] for a in (angles, vector))
+    angles = read.as_euler(READ_ORDER)
+    for columns in (RPY, RPY[::-1]):
+        of_columns = [RPY.index(name) for name in columns]
+        turned, vector = angles[:, of_columns], _as_rotation_vector(angles)[:, of_columns]
         clause = f"{', '.join(columns)} hold the x, y and z of a rotation vector (axis times angle)"
-        yield _matrices(Rotation.from_rotvec(vector)), clause
+        yield _matrices(Rotation.from_rotvec(vector)), clause, 1.0
         for order in EULER_ORDERS:
             product = " · ".join(f"Rot{axis}({name})" for axis, name in zip(order, columns, strict=True))
-            for factor, unit in ((1.0, ""), (180 / np.pi, " in radians that are named degrees")):
-                if (order, columns[0], factor) == (READ_ORDER, "roll", 1.0):
-                    continue
-                clause = (
-                    f"roll, pitch and yaw are angles of another order, the Euler angles of {product}{unit}"
-                )
-                yield _matrices(Rotation.from_euler(order, factor * turned)), clause
+            clause = f"roll, pitch and yaw are angles of another order, the Euler angles of {product}"
+            yield _matrices(Rotation.from_euler(order, turned)), clause, 1.0
+            clause += " in radians that are named degrees"
+            yield _matrices(Rotation.from_euler(order, np.rad2deg(turned))), clause, 1.0
+    for signs in itertools.product((1, -1), repeat=3):
+        names = ", ".join(("-" if sign < 0 else "") + name for sign, name in zip(signs, RPY, strict=True))
+        clause = f"signs of angles are reversed: {names} were meant"
+        yield _matrices(Rotation.from_euler(READ_ORDER, angles * signs)), clause, 1.5
 
 
 def _as_rotation_vector(angles: Float64[np.ndarray, "rows 3"]) -> Float64[np.ndarray, "rows 3"]:

@@ -28,9 +28,7 @@ def calibrated(nominal, rows):
     return calibrate.calibrate(nominal, rows, CalibrationSettings(model="geometric", folds=0)).model
 
 
-@pytest.mark.parametrize(
-    "name", ["sign of q6", "reversed Euler order", "quaternion wxyz", "quaternion conjugated"]
-)
+@pytest.mark.parametrize("name", ["sign of q6", "quaternion wxyz"])
 def test_orientations_are_judged(poses, name):
     nominal, training, rows = poses
     model = calibrated(nominal, training)
