@@ -70,7 +70,8 @@ class CalibrationSettings:
             text, so that ("*/0", "*/1") means a/0 and a/1, b/0 and b/1 and so on.
 
     Raises:
-        IdentificationError: the model is no choice, or only one of the two prior standard deviations is 0.
+        IdentificationError: the model is no choice, has no use for gravity, or only one of the two prior standard
+            deviations is 0.
         MeasurementError: the split is no choice, or settings of the validation exclude each other.
     """
 
@@ -110,6 +111,10 @@ class CalibrationSettings:
             raise MeasurementError(
                 f"a seed from 0 to 2^63 - 1 and at most {LARGEST_REPEATS:,} repeats were wanted, got {self.seed} and "
                 f"{self.repeats or 'the usual'}."
+            )
+        if self.gravity is not None and self.model != "hybrid":
+            raise IdentificationError(
+                f"gravity {self.gravity}: a geometric calibration has no use for it; leave it out, or take the hybrid."
             )
         prior = (self.prior_length, self.prior_angle)
         if not all(map(math.isfinite, prior)) or min(prior) < 0 or (prior[0] == 0) != (prior[1] == 0):

@@ -274,6 +274,9 @@ def test_inverse_calibration_wants_one_frame_and_target(refuses, repository, tar
         (("--free", "a_9"), "a_9"),
         (("--prior-mm", "0"), "or both 0 for none, got 0 mm and 1 mrad."),
         (("--prior-mm", "nan"), "got nan mm"),
+        (("--gravity", "0,1"), "the direction of gravity as X,Y,Z was wanted"),
+        (("--gravity", "0,0,-1"), "a geometric calibration has no use for it"),
+        (("--new-frame-at", 500), "poses.csv: a new frame at line 500 was asked for"),
     ],
 )
 def test_options_at_fault(refuses, data, tmp_path, arguments, complaint):
@@ -281,6 +284,15 @@ def test_options_at_fault(refuses, data, tmp_path, arguments, complaint):
         "calibrate", "kiro4", data, "--out", tmp_path / "arm", "--model", "geometric", *arguments
     )
     assert not (tmp_path / "arm").exists()
+
+
+def test_a_new_frame_at_a_line(run, data, tmp_path):
+    command = ("calibrate", "kiro4", data, "--out", tmp_path / "arm", "--model", "geometric", "--folds", 0)
+    result = run(*command, "--new-frame-at", 20, "--new-frame-at", 40)
+    assert result.exit_code == 0, result.output
+    card = (tmp_path / "arm" / "README.md").read_text()
+    assert "--folds 0 --new-frame-at 20 --new-frame-at 40`" in card
+    assert "base_from line 40_x" in card
 
 
 def test_robots_and_files_at_fault(refuses, data, tmp_path):
