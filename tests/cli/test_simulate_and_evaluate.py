@@ -125,8 +125,11 @@ def test_simulating_what_is_measured_is_refused(refuses, repository, trained, tm
 
 
 def test_an_out_that_cannot_be_written(refuses, trained, tmp_path):
-    for out in (tmp_path, tmp_path / "nothing" / "data.csv"):
-        assert "cannot be written" in refuses("simulate", trained[0] / "kiro3.yaml", "--out", out)
+    for out, complaint in (
+        (tmp_path, "is a folder"),
+        (tmp_path / "nothing" / "data.csv", "there is no folder"),
+    ):
+        assert f"{out}: {complaint}" in refuses("simulate", trained[0] / "kiro3.yaml", "--out", out)
 
 
 def test_rows_that_the_model_does_not_predict_are_left_out_of_both(run, held_out, tmp_path):
