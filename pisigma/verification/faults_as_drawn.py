@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import lru_cache
 
 import torch
 from jaxtyping import Float64, Int64
@@ -34,7 +33,6 @@ USUAL = 1e-3
 """Usual prior standard deviation of geometric errors [m and rad]."""
 
 
-@lru_cache(maxsize=1)  # the same rows are looked at before a calibration and after it
 def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[SetupFault, ...]:
     """Find what makes the errors of the robot as drawn collapse to a quarter or less, the simplest first.
 
@@ -120,6 +118,7 @@ def are_unrelated(robot: Robot, measurements: Measurements) -> bool:
     rows = largest_group(measurements)
     if rows.rows < FEWEST_ROWS_AS_DRAWN:
         return False
+    rows = rows.select(spread(torch.arange(rows.rows), MOST_ROWS_AS_DRAWN))
     assert rows.position is not None
     spread_out = float((rows.position - rows.position.mean(0)).square().sum(1).mean().sqrt())
     return spread_out > usual_error(robot, rows.q) and explains_nothing(

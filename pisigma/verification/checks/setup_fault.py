@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from functools import lru_cache
 
 from pisigma.errors import IdentificationError
 from pisigma.judging.diagnostic import Diagnostic, Severity
@@ -32,15 +33,16 @@ class SetupFaultCheck(AbstractCheck):
         yield from setup_diagnostics(checked.robot, checked.rows)
 
 
-def setup_diagnostics(robot: Robot, rows: Measurements) -> list[Diagnostic]:
+@lru_cache(maxsize=1)  # the same rows are looked at before a calibration and after it
+def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...]:
     """Say which setup faults explain the errors of the robot as drawn; see `SetupFaultCheck`."""
     if faults := find_faults_as_drawn(robot, rows):
         fault, largest = either(faults), IMPLAUSIBLE * USUAL * math.sqrt(robot.dof)
         severity: Severity = "implausible" if fault.moved > largest else "warning"
-        return [Diagnostic(kind="setup_fault", severity=severity, sentence=fault.sentence)]
+        return (Diagnostic(kind="setup_fault", severity=severity, sentence=fault.sentence),)
     if are_unrelated(robot, rows):
-        return [Diagnostic(kind="setup_fault", severity="implausible", sentence=UNRELATED)]
-    return []
+        return (Diagnostic(kind="setup_fault", severity="implausible", sentence=UNRELATED),)
+    return ()
 
 
 def explained(refusal: IdentificationError, robot: Robot, rows: Measurements) -> IdentificationError:
