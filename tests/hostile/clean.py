@@ -18,7 +18,9 @@ from testing.simulated_arm import simulate
 
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
+from pisigma.model.row_poses import poses_of_rows
 from pisigma.robot import Robot
 from pisigma.robot.writing import robot_to_urdf, robot_to_yaml
 
@@ -89,7 +91,7 @@ def write_clean(folder: Path) -> Clean:
         REPOSITORY / "training" / f"{name}.yaml"
         for name in ("kiro3", "kiro4", "rb5_redundancy", "rb5_hybrid", "kiro3_physical", "ur10_inverse")
     )
-    models, poses = _models(folder, rows)
+    models, poses = _models(folder)
     return Clean(rows, robots, urdfs, recipes, models, poses)
 
 
@@ -157,7 +159,17 @@ def _simulator() -> ModuleType:
     return simulator
 
 
-def _models(folder: Path, rows: dict[str, CleanRows]) -> tuple[dict[Path, Path], Path]:
+def _explained_rows(folder: Path, model: CalibratedModel) -> Path:
+    """Positions that a model predicts at joint values that it keeps, with noise, as a file beside its folder."""
+    path, q = folder.with_suffix(".csv"), model.starts[:40]
+    with torch.no_grad():
+        position = poses_of_rows(model, Measurements(q=q))[:, :3, 3].contiguous()
+    noise = NOISE * torch.from_numpy(np.random.default_rng(0).normal(size=position.shape))
+    Measurements(q=q, position=position + noise).write_csv(path, model.robot)
+    return path
+
+
+def _models(folder: Path) -> tuple[dict[Path, Path], Path]:
     """A geometric, a hybrid and a network model, and poses of the first."""
     geometric, q, T = calibrated_ur5(40)
     models = {}
@@ -168,7 +180,7 @@ def _models(folder: Path, rows: dict[str, CleanRows]) -> tuple[dict[Path, Path],
     }.items():
         (path := folder / f"{name}_model").mkdir()
         save_model(model, path)
-        models[path] = rows[name].path
+        models[path] = _explained_rows(path, model)
     poses = folder / "poses.csv"
     position = T[:, :3, 3] * 1e3
     rotation = Measurements(q=q, rotation=T[:, :3, :3].contiguous())

@@ -16,7 +16,7 @@ KINDS: dict[str, tuple[Generator, int]] = {
     "healthy robots": (healthy_robot, 1),
     "clean measurements": (measured_robot, 1),
     "damaged measurements": (damaged_measurements, 14),
-    "wrong measurements": (wrong_measurements, 3),
+    "wrong measurements": (wrong_measurements, 2),
     "another robot": (another_robot, 2),
     "poses": (wrong_poses, 20),
     "robots": (wrong_robot, 7),

@@ -248,20 +248,21 @@ _CHANGES: tuple[Change, ...] = (
 def damaged_measurements(rng: Rng, clean: Clean, folder: Path) -> Case:
     """A measurement file with damaged text, for any command that reads one."""
     name = one_of(rng, list(clean.rows))
-    rows = clean.rows[name]
-    what, content = damaged(rng, rows.path.read_bytes())
-    (folder / "rows.csv").write_bytes(content)
-    models = [str(model) for model, data in clean.models.items() if data == rows.path]
-    if models and rng.random() < 0.4:
-        command = one_of(
+    rows, (model, explained) = clean.rows[name], one_of(rng, list(clean.models.items()))
+    commands = {
+        rows.path: calibrate(rows.robot, "rows.csv"),
+        explained: one_of(
             rng,
             (
-                ("evaluate", models[0], "rows.csv", "--resamples", "20"),
-                ("verify", models[0], "rows.csv", "--json"),
+                ("evaluate", str(model), "rows.csv", "--resamples", "20"),
+                ("verify", str(model), "rows.csv", "--json"),
             ),
-        )
-        return Case(f"{name}: {what}", command)
-    return Case(f"{name}: {what}", calibrate(rows.robot, "rows.csv"), rows)
+        ),
+    }
+    path = one_of(rng, (rows.path, rows.path, explained))
+    what, content = damaged(rng, path.read_bytes())
+    (folder / "rows.csv").write_bytes(content)
+    return Case(f"{path.stem}: {what}", commands[path], rows if path == rows.path else None)
 
 
 def wrong_measurements(rng: Rng, clean: Clean, folder: Path) -> Case:
