@@ -1,6 +1,6 @@
 """Run many hostile inputs, each in a process of its own with bounds on time and memory, and say what came of them.
 
-`python tests/hostile/run.py --count 4000 [--seed 1] [--kind "wrong measurements"] [--number 17]`
+`python tests/hostile/run.py --count 4000 [--seed 1] [--kind "wrong measurements"] [--number 17]`, or `--mistakes`
 """
 
 import argparse
@@ -16,6 +16,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 sys.path.append(str(Path(__file__).parents[2] / "training" / "papers"))
 
+from hostile import mistakes
 from hostile.clean import Clean, write_clean
 from hostile.kinds import KINDS, make, shares
 from hostile.outcome import LONGEST, WAITS, Ending, Outcome, attempt
@@ -76,7 +77,10 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--kind", choices=sorted(KINDS))
     parser.add_argument("--number", type=int, help="run this one only, and print all that it said")
+    parser.add_argument("--mistakes", action="store_true", help="make the 60 realistic mistakes instead")
     wanted = parser.parse_args()
+    if wanted.mistakes:
+        sys.exit(mistakes.main([]))
     kinds = (wanted.kind,) if wanted.kind else tuple(KINDS)
     table: dict[str, Counter[Ending]] = {}
     with tempfile.TemporaryDirectory() as temporary:
