@@ -13,7 +13,7 @@ from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.hybrid.arm import JointCoverage
 from pisigma.hybrid.design import Design, Rows, weigh
 from pisigma.hybrid.evidence import SMALLEST_NOISE
-from pisigma.hybrid.gravity import gravity_by_evidence, gravity_sentence, in_first_row
+from pisigma.hybrid.gravity import USUAL, gravity_by_evidence, gravity_sentence, in_first_row
 from pisigma.hybrid.mini_batches import MANY_ROWS, MiniBatches, batch_checkpoints, refine_in_batches
 from pisigma.hybrid.refinement import Refined, linearised, refine, with_frames_of
 from pisigma.hybrid.regression import regression
@@ -180,6 +180,9 @@ class HybridCalibrator:
 
         What a geometric calibration does not explain is not for that reason wrong: a first hybrid model is fitted to
         all rows but those that are beyond any robot's errors, and rows are weighted by their distance from that.
+
+        Where gravity seems to act in another direction than down, everything is tried with both: what torques along
+        other axes imitate may be products.
         """
         problem, view = solved.problem, view_of(solved.solution.linearisation)
         if problem.q.shape[0] > SEARCHED_ROWS:
@@ -200,14 +203,19 @@ class HybridCalibrator:
             return Search(rows, view.noise, view.prior_scale, [], progress).best([], [])
         robot = self.geometric.robot
         gravity = self.gravity or gravity_by_evidence(robot, rows, view.noise, view.prior_scale)
-        growing, others = self._features(solved, problem, in_first_row(robot, gravity))
+        directions = dict.fromkeys((gravity, USUAL if self.gravity is None else gravity))
+        tried = [self._features(solved, problem, in_first_row(robot, one)) for one in directions]
+        growing, others = tried[0]
         first = Design(problem, (*others, *growing[:FIRST_MODEL_SIZES][-1:]))
         posterior = regression(first, rows).maximise_evidence(first.prior(view.prior_scale), view.noise)
         rows = linearised(first, posterior.x, posterior.effective, group)
-        several = self.products and robot.dof > 1
-        products = [InputProducts(robot)] if several else []
-        largest = [*others, *growing[-1:], *products]
-        return Search(rows, view.noise, view.prior_scale, largest, progress).best(growing, others, products)
+        products = [InputProducts(robot)] if self.products and robot.dof > 1 else []
+        choices = []
+        for growing, others in tried:
+            largest = [*others, *growing[-1:], *products]
+            search = Search(rows, view.noise, view.prior_scale, largest, progress)
+            choices.append(search.best(growing, others, products))
+        return max(choices, key=lambda choice: choice.best.posterior.log_evidence)
 
     def _features(
         self, solved: SolvedCalibration, problem: CalibrationProblem, gravity: Direction
