@@ -29,7 +29,10 @@ def test_ur5_beyond_half_of_a_joints_range(shared_data: Path) -> None:
     with no_type_checker():
         for joint in (0, 1, 3):
             half = data.q[:, joint] < data.q[:, joint].median()
-            result, rest = HybridCalibrator(robot, harmonics=(8, 24, 56)).fit(data.select(half)), data.select(~half)
+            result, rest = (
+                HybridCalibrator(robot, harmonics=(8, 24, 56)).fit(data.select(half)),
+                data.select(~half),
+            )
             ratios.append(rms(result, rest) / rms(result.geometric, rest))
     assert max(ratios) < 1.15
     assert math.prod(ratios) ** (1 / 3) < 0.75
