@@ -99,8 +99,10 @@ def _behind(T: Float64[Tensor, "rows 4 4"], measured: MeasuredPoses) -> Float64[
 def _one_name(rows: Measurements, number: Int64[Tensor, " rows"]) -> Cause:
     used, sizes = torch.unique(number, return_counts=True)
     first = [_where(rows, int((number == k).nonzero()[0, 0])) for k in used]
-    counts = joined(map(str, sizes.tolist()))
-    clause = f"the targets look mixed up: the rows are of {len(used)} targets under one name ({counts} rows)"
+    shares = joined(f"{100 * size / len(number):.0f} %" for size in sizes.tolist())
+    clause = (
+        f"the targets look mixed up: the rows are of {len(used)} targets under one name ({shares} of them)"
+    )
     return Cause(
         "target",
         clause,
