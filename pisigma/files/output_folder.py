@@ -10,6 +10,9 @@ from pisigma.files.conflicts import Input, check_apart
 from pisigma.files.model_files import MODEL_FILES, is_model
 from pisigma.files.scratch import ASIDE, FOLDER, KEPT, scratch_beside, sweep
 
+MOST_NEW_FOLDERS = 100
+"""Folders in one another that are made for a model at most."""
+
 
 def check_folder(
     folder: str | os.PathLike[str],
@@ -27,7 +30,8 @@ def check_folder(
 
     Raises:
         OutputError: it is a file, the working directory or above it, is, holds or lies in an input, lies in a model,
-            holds anything but a model, or a model without `overwrite`; or it cannot be written to.
+            holds anything but a model, or a model without `overwrite`; it lies too many folders deep; or it
+            cannot be written to.
     """
     try:
         target = Path(os.path.realpath(folder))
@@ -36,6 +40,11 @@ def check_folder(
                 f"{folder}: is the working directory, or the working directory lies in it; choose another --out."
             )
         parent = next(path for path in target.parents if path.exists())
+        if len(target.relative_to(parent).parts) > MOST_NEW_FOLDERS:
+            raise OutputError(
+                f"{folder}: more than {MOST_NEW_FOLDERS} folders in one another would have to be made; choose another "
+                "--out."
+            )
         if parent == target.parent:
             sweep(target)
         check_apart(folder, inputs)

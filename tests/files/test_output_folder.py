@@ -256,3 +256,9 @@ def test_what_somebody_puts_there_meanwhile_is_not_replaced(tmp_path):
     assert (tmp_path / "model" / "notes.txt").read_text() == "mine"
     assert load_model(tmp_path / "model").robot.name == "kiro3"
     assert names(tmp_path) == ["model"]
+
+
+def test_folders_are_not_made_without_limit(tmp_path):
+    with pytest.raises(OutputError, match="more than 100 folders in one another"):
+        check_folder(tmp_path.joinpath(*["a"] * 1_500), overwrite=False)
+    assert not list(tmp_path.iterdir())
