@@ -203,7 +203,7 @@ class HybridCalibrator:
             return Search(rows, view.noise, view.prior_scale, [], progress).best([], [])
         robot = self.geometric.robot
         gravity = self.gravity or gravity_by_evidence(robot, rows, view.noise, view.prior_scale)
-        directions = dict.fromkeys((gravity, USUAL if self.gravity is None else gravity))
+        directions = dict.fromkeys((gravity, self.gravity or USUAL))
         tried = [self._features(solved, problem, in_first_row(robot, one)) for one in directions]
         growing, others = tried[0]
         first = Design(problem, (*others, *growing[:FIRST_MODEL_SIZES][-1:]))

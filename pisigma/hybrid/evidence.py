@@ -187,11 +187,6 @@ class AbstractRegression(ABC):
     def covariance_root(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
         """R with `R R^T` the covariance of the unknowns."""
 
-    def covariance(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
-        """Covariance of the unknowns."""
-        root = self.covariance_root(posterior)
-        return root @ root.t()
-
     @abstractmethod
     def select(self, design: "Design") -> "AbstractRegression":
         """The same for the unknowns of a design that has some of the features, or smaller ones."""

@@ -86,14 +86,19 @@ DEFECT = (
 )
 
 
-def test_a_defect_of_ours_exits_1_with_one_line():
-    done = subprocess.run(
+def with_a_defect(traceback: str) -> "subprocess.CompletedProcess[str]":
+    """Run a command that fails by our fault."""
+    return subprocess.run(
         [sys.executable, "-c", DEFECT],
         capture_output=True,
         text=True,
         check=False,
-        env={**os.environ, TRACEBACK: ""},
+        env={**os.environ, TRACEBACK: traceback},
     )
+
+
+def test_a_defect_of_ours_exits_1_with_one_line():
+    done = with_a_defect(traceback="")
     assert (done.returncode, done.stdout) == (1, "")
     (line,) = done.stderr.splitlines()
     assert line.startswith(
@@ -104,13 +109,7 @@ def test_a_defect_of_ours_exits_1_with_one_line():
 
 
 def test_a_defect_of_ours_shows_its_traceback_on_demand():
-    done = subprocess.run(
-        [sys.executable, "-c", DEFECT],
-        capture_output=True,
-        text=True,
-        check=False,
-        env={**os.environ, TRACEBACK: "1"},
-    )
+    done = with_a_defect(traceback="1")
     assert done.returncode == 1
     assert "Traceback" in done.stderr
     assert "ZeroDivisionError" in done.stderr

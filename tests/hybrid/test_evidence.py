@@ -9,6 +9,7 @@ import torch
 from scipy.stats import multivariate_normal
 from testing.closeness import assert_close
 from testing.dense_regression import DenseRegression
+from testing.posteriors import covariance as covariance_of
 from testing.regression_cases import poses
 from torch import Tensor
 
@@ -58,7 +59,7 @@ def test_posterior_is_that_of_normal_variables(seed: int) -> None:
         for parts in (X, y)
     )
     covariance = np.linalg.inv(columns.T @ columns + np.diag(prior().precision.numpy()))
-    assert_close(fit.covariance(found), covariance, atol=1e-12)
+    assert_close(covariance_of(fit, found), covariance, atol=1e-12)
     assert_close(found.x, covariance @ columns.T @ targets, atol=1e-12)
     told = 1 - prior().precision.numpy() * covariance.diagonal()
     assert_close(found.effective, told.sum(), rtol=1e-10)
@@ -199,7 +200,7 @@ def test_noise_that_is_given_falls_below_it_never_and_of_what_is_certain_not_at_
 def test_noise_is_the_misfit_over_the_values_that_the_unknowns_leave() -> None:
     fit = DenseRegression.between(*problem())
     posterior = fit.solve(prior(), NOISE)
-    C, X = fit.covariance(posterior), fit.X[:30] / NOISE[0]
+    C, X = covariance_of(fit, posterior), fit.X[:30] / NOISE[0]
     residual = fit.y[:30] - fit.X[:30] @ posterior.x
     used = float(((X @ C) * X).sum())
     assert_close(posterior.used[0], used, rtol=1e-10)
