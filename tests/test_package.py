@@ -49,6 +49,7 @@ LAYERS = (
     "verification",
     "recipes",
     "reporting",
+    "measuring",
     "workflow",
     "cli",
 )

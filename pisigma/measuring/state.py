@@ -1,0 +1,155 @@
+"""What a measuring session has come to, as terminals and pages show it."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+AlarmKind = Literal["unreadable", "duplicate", "frozen", "swapped", "off", "pose"]
+"""The row cannot be read; it equals another one; the sensor shows an old value; the values of two poses are swapped;
+the value is off; the joint values are not those of a pose of the plan (a remark: the row counts)."""
+
+
+@dataclass(frozen=True)
+class Alarm:
+    """A row that cannot be right, or a remark on one.
+
+    Attributes:
+        line: the row's line in the file.
+        kind: what is wrong.
+        sentence: what was expected, what came, and whether to measure the pose again.
+        repeat: whether the pose is to be measured again; the row does not count then.
+    """
+
+    line: int
+    kind: AlarmKind
+    sentence: str
+    repeat: bool
+
+
+@dataclass(frozen=True, eq=False)
+class RowsSoFar:
+    """All rows that were read, in the order of the file.
+
+    Attributes:
+        line: lines in the file.
+        q: commanded joint values [rad or m].
+        position: where the target is predicted, in the robot's base frame [m]; NaN while base and tool are unknown.
+        error: measured - predicted position in the base frame [m]; NaN where it cannot be judged.
+        check: rows of the set "test", which judge the calibration and are not calibrated with.
+        alarmed: rows that do not count, as the pose is to be measured again.
+    """
+
+    line: tuple[int, ...]
+    q: Float64[np.ndarray, "rows dof"]
+    position: Float64[np.ndarray, "rows 3"]
+    error: Float64[np.ndarray, "rows 3"]
+    check: Bool[np.ndarray, " rows"]
+    alarmed: Bool[np.ndarray, " rows"]
+
+
+@dataclass(frozen=True, eq=False)
+class NextPose:
+    """The pose to be measured next.
+
+    Attributes:
+        number: of the pose in the plan that holds now, from 1.
+        count: of all poses in that plan.
+        q: joint values [rad or m].
+        check: whether it judges the calibration.
+    """
+
+    number: int
+    count: int
+    q: Float64[np.ndarray, " dof"]
+    check: bool
+
+
+@dataclass(frozen=True)
+class JointSpan:
+    """The values at which a joint was measured.
+
+    Attributes:
+        name: of the joint.
+        lower: smallest value measured [rad or m].
+        upper: largest value measured [rad or m].
+        planned: width that was measured over the width that the plan has; 1 where both are the same.
+    """
+
+    name: str
+    lower: float
+    upper: float
+    planned: float
+
+
+@dataclass(frozen=True)
+class AccuracyPoint:
+    """How accurately a calibration with so many poses places the tool over the task [m]; NaN where that is unknown.
+
+    Attributes:
+        poses: number of poses calibrated with.
+        predicted_rms: root mean square, from the posterior.
+        predicted_p95: what 95 % of the poses stay below, from the posterior.
+        cross_validated_rms: root mean square of the errors of left-out rows, which hold the noise of the sensor too.
+        cross_validated_p95: what 95 % of them stay below.
+        random_rms: predicted root mean square of as many poses drawn at random.
+    """
+
+    poses: int
+    predicted_rms: float
+    predicted_p95: float
+    cross_validated_rms: float = math.nan
+    cross_validated_p95: float = math.nan
+    random_rms: float = math.nan
+
+
+@dataclass(frozen=True)
+class Advice:
+    """Whether to go on.
+
+    Attributes:
+        action: "measure" the next pose; "repeat" a pose; "stop".
+        sentence: why.
+    """
+
+    action: Literal["measure", "repeat", "stop"]
+    sentence: str
+
+
+@dataclass(frozen=True, eq=False)
+class SessionState:
+    """A measuring session after some rows.
+
+    Attributes:
+        rows: all rows that were read.
+        alarms: what is wrong with which of them, in the order of the file.
+        next_pose: the pose to be measured next; None where the plan is done.
+        remaining: joint values of all poses that are left, the next one first [rad or m].
+        coverage: what was measured of every joint.
+        reached: accuracy so far, a point for each time that it was worked out, the last one holds.
+        expected: accuracy that the poses that are left would bring.
+        advice: whether to go on.
+        base: `T_sensor_base`, where the robot's base is in the frame of the sensor [m]; None as long as it is unknown.
+    """
+
+    rows: RowsSoFar
+    alarms: tuple[Alarm, ...]
+    next_pose: NextPose | None
+    remaining: Float64[np.ndarray, "poses dof"]
+    coverage: tuple[JointSpan, ...]
+    reached: tuple[AccuracyPoint, ...]
+    expected: tuple[AccuracyPoint, ...]
+    advice: Advice
+    base: Float64[np.ndarray, "4 4"] | None = None
+
+    @property
+    def accuracy(self) -> AccuracyPoint | None:
+        """Accuracy so far; None as long as it could not be worked out."""
+        return self.reached[-1] if self.reached else None
+
+    @property
+    def finished(self) -> bool:
+        """Whether more poses would not help, or none are left."""
+        return self.advice.action == "stop"
