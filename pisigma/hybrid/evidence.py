@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.hybrid.covariance_root import CovarianceRoot
+
 if TYPE_CHECKING:
     from pisigma.hybrid.design import Design
     from pisigma.joint_correction.feature import AbstractFeature
@@ -184,8 +186,8 @@ class AbstractRegression(ABC):
         """The posterior under a prior and noise; the log evidence is that of MacKay 1992, eq. (4.9)."""
 
     @abstractmethod
-    def covariance_root(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
-        """R with `R R^T` the covariance of the unknowns."""
+    def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
+        """Root of the covariance of the unknowns."""
 
     @abstractmethod
     def select(self, design: "Design") -> "AbstractRegression":

@@ -115,7 +115,7 @@ def refine_in_batches(
     posterior = replace(few.posterior, x=unknowns.values(z.to(solved.problem.q)).detach())
     progress("looking at all rows")
     refined = refined_at(replace(few.design, problem=solved.problem), posterior, group, schedule.epochs)
-    deviation = refined.regression.covariance_root(refined.posterior).norm(dim=1)
+    deviation = refined.regression.covariance_root(refined.posterior).dense.norm(dim=1)
     off = float(((refined.posterior.x - posterior.x) / deviation).square().mean().sqrt())
     sentence = f"Trained on mini-batches to within {off:.2g} standard deviations of the optimum."
     if not off <= SETTLED:
@@ -145,7 +145,7 @@ class WhitenedUnknowns:
     @staticmethod
     def around(few: Refined) -> "WhitenedUnknowns":
         """Around the solution of a part of the rows."""
-        root = few.regression.covariance_root(few.posterior)
+        root = few.regression.covariance_root(few.posterior).dense
         return WhitenedUnknowns(few.design, few.posterior, root)
 
     @property

@@ -9,6 +9,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
+from pisigma.hybrid.covariance_root import CovarianceRoot
 from pisigma.hybrid.design import Design, Rows, chunks
 from pisigma.hybrid.evidence import AbstractRegression, GaussianPrior, LeftOut, Posterior, SensorCount
 from pisigma.hybrid.sensor_values import SensorValues
@@ -144,12 +145,12 @@ class NormalEquations(AbstractRegression):
         best = alone.maximise_evidence(prior, (1.0,))
         return best.log_evidence + rest / 2, best.prior.sizes
 
-    def covariance_root(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
+    def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
         """See `AbstractRegression.covariance_root`; with `N = L L^T` it is `L^-T`."""
         scale, factor, _ = self._solved(posterior.prior, posterior.noise)
         root = torch.zeros_like(factor)
         _invert_triangle(factor, root)
-        return root.t().mul_(scale[:, None])
+        return CovarianceRoot(root.t().mul_(scale[:, None]))
 
     def _solved(self, prior: GaussianPrior, noise: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """Column scale and Cholesky factor of the matrix, and the most probable values."""

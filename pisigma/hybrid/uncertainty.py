@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.hybrid.covariance_root import CovarianceRoot
 from pisigma.hybrid.design import FOLDS, Design, Rows
 from pisigma.hybrid.evidence import AbstractRegression, LeftOut, Posterior
 from pisigma.hybrid.sensor_values import joint_columns, weight_columns
@@ -40,16 +41,21 @@ class PositionUncertainty:
         space: the parameters.
         geometry: where the derivative is taken.
         features: what the weights belong to.
-        root: `R` with `C = R R^T`, of all parameters of the space (0 for those that were not free) and then all
-            weights, scaled so that left-out rows are missed by as much as it says.
+        covariance_root: `R` with `C = R R^T`, of all parameters of the space (0 for those that were not free) and then
+            all weights, scaled so that left-out rows are missed by as much as it says.
         prior_scale: factor on the variances that this took.
     """
 
     space: ParameterSpace
     geometry: IdentifiedGeometry
     features: tuple[AbstractFeature, ...]
-    root: Float64[Tensor, "unknowns directions"]
+    covariance_root: CovarianceRoot
     prior_scale: float
+
+    @property
+    def root(self) -> Float64[Tensor, "unknowns directions"]:
+        """R as a matrix."""
+        return self.covariance_root.dense
 
     def deviation(
         self, measurements: Measurements, q_moved: Float64[Tensor, "rows dof"]
@@ -78,13 +84,13 @@ class PositionUncertainty:
         base, tool = list(self.geometry.bases.values())[frame], list(self.geometry.tools.values())[target]
         robot = self.geometry.robot.with_geometry(base=base, tool=tool)
         J = identification_jacobian(robot, q_moved)[1][:, :3]
-        columns = J.new_zeros((len(q_moved), 3, self.root.shape[0]))
+        columns = J.new_zeros((len(q_moved), 3, len(self.covariance_root.directions)))
         columns[..., : space.arm_size] = J[..., : space.arm_size]
         for group, number, first in (("base", frame, space.arm_size), ("tool", target, space.arm_size + 6)):
             start = space.of(group).start + 6 * number
             columns[..., start : start + 6] = J[..., first : first + 6]
         columns[..., len(space.parameters) :] = self._weight_columns(J, state)
-        return (columns @ self.root).square().sum(-1).sqrt()
+        return self.covariance_root.along(columns).square().sum(-1).sqrt()
 
     def _weight_columns(self, J: Tensor, state: JointState) -> Float64[Tensor, "rows 3 weights"]:
         joints = J[..., joint_columns(self.space)] * J.new_tensor(self.space.robot.directions)
@@ -92,9 +98,7 @@ class PositionUncertainty:
         return torch.cat([joints[..., :0], *blocks], -1)
 
 
-def root_of_sizes(
-    posterior: Posterior, root: Float64[Tensor, "unknowns unknowns"]
-) -> Float64[Tensor, "unknowns groups"]:
+def root_of_sizes(posterior: Posterior, root: CovarianceRoot) -> Float64[Tensor, "unknowns groups"]:
     """What the uncertainty of the prior's sizes adds to a root of the covariance C of the unknowns.
 
     With `dx / d log s_g = 2 C Λ_g x` for the unknowns of group g and `var(log s_g) = 1 / (2 n_g)`, where n_g of
@@ -104,7 +108,7 @@ def root_of_sizes(
     groups = torch.zeros(len(x), len(prior.sizes), dtype=x.dtype, device=x.device)
     groups[torch.arange(len(x)), prior.group] = 1.0
     certain = posterior.determined > LEAST_EFFECTIVE
-    moved = 2 * root @ (root.t() @ (groups * (prior.precision * x)[:, None])[:, certain])
+    moved = 2 * root.covariance_times((groups * (prior.precision * x)[:, None])[:, certain])
     return moved * (2 * posterior.determined[certain]).rsqrt()
 
 
@@ -146,7 +150,6 @@ def position_uncertainty(
         missed = fit.left_out(posterior, folds)
     prior_scale = left_out_scale(missed)
     root = fit.covariance_root(posterior)
-    root = torch.cat([root, root_of_sizes(posterior, root)], 1).mul_(prior_scale**0.5).cpu()
     change = geometry.change[:, design.problem.active.cpu()]
-    root = torch.cat([change @ root[: design.active], root[design.active :]])
+    root = root.extended(root_of_sizes(posterior, root), prior_scale**0.5, change)
     return PositionUncertainty(design.problem.space, geometry, design.features, root, prior_scale)

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.hybrid.covariance_root import CovarianceRoot, FewValues
 from pisigma.hybrid.design import Design, Rows
 from pisigma.hybrid.evidence import AbstractRegression, GaussianPrior, LeftOut, Posterior, SensorCount
 from pisigma.hybrid.normal_equations import NormalEquations, factored, inverted, log_determinant, log_noise
@@ -105,7 +106,7 @@ class ValueCovariance(AbstractRegression):
             y=self.y[kept],
             sensor=sensor,
             group=self.group[kept],
-            K=self.K[:, torch.isin(torch.tril_indices(len(self.y), len(self.y)), kept).all(0)],
+            K=self.K[:, _places_of_pairs(kept)],
             sensors=tuple(replace(one, values=one.values * part) for one, part in counts),
         )
 
@@ -146,9 +147,25 @@ class ValueCovariance(AbstractRegression):
         used = self._by_sensor(1 - variance * P.diagonal())
         return Posterior(x, -0.5 * evidence, prior, noise, square, determined, misfit, used)
 
-    def covariance_root(self, posterior: Posterior) -> Float64[Tensor, "unknowns unknowns"]:
-        """See `AbstractRegression.covariance_root`; not from P, which loses what is small beside the prior."""
-        return self.normal_equations.covariance_root(posterior)
+    def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
+        """See `AbstractRegression.covariance_root`; the weights follow the parameters by `-Λ^-1 X^T V^-1 G`."""
+        if self._is_ill(posterior.prior, posterior.noise):
+            return self.normal_equations.covariance_root(posterior)
+        active, precision = self.design.active, posterior.prior.precision
+        sigma = self.y.new_tensor(posterior.noise)[self.sensor]
+        size = precision[active:].rsqrt()
+        G, Z = self.X[:, :active] / sigma[:, None], self.X[:, active:] / sigma[:, None] * size
+        V = Z @ Z.t()
+        V.diagonal().add_(1.0)
+        factor = torch.linalg.cholesky(V)
+        inner = torch.linalg.solve_triangular(factor, G, upper=False)
+        normal = inner.t() @ inner
+        normal.diagonal().add_(precision[:active])
+        scale, lower = factored(normal)
+        root = torch.linalg.solve_triangular(lower, torch.diag(scale), upper=False).t()
+        follow = torch.linalg.solve_triangular(factor.t(), inner @ root, upper=True)
+        directions = torch.cat([root, -size[:, None] * (Z.t() @ follow)])
+        return CovarianceRoot(directions, FewValues(size, Z, factor))
 
     @cached_property
     def normal_equations(self) -> NormalEquations:
@@ -227,10 +244,18 @@ def _gram(X: Tensor, prior: GaussianPrior, group: int, active: int) -> Tensor:
     return (Z @ Z.t()).flatten()[_lower_triangle(len(X))]
 
 
+@lru_cache(maxsize=4)
 def _lower_triangle(size: int) -> Int64[Tensor, " pairs"]:
     """Where the lower triangle stands in a matrix that is stored row by row."""
     pairs: Tensor = torch.tril_indices(size, size)
     return pairs[0] * size + pairs[1]
+
+
+def _places_of_pairs(values: Int64[Tensor, " values"]) -> Int64[Tensor, " pairs"]:
+    """Where the pairs of some values, which ascend, stand among the pairs of all values."""
+    first, second = values[torch.tril_indices(len(values), len(values))]
+    pairs: Tensor = first * (first + 1) // 2 + second
+    return pairs
 
 
 def _stacked(K: list[Tensor], y: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
@@ -13,6 +13,7 @@ from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.judging.pose_statistics import PoseErrors, error_statistics
 from pisigma.judging.predicted_spread import PredictedSpread, predicted_spread
 from pisigma.judging.progress import Progress, stage
+from pisigma.judging.side_by_side import side_by_side
 from pisigma.judging.trained_calibrations import (
     Calibrator,
     Result,
@@ -26,6 +27,9 @@ from pisigma.judging.validation_figures import LearningPoint, ValidationFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import TrainTest, with_fewer
 from pisigma.sensors.registry import SENSORS
+
+FEW_ROWS = 500
+"""Folds of up to so many rows are calibrated side by side; more need their memory for themselves."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,37 +117,46 @@ class CalibrationValidation:
         return ValidationFigures.model_validate(figures)
 
 
-class _Judged:
-    """What is gathered of all models: errors of held-out rows, and of known distances of held-out sockets."""
+@dataclass(frozen=True, eq=False)
+class _JudgedFold:
+    """What is kept of one fold: errors of its held-out rows under all models.
 
-    def __init__(self, measurements: Measurements) -> None:
-        units = {SENSORS[kind].unit for kind in measurements.kinds if kind in SENSORS}
-        self._turned = measurements.rotation is not None or "rad" in units
-        self._rows = measurements.rows
-        self._errors: dict[str, PoseErrors] = {}
-        self._distances: dict[str, list[Tensor]] = {}
-        self._spread: PredictedSpread | None = None
+    Attributes:
+        test: numbers of these rows.
+        errors: by model.
+        distances: by model, of known distances of held-out sockets.
+        spread: errors of positions beside what a hybrid predicts of them.
+        frames: held out whole.
+        sockets: held out whole.
+        left_out: held-out rows that could not be judged.
+    """
 
-    def add(self, name: str, errors: PoseErrors, distances: Tensor, test: Tensor) -> None:
-        """Errors of some rows under one model."""
-        if name not in self._errors:
-            self._errors[name] = PoseErrors.none(self._rows, self._turned)
-            self._distances[name] = []
-        self._errors[name].put(test, errors)
-        self._distances[name].append(distances)
+    test: Int64[Tensor, " rows"]
+    errors: Mapping[str, PoseErrors]
+    distances: Mapping[str, Float64[Tensor, " _pairs"]]
+    spread: PredictedSpread | None
+    frames: int = 0
+    sockets: int = 0
+    left_out: int = 0
 
-    def add_spread(self, spread: PredictedSpread, test: Tensor) -> None:
-        """Errors of positions of some rows and what was predicted of them."""
-        if self._spread is None:
-            self._spread = PredictedSpread.none(self._rows)
-        self._spread.error[test], self._spread.sigma[test] = spread.error, spread.sigma
 
-    def validation(
-        self, folds: int, frames: int = 0, sockets: int = 0, left_out: int = 0
-    ) -> CalibrationValidation:
-        """Everything together."""
-        distances = {name: torch.cat(errors) for name, errors in self._distances.items()}
-        return CalibrationValidation(folds, self._errors, self._spread, distances, frames, sockets, left_out)
+def _joined(measurements: Measurements, judged: Sequence[_JudgedFold], folds: int) -> CalibrationValidation:
+    """Everything together, in the order of the rows."""
+    units = {SENSORS[kind].unit for kind in measurements.kinds if kind in SENSORS}
+    turned = measurements.rotation is not None or "rad" in units
+    errors = {name: PoseErrors.none(measurements.rows, turned) for name in judged[0].errors}
+    spread = None
+    for fold in judged:
+        for name, of_fold in fold.errors.items():
+            errors[name].put(fold.test, of_fold)
+        if fold.spread is not None:
+            spread = spread or PredictedSpread.none(measurements.rows)
+            spread.error[fold.test], spread.sigma[fold.test] = fold.spread.error, fold.spread.sigma
+    distances = {name: torch.cat([fold.distances[name] for fold in judged]) for name in errors}
+    frames, sockets, left_out = (
+        sum(getattr(fold, count) for fold in judged) for count in ("frames", "sockets", "left_out")
+    )
+    return CalibrationValidation(folds, errors, spread, distances, frames, sockets, left_out)
 
 
 def validate(
@@ -165,27 +178,7 @@ def validate(
         IdentificationError: the training rows of a split do not determine what is asked for, or no test row has a
             target or anchor that its training rows have too.
     """
-    judged = _Judged(measurements)
-    frames = sockets = left_out = 0
-    for done, (train, test) in enumerate(splits):
-        fold = f"fold {done + 1} of {len(splits)}"
-        progress(fold)
-        training = measurements.select(train)
-        judged_rows = test[judgeable(measurements, test, training)]
-        left_out += len(test) - len(judged_rows)
-        held_out = measurements.select(judged_rows)
-        frames += len(set(held_out.frame) - set(training.frame))
-        sockets += len(_sockets(held_out) - _sockets(training))
-        chosen = without_missing(calibrator, training, measurements)
-        try:
-            results = trained(chosen, training, stage(progress, fold))
-        except IdentificationError as problem:
-            raise IdentificationError(
-                f"{fold}, calibrated with {training.rows} of the {measurements.rows} rows: {problem} All rows at once "
-                "may do: leave out the cross-validation, or ask for more folds."
-            ) from None
-        _judge(judged, geometric_of(calibrator), results, training, (held_out, judged_rows))
-    return judged.validation(len(splits), frames, sockets, left_out)
+    return validate_repeatedly(calibrator, measurements, [splits], progress)
 
 
 def validate_repeatedly(
@@ -195,15 +188,45 @@ def validate_repeatedly(
     progress: Progress = lambda what: None,
 ) -> CalibrationValidation:
     """Validate on several repeats of folds; see `validate` and `pisigma.measurement.splits.repeats`."""
-    if len(repeats) == 1:
-        return validate(calibrator, measurements, repeats[0], progress)
-    first, *again = (
-        validate(
-            calibrator, measurements, splits, stage(progress, f"repeat {number} of {len(repeats)}", ", ")
-        )
-        for number, splits in enumerate(repeats, 1)
+    tasks = []
+    for number, splits in enumerate(repeats, 1):
+        of_repeat = progress
+        if len(repeats) > 1:
+            of_repeat = stage(progress, f"repeat {number} of {len(repeats)}", ", ")
+        names = (f"fold {fold} of {len(splits)}" for fold in range(1, len(splits) + 1))
+        tasks += [(name, split, of_repeat) for name, split in zip(names, splits, strict=True)]
+    judged = side_by_side(
+        lambda task: _judged_fold(calibrator, measurements, *task), tasks, measurements.rows > FEW_ROWS
     )
+    first, *again = [_joined(measurements, [next(judged) for _ in splits], len(splits)) for splits in repeats]
     return replace(first, again=tuple(again))
+
+
+def _judged_fold(
+    calibrator: Calibrator, measurements: Measurements, fold: str, split: TrainTest, progress: Progress
+) -> _JudgedFold:
+    """Calibrate on the training rows of one split and judge on its test rows."""
+    progress(fold)
+    train, test = split
+    training = measurements.select(train)
+    judged_rows = test[judgeable(measurements, test, training)]
+    held_out = measurements.select(judged_rows)
+    chosen = without_missing(calibrator, training, measurements)
+    try:
+        results = trained(chosen, training, stage(progress, fold))
+    except IdentificationError as problem:
+        raise IdentificationError(
+            f"{fold}, calibrated with {training.rows} of the {measurements.rows} rows: {problem} All rows at once "
+            "may do: leave out the cross-validation, or ask for more folds."
+        ) from None
+    judged = _judge(geometric_of(calibrator), results, training, held_out)
+    return replace(
+        judged,
+        test=judged_rows,
+        frames=len(set(held_out.frame) - set(training.frame)),
+        sockets=len(_sockets(held_out) - _sockets(training)),
+        left_out=len(test) - len(judged_rows),
+    )
 
 
 def learning_curve(
@@ -261,27 +284,26 @@ def judge(
     Raises:
         IdentificationError: a test row has a frame or target that was not calibrated.
     """
-    judged = _Judged(test)
     results = trained(calibrator, training, result=result)
-    _judge(judged, None, results, training, (test, torch.arange(test.rows)))
-    return judged.validation(0)
+    return _joined(test, [_judge(None, results, training, test)], 0)
 
 
 def _judge(
-    judged: _Judged,
     calibrator: GeometricCalibrator | None,
     results: Mapping[str, Result],
     training: Measurements,
-    held_out: tuple[Measurements, Tensor],
-) -> None:
+    held_out: Measurements,
+) -> _JudgedFold:
     """Judge all models on held-out rows, with frames that they lack fitted by a calibrator, if there is one."""
-    rows, test = held_out
+    stated = {} if calibrator is None else calibrator.socket_distances
+    errors, distances, spread = {}, {}, None
     for name, fitted in results.items():
-        result = fitted if calibrator is None else with_frames(calibrator, fitted, rows)
-        stated = {} if calibrator is None else calibrator.socket_distances
-        judged.add(name, errors_under(result, rows), _distance_errors(stated, result, training, rows), test)
+        result = fitted if calibrator is None else with_frames(calibrator, fitted, held_out)
+        errors[name] = errors_under(result, held_out)
+        distances[name] = _distance_errors(stated, result, training, held_out)
         if isinstance(result, HybridResult):
-            judged.add_spread(predicted_spread(result, rows), test)
+            spread = predicted_spread(result, held_out)
+    return _JudgedFold(torch.arange(held_out.rows), errors, distances, spread)
 
 
 def errors_under(result: Result, measurements: Measurements) -> PoseErrors:

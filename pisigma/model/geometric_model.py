@@ -7,6 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.hybrid.covariance_root import CovarianceRoot
 from pisigma.hybrid.result import HybridResult
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.problem.setup import IdentifiedGeometry
@@ -96,7 +97,9 @@ def model_of_hybrid(
 
 def _kept(uncertainty: PositionUncertainty, geometry: IdentifiedGeometry) -> PositionUncertainty:
     """An uncertainty at the geometry of a model, with a root that float32 holds."""
-    return replace(uncertainty, geometry=geometry, root=uncertainty.root.float().double())
+    return replace(
+        uncertainty, geometry=geometry, covariance_root=CovarianceRoot(uncertainty.root.float().double())
+    )
 
 
 def _branches(nominal: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:

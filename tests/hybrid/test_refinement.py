@@ -100,5 +100,5 @@ def test_unknowns_at_the_solution_are_solved_with_their_sizes_as_they_stand(refi
     assert found.rounds == 7
     assert_close(found.posterior.prior.sizes, refined.posterior.prior.sizes)
     assert_close(found.posterior.noise[0], refined.posterior.noise[0], rtol=0.05)
-    deviation = refined.regression.covariance_root(refined.posterior).norm(dim=1)
+    deviation = refined.regression.covariance_root(refined.posterior).dense.norm(dim=1)
     assert float(((found.posterior.x - refined.posterior.x) / deviation).abs().max()) < 0.5

@@ -168,7 +168,7 @@ def test_deviation_is_that_of_drawn_calibrations(arm: LinearisedArm) -> None:
     """The covariance of positions at the training rows, as their columns give it, widened."""
     found, fitted, correction = uncertainty(arm)
     root = NormalEquations.of(fitted.design, arm.rows).covariance_root(fitted.posterior)
-    root = torch.cat([root, root_of_sizes(fitted.posterior, root)], 1)
+    root = torch.cat([root.dense, root_of_sizes(fitted.posterior, root)], 1)
     C = root @ root.t()
     values = arm.rows.values[0].select(torch.arange(10))
     X = fitted.design.columns(values, slice(None))

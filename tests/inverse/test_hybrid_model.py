@@ -13,6 +13,7 @@ from testing.closeness import assert_close
 from testing.hybrid import hybrid_of, joints_in
 
 from pisigma.errors import MeasurementError, ModelError, PoseError
+from pisigma.hybrid.covariance_root import CovarianceRoot
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.jacobian import joint_jacobian
 from pisigma.measurement.dataset import Measurements
@@ -152,7 +153,7 @@ def test_without_a_correction_it_is_the_geometric_model(tmp_path):
     arm, _ = model_of("additive")
     known = arm.result.uncertainty
     size = len(known.space.parameters)
-    bare = replace(known, features=(), root=known.root[:size])
+    bare = replace(known, features=(), covariance_root=CovarianceRoot(known.root[:size]))
     result = replace(arm.result, learned=None, uncertainty=bare)
     model = model_of_hybrid("geometric", arm.true.nominal, result, arm.measurements)
     assert (model.kind, model.hybrid) == ("geometric_calibration", None)

@@ -12,6 +12,7 @@ from testing.simulated_arm import draw_joints, simulate
 
 import pisigma
 from pisigma.errors import ModelError
+from pisigma.hybrid.covariance_root import CovarianceRoot
 from pisigma.hybrid.result import HybridResult
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
@@ -238,7 +239,7 @@ def test_a_folder_keeps_what_the_sensors_found_out_about_themselves(tmp_path):
     rows, robot = wire_data(), true_robot().nominal
     result = GeometricCalibrator(robot).fit(rows)
     solved = result.solved
-    known = PositionUncertainty(solved.problem.space, solved.geometry, (), solved.root, 1.0)
+    known = PositionUncertainty(solved.problem.space, solved.geometry, (), CovarianceRoot(solved.root), 1.0)
     hybrid = HybridResult(result, learned=None, uncertainty=known, trials=(), verdict="")
     model = model_of_hybrid("wires", robot, hybrid, rows)
     save_model(model, tmp_path)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from pisigma.hybrid.covariance_root import CovarianceRoot
 from pisigma.hybrid.design import Design, Rows
 from pisigma.hybrid.evidence import AbstractRegression, GaussianPrior, LeftOut, Posterior, SensorCount
 
@@ -80,9 +81,9 @@ class DenseRegression(AbstractRegression):
             used=self._by_sensor(used),
         )
 
-    def covariance_root(self, posterior: Posterior) -> Tensor:
+    def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
         """Inverse of the triangular root of the precision of values and prior together."""
-        return _inverse(self._factor(posterior.prior, posterior.noise)[0])
+        return CovarianceRoot(_inverse(self._factor(posterior.prior, posterior.noise)[0]))
 
     def select(self, design: Tensor) -> "DenseRegression":
         """Of some columns, by their numbers."""

@@ -11,7 +11,7 @@ from pisigma.hybrid.evidence import AbstractRegression, GaussianPrior, Posterior
 
 def covariance(fit: AbstractRegression, posterior: Posterior) -> Tensor:
     """Covariance of the unknowns, from its root."""
-    root = fit.covariance_root(posterior)
+    root = fit.covariance_root(posterior).dense
     return root @ root.t()
 
 

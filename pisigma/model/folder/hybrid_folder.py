@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from pisigma.hybrid.arm import HybridArm, JointCoverage
+from pisigma.hybrid.covariance_root import CovarianceRoot
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.problem.setup import IdentifiedGeometry
@@ -254,7 +255,8 @@ def _uncertainty(
         if wrong:
             raise ValueError(f"{len(own.columns)} values of every {own.name} were wanted, got {wrong.pop()}")
     geometry = IdentifiedGeometry(robot, bases, tools, unknowns)
-    return PositionUncertainty(space, geometry, _weighted(known, hybrid), full, known.prior_scale)
+    features = _weighted(known, hybrid)
+    return PositionUncertainty(space, geometry, features, CovarianceRoot(full), known.prior_scale)
 
 
 def _unknowns_section(groups: Sequence[UnknownGroup]) -> dict[str, object]:

@@ -1,0 +1,102 @@
+"""A root R of the covariance of all unknowns, `C = R R^T`, as a matrix or as the factors of few values."""
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class FewValues:
+    """What n values leave of the prior of the weights: `D (I - Z^T L^-T (L + 1)^-1 Z)` with `L L^T = Z Z^T + 1`.
+
+    Its product with its transpose is `D (Z^T Z + 1)^-1 D`: the update of Andrews 1968 (AIAA Journal 6(6), 1165-1166)
+    for all values at once.
+
+    Attributes:
+        size: prior standard deviation of every weight, the diagonal of D.
+        Z: the values' derivatives by the weights, times D and over the noise.
+        factor: L, a lower triangle.
+    """
+
+    size: Float64[Tensor, " weights"]
+    Z: Float64[Tensor, "values weights"]
+    factor: Float64[Tensor, "values values"]
+
+    def along(self, columns: Float64[Tensor, "*batch weights"]) -> Float64[Tensor, "*batch weights"]:
+        """`columns @ root`."""
+        scaled = columns.flatten(0, -2) * self.size
+        once = self.factor + torch.eye(len(self.factor)).to(self.factor)
+        inner = torch.linalg.solve_triangular(self.factor, self.Z @ scaled.t(), upper=False)
+        inner = torch.linalg.solve_triangular(once.t(), inner, upper=True)
+        result: Tensor = scaled - inner.t() @ self.Z
+        return result.reshape(columns.shape)
+
+    def times(self, matrix: Float64[Tensor, "weights columns"]) -> Float64[Tensor, "weights columns"]:
+        """`root @ matrix`."""
+        once = self.factor + torch.eye(len(self.factor)).to(self.factor)
+        inner = torch.linalg.solve_triangular(once, self.Z @ matrix, upper=False)
+        inner = torch.linalg.solve_triangular(self.factor.t(), inner, upper=True)
+        result: Tensor = self.size[:, None] * (matrix - self.Z.t() @ inner)
+        return result
+
+
+@dataclass(frozen=True, eq=False)
+class CovarianceRoot:
+    """R: some directions of all unknowns, and beside them those of the weights alone that few values leave.
+
+    Attributes:
+        directions: columns of R.
+        weights: the other columns, which are 0 for the parameters in front; None where there are none.
+    """
+
+    directions: Float64[Tensor, "unknowns directions"]
+    weights: FewValues | None = None
+
+    @cached_property
+    def dense(self) -> Float64[Tensor, "unknowns directions"]:
+        """All of R."""
+        if self.weights is None:
+            return self.directions
+        count = len(self.weights.size)
+        below = self.weights.along(torch.eye(count).to(self.directions))
+        above = self.directions.new_zeros((len(self.directions) - count, count))
+        return torch.cat([self.directions, torch.cat([above, below])], 1)
+
+    def along(self, columns: Float64[Tensor, "*batch unknowns"]) -> Float64[Tensor, "*batch directions"]:
+        """`columns @ R`."""
+        if self.weights is None:
+            return columns @ self.directions
+        first = self.directions.shape[0] - len(self.weights.size)
+        return torch.cat([columns @ self.directions, self.weights.along(columns[..., first:])], -1)
+
+    def covariance_times(
+        self, matrix: Float64[Tensor, "unknowns columns"]
+    ) -> Float64[Tensor, "unknowns columns"]:
+        """`C @ matrix`."""
+        result = self.directions @ (self.directions.t() @ matrix)
+        if self.weights is not None:
+            first = len(result) - len(self.weights.size)
+            result[first:] += self.weights.times(self.weights.along(matrix[first:].t()).t())
+        return result
+
+    def extended(
+        self,
+        added: Float64[Tensor, "unknowns columns"],
+        scale: float,
+        change: Float64[Tensor, "parameters active"],
+    ) -> "CovarianceRoot":
+        """With more columns, a factor on the standard deviations, and the first unknowns in other coordinates.
+
+        Args:
+            added: columns.
+            scale: the factor.
+            change: parameters in the other coordinates by the first unknowns.
+        """
+        directions = torch.cat([self.directions, added], 1).mul_(scale).cpu()
+        active = change.shape[1]
+        directions = torch.cat([change @ directions[:active], directions[active:]])
+        few = self.weights
+        return CovarianceRoot(directions, None if few is None else replace(few, size=few.size * scale))
