@@ -78,6 +78,10 @@ class IdentificationError(PisigmaError, ValueError):
     """The measurements do not determine what is asked for."""
 
 
+class PlanningError(PisigmaError, ValueError):
+    """A cell, a plan or the settings of one cannot be used."""
+
+
 class OutputError(PisigmaError, ValueError):
     """An output cannot be written where it was asked for."""
 

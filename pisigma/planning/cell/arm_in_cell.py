@@ -1,0 +1,186 @@
+"""A robot in its cell: which joint values are within the limits, free of collisions, and seen by the tracker."""
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from torch import Tensor
+
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
+from pisigma.planning.cell.capsules import Capsules
+from pisigma.planning.cell.cell import Cell
+from pisigma.planning.cell.distances import box_distance, segment_distance
+from pisigma.robot.description import Robot
+
+CHUNK = 2048
+"""Poses that are looked at together: some MB."""
+
+
+@dataclass(frozen=True, eq=False)
+class Faults:
+    """Why poses are not allowed.
+
+    Attributes:
+        reasons: what a pose may fail for, each a sentence without its full stop.
+        failed: per pose and reason.
+    """
+
+    reasons: tuple[str, ...]
+    failed: Bool[Tensor, "poses reasons"]
+
+    @property
+    def allowed(self) -> Bool[Tensor, " poses"]:
+        """Poses that fail for nothing."""
+        return ~self.failed.any(1)
+
+    def counts(self) -> Counter[str]:
+        """How many poses fail for what; a pose counts for its first reason only."""
+        first = self.failed[self.failed.any(1)].int().argmax(1)
+        return Counter(self.reasons[reason] for reason in first.tolist())
+
+    def sentence(self, pose: int) -> str | None:
+        """Why a pose is not allowed; None where it is."""
+        failed = self.failed[pose].nonzero()[:, 0].tolist()
+        return "; ".join(self.reasons[column] for column in failed) + "." if failed else None
+
+
+@dataclass(frozen=True, eq=False)
+class ArmInCell:
+    """A robot in its cell.
+
+    Attributes:
+        robot: as drawn, with the reflector as its tool; its base is that of the cell.
+        cell: what stands around it.
+        capsules: along its links.
+        pairs: of pieces of links that may touch each other.
+        beside: pieces that must not stand in the tracker's beam: none of the link with the reflector, and none that
+            is so near to the reflector that it touches every beam.
+        limits: of the joints, with their margins [rad or m].
+    """
+
+    robot: Robot
+    cell: Cell
+    capsules: Capsules
+    pairs: Int64[Tensor, "pairs 2"]
+    beside: Int64[Tensor, " pieces"]
+    limits: Float64[Tensor, "dof 2"]
+
+    @staticmethod
+    def of(robot: Robot, cell: Cell | None = None) -> "ArmInCell":
+        """Put a robot into its cell; None for an empty one, in which only limits and self-collision count."""
+        cell = cell or Cell()
+        capsules = cell.capsules(robot)
+        return ArmInCell(
+            capsules.robot,
+            cell,
+            capsules,
+            capsules.pairs(cell.clearance),
+            _beside(capsules, cell.clearance),
+            cell.joints.limits(robot),
+        )
+
+    def faults(self, q: Float64[Tensor, "poses dof"]) -> Faults:
+        """Say why which joint values [rad or m] are not allowed.
+
+        Raises:
+            PoseError: they do not fit the robot.
+        """
+        self.robot.check_joint_count(q.shape[-1])
+        chunks = [self._faults(chunk) for chunk in torch.split(q, CHUNK)]
+        return Faults(tuple(chunks[0]), torch.cat([torch.stack([*chunk.values()], 1) for chunk in chunks]))
+
+    def gap(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
+        """The least room [m] between the links and what they must not touch, above the clearance.
+
+        Negative where it is not kept, infinite where there is nothing to touch.
+        """
+        gaps = [
+            torch.stack([*self._gaps(self.capsules.segments(chunk)).values()])
+            for chunk in torch.split(q, CHUNK)
+        ]
+        return torch.cat(gaps, -1).min(0).values
+
+    @cached_property
+    def lever(self) -> Float64[Tensor, " dof"]:
+        """How far a point of the robot moves at most per joint value [m/rad, or 1 for joints that slide]."""
+        d, strokes = np.abs(self.robot.dh[:, 1]), np.zeros(len(self.robot.rows))
+        for index, row in enumerate(self.robot.rows):
+            bounds = [abs(bound) for bound in (row.lower, row.upper) if math.isfinite(bound)]
+            strokes[index] = max(bounds, default=0.0) if row.type == "prismatic" else 0.0
+        lengths = np.append(np.hypot(d + strokes, self.robot.dh[:, 2]), np.linalg.norm(self.robot.tool[:3]))
+        beyond = np.cumsum(lengths[::-1])[::-1][list(self.robot.joint_rows)]
+        return torch.from_numpy(np.where(self.robot.revolute, beyond, 1.0))
+
+    def _faults(self, q: Float64[Tensor, "poses dof"]) -> dict[str, Bool[Tensor, " poses"]]:
+        segments = self.capsules.segments(q)
+        outside = (q < self.limits[:, 0] - LIMIT_TOLERANCE) | (q > self.limits[:, 1] + LIMIT_TOLERANCE)
+        faults = {"a joint is outside its limits or their margin": outside.any(-1)}
+        faults |= {reason: gap < 0 for reason, gap in self._gaps(segments).items()}
+        if self.cell.tracker is not None:
+            T = forward_kinematics(self.robot, q)
+            beam = torch.stack([self.cell.tracker.position.expand_as(T[:, :3, 3]), T[:, :3, 3]], -2)
+            faults |= {reason: gap < 0 for reason, gap in self._beam_gaps(beam, segments).items()}
+            faults |= self._turned_away(T, beam)
+        return faults
+
+    def _gaps(self, segments: Float64[Tensor, "poses pieces 2 3"]) -> dict[str, Float64[Tensor, " poses"]]:
+        """Room between the links and everything that they must not touch [m], above the clearance."""
+        clearance, radius = self.cell.clearance, self.capsules.radius
+        infinite = segments.new_full((len(segments), 1), torch.inf)
+        first, second = self.pairs.unbind(-1)
+        apart = segment_distance(segments[:, first], segments[:, second]) - radius[first] - radius[second]
+        gaps = {"links of the robot touch each other": _least(apart, infinite) - clearance}
+        moving = ~self.capsules.carrier
+        if self.cell.floor_mm is not None:
+            height = segments[:, moving, 1, 2] - radius[moving] - self.cell.floor_mm / 1e3
+            gaps["the robot touches the floor"] = _least(height, infinite) - clearance
+        for box in self.cell.boxes:
+            distance = box_distance(box.within(segments[:, moving]), box.half_size) - radius[moving]
+            gaps[f"the robot touches the box '{box.name}'"] = _least(distance, infinite) - clearance
+        return gaps
+
+    def _beam_gaps(
+        self, beam: Float64[Tensor, "poses 2 3"], segments: Float64[Tensor, "poses pieces 2 3"]
+    ) -> dict[str, Float64[Tensor, " poses"]]:
+        """Room between the tracker's beam and what may hide the reflector [m], above the clearance."""
+        clearance = self.cell.clearance
+        infinite = beam.new_full((len(beam), 1), torch.inf)
+        distance = (
+            segment_distance(beam[:, None], segments[:, self.beside]) - self.capsules.radius[self.beside]
+        )
+        gaps = {"a link hides the reflector from the tracker": _least(distance, infinite) - clearance}
+        for box in self.cell.boxes:
+            distance = box_distance(box.within(beam), box.half_size)
+            gaps[f"the box '{box.name}' hides the reflector from the tracker"] = distance - clearance
+        return gaps
+
+    def _turned_away(
+        self, T: Float64[Tensor, "poses 4 4"], beam: Float64[Tensor, "poses 2 3"]
+    ) -> dict[str, Bool[Tensor, " poses"]]:
+        """Poses in which the tracker stands outside the cone in which the reflector reflects."""
+        reflector = self.cell.reflector
+        if reflector is None:
+            return {}
+        axis = torch.nn.functional.normalize(torch.tensor(reflector.axis, dtype=torch.float64), dim=0)
+        to_tracker = torch.nn.functional.normalize(beam[:, 0] - beam[:, 1], dim=-1)
+        cosine = ((T[:, :3, :3] @ axis) * to_tracker).sum(-1).clamp(-1, 1)
+        turned_away = torch.rad2deg(torch.acos(cosine)) > reflector.acceptance_deg
+        return {f"the reflector ({reflector.name}) is turned away from the tracker": turned_away}
+
+
+def _beside(capsules: Capsules, clearance: float) -> Int64[Tensor, " pieces"]:
+    """Pieces that do not touch the reflector by construction; see `Capsules.pairs`."""
+    q = capsules.random_joints()
+    reflector = forward_kinematics(capsules.robot, q)[:, None, None, :3, 3].expand(-1, 1, 2, 3)
+    touches = segment_distance(reflector, capsules.segments(q)) < capsules.radius + clearance
+    wanted = (capsules.link < capsules.link.max()) & (touches.double().mean(0) < 0.5)
+    return wanted.nonzero()[:, 0]
+
+
+def _least(gaps: Float64[Tensor, "poses things"], infinite: Float64[Tensor, "poses 1"]) -> Tensor:
+    return torch.cat([gaps, infinite], 1).min(1).values

@@ -1,0 +1,239 @@
+"""What stands around a robot that is measured, as people write it down: joint margins, floor, boxes, tracker."""
+
+import os
+from typing import Annotated
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from pisigma.errors import PlanningError, RecipeError, nearest_choice
+from pisigma.planning.cell.capsules import TOOL_RADIUS, Capsules
+from pisigma.robot.description import Robot
+from pisigma.robot.robot_file import Bounded, FrameSection, Limits
+from pisigma.se3 import rotation_from_rpy
+from pisigma.simulation.errors.source import stated_joints
+from pisigma.yaml_file import Section, line_of, read_yaml
+
+Positive = Annotated[Bounded, Field(gt=0)]
+NotNegative = Annotated[Bounded, Field(ge=0)]
+Point = tuple[Bounded, Bounded, Bounded]
+
+
+class JointSection(Section):
+    """How far joints may move here.
+
+    Attributes:
+        margin_deg: that joints which turn keep from their limits [deg].
+        margin_mm: the same of joints that slide [mm].
+        limits_deg: narrower limits of joints that turn, by name [deg].
+        limits_mm: the same of joints that slide [mm].
+    """
+
+    margin_deg: NotNegative = 0.0
+    margin_mm: NotNegative = 0.0
+    limits_deg: dict[str, Limits] = Field(default_factory=dict)
+    limits_mm: dict[str, Limits] = Field(default_factory=dict)
+
+    def limits(self, robot: Robot) -> Float64[Tensor, "dof 2"]:
+        """Lowest and highest joint values that are allowed [rad or m]; infinite where there is no limit.
+
+        Raises:
+            RecipeError: a name is no joint, or one of the other kind.
+            PlanningError: nothing is left of a joint's range.
+        """
+        fields = ("limits_deg", "limits_mm")
+        stated = stated_joints(robot, self.limits_deg, self.limits_mm, fields, "joints")
+        limits = robot.limits.copy()
+        for index, joint in enumerate(robot.joints):
+            to_si = (
+                np.deg2rad
+                if joint.type == "revolute"
+                else (lambda millimetres: np.asarray(millimetres) / 1e3)
+            )
+            margin = to_si(self.margin_deg if joint.type == "revolute" else self.margin_mm)
+            if index in stated:
+                lower, upper = to_si(stated[index])
+                limits[index] = max(lower, limits[index, 0]), min(upper, limits[index, 1])
+            limits[index] += (margin, -margin)
+            if not limits[index, 0] < limits[index, 1]:
+                raise PlanningError(
+                    f"joints: the limits and margins leave nothing of the range of joint '{joint.name}'; "
+                    "make them wider."
+                )
+        return torch.from_numpy(limits)
+
+
+class Box(Section):
+    """A box that the robot keeps out of, and that hides what is behind it.
+
+    Attributes:
+        name: for messages.
+        center_mm: its centre in the robot's base frame [mm].
+        size_mm: its edges along its own axes [mm].
+        yaw_deg: by which it is turned about the base frame's z axis [deg].
+    """
+
+    name: str = Field(min_length=1)
+    center_mm: Point
+    size_mm: tuple[Positive, Positive, Positive]
+    yaw_deg: Bounded = 0.0
+
+    @property
+    def center(self) -> Float64[Tensor, " 3"]:
+        """Its centre [m]."""
+        return torch.tensor(self.center_mm, dtype=torch.float64) / 1e3
+
+    @property
+    def half_size(self) -> Float64[Tensor, " 3"]:
+        """Half of its edges [m]."""
+        return torch.tensor(self.size_mm, dtype=torch.float64) / 2e3
+
+    @property
+    def rotation(self) -> Float64[Tensor, "3 3"]:
+        """Its axes in the base frame, as columns."""
+        return rotation_from_rpy(torch.tensor([np.deg2rad(self.yaw_deg), 0.0, 0.0], dtype=torch.float64))
+
+    def within(self, points: Float64[Tensor, "*batch 3"]) -> Float64[Tensor, "*batch 3"]:
+        """Points of the base frame in the frame of the box [m]."""
+        return (points - self.center) @ self.rotation
+
+
+class LinkSection(Section):
+    """How thick links are.
+
+    Attributes:
+        radius_mm: of all links [mm]; None for a share of the arm's length, see `capsules.RADIUS_SHARES`.
+        radii_mm: of single links, by the names of their rows [mm].
+    """
+
+    radius_mm: Positive | None = None
+    radii_mm: dict[str, Positive] = Field(default_factory=dict)
+
+
+class ToolSection(FrameSection):
+    """Where the reflector is mounted, seen from the flange (the frame behind the last row), in mm and deg.
+
+    Attributes:
+        radius_mm: of what carries it [mm].
+    """
+
+    radius_mm: Positive = TOOL_RADIUS * 1e3
+
+
+class TrackerSection(Section):
+    """Where the tracker stands in the robot's base frame; near is enough."""
+
+    x_mm: Bounded
+    y_mm: Bounded
+    z_mm: Bounded
+
+    @property
+    def position(self) -> Float64[Tensor, " 3"]:
+        """Its origin [m]."""
+        return torch.tensor([self.x_mm, self.y_mm, self.z_mm], dtype=torch.float64) / 1e3
+
+
+class ReflectorSection(Section):
+    """A reflector that is not turned by hand between poses: from where the tracker sees it.
+
+    Attributes:
+        name: such as "cat's eye".
+        axis: where it looks, in the frame of the tool.
+        acceptance_deg: half the angle of the cone in which it reflects [deg].
+    """
+
+    name: str = "SMR of 1.5 inches"
+    axis: Point = (0.0, 0.0, 1.0)
+    acceptance_deg: Annotated[float, Field(gt=0, le=180)] = 30.0
+
+    @model_validator(mode="after")
+    def _has_direction(self) -> "ReflectorSection":
+        if not any(self.axis):
+            raise ValueError("axis: a direction was wanted, such as [0, 0, 1]")
+        return self
+
+
+class Cell(Section):
+    """What stands around a robot: everything is optional, and in the frame of the robot's base in mm and deg.
+
+    Attributes:
+        clearance_mm: that links, and the tracker's beam, keep from everything [mm].
+        floor_mm: height of the floor [mm]; None for no floor.
+        joints: margins and limits.
+        boxes: that the robot keeps out of.
+        links: how thick the links are.
+        tool: where the reflector is; None for the tool of the robot.
+        tracker: that has to see the reflector; None where the sensor needs no line of sight.
+        reflector: from where it can be seen; None where it is turned to the tracker at every pose.
+    """
+
+    clearance_mm: NotNegative = 20.0
+    floor_mm: Bounded | None = None
+    joints: JointSection = JointSection()
+    boxes: tuple[Box, ...] = Field(default=(), max_length=100)
+    links: LinkSection = LinkSection()
+    tool: ToolSection | None = None
+    tracker: TrackerSection | None = None
+    reflector: ReflectorSection | None = None
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "Cell":
+        names = [box.name for box in self.boxes]
+        if twice := sorted({name for name in names if names.count(name) > 1}):
+            raise ValueError(f"the name '{twice[0]}' stands twice in boxes; names must differ")
+        if self.reflector is not None and self.tracker is None:
+            raise ValueError(
+                "a reflector is seen from a tracker; add the section tracker, or leave reflector out"
+            )
+        for box in self.boxes if self.tracker is not None else ():
+            assert self.tracker is not None
+            if bool((box.within(self.tracker.position).abs() <= box.half_size).all()):
+                raise ValueError(f"the tracker stands inside the box '{box.name}'; correct one of them")
+        return self
+
+    @property
+    def clearance(self) -> float:
+        """What links and the tracker's beam keep from everything [m]."""
+        return self.clearance_mm / 1e3
+
+    def robot_with_tool(self, robot: Robot) -> Robot:
+        """The robot with the reflector as its tool, where the cell says where that is."""
+        return robot if self.tool is None else robot.with_geometry(tool=self.tool.to_si())
+
+    def capsules(self, robot: Robot) -> Capsules:
+        """Capsules along the links of a robot and its reflector's bracket."""
+        radius = self.links.radius_mm
+        radii = {name: size / 1e3 for name, size in self.links.radii_mm.items()}
+        tool_radius = TOOL_RADIUS if self.tool is None else self.tool.radius_mm / 1e3
+        return Capsules.of(
+            self.robot_with_tool(robot), None if radius is None else radius / 1e3, radii, tool_radius
+        )
+
+
+def read_cell(path: str | os.PathLike[str], robot: Robot) -> Cell:
+    """Read the file of a cell.
+
+    Args:
+        path: the YAML file.
+        robot: that stands in it.
+
+    Raises:
+        PlanningError: the file cannot be used, or it names links or joints that the robot has not; the message names
+            file, line and key.
+    """
+    cell = read_yaml(path, Cell, PlanningError)
+    names = [row.name for row in robot.rows]
+    for name in cell.links.radii_mm:
+        if name not in names:
+            line = line_of(path, ("links", "radii_mm", name))
+            raise PlanningError(
+                f"{path}, line {line}: robot '{robot.name}' has no row '{name}'; {nearest_choice(name, names)}"
+            )
+    try:
+        cell.joints.limits(robot)
+    except (RecipeError, PlanningError) as problem:
+        raise PlanningError(f"{path}, line {line_of(path, ('joints',))}: {problem}") from None
+    return cell

@@ -1,0 +1,203 @@
+"""In which order to go to the poses of a plan, by what way points, and how long that takes."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.errors import PlanningError
+from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.cell.motion import is_free, way_points
+from pisigma.robot.description import Robot
+
+ROUNDS = 8
+"""So often motions that turn out to be blocked are avoided by another order; what is left gets way points."""
+SAMPLE = 50
+"""Poses to which ways are looked for, to tell which of two poses is shut in."""
+DETOUR = 3.0
+"""A blocked motion counts as this many times its time while the order is looked for."""
+
+
+@dataclass(frozen=True)
+class Pace:
+    """How fast the robot goes from pose to pose.
+
+    Attributes:
+        speed: of every joint that turns [rad/s]; the joint that needs longest decides.
+        slide: of every joint that slides [m/s].
+        settling: time at every pose until the robot is still and was measured [s].
+    """
+
+    speed: float = math.radians(30.0)
+    slide: float = 0.25
+    settling: float = 3.0
+
+    def __post_init__(self) -> None:
+        """Refuse times that are none."""
+        if not (0 < self.speed < math.inf and 0 < self.slide < math.inf and 0 <= self.settling < math.inf):
+            raise PlanningError(
+                f"a speed above 0 and a settling time of 0 s or more were wanted, got {math.degrees(self.speed):g} "
+                f"deg/s, {self.slide * 1e3:g} mm/s and {self.settling:g} s."
+            )
+
+    def seconds(
+        self, robot: Robot, start: Float64[Tensor, "*#batch dof"], end: Float64[Tensor, "*#batch dof"]
+    ) -> Float64[Tensor, "*_batch"]:
+        """Time of motions between joint values [s]: of the joint that needs longest, without its acceleration."""
+        speed = torch.where(torch.tensor(robot.revolute), self.speed, self.slide)
+        seconds: Tensor = ((end - start).abs() / speed).amax(-1)
+        return seconds
+
+
+@dataclass(frozen=True, eq=False)
+class Tour:
+    """An order of poses.
+
+    Attributes:
+        order: the poses, as they follow each other; those that no free motion was found to are left out.
+        before: per pose in this order, the way points that lead to it [rad or m]; mostly none.
+        left_out: poses that no free motion was found to.
+        seconds: that all takes.
+    """
+
+    order: Int64[Tensor, " poses"]
+    before: tuple[Float64[Tensor, "points dof"], ...]
+    left_out: Int64[Tensor, " others"]
+    seconds: float
+
+
+def tour(
+    arm: ArmInCell,
+    q: Float64[Tensor, "poses dof"],
+    pace: Pace,
+    pool: Float64[Tensor, "free dof"],
+    start: Float64[Tensor, " dof"] | None = None,
+) -> Tour:
+    """Order poses so that all of it takes little time, by motions that touch nothing.
+
+    Nearest neighbour, then 2-opt (Croes 1958, Operations Research 6(6)), on the time of the straight motions. Motions
+    that are blocked are made expensive and the order is improved again; those that stay get way points.
+
+    Args:
+        arm: the robot in its cell.
+        q: joint values [rad or m] of the poses, each of them free.
+        pace: of the robot.
+        pool: free poses that way points may be.
+        start: joint values where the robot stands [rad or m]; None for anywhere.
+    """
+    poses = q if start is None else torch.cat([start[None], q])
+    seconds = pace.seconds(arm.robot, poses[:, None], poses[None]).numpy().copy()
+    order = _nearest_neighbours(seconds, start is not None)
+    for _ in range(ROUNDS):
+        order = _two_opt(seconds, order, start is not None)
+        stops = torch.from_numpy(order)
+        blocked = (~is_free(arm, poses[stops[:-1]], poses[stops[1:]])).numpy()
+        counted = blocked & (seconds[order[:-1], order[1:]] < _BLOCKED)
+        if not counted.any():
+            break
+        one, other = order[:-1][counted], order[1:][counted]
+        seconds[one, other] = seconds[other, one] = _BLOCKED + DETOUR * seconds[one, other]
+    return _with_way_points(arm, poses, order, pace, pool, start is not None)
+
+
+_BLOCKED = 1e4
+"""[s] Added to the time of motions that are blocked: longer than any motion."""
+
+
+def _nearest_neighbours(seconds: Float64[np.ndarray, "poses poses"], fixed_start: bool) -> np.ndarray:
+    """Always go to the nearest pose that is left, from every pose as the first one (or from the first alone)."""
+    best: list[int] = []
+    shortest = math.inf
+    for first in range(1 if fixed_start else len(seconds)):
+        order, left = [first], np.ones(len(seconds), dtype=bool)
+        left[first], total = False, 0.0
+        while left.any():
+            step = np.where(left, seconds[order[-1]], math.inf)
+            order.append(int(step.argmin()))
+            total += float(step.min())
+            left[order[-1]] = False
+        if total < shortest:
+            best, shortest = order, total
+    return np.array(best)
+
+
+def _two_opt(seconds: Float64[np.ndarray, "poses poses"], order: np.ndarray, fixed_start: bool) -> np.ndarray:
+    """Turn stretches of the order round as long as that saves time; the ends are open."""
+    count, first = len(order), 1 if fixed_start else 0
+    while count > 2:
+        times = seconds[np.ix_(order, order)]
+        steps = np.diagonal(times, 1)
+        before = np.concatenate([[0.0], steps])  # into the stretch i to j, and out of it
+        after = np.concatenate([steps, [0.0]])
+        into = np.vstack([np.zeros(count), times[:-1]])  # from i - 1 to j
+        out = np.hstack([times[:, 1:], np.zeros((count, 1))])  # from i to j + 1
+        saved = np.triu(before[:, None] + after[None] - into - out, 1)
+        saved[:first] = 0.0
+        i, j = np.unravel_index(int(saved.argmax()), saved.shape)
+        if saved[i, j] < 1e-9:
+            break
+        order = np.concatenate([order[:i], order[i : j + 1][::-1], order[j + 1 :]])
+    return order
+
+
+def _with_way_points(
+    arm: ArmInCell,
+    poses: Float64[Tensor, "poses dof"],
+    order: np.ndarray,
+    pace: Pace,
+    pool: Float64[Tensor, "free dof"],
+    fixed_start: bool,
+) -> Tour:
+    """Put way points in where a motion is blocked, and leave out poses that none leads to."""
+    stops, before, left_out = [int(order[0])], [poses[:0]], []
+    for stop in order[1:].tolist():
+        points = _points_between(arm, poses[stops[-1]], poses[stop], pool)
+        if (
+            points is None
+            and len(stops) > int(fixed_start)
+            and _is_shut_in(arm, poses[stops[-1]], poses[stop], pool)
+        ):
+            left_out.append(stops.pop())
+            before.pop()
+            points = _points_between(arm, poses[stops[-1]], poses[stop], pool) if stops else poses[:0]
+        if points is None:
+            left_out.append(stop)
+        else:
+            stops.append(stop)
+            before.append(points)
+    path = torch.cat([torch.cat([points, poses[[stop]]]) for stop, points in zip(stops, before, strict=True)])
+    seconds = float(pace.seconds(arm.robot, path[:-1], path[1:]).sum()) + pace.settling * len(stops)
+    if fixed_start:
+        stops, before, seconds = stops[1:], before[1:], seconds - pace.settling
+    offset = int(fixed_start)
+    return Tour(
+        torch.tensor(stops, dtype=torch.int64) - offset,
+        tuple(before),
+        torch.tensor(left_out, dtype=torch.int64) - offset,
+        seconds,
+    )
+
+
+def _points_between(
+    arm: ArmInCell,
+    start: Float64[Tensor, " dof"],
+    end: Float64[Tensor, " dof"],
+    pool: Float64[Tensor, "free dof"],
+) -> Float64[Tensor, "points dof"] | None:
+    """Way points of a motion, none where it is free as it is; None where no way was found."""
+    return pool[:0] if bool(is_free(arm, start[None], end[None])) else way_points(arm, start, end, pool)
+
+
+def _is_shut_in(
+    arm: ArmInCell,
+    pose: Float64[Tensor, " dof"],
+    other: Float64[Tensor, " dof"],
+    pool: Float64[Tensor, "free dof"],
+) -> bool:
+    """Whether fewer free motions lead away from a pose than from another one."""
+    sample = pool[:: max(1, len(pool) // SAMPLE)]
+    ways = [int(is_free(arm, q.expand_as(sample), sample).sum()) for q in (pose, other)]
+    return ways[0] < ways[1]

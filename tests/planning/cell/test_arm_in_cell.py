@@ -1,0 +1,69 @@
+"""Which poses and motions a cell allows, against points on the links."""
+
+import numpy as np
+import torch
+from testing.cells import CELL, is_collision_free, is_visible
+from testing.closeness import assert_close
+
+from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.cell.motion import is_free, way_points
+from pisigma.robot import Robot
+
+ARM = ArmInCell.of(Robot.load("fanuc_r2000"), CELL)
+RADIUS = np.array([*(0.05 * 3.534 for _ in range(3)), *(0.035 * 3.534 for _ in range(3)), 0.025])
+LIMITS = ARM.limits.clamp(-np.pi, np.pi)
+DRAWS = torch.rand(400, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(5))
+Q = LIMITS[:, 0] + (LIMITS[:, 1] - LIMITS[:, 0]) * DRAWS
+FAULTS = ARM.faults(Q)
+
+
+def test_capsules_are_as_thick_as_the_documentation_says():
+    assert_close(ARM.capsules.radius.unique(), np.unique(RADIUS), rtol=1e-3)
+
+
+def test_every_allowed_pose_is_free_and_visible():
+    allowed = Q[FAULTS.allowed].numpy()
+    assert 20 < len(allowed) < 200
+    assert all(is_collision_free(ARM.robot, CELL, q, RADIUS) for q in allowed)
+    assert all(is_visible(ARM.robot, CELL, q, RADIUS) for q in allowed)
+
+
+def test_what_is_refused_is_refused_for_a_reason():
+    """Points lie a little farther apart than the lines they stand on, hence the few that only lines refuse."""
+    refused = Q[~FAULTS.allowed][:60].numpy()
+    wrongly = [
+        is_collision_free(ARM.robot, CELL, q, RADIUS) and is_visible(ARM.robot, CELL, q, RADIUS)
+        for q in refused
+    ]
+    assert sum(wrongly) <= 0.1 * len(refused)
+
+
+def test_every_reason_is_named():
+    everything = " ".join(FAULTS.counts())
+    for word in ("links", "floor", "'table'", "hides", "turned away"):
+        assert word in everything
+    outside = ARM.faults(torch.tensor([[4.0, 0, 0, 0, 0, 0]], dtype=torch.float64))
+    assert "outside its limits" in str(outside.sentence(0))
+    assert FAULTS.sentence(int(FAULTS.allowed.nonzero()[0])) is None
+
+
+def test_a_motion_is_free_where_all_poses_on_it_are():
+    q = Q[ARM.gap(Q) >= 0]
+    start, end = q[:40], q[40:80]
+    free = is_free(ARM, start, end)
+    assert 0 < int(free.sum()) < len(free)
+    steps = torch.linspace(0, 1, 200, dtype=torch.float64)[:, None, None]
+    least = ARM.gap((start + steps * (end - start)).reshape(-1, 6)).reshape(200, -1).min(0).values
+    assert bool((least[free] > -ARM.cell.clearance / 2).all())
+    assert bool((least[~free] < 0).all())
+
+
+def test_way_points_lead_round_what_blocks_a_motion():
+    q = Q[ARM.gap(Q) >= 0]
+    blocked = (~is_free(ARM, q[:40], q[40:80])).nonzero()[:, 0].tolist()
+    start, end = q[blocked[0]], q[40 + blocked[0]]
+    points = way_points(ARM, start, end, q)
+    assert points is not None
+    path = torch.cat([start[None], points, end[None]])
+    assert bool(is_free(ARM, path[:-1], path[1:]).all())
+    assert way_points(ARM, start, end, q[:0]) is None
