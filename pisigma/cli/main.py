@@ -1,6 +1,7 @@
 """The `pisigma` command."""
 
 import io
+import os
 import sys
 from typing import Annotated
 
@@ -51,6 +52,8 @@ def run() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # whatever letters a terminal knows, nothing fails for them
             stream.reconfigure(errors="backslashreplace")
+    # Threads that wait for work sleep: while they spin, what others do beside them makes both many times slower.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     try:
         try:
             app()
