@@ -63,6 +63,27 @@ def rotation_from_quaternion(quaternion: Float[Tensor, "*batch 4"]) -> Float[Ten
     return torch.stack(rows, -2)
 
 
+def quaternion_from_rotation(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
+    """Quaternion (x, y, z, w) of a rotation, w >= 0; inverse of `rotation_from_quaternion`.
+
+    The outer product 4·q·q^T is linear in R (Shepperd 1978, J. Guidance and Control 1(3)); its row with the
+    largest diagonal entry is q up to length and sign, without cancellation for any angle.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in R.unbind(-2))
+    rows = [
+        torch.stack([1 + xx - yy - zz, xy + yx, xz + zx, zy - yz], -1),
+        torch.stack([xy + yx, 1 - xx + yy - zz, yz + zy, xz - zx], -1),
+        torch.stack([xz + zx, yz + zy, 1 - xx - yy + zz, yx - xy], -1),
+        torch.stack([zy - yz, xz - zx, yx - xy, 1 + xx + yy + zz], -1),
+    ]
+    outer = torch.stack(rows, -2)
+    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
+    q = torch.take_along_dim(outer, largest[..., None, None], -2)[..., 0, :]
+    sign = torch.where(q[..., 3:] < 0, -1.0, 1.0).to(q)
+    length = (q * q).sum(-1, keepdim=True).sqrt()
+    return sign * q / length
+
+
 def rotation_from_vector(vector: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation of a rotation vector [rad] (Rodrigues), with finite gradients at zero."""
     square = (vector * vector).sum(-1)

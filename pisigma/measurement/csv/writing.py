@@ -17,6 +17,7 @@ from pisigma.measurement.csv.columns import number_fields
 from pisigma.measurement.csv.rows import first_of_equal_rows
 from pisigma.measurement.fields import KINDS, TEXTS, MeasuredFields
 from pisigma.measurement.readings import READINGS, Unit, from_si, reading_texts
+from pisigma.se3 import quaternion_from_rotation
 
 
 def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: Sequence[bool]) -> None:
@@ -64,7 +65,7 @@ def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float6
     nothing = torch.full((data.rows, 3), torch.nan, dtype=torch.float64)
     fields = {"position": nothing, **data.numbers}
     if "rotation" in fields:
-        fields["rotation"] = _quaternions(fields["rotation"])
+        fields["rotation"] = quaternion_from_rotation(fields["rotation"])
     alone = not any(bool(data.measured(kind).any()) for kind in ("socket", "touch", "distance", *READINGS))
     for field in number_fields(len(revolute)):
         if field.name in fields:
@@ -72,27 +73,6 @@ def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float6
             for column, of_column in zip(field.columns, values, strict=False):
                 add(column.name, of_column, column.unit, needed=alone and field.name == "position")
     return columns
-
-
-def _quaternions(R: Float64[Tensor, "rows 3 3"]) -> Float64[Tensor, "rows 4"]:
-    """Quaternions (x, y, z, w) of rotations, w >= 0.
-
-    The outer product 4·q·q^T is linear in R (Shepperd 1978, J. Guidance and Control 1(3)); its row with the
-    largest diagonal entry is q up to length and sign, without cancellation for any angle.
-    """
-    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = (row.unbind(-1) for row in R.unbind(-2))
-    rows = [
-        torch.stack([1 + xx - yy - zz, xy + yx, xz + zx, zy - yz], -1),
-        torch.stack([xy + yx, 1 - xx + yy - zz, yz + zy, xz - zx], -1),
-        torch.stack([xz + zx, yz + zy, 1 - xx - yy + zz, yx - xy], -1),
-        torch.stack([zy - yz, xz - zx, yx - xy, 1 + xx + yy + zz], -1),
-    ]
-    outer = torch.stack(rows, -2)
-    largest = outer.diagonal(dim1=-2, dim2=-1).argmax(-1)
-    q = torch.take_along_dim(outer, largest[:, None, None], -2)[:, 0]
-    sign = torch.where(q[:, 3:] < 0, -1.0, 1.0).to(q)
-    length = (q * q).sum(-1, keepdim=True).sqrt()
-    return sign * q / length
 
 
 def _check(
