@@ -14,6 +14,7 @@ from pisigma.cli.endings import end_with, tell_problems
 from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
 from pisigma.cli.ik import ik
+from pisigma.cli.import_ import import_
 from pisigma.cli.report import report
 from pisigma.cli.robots import robots
 from pisigma.cli.simulate import simulate
@@ -28,8 +29,21 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-for command in (robots, simulate, calibrate, train, evaluate, report, ik, distill, export, verify, upgrade):
-    app.command()(tell_problems(command))
+for command in (
+    robots,
+    simulate,
+    import_,
+    calibrate,
+    train,
+    evaluate,
+    report,
+    ik,
+    distill,
+    export,
+    verify,
+    upgrade,
+):
+    app.command(command.__name__.rstrip("_"))(tell_problems(command))
 
 
 def _show_version(wanted: bool) -> None:

@@ -23,6 +23,7 @@ from pisigma.measurement.csv.header import Layout, read_header
 from pisigma.measurement.csv.rows import CheckedRows, check_cells, check_equal_rows
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.fields import TEXTS, LeftOut, MeasuredFields, OnBadRow
+from pisigma.measurement.foreign.import_hint import import_hint
 from pisigma.measurement.readings import READINGS, reading_texts, to_si
 from pisigma.measurement.rules import Labels, group_faults, row_faults
 from pisigma.robot import Robot
@@ -59,8 +60,25 @@ def read_fields(
         raise MeasurementError(
             f"on_bad_row '{on_bad_row}': {nearest_choice(on_bad_row, ('error', 'leave_out'))}"
         )
-    table = read_table(path)
-    layout = read_header(table, robot)
+    try:
+        table = read_table(path)
+        layout = read_header(table, robot)
+    except MeasurementError as problem:
+        raise MeasurementError(f"{problem}{import_hint(path)}") from None
+    return _fields_of(table, layout, robot, on_bad_row)
+
+
+def fields_of(table: Table) -> MeasuredFields:
+    """Read the table of a measurement file; see `read_fields`.
+
+    Raises:
+        MeasurementError: its header or a row cannot be used.
+    """
+    return _fields_of(table, read_header(table, None), None, "error")
+
+
+def _fields_of(table: Table, layout: Layout, robot: Robot | None, on_bad_row: OnBadRow) -> MeasuredFields:
+    """Check all rows and turn them into fields."""
     rows = check_cells(table, layout, robot)
     data, labels, faults = _fields(table, layout, rows), _labels(layout), rows.faults
     faults.add(row_faults(data, labels))

@@ -1,0 +1,1 @@
+"""What instruments and controllers export, turned into measurement files."""

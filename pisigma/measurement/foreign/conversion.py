@@ -1,0 +1,165 @@
+"""The rows of an export in columns of measurement files; every number with all of its digits."""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.errors import MeasurementError
+from pisigma.measurement.csv.columns import QUATERNION, RPY, find_column
+from pisigma.measurement.foreign.export_file import ExportFile
+from pisigma.measurement.foreign.mapping import FileMapping
+from pisigma.measurement.foreign.number_format import is_missing
+from pisigma.measurement.foreign.quantities import KEYS, LEFT_OUT, MappedColumn, measurement_column
+from pisigma.measurement.foreign.rotations import ROTATIONS, RotationEncoding
+from pisigma.measurement.foreign.units import UNITS, scaled
+from pisigma.se3 import quaternion_from_rotation
+
+
+@dataclass(frozen=True, eq=False)
+class ConvertedRows:
+    """Rows of an export, or of several, in columns of measurement files.
+
+    Attributes:
+        source: the file.
+        lines: where the rows stand in it.
+        cells: texts of every row by column, such as "q1_deg", and by the keys "point" and "time".
+    """
+
+    source: str
+    lines: tuple[int, ...]
+    cells: Mapping[str, tuple[str, ...]]
+
+
+def check_complete(mapping: FileMapping) -> None:
+    """Make sure that every column that is kept is in a unit, and is the only one of its quantity.
+
+    Raises:
+        MeasurementError: see above, or the encoding of a rotation is open.
+    """
+    source, kept = mapping.file.source, [one for one in mapping.columns if one.target.quantity != LEFT_OUT]
+    for column in kept:
+        other = mapping.quantities[column.target.quantity]
+        if other != column:
+            raise MeasurementError(
+                f"{source}: the columns '{column.heading}' and '{other.heading}' are both {column.target.quantity}; "
+                f"say which one is wanted, such as --map '{column.heading}=-'."
+            )
+    if mapping.rotations:
+        raise MeasurementError(
+            f"{source}: the headings do not say how the rotation is written; state --rotation "
+            f"{', '.join(mapping.rotations)}, or none to leave it out."
+        )
+    if lacking := mapping.without_unit:
+        names = ", ".join(f"'{one.heading}'" for one in lacking)
+        many, example = "s" if len(lacking) > 1 else "", mapping.example_units
+        first = replace(
+            lacking[0].target, unit=example.split(",")[0 if lacking[0].target.needs == "length" else -1]
+        )
+        raise MeasurementError(
+            f"{source}: no unit is stated of the column{many} {names}; state it, --unit {example} if that is right, or "
+            f"--map '{lacking[0].heading}={first.text}'."
+        )
+
+
+def convert(mapping: FileMapping) -> ConvertedRows:
+    """Convert the rows of a file.
+
+    Raises:
+        MeasurementError: see `check_complete`, or the values of a row are no rotation; the message names the line.
+    """
+    check_complete(mapping)
+    file, cells = mapping.file, {}
+    for quantity, column in mapping.quantities.items():
+        if quantity in KEYS:
+            cells[quantity] = _key(file, quantity, file.column(column.index), column.target.unit)
+        elif not any(quantity in one.quantities() for one in ROTATIONS.values()):
+            name, texts = _column(file, quantity, column)
+            cells[name] = texts
+    for encoding in ROTATIONS.values():
+        columns = [mapping.quantities.get(quantity) for quantity in encoding.quantities()]
+        present = [column for column in columns if column is not None]
+        if len(present) == len(columns):
+            cells |= _rotation(file, encoding, present)
+        elif present:
+            raise MeasurementError(
+                f"{file.source}: of a rotation in the way '{encoding.name}', only {len(present)} of {len(columns)} "
+                f"values are mapped; map {', '.join(encoding.quantities())}."
+            )
+    return ConvertedRows(file.source, file.lines, cells)
+
+
+def _key(file: ExportFile, quantity: str, texts: list[str], unit: str) -> tuple[str, ...]:
+    """Names of points as they are; times in s where they are numbers."""
+    if quantity == "point":
+        return tuple(texts)
+    numbers = [file.dialect.numbers.text(text) for text in texts]
+    return tuple(
+        text if number is None else scaled(number, unit) for text, number in zip(texts, numbers, strict=True)
+    )
+
+
+def _column(file: ExportFile, quantity: str, column: MappedColumn) -> tuple[str, tuple[str, ...]]:
+    """A column of measurement files, and its cells."""
+    unit = column.target.unit
+    written = UNITS[unit].column if unit else ""
+    if quantity in RPY and written == "rad":
+        numbers = _numbers(file, column)
+        return f"{quantity}_deg", tuple(repr(math.degrees(float(text))) if text else "" for text in numbers)
+    name = measurement_column(quantity, written)
+    kept = find_column(name)
+    assert kept is not None  # as parse_target and the proposals make it
+    return name, _numbers(file, column) if kept.is_number else tuple(file.column(column.index))
+
+
+def _numbers(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
+    """The numbers of a column in the unit of measurement files, "" where nothing was measured.
+
+    Raises:
+        MeasurementError: a cell holds something else; the message names its line.
+    """
+    numbers = []
+    for line, cell in zip(file.lines, file.column(column.index), strict=True):
+        number = "" if is_missing(cell) else file.dialect.numbers.text(cell)
+        if number is None:
+            sign = "point" if file.dialect.numbers.decimal == "." else "comma"
+            raise MeasurementError(
+                f"{file.source}, line {line}, column '{column.heading}': '{cell}' is no number with a decimal {sign}; "
+                "correct it, leave it empty where nothing was measured, or remove the row."
+            )
+        numbers.append(scaled(number, column.target.unit) if number else "")
+    return tuple(numbers)
+
+
+def _rotation(
+    file: ExportFile, encoding: RotationEncoding, columns: list[MappedColumn]
+) -> dict[str, tuple[str, ...]]:
+    """Quaternions of rotations; "" in rows without."""
+    rows = list(zip(*(_numbers(file, column) for column in columns), strict=True))
+    values = torch.tensor([[float(text or "nan") for text in row] for row in rows], dtype=torch.float64)
+    if columns[0].target.unit and UNITS[columns[0].target.unit].column == "deg":
+        values = values.deg2rad()
+    measured = torch.tensor([any(row) for row in rows], dtype=torch.bool)
+    wrong = measured & ~encoding.is_rotation(values)
+    if bool(wrong.any()):
+        names = ", ".join(f"'{column.heading}'" for column in columns)
+        raise MeasurementError(
+            f"{file.source}, line {file.lines[int(wrong.nonzero()[0, 0])]}, columns {names}: are no rotation in "
+            f"the way '{encoding.name}' ({encoding.meaning}); correct or empty them, or state another --rotation."
+        )
+    quaternions = _quaternion_texts(encoding, values, measured)
+    return dict(zip(QUATERNION, zip(*quaternions, strict=True), strict=True))
+
+
+def _quaternion_texts(
+    encoding: RotationEncoding, values: Float64[Tensor, "rows values"], measured: Tensor
+) -> list[tuple[str, ...]]:
+    """The quaternion of every row as texts, empty where nothing was measured."""
+    texts: list[tuple[str, ...]] = [("",) * 4] * len(values)
+    quaternions = quaternion_from_rotation(encoding.to_rotation(values[measured]))
+    for row, quaternion in zip(measured.nonzero()[:, 0].tolist(), quaternions.tolist(), strict=True):
+        texts[row] = tuple(map(repr, quaternion))
+    return texts

@@ -1,0 +1,176 @@
+"""An export as a table of texts: its comments, heading, units and rows."""
+
+import os
+import re
+from collections import Counter
+from dataclasses import dataclass
+
+from pisigma.errors import MeasurementError, printable
+from pisigma.files.input_file import read_input
+from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
+from pisigma.measurement.foreign.dialect import COMMENT, MOST_COLUMNS, Dialect, sniff
+from pisigma.measurement.foreign.headings import is_recognised
+from pisigma.measurement.foreign.number_format import Decimal, is_missing
+from pisigma.measurement.foreign.text_encoding import decoded
+from pisigma.measurement.foreign.units import unit_symbol
+
+_Lines = list[tuple[int, str]]
+
+
+@dataclass(frozen=True, eq=False)
+class ExportFile:
+    """A file of an instrument or a controller, before its meaning is looked at.
+
+    Attributes:
+        source: the file, as complaints call it.
+        headings: of the columns; their numbers from "1" on where the file has none.
+        has_header: whether it has headings.
+        units: symbols of the units of its unit row, "" for columns without.
+        comments: titles and comments, as they stand there.
+        records: the cells of every row, in the order of the file.
+        lines: where the rows stand.
+        dialect: how it is written.
+        skipped: lines after the first row that are no rows.
+    """
+
+    source: str
+    headings: tuple[str, ...]
+    has_header: bool
+    units: tuple[str, ...]
+    comments: tuple[str, ...]
+    records: list[list[str]]
+    lines: tuple[int, ...]
+    dialect: Dialect
+    skipped: tuple[int, ...]
+
+    def column(self, index: int) -> list[str]:
+        """The cells of a column."""
+        return [record[index] for record in self.records]
+
+    def numbers(self, index: int) -> list[float]:
+        """The numbers of a column in its file's unit, without the cells that hold none."""
+        texts = (self.dialect.numbers.text(cell) for cell in self.column(index))
+        return [float(text) for text in texts if text is not None]
+
+
+def read_export(path: str | os.PathLike[str], decimal: Decimal | None = None) -> ExportFile:
+    """Read an export: encoding, separator and decimal sign are recognised, headings, unit row and comments told apart.
+
+    Args:
+        path: the file.
+        decimal: the decimal sign, where it is stated.
+
+    Raises:
+        MeasurementError: the file cannot be read, is no text, holds no table of numbers, or a row has another number
+            of cells than the others; the message names the line.
+    """
+    source = printable(str(path), cut=False)
+    text = decoded(read_input(path, MeasurementError), source)
+    lines = [(number, line) for number, line in enumerate(text.split("\n"), start=1) if line.strip()]
+    dialect = sniff([line for _, line in lines], source, decimal)
+    rows = [(number, dialect.split(line)) for number, line in lines]
+    width = Counter(len(row) for _, row in rows if _is_row(dialect, row, len(row))).most_common(1)[0][0]
+    first = next(i for i, (_, row) in enumerate(rows) if _is_row(dialect, row, width))
+    headings, units, comments = _read_top(lines[:first], dialect, width, source)
+    records, numbers, skipped = [], [], []
+    for (number, row), (_, line) in zip(rows[first:], lines[first:], strict=True):
+        if _is_row(dialect, row, width) or (len(row) == width and _is_content(line, row, headings)):
+            records.append(row)
+            numbers.append(number)
+        elif any(row):
+            skipped.append(number)
+            _check_skipped(line, row, dialect, headings, width, f"{source}, line {number}")
+            comments.append(line)
+    used = [i for i in range(width) if (headings and headings[i]) or any(row[i] for row in records)]
+    return ExportFile(
+        source=source,
+        headings=tuple(headings[i] if headings and headings[i] else str(i + 1) for i in used),
+        has_header=bool(headings),
+        units=tuple(units[i] if units else "" for i in used),
+        comments=tuple(comments),
+        records=[[row[i] for i in used] for row in records],
+        lines=tuple(numbers),
+        dialect=dialect,
+        skipped=tuple(skipped),
+    )
+
+
+def _is_row(dialect: Dialect, row: list[str], width: int) -> bool:
+    """Whether cells are a row of a width: two numbers or more, or numbers and what stands for them."""
+    if len(row) != width or not 2 <= width <= MOST_COLUMNS:
+        return False
+    if row[0].startswith(("#", "%", ";", "!")):
+        return row[0] in SPREADSHEET_ERRORS
+    numeric = sum(map(dialect.is_number, row))
+    return numeric >= 2 or (numeric >= 1 and numeric + sum(map(is_missing, row)) >= width - 1)
+
+
+def _is_content(line: str, row: list[str], headings: list[str]) -> bool:
+    """Whether cells without numbers are a row nevertheless, whose reader will say what is wrong with it."""
+    return any(row) and row != headings and not _is_comment(line, row)
+
+
+def _is_comment(line: str, row: list[str]) -> bool:
+    return bool(COMMENT.match(line)) and row[0] not in SPREADSHEET_ERRORS
+
+
+def _check_skipped(
+    line: str, row: list[str], dialect: Dialect, headings: list[str], width: int, place: str
+) -> None:
+    """Refuse a row of another width, which would be lost; comments and headings that come again are none.
+
+    Raises:
+        MeasurementError: see above.
+    """
+    if _is_comment(line, row) or row == headings or sum(map(dialect.is_number, row)) < 2:
+        return
+    raise MeasurementError(
+        f"{place}: {len(row)} cells, but the other rows have {width}; complete or remove the row, or state --decimal "
+        "where decimal commas were taken for separators."
+    )
+
+
+def _read_top(
+    lines: _Lines, dialect: Dialect, width: int, source: str
+) -> tuple[list[str], list[str], list[str]]:
+    """What stands before the first row: headings, the unit row (each [] where there is none), and comments."""
+    headings: list[str] = []
+    units: list[str] = []
+    comments: list[str] = []
+    for number, line in reversed(lines):
+        cells = _heading_cells(line, dialect, width)
+        symbols = [unit_symbol(cell) for cell in cells]
+        is_units = any(symbols) and all(symbols[i] or not cell for i, cell in enumerate(cells))
+        if headings or not any(cells) or set(line) <= set("-=+|_ \t"):
+            comments.append(line)
+        elif len(cells) == width and is_units and not units:
+            units = symbols
+        elif len(cells) == width and (not COMMENT.match(line) or _recognised(cells) >= 0.5):
+            headings = cells
+        elif len(cells) > 2 and _recognised(cells) >= 0.5:
+            raise MeasurementError(
+                f"{source}, line {number}: {len(cells)} headings stand over rows of {width} cells; give every column "
+                "one heading."
+            )
+        else:
+            comments.append(line)
+    return headings, units, comments[::-1]
+
+
+def _heading_cells(line: str, dialect: Dialect, width: int) -> list[str]:
+    """The cells of a heading, which may begin as a comment, end with a separator or have blanks before its units."""
+    bare = COMMENT.sub("", line, count=1) if COMMENT.match(line) else line
+    for text in (line, bare, re.sub(r"\s+(?=[\[(])", "", bare)):
+        cells = dialect.split(text)
+        if len(cells) == width + 1 and not cells[-1]:
+            cells = cells[:-1]
+        if len(cells) == width - 1:  # rows end with a separator
+            cells = [*cells, ""]
+        if len(cells) == width:
+            return [cell.lstrip("#%").strip() for cell in cells]
+    return dialect.split(bare)
+
+
+def _recognised(cells: list[str]) -> float:
+    """Share of the cells that are names which instruments use."""
+    return sum(map(is_recognised, cells)) / len(cells)

@@ -1,0 +1,179 @@
+"""What the headings of exports mean: a registry of the names that makers and instruments use."""
+
+import re
+from dataclasses import dataclass
+
+from pisigma.measurement.csv.columns import find_column
+from pisigma.measurement.foreign.rotations import ROTATIONS
+from pisigma.measurement.foreign.units import unit_symbol
+
+_SIDES = {
+    "commanded": "target cmd command commanded setpoint soll nominal nom ref reference desired",
+    "measured": "actual act meas measured ist",
+    "": "robot tcp tool pos position pose coord coordinate coordinates value values val tracker reflector smr jnt "
+    "trans translation",
+}
+"""Words that may stand beside a name, by what they say: how it came about, or nothing."""
+_SIDE_OF = {word: side for side, words in _SIDES.items() for word in words.split()}
+_OF_QUATERNION = re.compile(r"^(?:rot|rotation|ori|orient|orientation|quat|quaternion)(?=q[0-4xyzw]$)")
+_BRACKETS = re.compile(r"^(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\)|<([^>]*)>)\s*$")
+_TRAILING = re.compile(r"^(.*?)(?:\s*/\s*|\s+in\s+|[\s_,-]+)([A-Za-z°µμ]+)\.?$")
+
+
+@dataclass(frozen=True)
+class Heading:
+    """A heading, taken apart.
+
+    Attributes:
+        text: as in the file.
+        name: what is left without unit, case, separators and words that say nothing, such as "j1" of "J_1 [deg]".
+        unit: symbol of the unit that stands in it, or "".
+        unknown_unit: what stands in brackets and is no unit.
+        side: "commanded" or "measured" where it says so.
+        is_column: whether it is the name of a column of measurement files, but for its case.
+    """
+
+    text: str
+    name: str
+    unit: str
+    unknown_unit: str = ""
+    side: str = ""
+    is_column: bool = False
+
+
+def parse_heading(text: str) -> Heading:
+    """Take a heading apart."""
+    column = find_column(text.strip().lower())
+    if column is not None:
+        return Heading(text, column.quantity, column.unit, is_column=True)
+    name, unit, unknown = _unit_apart(text.strip())
+    words = [word for word in re.split(r"[\W_]+", name.casefold()) if word]
+    side = next(filter(None, (_SIDE_OF.get(word) for word in words)), "")
+    for sides in (("commanded", "measured"), ("",)):
+        rest = [word for word in words if _SIDE_OF.get(word) not in sides]
+        words = rest if rest and not all(word.isdigit() for word in rest) else words
+    name = _OF_QUATERNION.sub("", "".join(words))
+    return Heading(text, name, unit, unknown, side)
+
+
+def _unit_apart(text: str) -> tuple[str, str, str]:
+    """The name in a heading, the symbol of its unit, and what stands in the place of a unit and is none."""
+    match = _BRACKETS.match(text)
+    if match:
+        inside = next(group for group in match.groups()[1:] if group is not None)
+        symbol = unit_symbol(inside)
+        return match[1] or inside, symbol, "" if symbol or not match[1] else inside
+    match = _TRAILING.match(text)
+    if match and match[1] and (symbol := unit_symbol(match[2])):
+        return match[1], symbol, ""
+    return text, "", ""
+
+
+@dataclass(frozen=True)
+class Maker:
+    """How a maker names columns.
+
+    Attributes:
+        name: of the maker.
+        joints: names of the joints in their order, or one that numbers follow; "" where others name them so, too.
+        rotation: its encoding of rotations.
+        position: name of x, where it is needed to tell that it is this maker.
+        length: unit that it always writes lengths in; "" where that may be set.
+        angle: the same of angles.
+    """
+
+    name: str
+    joints: str = ""
+    rotation: str = ""
+    position: str = ""
+    length: str = ""
+    angle: str = ""
+
+
+MAKERS = (
+    Maker("KUKA", "a#", "kuka", length="mm", angle="deg"),
+    Maker("ABB", "rax#", "abb", length="mm", angle="deg"),
+    Maker("Kawasaki", "jt#", "kawasaki", length="mm", angle="deg"),
+    Maker("Yaskawa", "s l u r b t", "yaskawa", length="mm", angle="deg"),
+    Maker("Universal Robots", "q#", "ur", "tcppose0", "m", "rad"),
+    Maker("Universal Robots", "base shoulder elbow wrist1 wrist2 wrist3", "ur"),
+    Maker("FANUC", "", "fanuc", length="mm", angle="deg"),
+    Maker("Epson", "", "epson", length="mm", angle="deg"),
+    Maker("Kawasaki", "", "kawasaki", length="mm", angle="deg"),
+)
+"""An instrument or a controller more is one line; those without names of their own for the joints are recognised by
+their rotations."""
+
+JOINT_NAMES = (
+    "j",
+    "joint",
+    "q",
+    "axis",
+    "ax",
+    "achse",
+    "th",
+    "theta",
+    "gelenk",
+    "axe",
+    "eje",
+    "asse",
+    "jt",
+    "a",
+    "rax",
+)
+"""What numbers of joints follow, whoever writes it."""
+
+POSITIONS = tuple(
+    tuple(names.split())
+    for names in (
+        "x y z",
+        "px py pz",
+        "tcppose0 tcppose1 tcppose2",
+        "t14 t24 t34",
+        "m14 m24 m34",
+        "m03 m13 m23",
+        "r14 r24 r34",
+    )
+)
+"""Names of the coordinates of a position; a way to name them is one text."""
+
+_MEANINGS = {
+    "point": "point pos name pointname pointid punkt punktname pt ptname no nr num id index label number measurement",
+    "time": "time timestamp zeit datetime date_time utc stamp systemtime",
+    "temperature": "temperature temp temperatur t1 ambient",
+    "payload": "payload load last mass",
+    "set": "set split",
+}
+MEANINGS = {name: quantity for quantity, names in _MEANINGS.items() for name in names.split()}
+"""Names of what is no joint, position or rotation; a name more is one word."""
+_OTHERS = {
+    name
+    for names in (
+        *POSITIONS,
+        *(values for one in ROTATIONS.values() for values in (one.values, *one.aliases)),
+    )
+    for name in names
+} | set(MEANINGS)
+
+
+def joint_of(name: str, pattern: str) -> int | None:
+    """Number of a joint by its name in the way of a maker, as written; None where it is none.
+
+    Args:
+        name: of a heading.
+        pattern: see `Maker.joints`.
+    """
+    if not pattern.endswith("#"):
+        names = pattern.split()
+        return names.index(name) + 1 if name in names else None
+    start, number = pattern[:-1], name[len(pattern) - 1 :]
+    return int(number) if name.startswith(start) and re.fullmatch(r"[0-9]{1,3}", number) else None
+
+
+def is_recognised(text: str) -> bool:
+    """Say whether a heading means something that is kept."""
+    heading = parse_heading(text)
+    patterns = (*(f"{name}#" for name in JOINT_NAMES), *(maker.joints for maker in MAKERS if maker.joints))
+    return (
+        heading.is_column or heading.name in _OTHERS or any(joint_of(heading.name, one) for one in patterns)
+    )
