@@ -80,19 +80,33 @@ class PositionUncertainty:
     def _of_rows(
         self, state: JointState, q_moved: Float64[Tensor, "rows dof"], frame: int, target: int
     ) -> Float64[Tensor, "rows 3"]:
+        columns = self.columns(state, q_moved, frame, target)[:, :3]
+        return self.covariance_root.along(columns).square().sum(-1).sqrt()
+
+    def columns(
+        self, state: JointState, q_moved: Float64[Tensor, "rows dof"], frame: int = 0, target: int = 0
+    ) -> Float64[Tensor, "rows 6 unknowns"]:
+        """Derivative of position [m] and rotation vector [rad] of a target in a frame by all unknowns.
+
+        Args:
+            state: commanded joint values, and what is stated beside them.
+            q_moved: the joint values with their corrections.
+            frame: number of the frame.
+            target: number of the target.
+        """
         space = self.space
         base, tool = list(self.geometry.bases.values())[frame], list(self.geometry.tools.values())[target]
         robot = self.geometry.robot.with_geometry(base=base, tool=tool)
-        J = identification_jacobian(robot, q_moved)[1][:, :3]
-        columns = J.new_zeros((len(q_moved), 3, len(self.covariance_root.directions)))
+        J = identification_jacobian(robot, q_moved)[1]
+        columns = J.new_zeros((len(q_moved), 6, len(self.covariance_root.directions)))
         columns[..., : space.arm_size] = J[..., : space.arm_size]
         for group, number, first in (("base", frame, space.arm_size), ("tool", target, space.arm_size + 6)):
             start = space.of(group).start + 6 * number
             columns[..., start : start + 6] = J[..., first : first + 6]
         columns[..., len(space.parameters) :] = self._weight_columns(J, state)
-        return self.covariance_root.along(columns).square().sum(-1).sqrt()
+        return columns
 
-    def _weight_columns(self, J: Tensor, state: JointState) -> Float64[Tensor, "rows 3 weights"]:
+    def _weight_columns(self, J: Tensor, state: JointState) -> Float64[Tensor, "rows 6 weights"]:
         joints = J[..., joint_columns(self.space)] * J.new_tensor(self.space.robot.directions)
         blocks = [weight_columns(joints, chosen, state) for chosen in self.features]
         return torch.cat([joints[..., :0], *blocks], -1)

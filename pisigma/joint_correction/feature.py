@@ -15,6 +15,8 @@ from pisigma.onnx.graph import OnnxGraph
 from pisigma.robot.description import Robot
 from pisigma.yaml_file import Section
 
+USUAL_SIZE = 2e-5
+"""Prior size [rad] of weights of which nothing else is known."""
 Feature = TypeVar("Feature", bound="AbstractFeature")
 
 
@@ -72,6 +74,14 @@ class AbstractFeature(ABC):
     group: Int64[Tensor, "dof columns"]
     group_names: tuple[str, ...]
     size: int = 0
+
+    @property
+    def usual_sizes(self) -> tuple[float, ...]:
+        """Standard deviations of the weights of every group on usual robots [rad].
+
+        Fits of few rows start with them, and plans expect them before anything is measured.
+        """
+        return (USUAL_SIZE,) * len(self.group_names)
 
     def __init__(self, robot: Robot) -> None:
         """Prepare for the nominal robot."""

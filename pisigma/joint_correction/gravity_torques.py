@@ -79,6 +79,8 @@ class GravityTorques(AbstractFeature):
     ARM = 0.2
     """Centres of mass lie about this share of the reach from the frames' origins."""
     group_names = ("gravity",)
+    usual_sizes = (3e-4,)
+    """[rad] Simulated arms with a payload have 1.8e-4, the measured UR10 8.6e-4 and the UR5 1.7e-4."""
 
     def __init__(self, robot: Robot, gravity: Direction = (0.0, 0.0, -1.0)) -> None:
         """Prepare for a robot.

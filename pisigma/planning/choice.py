@@ -1,0 +1,164 @@
+"""Which of many candidate poses to measure: those that leave least uncertain."""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.errors import PlanningError
+from pisigma.planning.knowledge import Knowledge
+
+Criterion = Literal["D", "I"]
+LEAST_VARIANCE = 1e-4
+"""Share of the task's variance that directions which are left out may hold together."""
+EXCHANGED = 400
+"""So many of the candidates take part in the exchange: the chosen ones, and the best of the others."""
+LEAST_GAIN = 1e-6
+"""[nats or share of the variance] An exchange has to gain more."""
+PASSES = 3
+"""Every chosen pose is exchanged so often at most."""
+
+
+def choose(
+    knowledge: Knowledge,
+    candidates: Float64[Tensor, "candidates dof"],
+    count: int,
+    task: Float64[Tensor, "tasks dof"],
+    criterion: Criterion = "I",
+) -> Int64[Tensor, " count"]:
+    """Choose poses to measure, the most useful first.
+
+    "D" maximises the information on all unknowns, `log det(1 + Σ B_i^T B_i)`, with B of `Knowledge.measured`; "I"
+    minimises the mean variance of the tool's position over the task, `tr(C W)`. Poses are taken one after the other,
+    each the best beside those before it: for D a pivoted block Cholesky factorisation of the covariance of all values.
+    Then each is exchanged for the best other one as long as that gains something, and the chosen poses are put in
+    order again, so that the first n of them are a good choice of n.
+
+    Source: exchange of Fedorov 1972, "Theory of Optimal Experiments", section 3.3; greedy choice of Krause, Singh and
+    Guestrin 2008, JMLR 9, 235-284; for robots Borm and Menq 1991 choose poses by observability.
+
+    Args:
+        knowledge: before the first of them is measured.
+        candidates: joint values [rad or m].
+        count: how many to choose.
+        task: joint values [rad or m] where the robot shall be accurate.
+        criterion: see above.
+
+    Returns:
+        Numbers of candidates, each once at most.
+
+    Raises:
+        PlanningError: there are not as many candidates, or no task.
+    """
+    if not 1 <= count <= len(candidates):
+        raise PlanningError(
+            f"1 to {len(candidates)} poses can be chosen from {len(candidates)} candidates, {count} were wanted; ask "
+            "for fewer or draw more candidates."
+        )
+    if not len(task):
+        raise PlanningError("joint values of the task were wanted, got none; state some poses.")
+    B, goal = knowledge.measured(candidates), condensed(knowledge.tool(task))
+    choice = Choice(B, goal, criterion)
+    choice.grow(count)
+    remaining = choice.gains().argsort(descending=True)[: max(EXCHANGED - count, 0)]
+    pool = torch.cat(
+        [torch.tensor(choice.chosen), remaining[~torch.isin(remaining, torch.tensor(choice.chosen))]]
+    )
+    few = Choice(B[pool], goal, criterion)
+    for number in range(count):
+        few.add(number)
+    few.exchange()
+    chosen = pool[torch.tensor(few.chosen)]
+    ordered = Choice(B[chosen], goal, criterion)
+    ordered.grow(count)
+    result: Tensor = chosen[torch.tensor(ordered.chosen)]
+    return result
+
+
+def condensed(D: Float64[Tensor, "tasks 3 directions"]) -> Float64[Tensor, "rank directions"]:
+    """Give few rows W with the same mean variance, `W^T W = mean(D_i^T D_i)`, but for `LEAST_VARIANCE` of it."""
+    values, vectors = torch.linalg.eigh(torch.einsum("tcd,tce->de", D, D) / len(D))
+    left_out = values.clamp(min=0).cumsum(0)
+    kept = left_out > LEAST_VARIANCE * left_out[-1]
+    rows: Tensor = values[kept].sqrt()[:, None] * vectors[:, kept].t()
+    return rows
+
+
+class Choice:
+    """Some of the candidates, and what every one of the others would add to them.
+
+    With C the covariance of the standard normal numbers after the chosen poses, a pose changes it by
+    `-C B_i^T (1 + B_i C B_i^T)^-1 B_i C`, and taking it back by `+C B_i^T (1 - B_i C B_i^T)^-1 B_i C` (Woodbury).
+
+    Attributes:
+        chosen: numbers of the chosen candidates, in the order in which they came.
+    """
+
+    def __init__(
+        self,
+        B: Float64[Tensor, "candidates values directions"],
+        goal: Float64[Tensor, "rank directions"],
+        criterion: Criterion,
+    ) -> None:
+        """Start with no pose.
+
+        Args:
+            B: see `Knowledge.measured`.
+            goal: see `condensed`.
+            criterion: see `choose`.
+        """
+        self.chosen: list[int] = []
+        self._B, self._goal, self._criterion = B, goal, criterion
+        self._C = torch.eye(B.shape[2]).to(B)
+        self._S = B @ B.mT  # covariance of the values of every candidate
+        self._X = B @ goal.t() if criterion == "I" else B[..., :0]  # with the task's positions
+
+    def gains(self) -> Float64[Tensor, " candidates"]:
+        """What every candidate would gain: information [nats] for D, less variance [m²] for I; none for chosen ones."""
+        values = self._S + torch.eye(self._S.shape[1]).to(self._S)
+        lower = torch.linalg.cholesky(values)
+        if self._criterion == "D":
+            gains: Tensor = lower.diagonal(dim1=1, dim2=2).log().sum(1)
+        else:
+            gains = torch.linalg.solve_triangular(lower, self._X, upper=False).square().sum((1, 2))
+        gains[self.chosen] = -torch.inf
+        return gains
+
+    def add(self, number: int) -> None:
+        """Choose a candidate."""
+        self._update(number, 1.0)
+        self.chosen.append(number)
+
+    def grow(self, count: int) -> None:
+        """Choose the best candidate until there are so many."""
+        while len(self.chosen) < count:
+            self.add(int(self.gains().argmax()))
+
+    def exchange(self) -> None:
+        """Exchange every chosen candidate for the best other one, until nothing gains any more."""
+        for _ in range(PASSES if len(self.chosen) < len(self._B) else 0):
+            exchanged = False
+            for number in list(self.chosen):
+                self.chosen.remove(number)
+                self._update(number, -1.0)
+                gains = self.gains()
+                best = int(gains.argmax())
+                scale = 1.0 if self._criterion == "D" else float(gains[number])
+                if float(gains[best] - gains[number]) > LEAST_GAIN * scale:
+                    exchanged = True
+                    number = best
+                self.add(number)
+            if not exchanged:
+                break
+
+    def _update(self, number: int, sign: float) -> None:
+        """The covariance with a candidate (+1) or without it (-1)."""
+        G = self._C @ self._B[number].t()
+        here = torch.eye(G.shape[1]).to(G) + sign * self._B[number] @ G
+        half = torch.linalg.solve_triangular(torch.linalg.cholesky(here), G.t(), upper=False)
+        U = self._B @ half.t()
+        self._C -= sign * half.t() @ half
+        self._S -= sign * U @ U.mT
+        if self._criterion == "I":
+            self._X -= sign * U @ (half @ self._goal.t())

@@ -1,0 +1,242 @@
+"""What is known of a robot before the next pose is measured: the normal distribution of all its unknowns."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError, MeasurementError
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.hybrid.covariance_root import CovarianceRoot
+from pisigma.hybrid.gravity import USUAL, in_first_row
+from pisigma.hybrid.result import HybridResult
+from pisigma.hybrid.uncertainty import PositionUncertainty
+from pisigma.identification.prediction import predicted_poses
+from pisigma.identification.problem.noise import PriorGroup, prior_group_of
+from pisigma.identification.problem.parameters import ParameterSpace
+from pisigma.identification.problem.setup import IdentifiedGeometry
+from pisigma.joint_correction.feature import AbstractFeature
+from pisigma.joint_correction.fourier_series import USUAL_HARMONICS, FourierSeries
+from pisigma.joint_correction.gravity_torques import Direction, GravityTorques
+from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.conditions import JointState
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.robot.description import Robot
+from pisigma.se3 import rotation_vector
+
+SensorKind = Literal["position", "pose", "distance"]
+USUAL_ERRORS = {
+    PriorGroup.JOINT_OFFSET: 1.0e-3,
+    PriorGroup.LENGTH: 0.4e-3,
+    PriorGroup.NO_LENGTH: 0.25e-3,
+    PriorGroup.BETWEEN_AXES: 0.7e-3,
+}
+"""[m or rad] Standard deviations of the errors of nominal geometries, by class.
+
+Medians of the sizes that maximise the evidence of hybrid calibrations of the robots at hand: the measured UR5, UR10 and
+FANUC R-2000iC with all rows, and simulated kr10, irb120, arm7 and scara arms, two each, with 400 positions.
+"""
+WIDE_LENGTH, WIDE_TOOL, WIDE_ANGLE = 1.0, 0.1, 1.0
+"""[m, m, rad] Where base and tool may be before anything is measured: so wide that it does not matter."""
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """What measures, and how well; repeatability of the robot counts as noise of the instrument.
+
+    Attributes:
+        kind: "position" of a target, its "pose", or its "distance" from an anchor.
+        sigma: standard deviation of a coordinate or a distance [m]. The default is what hybrid calibrations of the
+            measured UR5 and UR10 leave of a laser tracker's coordinates, 0.028 and 0.043 mm.
+        sigma_rotation: standard deviation of an angle about an axis [rad], of the UR10's target.
+        anchor: where distances are from, in the measuring frame [m].
+    """
+
+    kind: SensorKind = "position"
+    sigma: float = 4e-5
+    sigma_rotation: float = 1.1e-4
+    anchor: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """The normal distribution of geometry, base, tool and the weights of a joint correction, and what measures them.
+
+    Poses are those of the first target in the first frame.
+
+    Attributes:
+        uncertainty: the covariance `R R^T` of all unknowns, and the geometry where derivatives are taken.
+        correction: the most probable joint correction; None where it is 0.
+        instrument: what measures.
+    """
+
+    uncertainty: PositionUncertainty
+    correction: JointCorrection | None
+    instrument: Instrument = Instrument()
+
+    @staticmethod
+    def of_robot(
+        robot: Robot,
+        instrument: Instrument = Instrument(),
+        *,
+        hybrid: bool = True,
+        gravity: Direction = USUAL,
+    ) -> "Knowledge":
+        """Give what is known of a robot that was never measured: errors of usual sizes around the drawing.
+
+        Geometric errors have the standard deviations `USUAL_ERRORS`, weights the `usual_sizes` of their features.
+
+        Args:
+            robot: as drawn; its tool should be about where the target is.
+            instrument: what will measure it.
+            hybrid: whether joint corrections are unknowns too, or the geometry alone.
+            gravity: direction in which things fall, in the frame of the robot's base.
+        """
+        space = ParameterSpace(robot)
+        features: tuple[AbstractFeature, ...] = ()
+        if hybrid:
+            features = (
+                GravityTorques(robot, in_first_row(robot, gravity)),
+                FourierSeries(robot, USUAL_HARMONICS),
+            )
+        root = CovarianceRoot(torch.diag(torch.cat([_usual_errors(space), *map(_usual_weights, features)])))
+        geometry = IdentifiedGeometry(robot, {"": robot.base}, {"": robot.tool}, {})
+        return Knowledge(PositionUncertainty(space, geometry, features, root, 1.0), None, instrument)
+
+    @staticmethod
+    def of_model(model: CalibratedModel, instrument: Instrument = Instrument()) -> "Knowledge":
+        """Give what a calibrated model knows: its posterior.
+
+        Raises:
+            IdentificationError: the model holds no uncertainty.
+        """
+        if model.uncertainty is None:
+            raise IdentificationError(
+                f"model '{model.name}' holds no uncertainty, so it does not say what to measure next; plan for its "
+                "robot, or calibrate it with this version."
+            )
+        return Knowledge(
+            model.uncertainty, None if model.hybrid is None else model.hybrid.correction, instrument
+        )
+
+    @staticmethod
+    def of_result(result: HybridResult, instrument: Instrument) -> "Knowledge":
+        """Give what a calibration knows: its posterior."""
+        return Knowledge(
+            result.uncertainty, None if result.learned is None else result.learned.correction, instrument
+        )
+
+    def after(self, rows: Measurements) -> "Knowledge":
+        """Return what is known once rows are measured: the posterior of a hybrid calibration of them.
+
+        While they are too few for one, the covariance after measuring them, whatever their values.
+
+        Raises:
+            PoseError: the joint values do not fit the robot.
+        """
+        try:
+            return Knowledge.of_result(
+                HybridCalibrator(self.uncertainty.space.robot).fit(rows), self.instrument
+            )
+        except IdentificationError:
+            return self.informed(rows.q)
+
+    def informed(self, q: Float64[Tensor, "poses dof"]) -> "Knowledge":
+        """Return what is known once poses are measured, whatever the values: `C' = R (1 + B^T B)^-1 R^T`.
+
+        Args:
+            q: commanded joint values [rad or m].
+        """
+        B = self.measured(q).flatten(0, 1)
+        lower = torch.linalg.cholesky(torch.eye(B.shape[1]).to(B) + B.t() @ B)
+        root = torch.linalg.solve_triangular(lower, self.uncertainty.root.t(), upper=False).t()
+        return replace(self, uncertainty=replace(self.uncertainty, covariance_root=CovarianceRoot(root)))
+
+    def moved(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch dof"]:
+        """Joint values with their most probable corrections [rad or m]."""
+        if self.correction is None:
+            return q
+        with torch.no_grad():
+            moved: Tensor = q + self.correction(q)
+        return moved
+
+    def columns(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 6 unknowns"]:
+        """Derivative of the target's position [m] and rotation vector [rad] in its frame by all unknowns."""
+        return self.uncertainty.columns(JointState(q), self.moved(q))
+
+    def tool(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 3 directions"]:
+        """Derivative D of the target's position by independent standard normal numbers: its covariance is `D D^T`."""
+        return self.uncertainty.covariance_root.along(self.columns(q)[:, :3])
+
+    def measured(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
+        """Derivative B of what is measured, over its noise, by these numbers; values have covariance `B B^T + 1`."""
+        columns, instrument = self.columns(q), self.instrument
+        if instrument.kind == "distance":
+            geometry = self.uncertainty.geometry
+            away = forward_kinematics(geometry.robot, self.moved(q))[:, :3, 3] - q.new_tensor(
+                instrument.anchor
+            )
+            columns = (away / away.norm(dim=1, keepdim=True))[:, None] @ columns[:, :3] / instrument.sigma
+        elif instrument.kind == "position":
+            columns = columns[:, :3] / instrument.sigma
+        else:
+            noise = q.new_tensor([instrument.sigma] * 3 + [instrument.sigma_rotation] * 3)
+            columns = columns / noise[:, None]
+        return self.uncertainty.covariance_root.along(columns)
+
+    def deviation(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
+        """Standard deviation of the predicted position [m], `sqrt(σx² + σy² + σz²)`."""
+        return self.tool(q).square().sum((1, 2)).sqrt()
+
+    def surprise(self, rows: Measurements) -> Float64[Tensor, " rows"]:
+        """Say how unlikely measured rows are: the length of `(B B^T + 1)^-1/2 r` over the root of its values.
+
+        r is what was measured minus what is predicted, over the noise. A row that fits has about 1; under the
+        predictive distribution the square times the number of values is chi-squared.
+
+        Args:
+            rows: positions, or poses where the instrument measures poses, of the first target in the first frame.
+
+        Returns:
+            NaN for rows in which nothing of the kind was measured.
+
+        Raises:
+            MeasurementError: the instrument measures distances.
+            IdentificationError: a row has a frame or a target that was not calibrated.
+        """
+        instrument, geometry = self.instrument, self.uncertainty.geometry
+        if instrument.kind == "distance" or rows.position is None:
+            raise MeasurementError("positions were wanted to compare with the predicted ones, got none.")
+        T = predicted_poses(
+            geometry.robot, geometry.bases, geometry.tools, replace(rows, q=self.moved(rows.q))
+        )
+        r = (rows.position - T[:, :3, 3]) / instrument.sigma
+        if instrument.kind == "pose" and rows.rotation is not None:
+            turned = rotation_vector(rows.rotation @ T[:, :3, :3].mT) / instrument.sigma_rotation
+            r = torch.cat([r, turned], 1)
+        B = self.measured(rows.q)[:, : r.shape[1]]
+        lower = torch.linalg.cholesky(B @ B.mT + torch.eye(r.shape[1]).to(r))
+        white = torch.linalg.solve_triangular(lower, r[..., None], upper=False)[..., 0]
+        surprise: Tensor = white.square().mean(1).sqrt()
+        return surprise
+
+
+def _usual_errors(space: ParameterSpace) -> Float64[Tensor, " parameters"]:
+    """Standard deviations of all parameters of a robot that was never measured [m or rad]."""
+    sizes = []
+    for parameter, value in zip(space.parameters, space.robot.dh.ravel().tolist(), strict=False):
+        drawn = abs(value) > USUAL_ERRORS[PriorGroup.LENGTH]
+        sizes.append(USUAL_ERRORS[PriorGroup(prior_group_of(parameter.group, drawn))])
+    sizes += [WIDE_LENGTH] * 3 + [WIDE_ANGLE] * 3 + [WIDE_TOOL] * 3 + [WIDE_ANGLE] * 3
+    return torch.tensor(sizes, dtype=torch.float64)
+
+
+def _usual_weights(feature: AbstractFeature) -> Float64[Tensor, " weights"]:
+    """Standard deviations of the used weights of a feature [rad, or m of prismatic joints]."""
+    sizes = torch.tensor(feature.usual_sizes, dtype=torch.float64)[feature.group]
+    unit = torch.where(torch.tensor(feature.robot.revolute), 1.0, feature.robot.reach)
+    return (sizes * unit[:, None])[feature.used]

@@ -1,0 +1,100 @@
+"""The choice of poses: greedy choice, exchange, order, and the accuracy that is predicted for it."""
+
+import pytest
+import torch
+
+from pisigma.errors import PlanningError
+from pisigma.planning.choice import Choice, Criterion, choose, condensed
+from pisigma.planning.expected_accuracy import curve, p95_of, remaining_errors, rms_of
+from pisigma.planning.knowledge import Knowledge
+from pisigma.robot import Robot
+from tests.testing.closeness import assert_close
+
+
+def random_joints(count: int, seed: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return (torch.rand(count, 6, generator=generator, dtype=torch.float64) * 2 - 1) * 2.5
+
+
+@pytest.fixture(scope="module")
+def knowledge() -> Knowledge:
+    return Knowledge.of_robot(Robot.load("ur5"), hybrid=False)
+
+
+def log_det(B: torch.Tensor) -> float:
+    rows = B.flatten(0, 1)
+    return float(torch.logdet(torch.eye(len(rows)).double() + rows @ rows.t())) / 2
+
+
+def variance(B: torch.Tensor, goal: torch.Tensor) -> float:
+    rows = B.flatten(0, 1)
+    C = torch.linalg.inv(torch.eye(B.shape[2]).double() + rows.t() @ rows)
+    return float((goal @ C @ goal.t()).trace())
+
+
+@pytest.mark.parametrize("criterion", ["D", "I"])
+def test_gains_and_exchange_are_those_of_the_criterion(knowledge: Knowledge, criterion: Criterion) -> None:
+    q, goal = random_joints(40, 0), condensed(knowledge.tool(random_joints(50, 1)))
+    # Base and tool are known to a millimetre here, so that determinants are right to the last digits.
+    B = knowledge.measured(q).clamp(-30, 30)
+    choice = Choice(B, goal, criterion)
+
+    def value(chosen: list[int]) -> float:
+        return log_det(B[chosen]) if criterion == "D" else -variance(B[chosen], goal)
+
+    for number in (3, 17, 8):
+        choice.add(number)
+    before = value([3, 17, 8])
+    gains = choice.gains()
+    assert_close(gains[21], value([3, 17, 8, 21]) - before, rtol=1e-6)
+    assert int(gains.argmax()) not in (3, 17, 8)
+    choice.grow(8)
+    grown = value(choice.chosen)
+    choice.exchange()
+    assert len(set(choice.chosen)) == 8
+    assert value(choice.chosen) >= grown - 1e-9 * abs(grown)
+
+
+def test_the_first_of_a_choice_are_the_greedy_choice_among_it(knowledge: Knowledge) -> None:
+    q, task = random_joints(60, 2), random_joints(40, 3)
+    chosen = choose(knowledge, q, 12, task, "I")
+    assert len(set(chosen.tolist())) == 12
+    choice = Choice(knowledge.measured(q[chosen]), condensed(knowledge.tool(task)), "I")
+    choice.grow(12)
+    assert choice.chosen == list(range(12))
+
+
+def test_the_curve_is_the_covariance_after_the_poses(knowledge: Knowledge) -> None:
+    q, task = random_joints(80, 4), random_joints(40, 5)
+    chosen = choose(knowledge, q, 20, task)
+    points = curve(knowledge, q, chosen, task, (10, 20))
+    for point in points:
+        after = knowledge.informed(q[chosen[: point.poses]])
+        assert_close(point.rms, float(after.deviation(task).square().mean().sqrt()), rtol=1e-6)
+        assert point.rms < point.p95 < 3 * point.rms
+        assert point.rms < point.random_rms
+    assert points[1].rms < points[0].rms
+
+
+def test_quantiles_are_those_of_one_normal_coordinate() -> None:
+    D = torch.zeros(500, 3, 500).double()
+    D[torch.arange(500), 0, torch.arange(500)] = 1e-3
+    assert_close(rms_of(D), 1e-3, rtol=1e-9)
+    assert_close(p95_of(D), 1.96e-3, rtol=0.03)
+
+
+def test_what_remains_is_named(knowledge: Knowledge) -> None:
+    task = random_joints(40, 6)
+    errors = remaining_errors(knowledge, task)
+    assert {"base", "tool", "joint offsets"} <= {error.name for error in errors}
+    assert errors[0].name == "base"
+    hybrid = Knowledge.of_robot(Robot.load("ur5")).informed(random_joints(300, 7))
+    assert any(error.name.startswith("correction of joint") for error in remaining_errors(hybrid, task))
+
+
+def test_impossible_choices_are_refused(knowledge: Knowledge) -> None:
+    q = random_joints(5, 0)
+    with pytest.raises(PlanningError, match="1 to 5 poses"):
+        choose(knowledge, q, 6, q)
+    with pytest.raises(PlanningError, match="joint values of the task"):
+        choose(knowledge, q, 2, q[:0])
