@@ -25,6 +25,7 @@ _NAMES = {
     "workflow.calibrate": "Calibration CalibrationSettings calibrate",
     "workflow.distill": "Distillation DistillationSettings distill",
     "workflow.evaluate": "EvaluationSettings Limits evaluate",
+    "workflow.import_rows": "ImportSettings import_rows",
     "workflow.report": "report",
     "workflow.train": "train",
     "workflow.train_networks": "TrainSettings",

@@ -23,6 +23,8 @@ from pisigma.workflow.distill import distill as distill
 from pisigma.workflow.evaluate import EvaluationSettings as EvaluationSettings
 from pisigma.workflow.evaluate import Limits as Limits
 from pisigma.workflow.evaluate import evaluate as evaluate
+from pisigma.workflow.import_rows import ImportSettings as ImportSettings
+from pisigma.workflow.import_rows import import_rows as import_rows
 from pisigma.workflow.report import report as report
 from pisigma.workflow.train import train as train
 from pisigma.workflow.train_networks import TrainSettings as TrainSettings

@@ -24,7 +24,7 @@ def import_hint(path: str | os.PathLike[str]) -> str:
     except MeasurementError:
         return ""
     is_half = (mapping.has_joints or mapping.has_measured) and set(KEYS) & set(mapping.quantities)
-    if not (is_half or (mapping.has_joints and mapping.has_measured)):
+    if mapping.possible_joints or not (is_half or (mapping.has_joints and mapping.has_measured)):
         return ""
     return f" The command `{_command(mapping)}` would read it as an export."
 
@@ -46,5 +46,5 @@ def _command(mapping: FileMapping) -> str:
     if units := mapping.example_units:
         words += ["--unit", units]
     if mapping.rotations:
-        words += ["--rotation", "|".join(mapping.rotations)]
+        words += ["--rotation", "MAKER"]
     return " ".join([*words, "--out", "data.csv"])

@@ -247,7 +247,7 @@ def _nothing(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within:
     """Say why no row has a partner."""
     if by == "time":
         times, logged = _times(measured), _times(joints)
-        apart = np.abs(times[:, None] - logged[None, :1000]).min()
+        apart = np.abs(times[:1000, None] - logged[None, :1000]).min()
         return (
             f"no time stamps are within {within:g} s of each other, the nearest are {apart:.6g} s apart; check the "
             "clocks and their zones."

@@ -22,8 +22,8 @@ from pisigma.measurement.foreign.quantities import (
 from pisigma.measurement.foreign.rotations import ROTATIONS
 from pisigma.measurement.foreign.units import UNITS, UnitKind, doubt, is_certain, stated_units
 
-_EXTERNAL = re.compile(r"e(?:ax|xt)?_?[1-6a-f]")
-"""How external axes are called."""
+_JOINT_LIKE = re.compile(r"(?:e(?:ax|xt)?_?[1-6a-f]|[qj]_?\d.*)")
+"""How external axes are called, and what begins like a joint."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,9 +76,15 @@ class FileMapping:
         return next(filter(None, self.file.column(column.index)), "")
 
     @property
+    def possible_joints(self) -> list[MappedColumn]:
+        """The columns that are left out, but that are named as joints are."""
+        left_out = [one for one in self.columns if one.target.quantity == LEFT_OUT and not one.is_stated]
+        return [one for one in left_out if _JOINT_LIKE.fullmatch(one.heading.lower())]
+
+    @property
     def doubts(self) -> tuple[str, ...]:
         """Why its values can hardly be in their units, each a sentence."""
-        sentences = [self._left_out(one) for one in self.columns if _EXTERNAL.fullmatch(one.heading.lower())]
+        sentences = [self._left_out(one) for one in self.possible_joints]
         for name, columns in (
             ("joint values", joint_columns(self.columns)),
             ("coordinates", coordinates(self.columns)),
@@ -91,7 +97,7 @@ class FileMapping:
 
     def _left_out(self, column: MappedColumn) -> str:
         """A sentence on an external axis that moves and is left out."""
-        values = self.file.numbers(column.index) if column.target.quantity == LEFT_OUT else []
+        values = self.file.numbers(column.index)
         if not values or min(values) == max(values):
             return ""
         return (

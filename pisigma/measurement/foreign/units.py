@@ -55,6 +55,7 @@ _SAID = re.compile(
     r"(?i)\b(?:units?|einheit(?:en)?|lengths?|angles?|distances?|joints?|coordinates?|positions?|values)\b(.*)"
 )
 _BETWEEN = frozenset(("", "in", "and", "und", "are", "is"))
+"""Words between such a word and its unit; an inch has to be spelt out in a comment."""
 
 
 def unit_symbol(text: str) -> str:
@@ -73,10 +74,11 @@ def stated_units(comments: Sequence[str]) -> dict[UnitKind, str]:
         while said := _SAID.search(rest):
             rest = said[1]
             for word in re.split(r"[\s,;:=/()\[\]]+", rest):
-                symbol = unit_symbol(word)
-                if symbol:
+                if word.lower() in _BETWEEN:
+                    continue
+                if symbol := unit_symbol(word):
                     stated.setdefault(UNITS[symbol].kind, symbol)
-                elif word.lower() not in _BETWEEN:
+                else:
                     break
     return stated
 

@@ -62,7 +62,7 @@ def test_points_joined_by_time_stamps():
     rows = imported("leica_list.txt", "leica_log.csv", settings=ImportSettings(join="time"))
     check(rows, None)
     assert not rows.warnings
-    assert rows.measurements.temperature.tolist() == [20.5] * 6
+    assert_close(rows.measurements.temperature, [20.5] * 6, atol=0.0)
 
 
 def test_cells_keep_their_digits():

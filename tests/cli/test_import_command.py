@@ -1,0 +1,99 @@
+"""`pisigma import`: the table, consent, saved mappings, joins, one JSON object."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+EXPORTS = Path(__file__).parents[1] / "measurement" / "foreign" / "exports"
+LOG, POINTS = EXPORTS / "polyworks_log.csv", EXPORTS / "polyworks_points.csv"
+
+
+@pytest.fixture
+def out(tmp_path: Path) -> Path:
+    return tmp_path / "data.csv"
+
+
+def test_without_a_terminal_it_shows_the_table_and_ends_with_2(refuses, out):
+    sentence = refuses("import", EXPORTS / "kuka.csv", "--out", out, stdout=None)
+    assert "accept the mapping with --yes, or change it with --map" in sentence
+    assert not out.exists()
+
+
+def test_yes_writes_the_file(run, out):
+    result = run("import", EXPORTS / "kuka.csv", "--out", out, "--yes")
+    assert result.exit_code == 0
+    assert "A1          10.500  q1_deg     name of KUKA" in result.stdout
+    assert "6 measurements written to" in result.stdout
+    assert out.read_text().startswith(
+        "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg\n"
+    )
+
+
+def test_a_saved_map_needs_no_consent(run, out, tmp_path):
+    saved = tmp_path / "map.yaml"
+    arguments = ("import", POINTS, LOG, "--join", "point", "--out", out)
+    first = run(*arguments, "--yes", "--save-map", saved)
+    assert first.exit_code == 0
+    assert "Nominal X: '-'" in saved.read_text()
+    text = out.read_text()
+    out.unlink()
+    second = run(*arguments, "--map", saved)
+    assert second.exit_code == 0, second.output
+    assert out.read_text() == text
+
+
+def test_json_is_one_object(run, out):
+    result = run("import", LOG, POINTS, "--join", "point", "--out", out, "--yes", "--json")
+    printed = json.loads(result.stdout)
+    assert result.stderr == ""
+    assert (printed["file"], printed["rows"], len(printed["unmatched"])) == (str(out), 6, 2)
+    assert printed["columns"][1] == {
+        "file": str(LOG),
+        "column": 2,
+        "heading": "J1 (deg)",
+        "read_as": "q1_deg",
+        "reason": "heading",
+    }
+    asked = run("import", LOG, POINTS, "--join", "point", "--out", out, "--json")
+    assert asked.exit_code == 2
+    assert json.loads(asked.stdout)["file"] is None
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (("--unit", "mn"), "'mn' is unknown; did you mean 'm'"),
+        (("--unit", "rad"), None),
+        (("--map", "X=x_mn"), "'x_mn' is unknown"),
+        (("--map", "Q=x_mm"), "no file has such a column"),
+        (("--rotation", "kuca"), "did you mean 'kuka'"),
+        (("--within", "soon"), "a duration was wanted"),
+        (("--join", "point"), "there is none without joint values"),
+        (("--save-map", "map.csv"), "a mapping goes into a .yaml or .yml file"),
+    ],
+)
+def test_options_that_do_not_fit(refuses, run, out, options, said):
+    if said is None:
+        assert run("import", EXPORTS / "kuka.csv", "--out", out, "--yes", *options).exit_code == 0
+    else:
+        assert said in refuses("import", EXPORTS / "kuka.csv", "--out", out, "--yes", *options, stdout=None)
+        assert not out.exists()
+
+
+def test_time_stamps_within_a_duration(run, refuses, out):
+    files = (EXPORTS / "leica_list.txt", EXPORTS / "leica_log.csv")
+    assert run("import", *files, "--join", "time", "--within", "200ms", "--out", out, "--yes").exit_code == 0
+    sentence = refuses(
+        "import", *files, "--join", "time", "--within", "0.01s", "--out", out, "--yes", stdout=None
+    )
+    assert "the nearest are 0.05" in sentence
+
+
+def test_an_input_is_not_written_over(refuses):
+    refuses("import", LOG, "--out", LOG, "--yes")
+
+
+def test_calibrate_names_the_command(refuses, tmp_path):
+    sentence = refuses("calibrate", "ur10", EXPORTS / "staubli.csv", "--out", tmp_path / "model")
+    assert "--rotation MAKER --out data.csv` would read it as an export" in sentence

@@ -1,0 +1,145 @@
+"""Which columns are what: by headings, by order, as stated; units that are lacking or do not fit."""
+
+from pathlib import Path
+
+import pytest
+
+from pisigma.errors import MeasurementError
+from pisigma.measurement.foreign.conversion import convert
+from pisigma.measurement.foreign.export_file import read_export
+from pisigma.measurement.foreign.mapping import FileMapping, map_columns
+
+ROW = "170,-20,30.5,40,50,60,1200.5,-300,400"
+
+
+def mapped(
+    tmp_path: Path, text: str, stated: dict[str, str] | None = None, rotation: str | None = None, **units: str
+) -> FileMapping:
+    path = tmp_path / "export.csv"
+    path.write_text(text)
+    return map_columns(read_export(path), stated or {}, rotation, units)
+
+
+def targets(mapping: FileMapping) -> list[str]:
+    return [column.target.text for column in mapping.columns]
+
+
+def refusal(tmp_path: Path, text: str, *stated: object, **units: str) -> str:
+    with pytest.raises(MeasurementError) as problem:
+        convert(mapped(tmp_path, text, *stated, **units))
+    return str(problem.value)
+
+
+DEGREES_MM = [*(f"q{i}_deg" for i in range(1, 7)), "x_mm", "y_mm", "z_mm"]
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "J1 [deg],J2 [deg],J3 [deg],J4 [deg],J5 [deg],J6 [deg],X [mm],Y [mm],Z [mm]",
+        "Joint 1 (°),Joint 2 (°),Joint 3 (°),Joint 4 (°),Joint 5 (°),Joint 6 (°),X (mm),Y (mm),Z (mm)",
+        "Axis1/deg,Axis2/deg,Axis3/deg,Axis4/deg,Axis5/deg,Axis6/deg,TCP X in mm,TCP Y in mm,TCP Z in mm",
+        "theta_1_deg,theta_2_deg,theta_3_deg,theta_4_deg,theta_5_deg,theta_6_deg,pos_x_mm,pos_y_mm,pos_z_mm",
+        "A1,A2,A3,A4,A5,A6,X,Y,Z",
+        "S,L,U,R,B,T,X,Y,Z",
+        "JT1,JT2,JT3,JT4,JT5,JT6,X,Y,Z",
+        "j1,j2,j3,j4,j5,j6,x,y,z\ndeg,deg,deg,deg,deg,deg,mm,mm,mm",
+        "# angles: deg, lengths: mm\nj1,j2,j3,j4,j5,j6,x,y,z",
+        "# q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm",
+        "J0 [deg],J1 [deg],J2 [deg],J3 [deg],J4 [deg],J5 [deg],X Measured [mm],Y Measured [mm],Z Measured [mm]",
+    ],
+)
+def test_headings(tmp_path: Path, header: str):
+    assert targets(mapped(tmp_path, f"{header}\n{ROW}\n{ROW}\n")) == DEGREES_MM
+
+
+def test_units_that_the_file_does_not_state(tmp_path: Path):
+    generic = f"j1,j2,j3,j4,j5,j6,x,y,z\n{ROW}\n"
+    assert "state it, --unit mm,deg if that is right, or --map 'j1=q1_deg'" in refusal(tmp_path, generic)
+    assert targets(mapped(tmp_path, generic, length="mm", angle="deg")) == DEGREES_MM
+    assert "says mm" in refusal(tmp_path, f"// units m\n{generic}", length="mm")
+    small = "A1,A2,A3,A4,A5,A6,X,Y,Z\n1,-2,0.5,1,2,3,1.2,-0.3,0.4\n"
+    assert "no unit is stated of the columns 'A1'" in refusal(tmp_path, small)  # may as well be rad and m
+
+
+def test_a_unit_in_a_heading_that_is_unknown_or_does_not_fit(tmp_path: Path):
+    furlongs = ROW.join(("q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,X [furlong],Y [mm],Z [mm]\n", "\n"))
+    assert "'X [furlong]'" in refusal(tmp_path, furlongs, length="mm")
+    assert targets(mapped(tmp_path, furlongs.replace("furlong", "deg")))[6] == "-"
+    assert "--map says mm, but the file says m" in refusal(
+        tmp_path, furlongs.replace("furlong", "m"), {"X [m]": "x_mm"}
+    )
+
+
+def test_stated_columns(tmp_path: Path):
+    text = f"a,b,c,d,e,f,u,v,w,note\n{ROW},warm\n{ROW},\n"
+    stated = {str(i + 1): name for i, name in enumerate([*DEGREES_MM, "-"])}
+    mapping = mapped(tmp_path, text, stated)
+    assert targets(mapping) == [*DEGREES_MM, "-"]
+    assert all(column.is_stated for column in mapping.columns)
+    with pytest.raises(MeasurementError, match="'q1_degg' is unknown; did you mean 'q1_deg'"):
+        mapped(tmp_path, text, {"a": "q1_degg"})
+    assert "are both q1" in refusal(tmp_path, text, stated | {"2": "q1_deg"})
+
+
+def test_what_was_commanded_is_no_measurement(tmp_path: Path):
+    header = "j1 [deg],j2 [deg],x nom [mm],y nom [mm],z nom [mm],x [mm],y [mm],z [mm]"
+    assert targets(mapped(tmp_path, f"{header}\n1,2,3,4,5,6,7,8\n"))[2:] == [
+        "-",
+        "-",
+        "-",
+        "x_mm",
+        "y_mm",
+        "z_mm",
+    ]
+    assert not mapped(tmp_path, "j1 [deg],j2 [deg],x nom,y nom,z nom\n1,2,3,4,5\n").has_measured
+
+
+@pytest.mark.parametrize("joints", [6, 7])
+def test_files_without_headings(tmp_path: Path, joints: int):
+    rows = [" ".join(map(str, [*range(10, 10 + joints), 500.5 + i, 2, 3])) for i in range(3)]
+    names = [*(f"q{i + 1}" for i in range(joints)), "x", "y", "z"]
+    assert targets(mapped(tmp_path, "\n".join(rows))) == names
+    counted = "\n".join(f"{i} {row}" for i, row in enumerate(rows, start=1))
+    assert targets(mapped(tmp_path, counted)) == ["point", *names]
+    with_quaternion = "\n".join(f"{row} 1 0 0 0" for row in rows)
+    assert targets(mapped(tmp_path, with_quaternion, rotation="abb")) == [*names, "qw", "qx", "qy", "qz"]
+    with pytest.raises(MeasurementError, match="say what they are by their numbers"):
+        mapped(tmp_path, with_quaternion)
+
+
+def test_rotations_that_several_makers_write_so(tmp_path: Path):
+    text = "J1 [deg],J2 [deg],X [mm],Y [mm],Z [mm],A [deg],B [deg],C [deg]\n1,2,3,4,5,6,7,8\n"
+    assert "state --rotation kuka, mitsubishi, doosan, or none" in refusal(tmp_path, text)
+    assert targets(mapped(tmp_path, text, rotation="mitsubishi"))[5:] == ["yaw_deg", "pitch_deg", "roll_deg"]
+    assert targets(mapped(tmp_path, text, rotation="none"))[5:] == ["-", "-", "-"]
+    assert targets(mapped(tmp_path, text.replace("J", "A"), length="mm"))[5:] == [
+        "roll_deg",
+        "pitch_deg",
+        "yaw_deg",
+    ]
+    with pytest.raises(MeasurementError, match="did you mean 'kuka'"):
+        mapped(tmp_path, text, rotation="kuca")
+
+
+def test_rows_that_are_no_rotation_are_named(tmp_path: Path):
+    names = ",".join(f"r{i}{k}" for i in (1, 2, 3) for k in (1, 2, 3))
+    text = f"q1_deg,q2_deg,x_mm,y_mm,z_mm,{names}\n1,2,3,4,5,1,0,0,0,1,0,0,0,1\n1,2,3,4,5,1,0,0,0,1,0,0,0,2\n"
+    assert "line 3, columns 'r11'" in refusal(tmp_path, text)
+    rows = convert(mapped(tmp_path, text.replace("1,0,0,0,1,0,0,0,2", ",,,,,,,,")))
+    assert rows.cells["qw"] == ("1.0", "")
+
+
+def test_cells_that_are_no_numbers_are_named(tmp_path: Path):
+    text = f"A1,A2,A3,A4,A5,A6,X,Y,Z\n{ROW}\n{ROW}\n{ROW.replace('30.5', '30.5.1')}\n"
+    assert "line 4, column 'A3': '30.5.1' is no number with a decimal point" in refusal(tmp_path, text)
+
+
+def test_doubts_about_units_and_external_axes(tmp_path: Path):
+    rows = "".join(f"{170 - i},-20,{i}.5,1200.5,{i},400\n" for i in range(8))
+    doubts = mapped(tmp_path, f"J1 [rad],J2 [rad],E1,X [m],Y [m],Z [m]\n{rows}").doubts
+    assert len(doubts) == 3
+    assert "'E1' moves from 0.5 to 7.5" in doubts[0]
+    assert "values up to 170 rad look like degrees" in doubts[1]
+    assert "values up to 1200.5 m look like millimetres" in doubts[2]
+    assert not mapped(tmp_path, f"J1 [deg],J2 [deg],-,X [mm],Y [mm],Z [mm]\n{rows}").doubts

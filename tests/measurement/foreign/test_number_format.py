@@ -1,0 +1,42 @@
+"""Numbers with points, commas and groups of thousands keep their digits."""
+
+import pytest
+
+from pisigma.measurement.foreign.number_format import NumberFormat, is_missing
+
+
+@pytest.mark.parametrize(
+    ("decimal", "cell", "text"),
+    [
+        (".", "-76.0480", "-76.0480"),
+        (".", "+1.5e-3", "+1.5e-3"),
+        (".", "1,234,567.80", "1234567.80"),
+        (".", "1'234.5", "1234.5"),
+        (".", "\u221212.5", "-12.5"),
+        (".", ".5", ".5"),
+        (",", "-76,0480", "-76.0480"),
+        (",", "1.234,5", "1234.5"),
+        (",", "1 234,5", "1234.5"),
+        (",", "12", "12"),
+        (",", "12.5", None),
+        (".", "12,5", None),
+        (".", "1,234'567", None),
+        (".", "1_000", None),
+        (".", "inf", None),
+        (".", "", None),
+        (".", "-", None),
+        (".", "12.5 mm", None),
+        (".", "1.2.3", None),
+    ],
+)
+def test_numbers(decimal: str, cell: str, text: str | None):
+    assert NumberFormat(decimal).text(cell) == text
+
+
+def test_a_group_without_decimals_may_be_a_decimal():
+    assert NumberFormat(".").certainty("1,234") < NumberFormat(",").certainty("1,234") == 1
+
+
+def test_what_says_that_nothing_was_measured():
+    assert all(map(is_missing, ("", " ", "-", "---", "NaN", "n/a", "null")))
+    assert not any(map(is_missing, ("0", "x", "-1")))

@@ -1,0 +1,33 @@
+"""Mappings on a command line and in files."""
+
+from pathlib import Path
+
+import pytest
+
+from pisigma.errors import MeasurementError
+from pisigma.measurement.foreign.saved_map import check_used, map_for, parse_map
+
+
+def test_mappings_of_a_command_line():
+    assert parse_map("A1=q1_deg, X [mm] =x_mm,note=-") == ({"A1": "q1_deg", "X [mm]": "x_mm", "note": "-"},)
+    assert parse_map("X, measured=x_mm,a=b=point") == ({"X, measured": "x_mm", "a=b": "point"},)
+    with pytest.raises(MeasurementError, match="HEADING=COLUMN was wanted"):
+        parse_map("A1=q1_deg,X")
+
+
+def test_mappings_of_a_file(tmp_path: Path):
+    path = tmp_path / "map.yaml"
+    path.write_text("files:\n- {A1: q1_deg, X: '-'}\n- {name: point, X: x_mm}\n")
+    maps = parse_map(str(path))
+    assert map_for(maps, ("X", "name")) == maps[1]
+    assert map_for(maps, ("A1", "X", "more")) == maps[0]
+    assert map_for(maps, ("other",)) == {}
+    path.write_text("columns: {}\n")
+    with pytest.raises(MeasurementError, match="unknown key 'columns'"):
+        parse_map(str(path))
+
+
+def test_a_heading_that_no_file_has_is_refused():
+    check_used(({"1": "q1_deg", "X": "x_mm"},), [("X", "Y")])
+    with pytest.raises(MeasurementError, match="no file has such a column; the columns are 'X', 'Y'"):
+        check_used(({"A1": "q1_deg"},), [("X", "Y")])
