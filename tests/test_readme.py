@@ -36,7 +36,7 @@ def test_training_readme_names_every_recipe(repository):
 
 def test_the_commands_of_the_readme_exist(repository):
     text = (repository / "README.md").read_text(encoding="utf-8")
-    known = {command.callback.__name__ for command in app.registered_commands}
+    known = {command.name for command in app.registered_commands}
     used = set(re.findall(r"^\| `pisigma (\w+)", text, flags=re.MULTILINE))
     assert used == known
 
