@@ -98,7 +98,7 @@ class MissingExtraError(PisigmaError, ImportError):
     """A package that comes with an extra of pisigma is not installed."""
 
 
-EXTRAS = {"lightning": "train", "onnx": "onnx", "numba": "compile"}
+EXTRAS = {"lightning": "train", "onnx": "onnx", "numba": "compile", "viser": "view"}
 """By the package that is imported on use, the extra that it comes with."""
 
 

@@ -1,9 +1,11 @@
 """Fixtures for all tests, and the folders of test support and of the papers on the import path."""
 
 import os
+import shutil
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 # One thread: the tests' arrays are small, and threads that wait for each other on a busy machine cost minutes.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -14,6 +16,9 @@ os.environ.setdefault("PISIGMA_TRACEBACK", "1")
 import pytest
 import torch
 
+if TYPE_CHECKING:
+    import playwright.sync_api
+
 sys.path.insert(0, str(Path(__file__).parent))
 sys.path.append(str(Path(__file__).parent.parent / "training" / "papers"))
 
@@ -23,6 +28,12 @@ from pisigma.recipes.reader import read_recipe
 from pisigma.recipes.recipe import InverseRecipe
 
 REPOSITORY = Path(__file__).parent.parent
+
+CHROMIUM = (
+    "--headless --no-sandbox --disable-quic --no-first-run --disable-background-networking "
+    "--disable-component-update --disable-sync --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader"
+)
+"""Options of a browser that fetches nothing by itself and draws in three dimensions without a graphics card."""
 
 
 @pytest.fixture(scope="session")
@@ -38,6 +49,19 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"measured data not found in {folder}; set PISIGMA_DATA to its folder")
     return folder
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator["playwright.sync_api.Browser"]:
+    """Headless Chromium."""
+    sync_api = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if path is None:
+        pytest.skip("no chromium on the path")
+    with sync_api.sync_playwright() as running:
+        started = running.chromium.launch(executable_path=path, args=CHROMIUM.split())
+        yield started
+        started.close()
 
 
 @pytest.fixture

@@ -51,6 +51,7 @@ LAYERS = (
     "reporting",
     "measuring",
     "workflow",
+    "viewing",
     "cli",
 )
 """Every module or package may import those before it, and itself."""

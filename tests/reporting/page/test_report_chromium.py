@@ -1,6 +1,5 @@
 """The page of a report in headless Chromium: no errors, nothing loaded, a map that turns, no sideways scrolling."""
 
-import shutil
 from contextlib import contextmanager
 
 import pytest
@@ -10,24 +9,6 @@ from testing.report import HOSTILE, hybrid_under_test, measured
 from pisigma.reporting.page.content import report_content
 from pisigma.reporting.page.figures import draw_figures
 from pisigma.reporting.page.page import render_page
-
-OPTIONS = (
-    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking "
-    "--disable-component-update --disable-sync"
-)
-
-
-@pytest.fixture(scope="module")
-def browser():
-    """Headless Chromium."""
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
-    path = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if path is None:
-        pytest.skip("no chromium on the path")
-    with playwright.sync_playwright() as running:
-        started = running.chromium.launch(executable_path=path, args=OPTIONS.split())
-        yield started
-        started.close()
 
 
 @pytest.fixture(scope="module")
