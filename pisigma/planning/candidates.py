@@ -18,8 +18,8 @@ MOST_DRAWS = 40
 """So many times as many poses are drawn at most as candidates are wanted."""
 OUTSIDE_WORKSPACE = "the reflector is outside the box of the workspace"
 
-Workspace = tuple[float, float, float, float, float, float]
-"""Lowest and then highest x, y, z of the reflector in the robot's base frame [m]."""
+Workspace = Float64[Tensor, "2 3"]
+"""Lowest and highest x, y, z of the reflector in the robot's base frame [m]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +140,8 @@ def _allowed(arm: ArmInCell, q: Float64[Tensor, "poses dof"], workspace: Workspa
     faults = arm.faults(q)
     allowed, refused = faults.allowed, faults.counts()
     if workspace is not None:
-        lowest, highest = torch.tensor(workspace, dtype=torch.float64).reshape(2, 3)
         reflector = forward_kinematics(arm.robot, q)[:, :3, 3]
-        inside = ((reflector >= lowest) & (reflector <= highest)).all(1)
+        inside = ((reflector >= workspace[0]) & (reflector <= workspace[1])).all(1)
         refused[OUTSIDE_WORKSPACE] = int((allowed & ~inside).sum())
         allowed = allowed & inside
     return Candidates(q[allowed], allowed.nonzero()[:, 0] + 1, len(q), +refused)

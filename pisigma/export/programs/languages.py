@@ -7,6 +7,8 @@ from pathlib import Path
 
 import jinja2
 import torch
+from jaxtyping import Float64
+from torch import Tensor
 
 from pisigma.errors import OutputError
 from pisigma.export.programs.targets import Targets
@@ -38,39 +40,47 @@ CARTESIAN = (
 
 @dataclass(frozen=True, eq=False)
 class Program:
-    """What a program is to hold.
+    """What a program is to hold: stops of a robot with six joints that turn.
 
     Attributes:
-        targets: of a robot with six joints that turn, none missing.
         name: of the program.
-        cartesian: whether it holds poses instead of joint values.
+        robot: as drawn.
+        heading: sentences on what the program does and on what it relies.
+        q: joint values of every stop [rad].
+        labels: what is said before the move to every stop.
+        waits: how long the robot waits at every stop [s]; 0 for not at all.
+        cartesian: the targets, where it holds poses instead of joint values; else None.
         config: configuration of the arm in all poses, where the language wants one; else "".
     """
 
-    targets: Targets
     name: str
-    cartesian: bool
+    robot: Robot
+    heading: list[str]
+    q: Float64[Tensor, "stops 6"]
+    labels: tuple[str, ...]
+    waits: tuple[float, ...]
+    cartesian: Targets | None = None
     config: str = ""
 
-    @property
-    def heading(self) -> list[str]:
-        """Sentences on what the program does and on what it relies."""
-        targets = self.targets
+    @staticmethod
+    def of_targets(targets: Targets, name: str, cartesian: bool, config: str = "") -> "Program":
+        """Give the program that goes to targets, of which none is missing."""
         said = [targets.title, TEST, COUNTING.format(robot=targets.robot.name)]
-        if self.cartesian:
-            said += [*CARTESIAN, *targets.remarks]
-        return [*said, targets.doubt] if targets.doubt else said
+        said += [*CARTESIAN, *targets.remarks] if cartesian else []
+        said += [targets.doubt] if targets.doubt else []
+        labels = [
+            f"line {line}{' OUTSIDE DOMAIN' if status == Status.OUTSIDE_DOMAIN else ''}"
+            for line, status in zip(targets.line, targets.status, strict=True)
+        ]
+        waits = (0.0,) * len(labels)
+        shown = targets if cartesian else None
+        return Program(name, targets.robot, said, targets.q, tuple(labels), waits, shown, config)
 
     @property
     def degrees(self) -> list[list[float]]:
-        """Joint values of every target [deg]."""
-        degrees: list[list[float]] = torch.rad2deg(self.targets.q).tolist()
+        """Joint values of every stop [deg]."""
+        degrees: list[list[float]] = torch.rad2deg(self.q).tolist()
         return degrees
-
-    def place(self, row: int) -> str:
-        """What is said before a move: where its pose stands, and whether its correction is a guess."""
-        guess = " OUTSIDE DOMAIN" if self.targets.status[row] == Status.OUTSIDE_DOMAIN else ""
-        return f"line {self.targets.line[row]}{guess}"
 
 
 @dataclass(frozen=True)
@@ -129,7 +139,7 @@ class Language:
             OutputError: it has more lines than the language takes.
         """
         said = [*self.cautions, *(self.cartesian_cautions if program.cartesian else ())]
-        content = {"program": program, "targets": program.targets, "cautions": said}
+        content = {"program": program, "targets": program.cartesian, "cautions": said}
         text = _templates().get_template(self.template).render(content) + "\n"
         lines = len(_NUMBERED_LINE.findall(text))
         if self.most_lines is not None and lines > self.most_lines:
@@ -285,7 +295,7 @@ def program_text(targets: Targets, path: Path, cartesian: bool, config: str | No
         )
     if cartesian and language.configuration:
         _check_turns(targets)
-    return language.write(Program(targets, language.program_name(path), cartesian, config or ""))
+    return language.write(Program.of_targets(targets, language.program_name(path), cartesian, config or ""))
 
 
 def _check_turns(targets: Targets) -> None:

@@ -16,6 +16,9 @@ ANCHOR_PLACE = ("anchor_x", "anchor_y", "anchor_z")
 REVOLUTE_UNITS: tuple[Unit, ...] = ("deg", "rad")
 PRISMATIC_UNITS: tuple[Unit, ...] = ("mm", "m")
 
+PLAN_COLUMNS = ("order", "candidate")
+"""What a plan says of its poses; measurements may keep it, and nothing reads it there."""
+
 _JOINT = re.compile(r"q([1-9][0-9]{0,2})_(deg|rad|mm|m)")
 _APPROACH = re.compile(r"approach([1-9][0-9]{0,2})")
 
@@ -37,7 +40,7 @@ class Column:
     @property
     def is_number(self) -> bool:
         """Whether its cells hold numbers."""
-        return self.quantity not in (*TEXTS, *reading_texts())
+        return self.quantity not in (*TEXTS, *PLAN_COLUMNS, *reading_texts())
 
     @property
     def joint(self) -> int:
@@ -120,6 +123,7 @@ def _columns() -> dict[str, Column]:
     """All columns by name but those of joints."""
     columns = [column for field in number_fields() for column in field.columns]
     columns += [Column(f"{name}_deg", name, "deg") for name in RPY]
+    columns += [Column(name, name, "") for name in PLAN_COLUMNS]
     columns += [Column("set" if name == "split" else name, name, "") for name in (*TEXTS, *reading_texts())]
     return {column.name: column for column in columns}
 

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
-from pisigma.measurement.csv.columns import QUATERNION, Column, quoted
+from pisigma.measurement.csv.columns import PLAN_COLUMNS, QUATERNION, Column, quoted
 from pisigma.measurement.csv.header import Layout
 from pisigma.measurement.csv.table import Faults, Table
 from pisigma.measurement.readings import READINGS, from_si, to_si
@@ -179,8 +179,9 @@ def _check_whole(missing: Bool[np.ndarray, "rows group"], columns: list[Column],
 
 
 def check_equal_rows(rows: CheckedRows, layout: Layout, table: Table) -> None:
-    """Find rows that equal another one in all columns; the later one is at fault."""
-    texts = [rows.texts(i) for i, column in enumerate(layout.columns) if not column.is_number]
+    """Find rows that equal another one in all columns but those of a plan; the later one is at fault."""
+    names = {index: column.quantity for index, column in enumerate(layout.columns) if not column.is_number}
+    texts = [rows.texts(index) for index, name in names.items() if name not in PLAN_COLUMNS]
     first = first_of_equal_rows(rows.values, texts)
     again = rows.faults.sound(len(rows.values)) & (first != np.arange(len(rows.values)))
     remedy = "remove one of them (a repeated measurement has other readings)"

@@ -1,0 +1,197 @@
+"""Plans as files: the poses as a CSV, and beside it a YAML with what is needed to go on planning."""
+
+import csv
+import io
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64, Int64
+from pydantic import Field
+from torch import Tensor
+
+from pisigma.errors import MeasurementError, PlanningError
+from pisigma.files.output_file import write_whole
+from pisigma.measurement.csv.columns import PLAN_COLUMNS
+from pisigma.measurement.csv.reading import read_joints
+from pisigma.measurement.csv.table import Table, read_table
+from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.cell.cell import Cell
+from pisigma.planning.plan_settings import FILES, PlanSettings
+from pisigma.robot.description import Robot
+from pisigma.robot.robot_file import Bounded, RobotDocument
+from pisigma.robot.writing import robot_document
+from pisigma.yaml_file import Section, read_yaml, yaml_text
+
+YAML_SUFFIX = ".plan.yaml"
+"""The plan `poses.csv` has its YAML beside it as `poses.plan.yaml`."""
+
+
+class WayPoint(Section):
+    """Joint values by way of which the robot goes to a pose.
+
+    Attributes:
+        before: the pose's number in the order.
+        joints: in deg, or mm of joints that slide.
+    """
+
+    before: int = Field(ge=1)
+    joints: tuple[Bounded, ...]
+
+
+class PlanDocument(Section):
+    """The YAML beside the poses.
+
+    Attributes:
+        poses: name of the CSV file, which lies in the same folder.
+        robot: as drawn.
+        model: folder of the model that was planned for, seen from this file; None for a robot as drawn.
+        settings: what was planned; its files are seen from this file.
+        cell: what stands around the robot.
+        way_points: between the poses, where the straight motion of the joints is not free.
+    """
+
+    poses: str
+    robot: RobotDocument
+    model: str | None = None
+    settings: PlanSettings
+    cell: Cell = Cell()
+    way_points: tuple[WayPoint, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class StoredPlan:
+    """Poses in the order in which they are measured, and what they were planned with.
+
+    Attributes:
+        arm: the robot in its cell.
+        settings: what was planned; its files are seen from the working directory.
+        model: folder of the model that was planned for; None for a robot as drawn.
+        q: joint values [rad or m].
+        check: whether a pose judges the calibration (set "test") or is calibrated with ("train").
+        candidate: row of the file of candidates, or number of the pose that was drawn; from 1.
+        way_points: per pose, the joint values by way of which the robot goes there [rad or m]; mostly none.
+    """
+
+    arm: ArmInCell
+    settings: PlanSettings
+    model: Path | None
+    q: Float64[Tensor, "poses dof"]
+    check: Bool[Tensor, " poses"]
+    candidate: Int64[Tensor, " poses"]
+    way_points: tuple[Float64[Tensor, "points dof"], ...]
+
+    def write(self, path: Path) -> None:
+        """Write the CSV, and the YAML beside it; both are replaced where they are there.
+
+        Raises:
+            OutputError: a file cannot be written there.
+        """
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow([*joint_columns(self.arm.robot), "set", *PLAN_COLUMNS])
+        sets = ["test" if check else "train" for check in self.check.tolist()]
+        rows = zip(self._in_file_units(self.q), sets, self.candidate.tolist(), strict=True)
+        for order, (joints, name, candidate) in enumerate(rows, start=1):
+            writer.writerow([*joints, name, order, candidate])
+        write_whole(path, text.getvalue())
+        write_whole(yaml_of(path), yaml_text(self._document(path)))
+
+    def _in_file_units(self, q: Float64[Tensor, "poses dof"]) -> list[list[float]]:
+        """Joint values in deg or mm, with the digits that controllers take."""
+        return [
+            [
+                round(joint.in_file_unit(value), 6)
+                for joint, value in zip(self.arm.robot.joints, row, strict=True)
+            ]
+            for row in q.tolist()
+        ]
+
+    def _document(self, path: Path) -> dict[str, Any]:
+        """The content of the YAML, of stated values only."""
+        folder = path.resolve().parent
+        settings = {name: value for name, value in asdict(self.settings).items() if value is not None}
+        settings |= {name: os.path.relpath(settings[name], folder) for name in FILES if name in settings}
+        settings |= {"box_mm": list(self.settings.box_mm)} if self.settings.box_mm is not None else {}
+        document: dict[str, Any] = {"poses": path.name, "settings": settings}
+        if self.model is not None:
+            document["model"] = os.path.relpath(self.model, folder)
+        document["cell"] = self.arm.cell.model_dump(mode="json", exclude_none=True)
+        points = enumerate(map(self._in_file_units, self.way_points), start=1)
+        document["way_points"] = [{"before": n, "joints": joints} for n, rows in points for joints in rows]
+        return document | {"robot": robot_document(self.arm.robot)}
+
+
+def joint_columns(robot: Robot) -> list[str]:
+    """Columns of the joint values in files, such as q1_deg."""
+    return [f"q{number}_{joint.file_unit}" for number, joint in enumerate(robot.joints, start=1)]
+
+
+def yaml_of(path: Path) -> Path:
+    """The YAML beside the CSV of a plan."""
+    return path.with_suffix(YAML_SUFFIX)
+
+
+def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
+    """Read a plan by its CSV or the YAML beside it.
+
+    Raises:
+        PlanningError: the YAML is missing or cannot be used.
+        MeasurementError: the CSV cannot be used.
+    """
+    file = Path(path)
+    if file.suffix.lower() == ".csv":
+        if not yaml_of(file).exists():
+            raise PlanningError(
+                f"{file}: a plan was wanted, but there is no {yaml_of(file).name} beside it; give the poses that "
+                "`pisigma plan` wrote."
+            )
+        file = yaml_of(file)
+    document = read_yaml(file, PlanDocument, PlanningError)
+    arm = ArmInCell.of(Robot(*document.robot.drawing()), document.cell)
+    poses = file.parent / document.poses
+    table, q = read_table(poses), read_joints(poses, arm.robot)
+    order = _numbers(table, "order")
+    scale = torch.tensor(
+        [np.pi / 180 if turns else 1e-3 for turns in arm.robot.revolute], dtype=torch.float64
+    )
+    return StoredPlan(
+        arm,
+        document.settings.with_files_from(file.parent),
+        None if document.model is None else file.parent / document.model,
+        q,
+        torch.tensor([name == "test" for name in _cells(table, "set")]),
+        torch.tensor(_numbers(table, "candidate")),
+        tuple(
+            torch.tensor(
+                [point.joints for point in document.way_points if point.before == number], dtype=torch.float64
+            ).reshape(-1, arm.robot.dof)
+            * scale
+            for number in order
+        ),
+    )
+
+
+def _cells(table: Table, name: str) -> list[str]:
+    """The cells of a column of a plan."""
+    if name not in table.header:
+        raise MeasurementError(
+            f"{table.source}, line {table.header_line}: the column '{name}' is missing; give the poses as "
+            "`pisigma plan` wrote them."
+        )
+    column = table.header.index(name)
+    return [row[column].strip() if column < len(row) else "" for row in table.records]
+
+
+def _numbers(table: Table, name: str) -> list[int]:
+    """The cells of a column of a plan that holds numbers from 1."""
+    cells = _cells(table, name)
+    for line, cell in zip(table.lines, cells, strict=True):
+        if not (cell.isascii() and cell.isdigit()):
+            raise MeasurementError(
+                f"{table.source}, line {line}, column '{name}': a number from 1 was wanted, got '{cell}'."
+            )
+    return list(map(int, cells))

@@ -1,0 +1,118 @@
+"""What is to be planned, as it is asked for: numbers in the units of files, and files by their paths."""
+
+import math
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+import torch
+from pydantic import ConfigDict
+
+from pisigma.errors import PlanningError, nearest_choice
+from pisigma.planning.candidates import Candidates, draw_candidates, read_candidates
+from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.tour import Pace
+from pisigma.yaml_file import MOST_POSES
+
+Sensor = Literal["position", "pose", "distance"]
+Criterion = Literal["D", "I"]
+FILES = ("candidates_from", "task", "measured")
+"""Settings that are files."""
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """What is to be planned.
+
+    Attributes:
+        count: poses to calibrate with.
+        check: poses that are measured besides, to judge the calibration.
+        sensor: what is measured: the position of a reflector, its pose, or its distance from a fixed point.
+        sigma_mm: standard deviation of a measured length [mm].
+        criterion: "D": what lowers the uncertainty of all unknowns most; "I": what lowers that of the tool's position
+            over the task most; None for D without, and I with a model.
+        limit_mm: RMS of the tool's position that is wanted [mm]; None for no limit.
+        candidates: poses that are drawn to choose from.
+        candidates_from: file of joint values to choose from instead.
+        box_mm: lowest and then highest x, y, z in the robot's base frame where the reflector is measured [mm].
+        task: file of joint values at which the robot is to be accurate; None for wherever it can be measured.
+        measured: file of rows that are measured already.
+        seed: of what is drawn.
+        speed_deg_s: of the joints that turn, from pose to pose [deg/s].
+        settling_s: time at every pose [s].
+
+    Raises:
+        PlanningError: a setting is no choice, or no number that it can be.
+    """
+
+    __pydantic_config__ = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+    count: int = 40
+    check: int = 10
+    sensor: Sensor = "position"
+    sigma_mm: float = 0.05
+    criterion: Criterion | None = None
+    limit_mm: float | None = None
+    candidates: int = 5000
+    candidates_from: str | None = None
+    box_mm: tuple[float, float, float, float, float, float] | None = None
+    task: str | None = None
+    measured: str | None = None
+    seed: int = 0
+    speed_deg_s: float = 30.0
+    settling_s: float = 3.0
+
+    def __post_init__(self) -> None:
+        """Refuse settings that are none."""
+        for name, choices in (("sensor", get_args(Sensor)), ("criterion", get_args(Criterion))):
+            value = getattr(self, name)
+            if value is not None and value not in choices:
+                raise PlanningError(f"{name} '{value}' is unknown; {nearest_choice(str(value), choices)}")
+        for name, least in (("count", 1), ("check", 0), ("candidates", 1), ("seed", 0)):
+            most = 2**63 - 1 if name == "seed" else MOST_POSES
+            if not least <= getattr(self, name) <= most:
+                raise PlanningError(f"{name}: {least} to {most:,} was wanted, got {getattr(self, name):,}.")
+        for name in ("sigma_mm", "limit_mm"):
+            value = getattr(self, name)
+            if value is not None and not 0 < value < math.inf:
+                raise PlanningError(f"{name}: a length above 0 was wanted, got {value:g}.")
+        box = self.box_mm
+        if box is not None and not all(lower < upper for lower, upper in zip(box[:3], box[3:], strict=True)):
+            raise PlanningError(
+                "box: the lowest x, y, z and then the highest were wanted [mm], got "
+                f"{', '.join(f'{value:g}' for value in box)}."
+            )
+        _ = self.pace
+
+    @property
+    def pace(self) -> Pace:
+        """How fast the robot goes from pose to pose."""
+        return Pace(speed=math.radians(self.speed_deg_s), settling=self.settling_s)
+
+    def find_candidates(self, arm: ArmInCell) -> Candidates:
+        """Draw or read the poses to choose from.
+
+        Raises:
+            MeasurementError: their file cannot be used.
+            PlanningError: a joint that slides has no limits to draw in.
+        """
+        workspace = None
+        if self.box_mm is not None:
+            workspace = torch.tensor(self.box_mm, dtype=torch.float64).reshape(2, 3) / 1e3
+        if self.candidates_from is not None:
+            return read_candidates(arm, self.candidates_from, workspace)
+        return draw_candidates(arm, self.candidates, self.seed, workspace)
+
+    def with_files_from(self, folder: Path) -> "PlanSettings":
+        """The same with the paths of its files seen from the working directory instead of a folder."""
+
+        def seen(path: str | None) -> str | None:
+            return None if path is None else os.path.normpath(folder / path)
+
+        return replace(
+            self,
+            candidates_from=seen(self.candidates_from),
+            task=seen(self.task),
+            measured=seen(self.measured),
+        )
