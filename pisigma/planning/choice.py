@@ -16,6 +16,8 @@ EXCHANGED = 400
 """So many of the candidates take part in the exchange: the chosen ones, and the best of the others."""
 LEAST_GAIN = 1e-6
 """[nats or share of the variance] An exchange has to gain more."""
+LEAST_LEFT = 1e-3
+"""Where a pose leaves a smaller share of a value's standard deviation than this, taking it back loses all digits."""
 PASSES = 3
 """Every chosen pose is exchanged so often at most."""
 
@@ -152,11 +154,24 @@ class Choice:
             if not exchanged:
                 break
 
+    def _start_again(self) -> None:
+        """The covariance of the chosen candidates, from the beginning."""
+        rows = self._B[self.chosen].flatten(0, 1)
+        information = torch.eye(rows.shape[1]).to(rows) + rows.t() @ rows
+        self._C = torch.cholesky_inverse(torch.linalg.cholesky(information))
+        along = self._B @ self._C
+        self._S = along @ self._B.mT
+        self._X = along @ self._goal.t() if self._criterion == "I" else self._B[..., :0]
+
     def _update(self, number: int, sign: float) -> None:
         """The covariance with a candidate (+1) or without it (-1)."""
         G = self._C @ self._B[number].t()
         here = torch.eye(G.shape[1]).to(G) + sign * self._B[number] @ G
-        half = torch.linalg.solve_triangular(torch.linalg.cholesky(here), G.t(), upper=False)
+        lower, failed = torch.linalg.cholesky_ex(here)
+        if sign < 0 and (int(failed) or float(lower.diagonal().min()) < LEAST_LEFT):
+            self._start_again()
+            return
+        half = torch.linalg.solve_triangular(lower, G.t(), upper=False)
         U = self._B @ half.t()
         self._C -= sign * half.t() @ half
         self._S -= sign * U @ U.mT
