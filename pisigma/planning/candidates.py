@@ -2,7 +2,7 @@
 
 import os
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from torch import Tensor
 from pisigma.errors import PlanningError
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.csv.reading import read_joints
-from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.cell.arm_in_cell import ArmInCell, Faults
 
 MOST_DRAWS = 40
 """So many times as many poses are drawn at most as candidates are wanted."""
@@ -76,17 +76,17 @@ def draw_candidates(arm: ArmInCell, count: int, seed: int, workspace: Workspace 
     """
     limits = _drawn_range(arm)
     generator = torch.Generator().manual_seed(seed)
-    blocks: list[Candidates] = []
-    enough = 0
-    while enough < count and len(blocks) < MOST_DRAWS:
+    q = limits.new_zeros((0, arm.robot.dof))
+    faults = _faults(arm, q, workspace)
+    while len(q) < MOST_DRAWS * count and int(faults.allowed.sum()) < count:
         draws = torch.rand(count, arm.robot.dof, generator=generator, dtype=torch.float64)
-        block = _allowed(arm, limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws, workspace)
-        blocks.append(block)
-        enough += len(block.q)
-    number = torch.cat([block.number + index * count for index, block in enumerate(blocks)])
-    refused = sum((block.refused for block in blocks), Counter[str]())
-    q = torch.cat([block.q for block in blocks])[:count]
-    return Candidates(q, number[:count], len(blocks) * count, refused)
+        drawn = limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws
+        q = torch.cat([q, drawn])
+        faults = replace(faults, failed=torch.cat([faults.failed, _faults(arm, drawn, workspace).failed]))
+    enough = (
+        int((faults.allowed.cumsum(0) < count).sum()) + 1
+    )  # poses, of which the last is the last that is needed
+    return _allowed(q[:enough], replace(faults, failed=faults.failed[:enough]))
 
 
 def read_candidates(
@@ -102,7 +102,8 @@ def read_candidates(
     Raises:
         MeasurementError: the file or a joint's cell cannot be used; the message names file, line and column.
     """
-    return _allowed(arm, read_joints(path, arm.robot), workspace)
+    q = read_joints(path, arm.robot)
+    return _allowed(q, _faults(arm, q, workspace))
 
 
 def spread(
@@ -135,16 +136,19 @@ def spread(
     return torch.tensor(chosen, dtype=torch.int64)
 
 
-def _allowed(arm: ArmInCell, q: Float64[Tensor, "poses dof"], workspace: Workspace | None) -> Candidates:
-    """Keep the poses that the cell and the workspace allow."""
+def _faults(arm: ArmInCell, q: Float64[Tensor, "poses dof"], workspace: Workspace | None) -> Faults:
+    """Why the cell and the workspace do not allow poses."""
     faults = arm.faults(q)
-    allowed, refused = faults.allowed, faults.counts()
-    if workspace is not None:
-        reflector = forward_kinematics(arm.robot, q)[:, :3, 3]
-        inside = ((reflector >= workspace[0]) & (reflector <= workspace[1])).all(1)
-        refused[OUTSIDE_WORKSPACE] = int((allowed & ~inside).sum())
-        allowed = allowed & inside
-    return Candidates(q[allowed], allowed.nonzero()[:, 0] + 1, len(q), +refused)
+    if workspace is None:
+        return faults
+    reflector = forward_kinematics(arm.robot, q)[:, :3, 3]
+    outside = ((reflector < workspace[0]) | (reflector > workspace[1])).any(1, keepdim=True)
+    return Faults((*faults.reasons, OUTSIDE_WORKSPACE), torch.cat([faults.failed, outside], 1))
+
+
+def _allowed(q: Float64[Tensor, "poses dof"], faults: Faults) -> Candidates:
+    """Keep the poses that fail for nothing."""
+    return Candidates(q[faults.allowed], faults.allowed.nonzero()[:, 0] + 1, len(q), faults.counts())
 
 
 def _drawn_range(arm: ArmInCell) -> Float64[Tensor, "dof 2"]:

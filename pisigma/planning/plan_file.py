@@ -82,7 +82,7 @@ class StoredPlan:
     q: Float64[Tensor, "poses dof"]
     check: Bool[Tensor, " poses"]
     candidate: Int64[Tensor, " poses"]
-    way_points: tuple[Float64[Tensor, "points dof"], ...]
+    way_points: tuple[Float64[Tensor, "_points dof"], ...]
 
     def write(self, path: Path) -> None:
         """Write the CSV, and the YAML beside it; both are replaced where they are there.

@@ -4,19 +4,21 @@ import math
 import os
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, get_args
 
 import torch
+from jaxtyping import Float64
 from pydantic import ConfigDict
+from torch import Tensor
 
 from pisigma.errors import PlanningError, nearest_choice
 from pisigma.planning.candidates import Candidates, draw_candidates, read_candidates
 from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.choice import Criterion
+from pisigma.planning.knowledge import Instrument, SensorKind
 from pisigma.planning.tour import Pace
 from pisigma.yaml_file import MOST_POSES
 
-Sensor = Literal["position", "pose", "distance"]
-Criterion = Literal["D", "I"]
 FILES = ("candidates_from", "task", "measured")
 """Settings that are files."""
 
@@ -29,7 +31,8 @@ class PlanSettings:
         count: poses to calibrate with.
         check: poses that are measured besides, to judge the calibration.
         sensor: what is measured: the position of a reflector, its pose, or its distance from a fixed point.
-        sigma_mm: standard deviation of a measured length [mm].
+        sigma_mm: standard deviation of a measured length [mm]; None for that of laser trackers, see
+            `pisigma.planning.knowledge.Instrument`.
         criterion: "D": what lowers the uncertainty of all unknowns most; "I": what lowers that of the tool's position
             over the task most; None for D without, and I with a model.
         limit_mm: RMS of the tool's position that is wanted [mm]; None for no limit.
@@ -50,8 +53,8 @@ class PlanSettings:
 
     count: int = 40
     check: int = 10
-    sensor: Sensor = "position"
-    sigma_mm: float = 0.05
+    sensor: SensorKind = "position"
+    sigma_mm: float | None = None
     criterion: Criterion | None = None
     limit_mm: float | None = None
     candidates: int = 5000
@@ -65,7 +68,7 @@ class PlanSettings:
 
     def __post_init__(self) -> None:
         """Refuse settings that are none."""
-        for name, choices in (("sensor", get_args(Sensor)), ("criterion", get_args(Criterion))):
+        for name, choices in (("sensor", get_args(SensorKind)), ("criterion", get_args(Criterion))):
             value = getattr(self, name)
             if value is not None and value not in choices:
                 raise PlanningError(f"{name} '{value}' is unknown; {nearest_choice(str(value), choices)}")
@@ -89,6 +92,23 @@ class PlanSettings:
     def pace(self) -> Pace:
         """How fast the robot goes from pose to pose."""
         return Pace(speed=math.radians(self.speed_deg_s), settling=self.settling_s)
+
+    def instrument(self, anchor: Float64[Tensor, " 3"] | None = None) -> Instrument:
+        """What measures.
+
+        Args:
+            anchor: where distances are from, in the measuring frame [m].
+
+        Raises:
+            PlanningError: distances are measured, but from nowhere.
+        """
+        if self.sensor == "distance" and anchor is None:
+            raise PlanningError(
+                "where distances are measured from was wanted; state it as the tracker of the cell (--cell)."
+            )
+        stated: dict[str, Any] = {} if self.sigma_mm is None else {"sigma": self.sigma_mm / 1e3}
+        stated |= {} if anchor is None else {"anchor": tuple(anchor.tolist())}
+        return Instrument(self.sensor, **stated)
 
     def find_candidates(self, arm: ArmInCell) -> Candidates:
         """Draw or read the poses to choose from.

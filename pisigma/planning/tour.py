@@ -64,7 +64,7 @@ class Tour:
     """
 
     order: Int64[Tensor, " poses"]
-    before: tuple[Float64[Tensor, "points dof"], ...]
+    before: tuple[Float64[Tensor, "_points dof"], ...]
     left_out: Int64[Tensor, " others"]
     seconds: float
 
@@ -90,17 +90,50 @@ def tour(
     """
     poses = q if start is None else torch.cat([start[None], q])
     seconds = pace.seconds(arm.robot, poses[:, None], poses[None]).numpy().copy()
+    motions = _Motions(arm, poses)
     order = _nearest_neighbours(seconds, start is not None)
     for _ in range(ROUNDS):
         order = _two_opt(seconds, order, start is not None)
-        stops = torch.from_numpy(order)
-        blocked = (~is_free(arm, poses[stops[:-1]], poses[stops[1:]])).numpy()
-        counted = blocked & (seconds[order[:-1], order[1:]] < _BLOCKED)
-        if not counted.any():
+        blocked = ~motions.are_free(order[:-1], order[1:]) & (seconds[order[:-1], order[1:]] < _BLOCKED)
+        if not blocked.any():
             break
-        one, other = order[:-1][counted], order[1:][counted]
+        one, other = order[:-1][blocked], order[1:][blocked]
         seconds[one, other] = seconds[other, one] = _BLOCKED + DETOUR * seconds[one, other]
-    return _with_way_points(arm, poses, order, pace, pool, start is not None)
+    return _with_way_points(motions, order, pace, pool, start is not None)
+
+
+class _Motions:
+    """Straight motions between poses, each of which is looked at once at most."""
+
+    def __init__(self, arm: ArmInCell, poses: Float64[Tensor, "poses dof"]) -> None:
+        self.arm, self.poses = arm, poses
+        self._free: dict[tuple[int, int], bool] = {}
+
+    def are_free(
+        self, start: Int64[np.ndarray, " motions"], end: Int64[np.ndarray, " motions"]
+    ) -> np.ndarray:
+        """Whether they touch nothing, by the numbers of their poses."""
+        pairs = [(min(pair), max(pair)) for pair in zip(start.tolist(), end.tolist(), strict=True)]
+        new = torch.tensor([pair for pair in pairs if pair not in self._free], dtype=torch.int64).reshape(
+            -1, 2
+        )
+        free = is_free(self.arm, self.poses[new[:, 0]], self.poses[new[:, 1]])
+        self._free |= dict(zip(map(tuple, new.tolist()), free.tolist(), strict=True))
+        return np.array([self._free[pair] for pair in pairs], dtype=bool)
+
+    def points_between(
+        self, start: int, end: int, pool: Float64[Tensor, "free dof"]
+    ) -> Float64[Tensor, "points dof"] | None:
+        """Way points of a motion, none where it is free as it is; None where no way was found."""
+        if self.are_free(np.array([start]), np.array([end]))[0]:
+            return pool[:0]
+        return way_points(self.arm, self.poses[start], self.poses[end], pool)
+
+    def is_shut_in(self, pose: int, other: int, pool: Float64[Tensor, "free dof"]) -> bool:
+        """Whether fewer free motions lead away from a pose than from another one."""
+        sample = pool[:: max(1, len(pool) // SAMPLE)]
+        ways = [int(is_free(self.arm, self.poses[i].expand_as(sample), sample).sum()) for i in (pose, other)]
+        return ways[0] < ways[1]
 
 
 _BLOCKED = 1e4
@@ -144,60 +177,28 @@ def _two_opt(seconds: Float64[np.ndarray, "poses poses"], order: np.ndarray, fix
 
 
 def _with_way_points(
-    arm: ArmInCell,
-    poses: Float64[Tensor, "poses dof"],
-    order: np.ndarray,
-    pace: Pace,
-    pool: Float64[Tensor, "free dof"],
-    fixed_start: bool,
+    motions: _Motions, order: np.ndarray, pace: Pace, pool: Float64[Tensor, "free dof"], fixed_start: bool
 ) -> Tour:
     """Put way points in where a motion is blocked, and leave out poses that none leads to."""
+    poses = motions.poses
     stops, before, left_out = [int(order[0])], [poses[:0]], []
     for stop in order[1:].tolist():
-        points = _points_between(arm, poses[stops[-1]], poses[stop], pool)
-        if (
-            points is None
-            and len(stops) > int(fixed_start)
-            and _is_shut_in(arm, poses[stops[-1]], poses[stop], pool)
-        ):
+        points = motions.points_between(stops[-1], stop, pool)
+        if points is None and len(stops) > int(fixed_start) and motions.is_shut_in(stops[-1], stop, pool):
             left_out.append(stops.pop())
             before.pop()
-            points = _points_between(arm, poses[stops[-1]], poses[stop], pool) if stops else poses[:0]
+            points = motions.points_between(stops[-1], stop, pool) if stops else poses[:0]
         if points is None:
             left_out.append(stop)
         else:
             stops.append(stop)
             before.append(points)
     path = torch.cat([torch.cat([points, poses[[stop]]]) for stop, points in zip(stops, before, strict=True)])
-    seconds = float(pace.seconds(arm.robot, path[:-1], path[1:]).sum()) + pace.settling * len(stops)
-    if fixed_start:
-        stops, before, seconds = stops[1:], before[1:], seconds - pace.settling
-    offset = int(fixed_start)
+    first = int(fixed_start)
+    seconds = float(pace.seconds(motions.arm.robot, path[:-1], path[1:]).sum())
     return Tour(
-        torch.tensor(stops, dtype=torch.int64) - offset,
-        tuple(before),
-        torch.tensor(left_out, dtype=torch.int64) - offset,
-        seconds,
+        torch.tensor(stops[first:], dtype=torch.int64) - first,
+        tuple(before[first:]),
+        torch.tensor(left_out, dtype=torch.int64) - first,
+        seconds + pace.settling * len(stops[first:]),
     )
-
-
-def _points_between(
-    arm: ArmInCell,
-    start: Float64[Tensor, " dof"],
-    end: Float64[Tensor, " dof"],
-    pool: Float64[Tensor, "free dof"],
-) -> Float64[Tensor, "points dof"] | None:
-    """Way points of a motion, none where it is free as it is; None where no way was found."""
-    return pool[:0] if bool(is_free(arm, start[None], end[None])) else way_points(arm, start, end, pool)
-
-
-def _is_shut_in(
-    arm: ArmInCell,
-    pose: Float64[Tensor, " dof"],
-    other: Float64[Tensor, " dof"],
-    pool: Float64[Tensor, "free dof"],
-) -> bool:
-    """Whether fewer free motions lead away from a pose than from another one."""
-    sample = pool[:: max(1, len(pool) // SAMPLE)]
-    ways = [int(is_free(arm, q.expand_as(sample), sample).sum()) for q in (pose, other)]
-    return ways[0] < ways[1]

@@ -1,0 +1,79 @@
+"""Candidates: drawn or read, allowed by the cell, and poses that are spread over them."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from testing.cells import CELL
+from testing.closeness import assert_close
+
+from pisigma.errors import PlanningError
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.planning.candidates import draw_candidates, read_candidates, spread
+from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.cell.cell import Cell
+from pisigma.robot import Robot
+
+ARM = ArmInCell.of(Robot.load("fanuc_r2000"), CELL)
+
+
+def test_candidates_are_allowed_and_the_same_at_every_draw():
+    candidates = draw_candidates(ARM, 40, seed=1)
+    again = draw_candidates(ARM, 40, seed=1)
+    assert len(candidates.q) == 40
+    assert bool(ARM.faults(candidates.q).allowed.all())
+    assert_close(again.q, candidates.q)
+    assert candidates.looked_at == int(candidates.number[-1]) == 40 + candidates.refused.total()
+    assert "turned away" in candidates.sentence
+
+
+def test_the_reflector_stays_in_the_workspace():
+    workspace = torch.tensor([[0.5, -2.0, 0.2], [2.5, 1.0, 2.5]], dtype=torch.float64)
+    candidates = draw_candidates(ARM, 20, 0, workspace)
+    position = forward_kinematics(ARM.robot, candidates.q)[:, :3, 3]
+    assert bool(((position >= workspace[0]) & (position <= workspace[1])).all())
+    assert any("workspace" in reason for reason in candidates.refused)
+
+
+def test_candidates_of_a_file_keep_their_row(tmp_path: Path):
+    drawn = draw_candidates(ARM, 5, 0)
+    refused = torch.tensor([[0.0, 1.2, -1.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    rows = torch.rad2deg(torch.cat([drawn.q[:2], refused, drawn.q[2:]])).tolist()
+    path = tmp_path / "some.csv"
+    path.write_text(
+        "\n".join(["q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"] + [",".join(map(repr, row)) for row in rows])
+    )
+    candidates = read_candidates(ARM, path)
+    assert candidates.number.tolist() == [1, 2, 4, 5, 6]
+    assert_close(candidates.q, drawn.q, atol=1e-12)
+
+
+def test_too_few_candidates_are_refused_with_the_reasons():
+    with pytest.raises(
+        PlanningError, match=r"50 poses were wanted, but 10 of .* turned away .* Ask for fewer"
+    ):
+        draw_candidates(ARM, 10, 0).check_count(50)
+
+
+def test_a_joint_that_slides_needs_limits():
+    robot = Robot.load("kiro3")
+    rows = tuple(row if row.type == "revolute" else type(row)(row.name, row.type) for row in robot.rows)
+    arm = ArmInCell.of(Robot(robot.name, "", "", rows, robot.dh))
+    with pytest.raises(PlanningError, match="joint 'd_3' of robot 'kiro3' slides without limits"):
+        draw_candidates(arm, 5, 0)
+    cell = Cell.model_validate({"joints": {"limits_mm": {"d_3": (-300.0, -10.0)}}})
+    drawn = draw_candidates(ArmInCell.of(arm.robot, cell), 50, 0).q[:, 2]
+    assert -0.3 <= float(drawn.min()) < float(drawn.max()) <= -0.01
+
+
+def test_spread_poses_are_farther_apart_than_random_ones():
+    q = draw_candidates(ARM, 200, 0).q
+    chosen = spread(ARM, q[20:], 10, q[:20])
+    position = forward_kinematics(ARM.robot, q)[:, :3, 3]
+
+    def nearest(index: torch.Tensor) -> float:
+        return float(torch.pdist(position[index]).min())
+
+    assert len(chosen.unique()) == 10
+    assert nearest(20 + chosen) > nearest(torch.arange(20, 30))
+    assert len(spread(ARM, q, 0, q[:3])) == 0

@@ -1,0 +1,99 @@
+"""Plans come back from their files, and foreign files are refused with file and line."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from testing.cells import CELL
+from testing.closeness import assert_close
+
+from pisigma.errors import MeasurementError, PlanningError
+from pisigma.planning.candidates import draw_candidates
+from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.plan_file import StoredPlan, read_plan
+from pisigma.planning.plan_settings import PlanSettings
+from pisigma.robot import Robot
+
+ARM = ArmInCell.of(Robot.load("fanuc_r2000"), CELL)
+
+
+@pytest.fixture
+def stored(tmp_path: Path) -> StoredPlan:
+    drawn = draw_candidates(ARM, 6, 0)
+    points = (drawn.q[:0], drawn.q[4:6], *(drawn.q[:0] for _ in range(2)))
+    settings = PlanSettings(
+        count=3,
+        check=1,
+        sigma_mm=0.03,
+        box_mm=(-900.0, -900.0, 0.0, 900.0, 900.0, 900.0),
+        measured=str(tmp_path / "rows.csv"),
+    )
+    check = torch.tensor([False, True, False, False])
+    plan = StoredPlan(ARM, settings, tmp_path / "model", drawn.q[:4], check, drawn.number[:4], points)
+    plan.write(tmp_path / "poses.csv")
+    return plan
+
+
+@pytest.mark.parametrize("name", ["poses.csv", "poses.plan.yaml"])
+def test_a_plan_comes_back(stored: StoredPlan, tmp_path: Path, name: str):
+    read = read_plan(tmp_path / name)
+    assert read.settings == stored.settings
+    assert read.arm.cell == stored.arm.cell
+    assert read.model == stored.model
+    assert_close(read.arm.robot.dh, ARM.robot.dh, atol=1e-12)
+    assert_close(read.q, stored.q, atol=1e-8)
+    assert read.check.tolist() == [False, True, False, False]
+    assert read.candidate.tolist() == stored.candidate.tolist()
+    for points, written in zip(read.way_points, stored.way_points, strict=True):
+        assert_close(points, written, atol=1e-8)
+
+
+def test_the_poses_are_in_their_order(stored: StoredPlan, tmp_path: Path):
+    header, *rows = (tmp_path / "poses.csv").read_text().splitlines()
+    assert header == "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,set,order,candidate"
+    assert [row.split(",")[6:8] for row in rows] == [
+        ["train", "1"],
+        ["test", "2"],
+        ["train", "3"],
+        ["train", "4"],
+    ]
+
+
+def test_a_table_without_its_plan_is_refused(stored: StoredPlan, tmp_path: Path):
+    (tmp_path / "poses.plan.yaml").unlink()
+    with pytest.raises(PlanningError, match=r"no poses\.plan\.yaml beside it"):
+        read_plan(tmp_path / "poses.csv")
+
+
+def test_faults_of_the_files_are_named(stored: StoredPlan, tmp_path: Path):
+    csv, yaml = tmp_path / "poses.csv", tmp_path / "poses.plan.yaml"
+    text = yaml.read_text()
+    yaml.write_text(text.replace("sensor: position", "sensor: camera"))
+    with pytest.raises(PlanningError, match=r"poses\.plan\.yaml, line \d+: 'settings.sensor'"):
+        read_plan(csv)
+    yaml.write_text(text)
+    csv.write_text(csv.read_text().replace(",order", ",number"))
+    with pytest.raises(MeasurementError, match=r"line 1: the column 'order' is missing"):
+        read_plan(csv)
+
+
+@pytest.mark.parametrize(
+    ("stated", "message"),
+    [
+        ({"sensor": "camera"}, "sensor 'camera' is unknown; Valid: distance, pose, position"),
+        ({"criterion": "A"}, "criterion 'A' is unknown; Valid: D, I"),
+        ({"count": 0}, "count: 1 to 100,000 was wanted, got 0"),
+        ({"sigma_mm": -1.0}, "sigma_mm: a length above 0"),
+        ({"box_mm": (0, 0, 0, 1, -1, 1)}, "box: the lowest x, y, z"),
+        ({"settling_s": -1.0}, "a settling time of 0 s or more"),
+    ],
+)
+@pytest.mark.usefixtures("without_type_checker")
+def test_settings_that_are_none_are_refused(stated: dict[str, object], message: str):
+    with pytest.raises(PlanningError, match=message):
+        PlanSettings(**stated)  # type: ignore[arg-type]
+
+
+def test_distances_are_measured_from_somewhere():
+    with pytest.raises(PlanningError, match="where distances are measured from"):
+        PlanSettings(sensor="distance").instrument()

@@ -1,0 +1,75 @@
+"""The order of poses: short, and by motions that touch nothing."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+from testing.cells import CELL
+from testing.closeness import assert_close
+
+from pisigma.errors import PlanningError
+from pisigma.planning.candidates import draw_candidates
+from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.cell.cell import Cell
+from pisigma.planning.cell.motion import is_free
+from pisigma.planning.tour import Pace, tour
+from pisigma.robot import Robot
+
+ARM = ArmInCell.of(Robot.load("fanuc_r2000"), CELL)
+PACE = Pace(speed=math.radians(20), settling=2.0)
+
+
+def test_few_poses_are_in_the_best_order():
+    q = torch.from_numpy(np.random.default_rng(3).uniform(-0.4, 0.4, (7, 6)))
+    arm = ArmInCell.of(Robot.load("fanuc_r2000"))
+    way = tour(arm, q, PACE, q)
+
+    def seconds(order: tuple[int, ...]) -> float:
+        path = q[list(order)]
+        return float(PACE.seconds(arm.robot, path[:-1], path[1:]).sum()) + PACE.settling * len(order)
+
+    best = min(seconds(order) for order in itertools.permutations(range(len(q))))
+    assert sorted(way.order.tolist()) == list(range(len(q)))
+    assert_close(way.seconds, seconds(tuple(way.order.tolist())), rtol=1e-12)
+    assert best - 1e-9 <= way.seconds <= 1.05 * best
+
+
+def test_a_tour_goes_on_from_where_the_robot_stands():
+    q = torch.from_numpy(np.random.default_rng(3).uniform(-0.4, 0.4, (7, 6)))
+    arm = ArmInCell.of(Robot.load("fanuc_r2000"))
+    start = q[4] + 0.01
+    way = tour(arm, q, PACE, q, start)
+    assert int(way.order[0]) == 4
+    assert sorted(way.order.tolist()) == list(range(7))
+
+
+def test_every_motion_touches_nothing():
+    arm = ArmInCell.of(ARM.robot, CELL.model_copy(update={"tracker": None, "reflector": None}))
+    pool = draw_candidates(arm, 60, 0).q
+    way = tour(arm, pool[:5], PACE, pool)
+    assert not len(way.left_out)
+    assert sum(map(len, way.before)) == 1, "the test wants a motion that is blocked"
+    stops = [
+        torch.cat([points, pool[[int(pose)]]]) for pose, points in zip(way.order, way.before, strict=True)
+    ]
+    path = torch.cat(stops)
+    assert bool(is_free(arm, path[:-1], path[1:]).all())
+
+
+def test_a_pose_that_no_motion_leads_to_is_left_out():
+    wall = {"name": "wall", "center_mm": (-3200.0, 0.0, 1500.0), "size_mm": (6000.0, 40.0, 3000.0)}
+    robot = Robot.load("kiro3")
+    q = torch.tensor([[1.5, 0.3, -0.1, 0], [1.2, 0.1, -0.2, 1], [-1.5, -0.3, -0.1, 0]], dtype=torch.float64)
+    blocked = Cell.model_validate(
+        {"boxes": [wall, wall | {"name": "other", "center_mm": (3200.0, 0.0, 1500.0)}]}
+    )
+    way = tour(ArmInCell.of(robot, blocked), q, PACE, q)
+    assert len(way.left_out) == 1
+    assert len(way.order) == 2
+
+
+def test_a_pace_is_a_pace():
+    with pytest.raises(PlanningError, match="a speed above 0"):
+        Pace(speed=0.0)
