@@ -12,6 +12,8 @@ from pisigma.kernels.array_kinematics import joint_jacobian as joint_jacobian
 from pisigma.kinematics.status import Status as Status
 from pisigma.measurement.dataset import Measurements as Measurements
 from pisigma.network.pi_sigma import PiSigma as PiSigma
+from pisigma.planning.cell.cell import Cell as Cell
+from pisigma.planning.plan_settings import PlanSettings as PlanSettings
 from pisigma.robot.description import Robot as Robot
 from pisigma.sensors.registry import register_sensor as register_sensor
 from pisigma.workflow.calibrate import Calibration as Calibration
@@ -25,6 +27,8 @@ from pisigma.workflow.evaluate import Limits as Limits
 from pisigma.workflow.evaluate import evaluate as evaluate
 from pisigma.workflow.import_rows import ImportSettings as ImportSettings
 from pisigma.workflow.import_rows import import_rows as import_rows
+from pisigma.workflow.plan import Plan as Plan
+from pisigma.workflow.plan import plan as plan
 from pisigma.workflow.report import report as report
 from pisigma.workflow.train import train as train
 from pisigma.workflow.train_networks import TrainSettings as TrainSettings

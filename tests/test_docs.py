@@ -16,7 +16,8 @@ from typer.main import get_command
 from pisigma.cli.main import app
 from pisigma.kinematics.status import Status
 from pisigma.measurement.csv.columns import column_choices, find_column
-from pisigma.robot import catalogue
+from pisigma.planning.cell.cell import read_cell
+from pisigma.robot import Robot, catalogue
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -213,6 +214,17 @@ def test_the_table_of_columns_is_that_of_the_reader() -> None:
     assert all(find_column(name) for name in joints - {"q2_..."})
     valid = column_choices("nothing").split("Valid: ", 1)[1].rstrip(".").split(", ")
     assert named - joints == {name for name in valid if not re.match(r"q\d", name)}
+
+
+def test_the_cell_that_is_shown_is_one(tmp_path: Path) -> None:
+    (block,) = re.findall(
+        r"^```yaml\n(.*?)^```", _text(DOCS / "how-to" / "plan.md"), re.MULTILINE | re.DOTALL
+    )
+    (tmp_path / "cell.yaml").write_text(block, encoding="utf-8")
+    cell = read_cell(tmp_path / "cell.yaml", Robot.load("ur10"))
+    assert set(cell.model_dump()) == set(cell.model_dump(exclude_defaults=True)), (
+        "the example shows everything"
+    )
 
 
 def test_the_keys_of_recipes_are_those_of_the_models() -> None:

@@ -15,6 +15,7 @@ from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
 from pisigma.cli.ik import ik
 from pisigma.cli.import_ import import_
+from pisigma.cli.plan import plan
 from pisigma.cli.report import report
 from pisigma.cli.robots import robots
 from pisigma.cli.simulate import simulate
@@ -32,6 +33,7 @@ app = typer.Typer(
 for command in (
     robots,
     simulate,
+    plan,
     import_,
     calibrate,
     train,

@@ -1,0 +1,160 @@
+"""`pisigma plan`: which poses to measure, and the accuracy that they are expected to give."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pisigma.cli.arguments import AsJson, complete_robot
+from pisigma.cli.calibrate import Base, Tip
+from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of
+
+if TYPE_CHECKING:
+    from pisigma.workflow.plan import Plan
+
+Subject = Annotated[
+    str,
+    typer.Argument(
+        metavar="ROBOT|MODEL",
+        help="Catalogue name, robot file (YAML or URDF), or a model folder to measure again.",
+        autocompletion=complete_robot,
+    ),
+]
+Out = Annotated[Path, typer.Option(help="CSV file of poses to write; its .plan.yaml is written beside it.")]
+Count = Annotated[int, typer.Option(help="Poses to calibrate with.")]
+Check = Annotated[int, typer.Option(help="Poses to measure besides, which judge the calibration (set test).")]
+CellFile = Annotated[
+    Path | None, typer.Option("--cell", help="What stands around the robot (YAML): see the documentation.")
+]
+Candidates = Annotated[int, typer.Option(help="Poses to draw, of which some are chosen.")]
+CandidatesFrom = Annotated[
+    Path | None, typer.Option(help="Choose from the joint values of this CSV file instead.")
+]
+Seed = Annotated[int, typer.Option(help="Seed of what is drawn.")]
+Box = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,Z,X,Y,Z",
+        help="Box of the reflector's positions: lowest and then highest x, y, z in the robot's base frame [mm].",
+    ),
+]
+Task = Annotated[
+    Path | None,
+    typer.Option(help="CSV file of joint values where the robot shall be accurate. [default: everywhere]"),
+]
+Measured = Annotated[Path | None, typer.Option(help="Measurements that are there already (CSV).")]
+SensorKind = Annotated[str, typer.Option("--sensor", help="What is measured: position, pose or distance.")]
+SigmaMm = Annotated[
+    float | None,
+    typer.Option(help="Standard deviation of a measured length [mm]. [default: of laser trackers]"),
+]
+CriterionName = Annotated[
+    str | None,
+    typer.Option(
+        "--criterion",
+        help="D: all unknowns; I: the tool's position over the task. [default: D, or I where something is measured]",
+    ),
+]
+LimitMm = Annotated[
+    float | None,
+    typer.Option(help="RMS of the tool's position that is wanted [mm]: how many poses does it need?"),
+]
+SpeedDegS = Annotated[float, typer.Option(help="Speed of every joint between the poses [deg/s].")]
+SettlingS = Annotated[float, typer.Option(help="Time at every pose until it is measured [s].")]
+Programs = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--program",
+        help="Program to write too: .script (URScript), .src (KUKA), .mod (ABB) or .ls (FANUC); may be repeated.",
+    ),
+]
+
+
+def plan(
+    subject: Subject,
+    out: Out,
+    count: Count = 40,
+    check: Check = 10,
+    cell: CellFile = None,
+    candidates: Candidates = 5000,
+    candidates_from: CandidatesFrom = None,
+    seed: Seed = 0,
+    box: Box = None,
+    task: Task = None,
+    measured: Measured = None,
+    sensor: SensorKind = "position",
+    sigma_mm: SigmaMm = None,
+    criterion: CriterionName = None,
+    limit_mm: LimitMm = None,
+    speed_deg_s: SpeedDegS = 30.0,
+    settling_s: SettlingS = 3.0,
+    program: Programs = None,
+    base: Base = None,
+    tip: Tip = None,
+    as_json: AsJson = False,
+) -> None:
+    """Plan which poses to measure so that the calibration gets accurate with few of them.
+
+    Prints the accuracy to expect against the number of poses, and writes the poses in the order in which they are
+    measured: add the measured columns, and the file goes to `pisigma calibrate`.
+    """
+    from pisigma.planning.plan_file import yaml_of
+    from pisigma.planning.plan_settings import PlanSettings
+    from pisigma.workflow import plan as workflow
+
+    stated: dict[str, Any] = {"count": count, "check": check, "sensor": sensor, "criterion": criterion}
+    stated |= {"candidates": candidates, "seed": seed, "sigma_mm": sigma_mm, "limit_mm": limit_mm}
+    stated |= {"speed_deg_s": speed_deg_s, "settling_s": settling_s, "box_mm": _box(box)}
+    files = {"candidates_from": candidates_from, "task": task, "measured": measured}
+    stated |= {name: None if file is None else str(file) for name, file in files.items()}
+    settings = PlanSettings(**stated)
+    wanted, programs = workflow.Subject.of(subject, base, tip), program or []
+    workflow.check_files(out, programs, settings, wanted.robot, (subject, cell))
+    with progress_of("plan") as progress:
+        planned = workflow.plan(wanted, settings, cell, progress)
+    planned.save(out, programs)
+    if as_json:
+        print_json({"file": str(out), **planned.to_json()})
+    else:
+        _print(planned, [out, yaml_of(out), *programs])
+
+
+def _print(planned: "Plan", files: list[Path]) -> None:
+    """Print for people what is expected of the poses, and what remains uncertain."""
+    columns = ("poses", "RMS [mm]", "95 % [mm]", "RMS of random poses [mm]")
+    rows = [
+        (str(point.poses), *(f"{error * 1e3:.3f}" for error in (point.rms, point.p95, point.random_rms)))
+        for point in planned.curve
+    ]
+    print_table("expected errors of the tool's position by number of poses", columns, rows)
+    settings = planned.stored.settings
+    if settings.limit_mm is not None:
+        needed = "needs more poses" if planned.needed is None else f"is expected with {planned.needed} poses"
+        print_lines([f"An RMS of {settings.limit_mm:g} mm {needed}."])
+    print_line("What the expected error will mostly come from:")
+    print_lines((f"- {line}" for line in planned.weak), indent="  ")
+    points = sum(map(len, planned.stored.way_points))
+    print_lines(
+        [
+            planned.candidates.sentence,
+            f"{planned.poses} poses and {planned.checks} to check with take {planned.travel / 60:.0f} minutes at "
+            f"{settings.speed_deg_s:g} deg/s and {settings.settling_s:g} s a pose, with {points} way points.",
+            *(f"Warning: {sentence}" for sentence in planned.warnings),
+            f"Written to {', '.join(map(str, files))}.",
+        ]
+    )
+
+
+def _box(stated: str | None) -> Any:
+    """Lowest and highest x, y, z [mm], from "X,Y,Z,X,Y,Z"."""
+    from pisigma.errors import PlanningError
+
+    try:
+        box = None if stated is None else tuple(map(float, stated.split(",")))
+    except ValueError:
+        box = ()
+    if box is not None and len(box) != 6:
+        raise PlanningError(
+            f"--box: six numbers such as -500,200,100,500,900,800 were wanted, got '{stated}'."
+        )
+    return box

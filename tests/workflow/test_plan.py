@@ -1,0 +1,104 @@
+"""Plans from a robot to its files: every pose is allowed by a check of its own, and the measured plan calibrates."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from testing.cells import CELL, is_collision_free, is_visible
+from testing.closeness import assert_close
+from testing.models import no_type_checker
+
+from pisigma.errors import PlanningError
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.dataset import Measurements
+from pisigma.planning.cell.motion import is_free
+from pisigma.planning.plan_file import read_plan
+from pisigma.planning.plan_settings import PlanSettings
+from pisigma.robot import Robot
+from pisigma.workflow.plan import Plan, plan
+
+SETTINGS = PlanSettings(count=14, check=4, candidates=80, limit_mm=1.0)
+RADIUS = np.array([*(0.05 * 3.534 for _ in range(3)), *(0.035 * 3.534 for _ in range(3)), 0.025])
+
+
+@pytest.fixture(scope="module")
+def planned() -> Plan:
+    with no_type_checker():
+        return plan("fanuc_r2000", SETTINGS, CELL)
+
+
+def test_every_planned_pose_is_reachable_free_and_seen(planned: Plan):
+    robot, q = planned.stored.arm.robot, planned.stored.q.numpy()
+    assert len(q) == 18
+    margin = np.deg2rad(5)
+    assert (q >= robot.limits[:, 0] + margin - 1e-9).all()
+    assert (q <= robot.limits[:, 1] - margin + 1e-9).all()
+    assert all(is_collision_free(robot, CELL, pose, RADIUS) for pose in q)
+    assert all(is_visible(robot, CELL, pose, RADIUS) for pose in q)
+
+
+def test_every_motion_is_free(planned: Plan):
+    stops = [
+        torch.cat([p, q[None]]) for p, q in zip(planned.stored.way_points, planned.stored.q, strict=True)
+    ]
+    path = torch.cat(stops)
+    steps = np.linspace(0, 1, 25)[:, None]
+    for start, end in zip(path[:-1].numpy(), path[1:].numpy(), strict=True):
+        on_the_way = start + steps * (end - start)
+        assert all(
+            is_collision_free(
+                planned.stored.arm.robot, CELL.model_copy(update={"clearance_mm": 5.0}), q, RADIUS
+            )
+            for q in on_the_way
+        )
+    assert bool(is_free(planned.stored.arm, path[:-1], path[1:]).all())
+
+
+def test_more_poses_are_expected_to_err_less(planned: Plan):
+    assert [point.poses for point in planned.curve] == [10, 14]
+    assert planned.curve[0].rms > planned.curve[1].rms > 0
+    assert planned.curve[1].random_rms > planned.curve[1].rms
+    assert planned.needed is not None
+    assert 1 <= planned.needed <= 14
+    assert planned.travel > 18 * 3.0
+    assert planned.weak
+
+
+def test_the_measured_plan_is_measurements(planned: Plan, tmp_path: Path):
+    planned.save(tmp_path / "poses.csv", [tmp_path / "poses.src", tmp_path / "poses.script"])
+    robot = Robot.load("fanuc_r2000")
+    header, *rows = (tmp_path / "poses.csv").read_text().splitlines()
+    position = forward_kinematics(robot, read_plan(tmp_path / "poses.csv").q)[:, :3, 3] * 1e3
+    lines = [f"{row},{x!r},{y!r},{z!r}" for row, (x, y, z) in zip(rows, position.tolist(), strict=True)]
+    (tmp_path / "measured.csv").write_text("\n".join([header + ",x_mm,y_mm,z_mm", *lines]))
+    train, test = Measurements.read_csv(tmp_path / "measured.csv", robot).split_sets()
+    assert test is not None
+    assert (train.rows, test.rows) == (14, 4)
+    script = (tmp_path / "poses.script").read_text()
+    assert script.count("sleep(3.0)") == 18
+    assert script.count("movej") == 18 + sum(map(len, planned.stored.way_points))
+    assert "WAIT SEC 3.0" in (tmp_path / "poses.src").read_text()
+
+
+def test_what_is_measured_already_counts(planned: Plan, tmp_path: Path):
+    planned.save(tmp_path / "poses.csv")
+    header, *rows = (tmp_path / "poses.csv").read_text().splitlines()
+    measured = [f"{row},0.0,0.0,0.0" for row in rows]
+    (tmp_path / "measured.csv").write_text("\n".join([header + ",x_mm,y_mm,z_mm", *measured[:4]]))
+    settings = PlanSettings(count=3, check=0, candidates=40, measured=str(tmp_path / "measured.csv"))
+    with no_type_checker():
+        more = plan("fanuc_r2000", settings, CELL)
+    assert [point.poses for point in more.curve] == [0, 3]
+    assert more.checks == 0
+
+
+def test_too_few_candidates_are_refused():
+    with pytest.raises(PlanningError, match="30 poses were wanted, but 20 of"):
+        plan("fanuc_r2000", PlanSettings(count=30, check=0, candidates=20), CELL)
+
+
+def test_plans_are_the_same_at_every_call(planned: Plan):
+    with no_type_checker():
+        again = plan("fanuc_r2000", SETTINGS, CELL)
+    assert_close(again.stored.q, planned.stored.q)
