@@ -39,9 +39,16 @@ class MeshBody(AbstractBody):
             tip: the link that is the tool, as in `Robot.load`.
 
         Raises:
-            RobotError: the file cannot be used, it shows no link, or a mesh is not at hand or of no usable format.
+            RobotError: the file cannot be used, it is of another robot or shows no link, or a mesh is not at hand or of
+                no usable format.
         """
-        self._joints, self._base = [joint.name for joint in robot.joints], read_chain(path, base, tip).base
+        chain = read_chain(path, base, tip)
+        self._base, self._joints = chain.base, [joint.name for joint in robot.joints]
+        if [joint.name for joint in chain.joints] != self._joints:
+            raise RobotError(
+                f"{path}: its joints are {', '.join(joint.name for joint in chain.joints)}, but those of robot "
+                f"'{robot.name}' are {', '.join(self._joints)}; give the file that the robot was loaded from."
+            )
         self._urdf, _ = read_urdf(path)
         self.links: dict[str, Surface] = {}
         for element in parse_xml(path).iterchildren("{*}link"):

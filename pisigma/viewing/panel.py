@@ -53,7 +53,7 @@ class SessionPanel:
             title="Accuracy over the task",
             scales=_scales(()),
             axes=({"label": "poses"}, {"label": "mm"}),
-            aspect=1.3,
+            aspect=1.6,
             visible=False,
         )
         self.magnification = gui.add_slider("errors magnified by", min=0, max=2000, step=10, initial_value=0)

@@ -2,12 +2,14 @@
 
 import contextlib
 import io
+import socket
 import threading
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float64
 
+from pisigma.errors import OutputError
 from pisigma.measuring.state import RowsSoFar, SessionState
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.viewing.body import AbstractBody, CapsuleBody
@@ -20,8 +22,9 @@ if TYPE_CHECKING:  # names in full, which type checkers at run time find without
 
 DRAWN = 0.15
 """Share of the robot's reach that an error at the end of the scale of colours is drawn with."""
-FIELD, RISE, AROUND_ROBOT = 0.8, 0.5, 0.7
-"""Of the first view: its angle [rad], how steeply it looks down, and the share of the reach that it shows around."""
+FIELD, RISE, AROUND_ROBOT, CLOSER = 0.8, 0.5, 0.7, 0.8
+"""Of the first view: its angle [rad], how steeply it looks down, the share of the reach that it shows around, and how
+much nearer than for all of that ball it is."""
 
 
 class SessionView:
@@ -52,9 +55,11 @@ class SessionView:
 
         Raises:
             ImportError: viser is not installed.
+            OutputError: the host is no address of this machine.
         """
         import viser
 
+        _check_host(host)
         self._reach, self._lock = arm.robot.reach, threading.Lock()
         self._state: SessionState | None = None
         self._magnified_by_hand = False
@@ -104,6 +109,19 @@ class SessionView:
                 self._scene.show_rows(rows, top_of_scale(rows), self._panel.magnification.value)
 
 
+def _check_host(host: str) -> None:
+    """Refuse an address that this machine has not; viser would look for a free port there for ever."""
+    try:
+        family, kind, _, _, address = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+        with socket.socket(family, kind) as trial:
+            trial.bind(address)
+    except OSError as problem:
+        raise OutputError(
+            f"the page cannot be served at '{host}' ({problem.strerror}); give an address of this machine, such as "
+            "127.0.0.1, or 0.0.0.0 for all of them."
+        ) from None
+
+
 def first_view(arm: ArmInCell) -> tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]:
     """From where to look at the robot and its tracker, which then stand side by side, and where to [m]."""
     tracker = np.zeros(3) if arm.cell.tracker is None else arm.cell.tracker.position.numpy()
@@ -112,7 +130,7 @@ def first_view(arm: ArmInCell) -> tuple[Float64[np.ndarray, " 3"], Float64[np.nd
     middle, radius = (low + high) / 2, float(np.linalg.norm(high - low)) / 2
     sideways = np.array([tracker[1], -tracker[0], 0.0]) if tracker[:2].any() else np.array([1.0, -1.0, 0.0])
     direction = sideways / np.linalg.norm(sideways) + np.array([0.0, 0.0, RISE])
-    return middle + radius / np.sin(FIELD / 2) * direction / np.linalg.norm(direction), middle
+    return middle + CLOSER * radius / np.sin(FIELD / 2) * direction / np.linalg.norm(direction), middle
 
 
 def top_of_scale(rows: RowsSoFar) -> float:

@@ -76,6 +76,11 @@ def test_what_cannot_be_drawn_is_refused(urdf, change, message):
         MeshBody(robot, urdf)
 
 
+def test_a_file_of_another_robot_is_refused(urdf):
+    with pytest.raises(RobotError, match="its joints are j1, j2, j3, but those of robot 'ur5' are"):
+        MeshBody(Robot.load("ur5"), urdf)
+
+
 def test_a_file_without_meshes_is_refused(urdf):
     robot = Robot.load(urdf)
     urdf.write_text(URDF.replace("visual>", "collision>"))

@@ -10,6 +10,7 @@ from testing.models import no_type_checker
 from testing.report import HOSTILE
 from testing.sessions import arm_beside_tracker, session_state
 
+from pisigma.errors import OutputError
 from pisigma.measuring.state import Advice, Alarm
 
 pytest.importorskip("viser", reason="the extra view is not installed")
@@ -63,7 +64,7 @@ def test_rows_appear_as_they_come(browser, view):
         shown = text_with(page, 20)
         for sentence in (
             "20 rows (3 of them check), 1 to be measured again",
-            "predicted: RMS 0.224 mm, 95 % below 0.380 mm (limit 0.150 mm)",
+            "predicted: RMS 0.224 mm, 95 % below 0.380 mm",
             "cross-validated: RMS 0.268 mm",
             "Line 21: the position is off by 5 mm",
             "theta_6",
@@ -83,6 +84,19 @@ def test_nothing_is_printed_where_results_stand(capfd):
     with no_type_checker(), SessionView(arm_beside_tracker(), port=0) as view:
         assert view.url.startswith("http://127.0.0.1:")
     assert capfd.readouterr().out == ""
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "no such host"])
+def test_an_address_of_another_machine_is_refused(host):
+    with no_type_checker(), pytest.raises(OutputError, match=f"cannot be served at '{host}'"):
+        SessionView(arm_beside_tracker(), host=host)
+
+
+def test_a_page_beside_another_takes_the_next_port():
+    with no_type_checker(), SessionView(arm_beside_tracker(), port=0) as first:
+        port = int(first.url.rpartition(":")[2])
+        with SessionView(arm_beside_tracker(), port=port) as second:
+            assert int(second.url.rpartition(":")[2]) > port
 
 
 def test_scales_end_beyond_the_rows_that_count():
