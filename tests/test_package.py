@@ -46,6 +46,7 @@ LAYERS = (
     "planning",
     "export",
     "judging",
+    "recalibration",
     "verification",
     "recipes",
     "reporting",

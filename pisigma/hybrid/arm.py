@@ -41,10 +41,25 @@ class JointCoverage:
         """Stretches around measured joint values."""
         rate = torch.from_numpy(turning_rate(robot))
         turning = tuple(bool(turns) for turns in robot.revolute)
-        stretches = [_stretches(angles.numpy(), turning[j]) for j, angles in enumerate((q.cpu() * rate).t())]
-        joint = torch.arange(robot.dof).repeat_interleave(torch.tensor([len(ends) for ends in stretches]))
+        return JointCoverage._around(list((q.cpu() * rate).t()), rate, turning)
+
+    @staticmethod
+    def _around(angles: list[Tensor], rate: Tensor, turning: tuple[bool, ...]) -> "JointCoverage":
+        stretches = [_stretches(of_joint.numpy(), turning[j]) for j, of_joint in enumerate(angles)]
+        joint = torch.arange(len(turning)).repeat_interleave(torch.tensor([len(ends) for ends in stretches]))
         ends = torch.tensor([pair for pairs in stretches for pair in pairs], dtype=torch.float64)
         return JointCoverage(joint, ends.mean(1), (ends[:, 1] - ends[:, 0]) / 2, rate, turning)
+
+    def with_rows(self, q: Float64[Tensor, "rows dof"]) -> "JointCoverage":
+        """Stretches around these and more measured joint values."""
+        angles = []
+        for j in range(len(self.turning)):
+            of_joint = [(q[:, j] * self.rate[j]).cpu()]
+            for middle, half in zip(self.middle[self.joint == j], self.half[self.joint == j], strict=True):
+                steps = 2 + int(2 * float(half) / LARGEST_GAP)
+                of_joint.append(middle + half * torch.linspace(-1, 1, steps, dtype=torch.float64))
+            angles.append(torch.cat(of_joint))
+        return JointCoverage._around(angles, self.rate, self.turning)
 
     def beyond(self, q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
         """Angle from every joint value to the nearest measured stretch [rad], 0 within one."""

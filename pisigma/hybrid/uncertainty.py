@@ -1,7 +1,8 @@
 """Standard deviations of predicted positions, from the posterior of parameters and weights."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 from jaxtyping import Float64
@@ -44,6 +45,8 @@ class PositionUncertainty:
         covariance_root: `R` with `C = R R^T`, of all parameters of the space (0 for those that were not free) and then
             all weights, scaled so that left-out rows are missed by as much as it says.
         prior_scale: factor on the variances that this took.
+        noise: per sensor, its standard deviation [m or rad], or a factor where the rows state it; empty in folders from
+            before it was kept.
     """
 
     space: ParameterSpace
@@ -51,6 +54,7 @@ class PositionUncertainty:
     features: tuple[AbstractFeature, ...]
     covariance_root: CovarianceRoot
     prior_scale: float
+    noise: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def root(self) -> Float64[Tensor, "unknowns directions"]:
@@ -166,4 +170,5 @@ def position_uncertainty(
     root = fit.covariance_root(posterior)
     change = geometry.change[:, design.problem.active.cpu()]
     root = root.extended(root_of_sizes(posterior, root), prior_scale**0.5, change)
-    return PositionUncertainty(design.problem.space, geometry, design.features, root, prior_scale)
+    noise = {sensor.name: sigma for sensor, sigma in zip(rows.values, posterior.noise, strict=True)}
+    return PositionUncertainty(design.problem.space, geometry, design.features, root, prior_scale, noise)

@@ -56,3 +56,9 @@ class InputProducts(AbstractFeature):
         units = int(torch.maximum((eigenvalues < 0).sum(1), (eigenvalues > 0).sum(1)).max())
         sides = torch.stack([plus + minus, plus - minus], -1)[:, :, :units]
         return sides.flatten(2).mT
+
+    def weights(self, factors: Float64[Tensor, "dof factors inputs"]) -> Float64[Tensor, " weights"]:
+        """Weights of the products that product units of order 2 add up to: the inverse of `factors`."""
+        first, second = self.pairs
+        M = factors[:, 0::2].mT @ factors[:, 1::2]
+        return (M + M.mT)[:, first, second].flatten()

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Protocol
 
 import torch
 from jaxtyping import Float64, Int64
@@ -306,7 +307,14 @@ def _judge(
     return _JudgedFold(torch.arange(held_out.rows), errors, distances, spread)
 
 
-def errors_under(result: Result, measurements: Measurements) -> PoseErrors:
+class PredictsErrors(Protocol):
+    """A calibration of any kind."""
+
+    def errors_of(self, measurements: Measurements) -> Mapping[str, Float64[Tensor, "rows components"]]:
+        """Measured - predicted values by sensor [m or rad]; see `CalibrationResult.errors_of`."""
+
+
+def errors_under(result: PredictsErrors, measurements: Measurements) -> PoseErrors:
     """Errors of any rows under a calibration, whatever sensor measured them.
 
     Returns:

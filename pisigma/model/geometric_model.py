@@ -46,7 +46,7 @@ def model_of_calibration(
         robot=robot,
         network=None,
         domain=None,
-        branches=_branches(robot, starts),
+        branches=branches_of(robot, starts),
         starts=starts,
         calibrated=result.robot,
         bases=dict(result.bases),
@@ -102,7 +102,7 @@ def _kept(uncertainty: PositionUncertainty, geometry: IdentifiedGeometry) -> Pos
     )
 
 
-def _branches(nominal: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:
-    """Branches of the nominal arm that joint values lie on, most frequent first; empty without closed form."""
+def branches_of(nominal: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:
+    """Name the branches of the nominal arm that joint values lie on, most frequent first; none without closed form."""
     solver = closed_form_solver(nominal)
     return () if solver is None else solver.frequent(nearest_branch(solver, q))

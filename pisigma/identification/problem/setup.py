@@ -102,7 +102,7 @@ def build_setup(
         PoseError: the joint values do not fit the robot.
     """
     robot.check_joint_count(measurements.q.shape[1])
-    rows, measurements = _usable(measurements)
+    rows, measurements = usable_rows(measurements)
     space = ParameterSpace(
         robot,
         tuple(dict.fromkeys(measurements.frame)),
@@ -112,6 +112,28 @@ def build_setup(
     guessed = guess(
         space, measurements, options.free_base, options.free_tool, options.turn_tool, options.frames
     )
+    return setup_around(space, guessed, (rows, measurements), options, prior, loss)
+
+
+def setup_around(
+    space: ParameterSpace,
+    guessed: InitialGuess,
+    usable: tuple[Tensor, Measurements],
+    options: SetupOptions,
+    prior: Prior | None,
+    loss: AbstractLoss,
+) -> CalibrationSetup:
+    """State the problem relative to where everything but the arm is.
+
+    Args:
+        space: the parameters.
+        guessed: bases, tools and sensors' unknowns.
+        usable: from `usable_rows`.
+        options: what the user says.
+        prior: of the arm's errors.
+        loss: how far-off rows count.
+    """
+    rows, measurements = usable
     device = measurements.q.device
     frame = numbers_of(measurements.frame, space.frames, measurements.rows).to(device)
     target = numbers_of(measurements.target, space.targets, measurements.rows).to(device)
@@ -149,8 +171,11 @@ def build_setup(
     return CalibrationSetup(problem, start, anchors, rows, unknown_frames, free, measurements)
 
 
-def _usable(measurements: Measurements) -> tuple[Tensor, Measurements]:
-    """The rows in which something was measured; those of pairs come first, side by side.
+def usable_rows(measurements: Measurements) -> tuple[Tensor, Measurements]:
+    """Select the rows in which something was measured; those of pairs come first, side by side.
+
+    Returns:
+        Their numbers, and the rows.
 
     Raises:
         IdentificationError: no row has a measured value, or all are of one pose.

@@ -62,6 +62,7 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
             "free": _free_rows(known),
             "products": any(isinstance(chosen, InputProducts) for chosen in known.features),
             "prior_scale": known.prior_scale,
+            "noise": dict(known.noise),
         }
     return result
 
@@ -255,8 +256,8 @@ def _uncertainty(
         if wrong:
             raise ValueError(f"{len(own.columns)} values of every {own.name} were wanted, got {wrong.pop()}")
     geometry = IdentifiedGeometry(robot, bases, tools, unknowns)
-    features = _weighted(known, hybrid)
-    return PositionUncertainty(space, geometry, features, CovarianceRoot(full), known.prior_scale)
+    features, root = _weighted(known, hybrid), CovarianceRoot(full)
+    return PositionUncertainty(space, geometry, features, root, known.prior_scale, known.noise)
 
 
 def _unknowns_section(groups: Sequence[UnknownGroup]) -> dict[str, object]:

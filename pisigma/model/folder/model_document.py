@@ -73,7 +73,7 @@ class UncertaintySection(Section):
         free: which parameters have a row in the root; the others' rows are 0. Behind them come all weights.
         products: whether the weights of products of inputs stand behind the others: see
             `pisigma.joint_correction.input_products.InputProducts`.
-        prior_scale: see `pisigma.hybrid.uncertainty.PositionUncertainty`.
+        prior_scale: see `pisigma.hybrid.uncertainty.PositionUncertainty`, as for the noise.
     """
 
     sockets: tuple[str, ...]
@@ -83,6 +83,7 @@ class UncertaintySection(Section):
     free: tuple[Annotated[int, Field(ge=0)], ...]
     products: bool
     prior_scale: Annotated[float, Field(gt=0)]
+    noise: dict[str, Annotated[FiniteFloat, Field(gt=0)]] = Field(default_factory=dict)
 
 
 class ProvenanceSection(Section):

@@ -1,0 +1,1 @@
+"""A calibrated model and few new rows: what has moved since, and the model that holds again."""

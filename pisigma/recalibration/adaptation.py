@@ -1,0 +1,213 @@
+"""A model adapted to new rows: the posterior of all unknowns, its drift by evidence, in rounds of linearisations."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.hybrid.design import Rows
+from pisigma.hybrid.normal_equations import factored
+from pisigma.hybrid.refinement import linearised, network
+from pisigma.identification.initial_guess.initial_guess import chosen_rows
+from pisigma.identification.prediction import predicted_poses
+from pisigma.identification.problem.setup import IdentifiedGeometry, identified_geometry
+from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import held_out_groups
+from pisigma.recalibration.drift import Drift, DriftGroup, DriftSearch, LinearValues
+from pisigma.recalibration.recalibration_problem import RecalibrationProblem
+from pisigma.sensors.registry import measured_errors
+
+MOST_ROUNDS = 5
+SETTLED = 0.05
+"""Rounds end when predicted values move by less than this share of the noise."""
+MOST_DIRECTIONS = 1.2
+"""Directions of a root that is kept, by the number of unknowns."""
+MOST_VALUES = 360
+"""Sizes of the drift are estimated from so many values at most; all values count in the end."""
+FIRST_NOISE = {"m": 1e-4, "rad": 1e-4}
+"""[m or rad] Of sensors that the calibration did not have, to start from."""
+
+
+@dataclass(frozen=True, eq=False)
+class Adaptation:
+    """A model as new rows have it.
+
+    Attributes:
+        problem: that it solves.
+        geometry: in the user's coordinates.
+        correction: of the joints; None where the model has none.
+        drift: sizes of what has drifted, and the noise.
+        shift: change of all unknowns, parameters relative to the anchors.
+        effective: how many directions the new rows determine.
+        rounds: linearisations made.
+        search: the evidence at the solution, for what moved.
+    """
+
+    problem: RecalibrationProblem
+    geometry: IdentifiedGeometry
+    correction: JointCorrection | None
+    drift: Drift
+    shift: Float64[Tensor, " unknowns"]
+    effective: float
+    rounds: int
+    search: DriftSearch
+    update: "_Update" = field(repr=False)
+
+    @cached_property
+    def root(self) -> Float64[Tensor, "unknowns directions"]:
+        """Root of the covariance of all unknowns in the user's coordinates, parameters first."""
+        root = torch.cat([self.update.root(), self.problem.standing], 1)
+        active = self.problem.design.active
+        return torch.cat([self.problem.change @ root[:active], root[active:]])
+
+    @property
+    def noise(self) -> dict[str, float]:
+        """Per sensor, its noise [m or rad], or a factor where the rows state it."""
+        names = (sensor.name for sensor in self.problem.design.problem.sensors)
+        return dict(zip(names, self.drift.noise.tolist(), strict=True))
+
+    def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
+        """Measured - predicted values of any measurements; see `CalibrationResult.errors_of`."""
+        moved = measurements
+        if self.correction is not None:
+            with torch.no_grad():
+                moved = replace(moved, q=moved.q + self.correction.of_rows(moved))
+        geometry = self.geometry
+        T = predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)
+        return measured_errors(T, measurements, geometry.unknowns)
+
+
+def adapt(
+    problem: RecalibrationProblem, usual_noise: Mapping[str, float], start: Drift | None = None
+) -> Adaptation:
+    """Adapt a model to new rows.
+
+    Args:
+        problem: the rows and the prior.
+        usual_noise: per sensor, that of the calibration.
+        start: sizes and noise to start from, such as those of other rows of the session.
+    """
+    design, mean = problem.design, problem.mean
+    sensors = design.problem.sensors
+    usual = torch.tensor(
+        [
+            usual_noise.get(sensor.name, 1.0 if sensor.sigma is not None else FIRST_NOISE[sensor.unit])
+            for sensor in sensors
+        ],
+        dtype=torch.float64,
+    )
+    group = held_out_groups(problem.setup.measurements)
+    x, effective = mean, 0.0
+    drift = start or Drift(problem.groups, usual)
+    drift = replace(drift, groups=_with_sizes(problem.groups, drift.groups))
+    rounds = 0
+    while rounds < MOST_ROUNDS:
+        rounds += 1
+        rows = linearised(design, x, effective, group)
+        values = linear_values(problem, rows)
+        search = _search(problem, values, drift, usual)
+        drift = search.estimated()
+        update = _Update(problem, values, drift)
+        step = values.X @ (mean + update.shift - x) / drift.noise[values.sensor]
+        x, effective = mean + update.shift, update.effective
+        if float(step.square().mean().sqrt()) < SETTLED:
+            break
+    point = design.problem.nominal.index_add(0, design.problem.active, x[: design.active])
+    return Adaptation(
+        problem=problem,
+        geometry=identified_geometry(problem.setup, point),
+        correction=network(design, x) if design.features else None,
+        drift=drift,
+        shift=update.shift,
+        effective=effective,
+        rounds=rounds,
+        search=search,
+        update=update,
+    )
+
+
+def linear_values(problem: RecalibrationProblem, rows: Rows) -> LinearValues:
+    """Put the values of all sensors together, their residuals those of the model."""
+    X, y, sensor = [], [], []
+    for number, one in enumerate(rows.values):
+        columns = (problem.design.columns(one, slice(None)) * one.root[:, None, None]).flatten(0, 1)
+        X.append(columns)
+        y.append((one.residual * one.root[:, None]).flatten() - columns @ problem.mean)
+        sensor.append(torch.full((len(columns),), number))
+    return LinearValues(torch.cat(X), torch.cat(y), torch.cat(sensor), rows.sensors)
+
+
+def _with_sizes(groups: tuple[DriftGroup, ...], like: tuple[DriftGroup, ...]) -> tuple[DriftGroup, ...]:
+    """The groups with the sizes that those of the same names have."""
+    sizes = {one.what: one.size for one in like}
+    return tuple(one if one.stands else replace(one, size=sizes.get(one.what, 0.0)) for one in groups)
+
+
+def _search(
+    problem: RecalibrationProblem, values: LinearValues, drift: Drift, usual: Float64[Tensor, " sensors"]
+) -> DriftSearch:
+    """The search for the sizes of the drift, on some of the values where there are many."""
+    chosen = values
+    if len(values.y) > MOST_VALUES:
+        chosen = values.select(chosen_rows(len(values.y), MOST_VALUES).sort().values)
+    return DriftSearch(chosen, chosen.X @ problem.root, drift.groups, drift.noise, usual)
+
+
+class _Update:
+    """Kalman's update of a root R of a covariance: with A = X R / noise, `R (I + A^T A)^-1/2` is that of the posterior.
+
+    It is worked out from the eigenvalues of `A A^T` where there are few values, else from Cholesky's factor of
+    `I + A^T A`. Source: Bierman 1977, Factorization Methods for Discrete Sequential Estimation, chapter II.
+    """
+
+    def __init__(self, problem: RecalibrationProblem, values: LinearValues, drift: Drift) -> None:
+        self._R = _with_drift(problem.root, drift.groups)
+        noise = drift.noise[values.sensor]
+        self._A = (values.X @ self._R) / noise[:, None]
+        y = values.y / noise
+        self._few = 2 * len(y) <= self._A.shape[1]
+        if self._few:
+            self._eigenvalues, self._U = torch.linalg.eigh(self._A @ self._A.t())
+            self._eigenvalues = self._eigenvalues.clamp(min=0.0)
+            along = self._U @ ((self._U.t() @ y) / (1 + self._eigenvalues))
+            z = self._A.t() @ along
+            self.effective = float((self._eigenvalues / (1 + self._eigenvalues)).sum())
+        else:
+            M = self._A.t() @ self._A
+            M.diagonal().add_(1.0)
+            self._L = torch.linalg.cholesky(M)
+            z = torch.cholesky_solve((self._A.t() @ y)[:, None], self._L)[:, 0]
+            self.effective = len(M) - float(torch.cholesky_inverse(self._L).trace())
+        self.shift: Tensor = self._R @ z
+
+    def root(self) -> Float64[Tensor, "unknowns directions"]:
+        """Root of the covariance of the posterior, of not many more directions than there are unknowns."""
+        if not self._few:
+            root: Tensor = torch.linalg.solve_triangular(self._L, self._R.t(), upper=False).t()
+        else:
+            # 1 / sqrt(t) - 1 over t - 1 with t = 1 + eigenvalue, without cancellation
+            t = 1 + self._eigenvalues
+            shrink = -1 / (t.sqrt() * (1 + t.sqrt()))
+            along = self._A.t() @ self._U
+            root = self._R + ((self._R @ along) * shrink) @ along.t()
+        if root.shape[1] <= MOST_DIRECTIONS * len(root):
+            return root
+        scale, factor = factored(root @ root.t())
+        return torch.where(root.any(1)[:, None], factor / scale[:, None], 0.0)
+
+
+def _with_drift(
+    root: Float64[Tensor, "unknowns directions"], groups: tuple[DriftGroup, ...]
+) -> Float64[Tensor, "unknowns _directions"]:
+    """A root of the covariance with what the groups have drifted."""
+    drifted = [group for group in groups if group.size > 0]
+    extra = root.new_zeros((len(root), sum(len(group.index) for group in drifted)))
+    first = 0
+    for group in drifted:
+        extra[group.index, first + torch.arange(len(group.index))] = group.deviation
+        first += len(group.index)
+    return torch.cat([root, extra], 1)

@@ -1,0 +1,130 @@
+"""Which model predicts left-out rows best: the old one with new frames, the recalibrated one, or one from scratch."""
+
+from collections.abc import Callable, Mapping, Set
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError
+from pisigma.judging.calibration_validation import PredictsErrors, errors_under
+from pisigma.judging.few_rows import fit_where_it_helps
+from pisigma.judging.progress import Progress
+from pisigma.judging.trained_calibrations import Calibrator, judgeable
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import groups_to_keep_whole
+from pisigma.measurement.splits import k_folds
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.recalibration.adaptation import Adaptation, adapt
+from pisigma.recalibration.model_posterior import ModelPosterior
+from pisigma.recalibration.recalibration_problem import Owner, recalibration_problem
+
+Kept = Literal["recalibrated", "old", "scratch"]
+FOLDS = 5
+ABOUT_AS_GOOD = 1.05
+"""A model is kept before others whose left-out errors are smaller by no more than this factor."""
+STRAY = 5.0
+"""Rows that every candidate misses by so many times the usual error say nothing of the candidates."""
+
+
+@dataclass(frozen=True)
+class Gate:
+    """Errors of left-out rows under every candidate, and the one that is kept.
+
+    Attributes:
+        kept: the first of recalibrated, old and scratch whose error is at most 1.05 times the smallest.
+        rms: by candidate the root mean square of the errors of left-out rows [m]; None where the rows are too few.
+        rows: number of rows that count.
+    """
+
+    kept: Kept
+    rms: Mapping[Kept, float | None]
+    rows: int
+
+    @property
+    def sentence(self) -> str:
+        """Which candidate won, and by how much."""
+        names: dict[Kept, str] = {
+            "recalibrated": "The recalibrated model",
+            "old": "The old model with the frames of the new rows",
+            "scratch": "A calibration from scratch",
+        }
+        others = [
+            f"{value / (self.rms[self.kept] or value):.2f} times that under {names[name][:1].lower()}{names[name][1:]}"
+            for name, value in self.rms.items()
+            if value is not None and name != self.kept
+        ]
+        if not self.rows:
+            return f"{names[self.kept]} is kept: the rows are too few to leave any out."
+        error = (self.rms[self.kept] or 0.0) * 1e3
+        compared = f"; it is {', and '.join(others)}" if others else ""
+        return f"{names[self.kept]} is kept: the RMS error of {self.rows} left-out rows is {error:.3g} mm{compared}."
+
+
+def gate(
+    model: CalibratedModel,
+    whole: Adaptation,
+    elsewhere: Set[Owner],
+    rows: Measurements,
+    calibrator: Calibrator,
+    progress: Progress,
+) -> Gate:
+    """Leave out one fold of the rows after the other and predict it by every candidate.
+
+    Args:
+        model: the model.
+        whole: adapted to all rows.
+        elsewhere: bases and tools that stand elsewhere.
+        rows: frames and targets by the names of the model.
+        calibrator: from scratch.
+        progress: called with the fold that is being judged.
+    """
+    posterior, noise = ModelPosterior.of(model), whole.noise
+
+    def adapted(training: Measurements, arm: bool) -> Adaptation:
+        problem = recalibration_problem(model, posterior, training, elsewhere)
+        return adapt(problem if arm else problem.without_arm(), noise, whole.drift if arm else None)
+
+    candidates: dict[Kept, Callable[[Measurements], PredictsErrors]] = {
+        "recalibrated": lambda training: adapted(training, True),
+        "old": lambda training: adapted(training, False),
+        "scratch": lambda training: fit_where_it_helps(calibrator, training, lambda what: None),
+    }
+    folds = min(FOLDS, int(groups_to_keep_whole(rows).max()) + 1)
+    errors = {name: torch.full((rows.rows,), torch.nan, dtype=torch.float64) for name in candidates}
+    for number, (train, test) in enumerate(k_folds(rows, folds, 0) if folds > 1 else (), 1):
+        progress(f"fold {number} of {folds}")
+        training = rows.select(train)
+        test = test[_predictable(rows, test, training)]
+        for name, candidate in candidates.items():
+            try:
+                errors[name][test] = errors_under(candidate(training), rows.select(test)).position
+            except IdentificationError:  # so few rows do not determine it
+                errors[name][test] = torch.inf
+    return _decided(errors)
+
+
+def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> Gate:
+    """The candidate that is kept."""
+    smallest = torch.stack(list(errors.values())).amin(0)
+    judged = torch.isfinite(smallest)
+    counted = judged & (smallest <= STRAY * smallest[judged].median()) if bool(judged.any()) else judged
+    rms: dict[Kept, float | None] = {}
+    for name, lengths in errors.items():
+        size = float(lengths[counted].square().mean().sqrt()) if bool(counted.any()) else float("inf")
+        rms[name] = size if size < float("inf") else None
+    best = min((size for size in rms.values() if size is not None), default=0.0)
+    within = (name for name, size in rms.items() if size is not None and size <= ABOUT_AS_GOOD * best)
+    return Gate(next(within, "recalibrated"), rms, int(counted.sum()))
+
+
+def _predictable(rows: Measurements, test: Tensor, training: Measurements) -> Tensor:
+    """Which test rows have a frame, a target and an anchor that the training rows have too."""
+    frames = set(training.frame)
+    framed = torch.tensor([rows.frame[row] in frames for row in test.tolist()])
+    try:
+        return framed & judgeable(rows, test, training)
+    except IdentificationError:
+        return torch.zeros_like(framed)

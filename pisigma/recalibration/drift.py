@@ -1,0 +1,225 @@
+"""How much every group of unknowns has drifted since a calibration, by the evidence of new rows."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.hybrid.evidence import SensorCount
+
+SIZES = torch.logspace(-6, -0.5, 56, dtype=torch.float64)
+"""Sizes that are tried: 1 µm to 0.3 m, 0.0001 to 18 deg; of corrections, shares of ten times their usual size."""
+WORTH = 2.0
+"""[nats] By so much a drift has to raise the log evidence: prior odds of about 1 to 7 for a group of the arm."""
+SWEEPS = 3
+NOISE_FACTORS = torch.linspace(-1.0, 1.6, 14, dtype=torch.float64).exp()
+"""Factors on the noise of the calibration that are tried."""
+NOISE_SPREAD = 0.3
+"""Standard deviation of the logarithm of the noise beside that of the calibration."""
+
+
+@dataclass(frozen=True, eq=False)
+class DriftGroup:
+    """Unknowns that drift by about as much: independent, of standard deviation `size · scale`.
+
+    Attributes:
+        what: has moved, such as "joint 3", "base" or "correction".
+        index: of its unknowns.
+        scale: of every unknown at size 1 [m or rad].
+        size: 0 where it has not drifted.
+        stands: whether the size is stated rather than estimated, as that of a base which stands elsewhere.
+        worth: [nats] by so much its drift has to raise the log evidence.
+    """
+
+    what: str
+    index: Int64[Tensor, " members"]
+    scale: Float64[Tensor, " members"]
+    size: float = 0.0
+    stands: bool = False
+    worth: float = WORTH
+
+    @property
+    def deviation(self) -> Float64[Tensor, " members"]:
+        """Standard deviation of every unknown's drift [m or rad]."""
+        return self.size * self.scale
+
+
+@dataclass(frozen=True, eq=False)
+class LinearValues:
+    """Measured values, linear in the unknowns: `y = X u + e` with u counted from the most probable values of a model.
+
+    Attributes:
+        X: weighted derivatives.
+        y: weighted residuals of the model.
+        sensor: number of every value's sensor.
+        counts: of the sensors.
+    """
+
+    X: Float64[Tensor, "values unknowns"]
+    y: Float64[Tensor, " values"]
+    sensor: Int64[Tensor, " values"]
+    counts: tuple[SensorCount, ...]
+
+    def select(self, values: Tensor) -> "LinearValues":
+        """Select some of the values."""
+        return replace(self, X=self.X[values], y=self.y[values], sensor=self.sensor[values])
+
+
+@dataclass(frozen=True, eq=False)
+class Drift:
+    """Sizes of the drift of all groups, and the noise of the new rows.
+
+    Attributes:
+        groups: with their sizes.
+        noise: per sensor [m or rad], or a factor where the rows state it.
+        log_evidence: of the new rows, with the prior odds of the drifts.
+    """
+
+    groups: tuple[DriftGroup, ...]
+    noise: Float64[Tensor, " sensors"]
+    log_evidence: float = -math.inf
+
+
+class DriftSearch:
+    """The evidence of new rows under a model's posterior that has drifted.
+
+    With A the derivatives by the directions of the posterior's root, Z_g those by the unknowns of a group times their
+    scale, and u ~ N(0, R R^T + Σ_g drift), the values are normal with the covariance
+    `V = A A^T + Σ_g size_g² Z_g Z_g^T + noise²`. Sizes are chosen one after the other, each with all others as they
+    are: for the eigenvalues λ and coordinates b of a group in the metric of the rest, a size s raises the log evidence
+    by `Σ (s² λ b² / (1 + s² λ) - log(1 + s² λ)) / 2` (Tipping and Faul 2003, Fast marginal likelihood maximisation for
+    sparse Bayesian models, eq. 18, for groups instead of single columns).
+    """
+
+    def __init__(
+        self,
+        values: LinearValues,
+        A: Float64[Tensor, "values directions"],
+        groups: Sequence[DriftGroup],
+        noise: Float64[Tensor, " sensors"],
+        usual_noise: Float64[Tensor, " sensors"],
+    ) -> None:
+        """Start with the sizes of some groups and a noise.
+
+        Args:
+            values: the new rows.
+            A: their derivatives by the directions of the root.
+            groups: with sizes to start from.
+            noise: to start from.
+            usual_noise: that of the calibration.
+        """
+        self._values, self._K = values, A @ A.t()
+        self._groups, self._noise, self._usual = list(groups), noise.clone(), usual_noise
+        self._Z = [_fewest_columns(values.X[:, one.index] * one.scale) for one in groups]
+        self._V = self._K + self._variances().diag()
+        for one, Z in zip(self._groups, self._Z, strict=True):
+            self._V += one.size**2 * Z @ Z.t()
+
+    def estimated(self, sweeps: int = SWEEPS) -> Drift:
+        """Estimate sizes and noise, group after group and sensor after sensor."""
+        for _ in range(sweeps):
+            before = [one.size for one in self._groups]
+            for number, group in enumerate(self._groups):
+                if not group.stands:
+                    self._resize(number, self._best_size(number))
+            for sensor, count in enumerate(self._values.counts):
+                if not count.exact and count.values:
+                    self._renew_noise(sensor, 1.0 if count.stated else 0.0)
+            if before == [one.size for one in self._groups]:
+                break
+        return Drift(tuple(self._groups), self._noise, self._log_evidence(self._V))
+
+    def shift(
+        self, number: int, held: bool = True
+    ) -> tuple[Float64[Tensor, " members"], Float64[Tensor, "members members"]]:
+        """Estimate how far the unknowns of a group have moved, everything else as by its own size.
+
+        Args:
+            number: of the group.
+            held: by its size, too; else it may have moved by anything.
+
+        Returns:
+            The shifts [m or rad] and their covariance.
+        """
+        group, (_, a, W) = self._groups[number], self._beside(number, reduced=False)
+        normal = W.t() @ W
+        if held:
+            normal.diagonal().add_(group.size**-2)
+        covariance = torch.linalg.pinv(normal, rtol=1e-9, hermitian=True)
+        return (covariance @ (W.t() @ a)) * group.scale, covariance * group.scale * group.scale[:, None]
+
+    def _best_size(self, number: int) -> float:
+        gains = _gains(SIZES, *self._coordinates(number))
+        best = int(gains.argmax())
+        return float(SIZES[best]) if float(gains[best]) > self._groups[number].worth else 0.0
+
+    def _coordinates(self, number: int) -> tuple[Tensor, Tensor]:
+        """Eigenvalues of a group's covariance in the metric of the rest, and squared coordinates of the values."""
+        _, a, W = self._beside(number)
+        U, S, _ = torch.linalg.svd(W, full_matrices=False)
+        return S.square(), (U.t() @ a).square()
+
+    def _beside(self, number: int, reduced: bool = True) -> tuple[Tensor, Tensor, Tensor]:
+        """A group's columns, and values and columns in the metric of everything else."""
+        group, Z, y = self._groups[number], self._Z[number], self._values.y
+        V = self._V - group.size**2 * Z @ Z.t()
+        if not reduced:
+            Z = self._values.X[:, group.index] * group.scale
+        both = torch.linalg.solve_triangular(_factor(V), torch.cat([y[:, None], Z], 1), upper=False)
+        return Z, both[:, 0], both[:, 1:]
+
+    def _resize(self, number: int, size: float) -> None:
+        group, Z = self._groups[number], self._Z[number]
+        self._V += (size**2 - group.size**2) * Z @ Z.t()
+        self._groups[number] = replace(group, size=size)
+
+    def _renew_noise(self, sensor: int, least: float) -> None:
+        """Take the factor on the usual noise that has the highest evidence, with a log-normal prior."""
+        chosen, now = (self._values.sensor == sensor).double(), float(self._noise[sensor])
+        tried = []
+        for factor in NOISE_FACTORS.tolist():
+            sigma = max(factor * float(self._usual[sensor]), least)
+            V = self._V + (chosen * (sigma**2 - now**2)).diag()
+            tried.append((self._log_evidence(V) - 0.5 * (math.log(factor) / NOISE_SPREAD) ** 2, sigma))
+        sigma = max(tried)[1]
+        self._V += (chosen * (sigma**2 - now**2)).diag()
+        self._noise[sensor] = sigma
+
+    def _variances(self) -> Float64[Tensor, " values"]:
+        return self._noise.square()[self._values.sensor]
+
+    def _log_evidence(self, V: Tensor) -> float:
+        factor = _factor(V)
+        a = torch.linalg.solve_triangular(factor, self._values.y[:, None], upper=False)
+        odds = sum(one.worth for one in self._groups if one.size > 0 and not one.stands)
+        return -0.5 * float(a.square().sum()) - float(factor.diagonal().log().sum()) - odds
+
+
+def _gains(
+    sizes: Float64[Tensor, " sizes"], eigenvalues: Float64[Tensor, " k"], squares: Float64[Tensor, " k"]
+) -> Float64[Tensor, " sizes"]:
+    """By how much sizes of a group raise the log evidence; see `DriftSearch`."""
+    ratio = sizes.square()[:, None] * eigenvalues
+    gains: Tensor = 0.5 * (ratio / (1 + ratio) * squares - ratio.log1p()).sum(1)
+    return gains
+
+
+def _fewest_columns(Z: Float64[Tensor, "values members"]) -> Float64[Tensor, "values columns"]:
+    """Columns with the same `Z Z^T`, no more than there are values."""
+    if Z.shape[1] <= len(Z):
+        return Z
+    columns: Tensor = torch.linalg.qr(Z.t(), mode="r").R.t()
+    return columns
+
+
+def _factor(V: Float64[Tensor, "values values"]) -> Float64[Tensor, "values values"]:
+    """Cholesky factor of a covariance of values; rounding of far larger variances is made up for."""
+    jitter = 0.0
+    while True:
+        factor, failed = torch.linalg.cholesky_ex(V + jitter * V.diagonal().diag())
+        if not failed:
+            return factor
+        jitter = max(10 * jitter, 1e-14)

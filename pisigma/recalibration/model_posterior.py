@@ -1,0 +1,103 @@
+"""What a calibrated model knows: the values of all unknowns of its arm, and the root of their covariance."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.errors import ModelError
+from pisigma.identification.problem.parameters import ParameterSpace
+from pisigma.identification.problem.setup import IdentifiedGeometry
+from pisigma.joint_correction.feature import AbstractFeature
+from pisigma.joint_correction.input_products import InputProducts
+from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+
+
+@dataclass(frozen=True, eq=False)
+class ModelPosterior:
+    """Normal distribution of geometry, bases, tools, sensors' unknowns and weights of the joint correction.
+
+    Attributes:
+        space: the parameters, of the robot as drawn.
+        geometry: their most probable values.
+        features: of the joint correction, products of inputs among them.
+        weights: of the used columns of the features.
+        root: `R` with the covariance `R R^T` of the parameters, in the user's coordinates, and then of the weights.
+        noise: per sensor [m or rad], see `pisigma.hybrid.uncertainty.PositionUncertainty`.
+    """
+
+    space: ParameterSpace
+    geometry: IdentifiedGeometry
+    features: tuple[AbstractFeature, ...]
+    weights: Float64[Tensor, " weights"]
+    root: Float64[Tensor, "unknowns directions"]
+    noise: Mapping[str, float]
+
+    @staticmethod
+    def of(model: CalibratedModel) -> "ModelPosterior":
+        """Take what a model of `pisigma calibrate` or `pisigma recalibrate` holds.
+
+        Raises:
+            ModelError: it holds no posterior, or not that of all unknowns.
+        """
+        known = model.uncertainty
+        if known is None:
+            raise ModelError(
+                f"model '{model.name}' holds no posterior of its parameters, which rows could be added to; make it "
+                "again with `pisigma calibrate ROBOT DATA --out DIR`."
+            )
+        if not bool(torch.isfinite(known.geometry.values_of(known.space)).all()):
+            raise ModelError(
+                f"model '{model.name}' is of a version that did not keep where its sockets or anchors are; make it "
+                "again with `pisigma calibrate ROBOT DATA --out DIR`."
+            )
+        correction = None if model.hybrid is None else model.hybrid.correction
+        weights = known.root.new_zeros(0) if correction is None else _weights(correction, known.features)
+        return ModelPosterior(known.space, known.geometry, known.features, weights, known.root, known.noise)
+
+    def renamed(self, rows: Measurements) -> Measurements:
+        """Name the frame and the target of rows as the model does where one of them has no name for its only one."""
+        names = {
+            "frame": (rows.frame, tuple(self.geometry.bases)),
+            "target": (rows.target, tuple(self.geometry.tools)),
+        }
+        return replace(
+            rows,
+            **{
+                field: known * rows.rows
+                for field, (stated, known) in names.items()
+                if len(known) == len(set(stated)) == 1 and "" in (known[0], stated[0])
+            },
+        )
+
+    def positions_in(self, space: ParameterSpace) -> list[int]:
+        """Say where the parameters stand in a space that has all of their frames, targets and owners."""
+        positions = list(range(self.space.arm_size))
+        for group, names, among, size in (
+            ("base", self.space.frames, space.frames, 6),
+            ("tool", self.space.targets, space.targets, 6),
+            *(
+                (own.name, own.owners, other.owners, len(own.columns))
+                for own in self.space.unknowns
+                for other in space.unknowns
+                if own.name == other.name
+            ),
+        ):
+            for name in names:
+                first = space.of(group).start + size * among.index(name)
+                positions += range(first, first + size)
+        return positions
+
+
+def _weights(
+    correction: JointCorrection, features: tuple[AbstractFeature, ...]
+) -> Float64[Tensor, " weights"]:
+    """Weights of the used columns of all features, those of products from the product units."""
+    linear = zip(correction.features, correction.linear, strict=True)
+    blocks = [weight.detach()[feature.used] for feature, weight in linear]
+    blocks += [one.weights(correction.weight.detach()) for one in features if isinstance(one, InputProducts)]
+    return torch.cat(blocks)

@@ -1,0 +1,120 @@
+"""What has moved since a calibration, by how much, and how sure that is."""
+
+import math
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.recalibration.adaptation import Adaptation
+from pisigma.recalibration.recalibration_problem import frame_stretch
+from pisigma.se3 import rotation_vector, transform_from_xyzrpy
+
+CLEAR = 3.3
+"""[standard deviations] What moved by less is not told from chance: one in 1,000 of what did not move."""
+NORMAL_95 = 1.959964
+UNITS: dict[str, tuple[Literal["mm", "deg"], float]] = {"m": ("mm", 1e3), "rad": ("deg", math.degrees(1.0))}
+
+
+@dataclass(frozen=True)
+class Moved:
+    """One thing that moved.
+
+    Attributes:
+        what: such as "joint 3", "a_2", "base" or "tool".
+        shift: by how much; of a base or a tool how far its origin, or by what angle it turned.
+        deviation: its standard deviation.
+        unit: of both.
+    """
+
+    what: str
+    shift: float
+    deviation: float
+    unit: Literal["mm", "deg"]
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the shift."""
+        half = NORMAL_95 * self.deviation
+        return self.shift - half, self.shift + half
+
+    @property
+    def sentence(self) -> str:
+        """It in words, with half the 95 % interval."""
+        half = NORMAL_95 * self.deviation
+        digits = min(max(1 - math.floor(math.log10(max(half, 1e-6))), 0), 4)
+        return f"{self.what} moved by {self.shift:.{digits}f} ± {half:.{digits}f} {self.unit}"
+
+    def to_json(self) -> dict[str, object]:
+        """Return it as plain values, the unit in the name of the shift."""
+        return {"what": self.what, f"shift_{self.unit}": self.shift, "interval": list(self.interval)}
+
+
+def moved_by(adaptation: Adaptation) -> tuple[Moved, ...]:
+    """Give what moved clearly: joints first, then lengths and angles of the arm, bases and tools.
+
+    A joint's shift is estimated with no prior, beside all else that has drifted.
+    """
+    space = adaptation.problem.design.problem.space
+    moved = []
+    for number, group in enumerate(adaptation.drift.groups):
+        if not group.size or group.what == "correction":
+            continue
+        kind, _, name = group.what.partition(" ")
+        if kind in ("base", "tool"):
+            moved += _of_frame(adaptation, number, kind, name)
+        elif kind in ("joint", "lengths", "angles"):
+            shift, covariance = adaptation.search.shift(number, held=kind != "joint")
+            for index, by, variance in zip(group.index, shift, covariance.diagonal(), strict=True):
+                parameter = space.parameters[int(index)]
+                unit, factor = UNITS[parameter.unit]
+                what = group.what if kind == "joint" else parameter.name
+                moved.append(Moved(what, float(by) * factor, float(variance) ** 0.5 * factor, unit))
+    return tuple(one for one in moved if abs(one.shift) > CLEAR * one.deviation)
+
+
+def what_moved(moved: tuple[Moved, ...]) -> str:
+    """Say in a sentence what moved."""
+    if not moved:
+        return "Nothing moved beyond its uncertainty."
+    clauses = "; ".join(one.sentence for one in moved)
+    return f"{clauses[:1].upper()}{clauses[1:]}; nothing else moved beyond its uncertainty."
+
+
+def _of_frame(adaptation: Adaptation, number: int, kind: str, name: str) -> list[Moved]:
+    """How far a base or a tool has moved, and by what angle it has turned."""
+    problem, group = adaptation.problem, adaptation.drift.groups[number]
+    space = problem.design.problem.space
+    before, after = (
+        geometry.bases if kind == "base" else geometry.tools
+        for geometry in (problem.posterior.geometry, adaptation.geometry)
+    )
+    name = name or next(iter(after))
+    if name not in before:
+        return []
+    old, new = (transform_from_xyzrpy(torch.from_numpy(np.asarray(one[name]))) for one in (before, after))
+    away, turn = new[:3, 3] - old[:3, 3], rotation_vector(new[:3, :3] @ old[:3, :3].mT)
+    if kind == "base":
+        anchor = problem.setup.anchors.bases[space.frames.index(name), :3, :3]
+        away, turn = anchor.t() @ away, anchor.t() @ turn
+    covariance = torch.zeros(6, 6, dtype=torch.float64)
+    column = group.index - frame_stretch(space, kind, name).start
+    covariance[column[:, None], column] = adaptation.search.shift(number)[1]
+    return [
+        Moved(group.what, float(vector.norm()) * factor, _along(vector, block) * factor, unit)
+        for vector, block, (unit, factor) in (
+            (away, covariance[:3, :3], UNITS["m"]),
+            (turn, covariance[3:, 3:], UNITS["rad"]),
+        )
+    ]
+
+
+def _along(vector: Float64[Tensor, " 3"], covariance: Float64[Tensor, "3 3"]) -> float:
+    """Standard deviation along a vector, or at most where it has no length."""
+    length = float(vector.norm())
+    if length > 0.0:
+        return math.sqrt(float(vector @ covariance @ vector)) / length
+    return math.sqrt(max(float(torch.linalg.eigvalsh(covariance)[-1]), 0.0))

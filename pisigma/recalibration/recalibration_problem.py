@@ -1,0 +1,259 @@
+"""The problem of a recalibration: new rows, and the posterior of a model as the prior of all unknowns."""
+
+from collections.abc import Sequence, Set
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from pisigma.hybrid.design import Design
+from pisigma.identification.initial_guess.initial_guess import InitialGuess, guess
+from pisigma.identification.problem.loss import HampelLoss
+from pisigma.identification.problem.parameters import LENGTHS, ParameterSpace
+from pisigma.identification.problem.setup import (
+    CalibrationSetup,
+    SetupOptions,
+    coordinate_change,
+    setup_around,
+    usable_rows,
+)
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.row_poses import Frames
+from pisigma.recalibration.drift import DriftGroup
+from pisigma.recalibration.model_posterior import ModelPosterior
+from pisigma.sensors.registry import unknown_groups
+from pisigma.sensors.sensor import UnknownGroup
+
+Owner = tuple[str, str]
+"""What can stand elsewhere: ("base", frame) or ("tool", target)."""
+
+ELSEWHERE = 0.1
+"""[m or rad] Standard deviation of a base, a tool or a sensor's unknown that stands anywhere, about its guess."""
+LARGEST_CORRECTION = 10.0
+"""Size 1 of the drift of a correction, in root mean squares of its weights."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecalibrationProblem:
+    """New rows, the unknowns, and what is known of them before.
+
+    Attributes:
+        posterior: of the model.
+        setup: the rows, relative to where bases and tools stand.
+        design: the unknowns: all parameters of the model and the rows, and the weights of the correction.
+        mean: of the unknowns, parameters counted from `design.problem.nominal`.
+        root: of their covariance, parameters relative to the anchors of the setup.
+        change: derivative of the parameters in the user's coordinates by those of the problem.
+        groups: that may drift, with no size, and those that stand elsewhere.
+        standing: root of the covariance of what is not to change.
+    """
+
+    posterior: ModelPosterior
+    setup: CalibrationSetup
+    design: Design
+    mean: Float64[Tensor, " unknowns"]
+    root: Float64[Tensor, "unknowns directions"]
+    change: Float64[Tensor, "parameters parameters"]
+    groups: tuple[DriftGroup, ...]
+    standing: Float64[Tensor, "unknowns _directions"]
+
+    def without_arm(self) -> "RecalibrationProblem":
+        """The same where the arm is exactly as it was: only what stands elsewhere is unknown."""
+        elsewhere = tuple(group for group in self.groups if group.stands)
+        return replace(self, root=self.standing, groups=elsewhere, standing=self.root)
+
+
+def recalibration_problem(
+    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, elsewhere: Set[Owner]
+) -> RecalibrationProblem:
+    """State the problem.
+
+    Args:
+        model: the model.
+        posterior: of it.
+        rows: new ones, frames and targets by the names of the model.
+        elsewhere: bases and tools that stand elsewhere than when the model was made; those that it does not have need
+            not be named.
+
+    Raises:
+        IdentificationError: nothing usable was measured, or too little to guess where something stands.
+        PoseError: the joint values do not fit the robot.
+    """
+    posterior.space.robot.check_joint_count(rows.q.shape[1])
+    usable, rows = usable_rows(rows)
+    space = _joined_space(posterior.space, rows)
+    known = {("base", name) for name in posterior.geometry.bases}
+    known |= {("tool", name) for name in posterior.geometry.tools}
+    new = {("base", name) for name in rows.frame} | {("tool", name) for name in rows.target}
+    new = (new - known) | set(elsewhere)
+    guessed = _guess(model, posterior, space, rows, new)
+    setup = setup_around(space, guessed, (usable, rows), SetupOptions(True, True), None, HampelLoss())
+    start = setup.start.clone()
+    start[: space.arm_size] = torch.from_numpy(posterior.geometry.robot.dh.ravel().copy())
+    problem = replace(setup.problem, nominal=start).with_active(range(len(start)))
+    change = coordinate_change(setup, start)
+    root = posterior.root.new_zeros((len(start) + len(posterior.weights), posterior.root.shape[1]))
+    parameters = len(posterior.space.parameters)
+    root[posterior.positions_in(space)] = posterior.root[:parameters]
+    for group, name in new & known:
+        root[frame_stretch(space, group, name)] = 0.0
+    root[: len(start)] = torch.linalg.pinv(change) @ root[: len(start)]
+    root[len(start) :] = posterior.root[parameters:]
+    mean = torch.cat([torch.zeros_like(start), posterior.weights])
+    design = Design(problem, posterior.features)
+    groups = _groups(posterior, space, rows, root, new)
+    return RecalibrationProblem(posterior, setup, design, mean, root, change, groups, root[:, :0])
+
+
+def _joined_space(space: ParameterSpace, rows: Measurements) -> ParameterSpace:
+    """The parameters of a model and of rows; frames, targets and owners that the model has come first."""
+    of_rows = {own.name: own for own in unknown_groups(rows)}
+    before = {own.name: own for own in space.unknowns}
+    frames = tuple(dict.fromkeys((*space.frames, *rows.frame)))
+    groups = []
+    for name, own in (of_rows | before).items():
+        there = of_rows.get(name, UnknownGroup(name, own.columns, ()))
+        stands = dict.fromkeys(own.owners, frames[0]) | dict(zip(there.owners, there.frames, strict=True))
+        groups.append(
+            UnknownGroup(name, own.columns, tuple(stands), tuple(stands.values()), there.angles or own.angles)
+        )
+    targets = tuple(dict.fromkeys((*space.targets, *rows.target)))
+    return ParameterSpace(space.robot, frames, targets, tuple(groups))
+
+
+def _guess(
+    model: CalibratedModel,
+    posterior: ModelPosterior,
+    space: ParameterSpace,
+    rows: Measurements,
+    new: Set[Owner],
+) -> InitialGuess:
+    """Where everything but the arm is: as in the model, and guessed where it does not say that."""
+    geometry = posterior.geometry
+    bases, tools = dict(geometry.bases), dict(geometry.tools)
+    unknowns = {group: dict(owners) for group, owners in geometry.unknowns.items()}
+    owners = {
+        (own.name, owner)
+        for own in space.unknowns
+        for owner in own.owners
+        if owner not in unknowns.get(own.name, {})
+    }
+    if new or owners:
+        moved = rows
+        if model.hybrid is not None:
+            with torch.no_grad():
+                moved = replace(rows, q=rows.q + model.hybrid.correction.of_rows(rows))
+        there = ParameterSpace(
+            geometry.robot,
+            tuple(dict.fromkeys(rows.frame)),
+            tuple(dict.fromkeys(rows.target)),
+            unknown_groups(rows),
+        )
+        stated = {name: tuple(bases[name]) for name in there.frames if ("base", name) not in new}
+        kinds = {kind for kind, _ in new}
+        first = guess(there, moved, "base" in kinds, "tool" in kinds, True, stated)
+        bases |= _new_frames("base", there.frames, first.bases, new)
+        tools |= _new_frames("tool", there.targets, first.tools, new)
+        for own in there.unknowns:
+            for owner, values in zip(own.owners, first.unknowns[own.name].numpy(), strict=True):
+                unknowns.setdefault(own.name, {}).setdefault(owner, values)
+    values = {
+        own.name: torch.from_numpy(np.stack([unknowns[own.name][owner] for owner in own.owners]))
+        for own in space.unknowns
+    }
+    return InitialGuess(
+        np.stack([bases[name] for name in space.frames]),
+        np.stack([tools[name] for name in space.targets]),
+        values,
+        {group: torch.ones_like(those, dtype=torch.bool) for group, those in values.items()},
+    )
+
+
+def _new_frames(kind: str, names: Sequence[str], frames: np.ndarray, new: Set[Owner]) -> Frames:
+    """Guessed bases or tools of those that stand elsewhere."""
+    return {name: frame for name, frame in zip(names, frames, strict=True) if (kind, name) in new}
+
+
+def frame_stretch(space: ParameterSpace, group: str, name: str) -> slice:
+    """Say where the parameters of a base or a tool stand."""
+    number = (space.frames if group == "base" else space.targets).index(name)
+    first = space.of(group).start + 6 * number
+    return slice(first, first + 6)
+
+
+def _groups(
+    posterior: ModelPosterior,
+    space: ParameterSpace,
+    rows: Measurements,
+    root: Float64[Tensor, "unknowns directions"],
+    new: Set[Owner],
+) -> tuple[DriftGroup, ...]:
+    """What may have drifted: the arm, bases and tools, and the correction; and what stands elsewhere."""
+    parameters = len(space.parameters)
+    free = root[:parameters].any(1)
+    groups = _arm_groups(space, free)
+    for kind, names, measured in (
+        ("base", space.frames, set(rows.frame)),
+        ("tool", space.targets, set(rows.target)),
+    ):
+        for name in names:
+            what = f"{kind} {name}" if len(names) > 1 else kind
+            stretch = frame_stretch(space, kind, name)
+            index = torch.arange(stretch.start, stretch.stop)
+            if (kind, name) in new:
+                groups.append(_elsewhere(what, index))
+            elif name in measured:
+                turn = 1 / space.robot.reach
+                scale = torch.tensor([1.0, 1.0, 1.0, turn, turn, turn], dtype=torch.float64)
+                groups.append(DriftGroup(what, index[free[index]], scale[free[index]], worth=0.0))
+    for own in space.unknowns:
+        for number, owner in enumerate(own.owners):
+            if owner not in posterior.geometry.unknowns.get(own.name, {}):
+                first = space.of(own.name).start + len(own.columns) * number
+                groups.append(
+                    _elsewhere(f"{own.name} {owner}", torch.arange(first, first + len(own.columns)))
+                )
+    if len(posterior.weights):
+        index = torch.arange(parameters, len(root))
+        groups.append(DriftGroup("correction", index, LARGEST_CORRECTION * _usual_weights(posterior)))
+    return tuple(group for group in groups if len(group.index))
+
+
+def _elsewhere(what: str, index: Tensor) -> DriftGroup:
+    """What stands anywhere about its guess."""
+    return DriftGroup(what, index, torch.full((len(index),), ELSEWHERE).double(), 1.0, stands=True)
+
+
+def _arm_groups(space: ParameterSpace, free: Bool[Tensor, " parameters"]) -> list[DriftGroup]:
+    """The zeros of single joints, and all other lengths and angles that were identified."""
+    robot = space.robot
+    zeros = {
+        5 * row + (0 if turns else 1): 1.0 if turns else robot.reach
+        for row, turns in zip(robot.joint_rows, robot.revolute, strict=True)
+    }
+    groups = [
+        DriftGroup(f"joint {number}", torch.tensor([index]), torch.tensor([scale], dtype=torch.float64))
+        for number, (index, scale) in enumerate(zeros.items(), 1)
+    ]
+    others = [index for index in range(space.arm_size) if bool(free[index]) and index not in zeros]
+    for what, lengths in (("lengths", True), ("angles", False)):
+        chosen = [one for one in others if (space.parameters[one].group in LENGTHS) is lengths]
+        scale = torch.ones(len(chosen), dtype=torch.float64)
+        groups.append(DriftGroup(what, torch.tensor(chosen, dtype=torch.int64), scale))
+    return groups
+
+
+def _usual_weights(posterior: ModelPosterior) -> Float64[Tensor, " weights"]:
+    """Root mean square of the weights of every prior size, as far as the posterior says."""
+    square = posterior.weights.square() + posterior.root[len(posterior.space.parameters) :].square().sum(1)
+    first, numbers = 0, []
+    for feature in posterior.features:
+        numbers.append(feature.group[feature.used] + first)
+        first += len(feature.group_names)
+    number = torch.cat(numbers)
+    count = torch.bincount(number, minlength=first).clamp(min=1)
+    mean = torch.zeros(first, dtype=square.dtype).index_add(0, number, square) / count
+    return mean.sqrt()[number]
