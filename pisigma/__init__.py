@@ -29,6 +29,7 @@ _NAMES = {
     "workflow.evaluate": "EvaluationSettings Limits evaluate",
     "workflow.import_rows": "ImportSettings import_rows",
     "workflow.plan": "Plan plan",
+    "workflow.recalibrate": "Recalibration RecalibrationSettings recalibrate",
     "workflow.report": "report",
     "workflow.train": "train",
     "workflow.train_networks": "TrainSettings",

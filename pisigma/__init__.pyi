@@ -29,6 +29,9 @@ from pisigma.workflow.import_rows import ImportSettings as ImportSettings
 from pisigma.workflow.import_rows import import_rows as import_rows
 from pisigma.workflow.plan import Plan as Plan
 from pisigma.workflow.plan import plan as plan
+from pisigma.workflow.recalibrate import Recalibration as Recalibration
+from pisigma.workflow.recalibrate import RecalibrationSettings as RecalibrationSettings
+from pisigma.workflow.recalibrate import recalibrate as recalibrate
 from pisigma.workflow.report import report as report
 from pisigma.workflow.train import train as train
 from pisigma.workflow.train_networks import TrainSettings as TrainSettings

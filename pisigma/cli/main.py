@@ -16,6 +16,7 @@ from pisigma.cli.export import export
 from pisigma.cli.ik import ik
 from pisigma.cli.import_ import import_
 from pisigma.cli.plan import plan
+from pisigma.cli.recalibrate import recalibrate
 from pisigma.cli.report import report
 from pisigma.cli.robots import robots
 from pisigma.cli.simulate import simulate
@@ -36,6 +37,7 @@ for command in (
     plan,
     import_,
     calibrate,
+    recalibrate,
     train,
     evaluate,
     report,

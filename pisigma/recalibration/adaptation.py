@@ -165,49 +165,44 @@ class _Update:
     """
 
     def __init__(self, problem: RecalibrationProblem, values: LinearValues, drift: Drift) -> None:
-        self._R = _with_drift(problem.root, drift.groups)
+        self._root = problem.root
+        drifted = [group for group in drift.groups if group.size > 0]
+        index = torch.cat([group.index for group in drifted] or [torch.zeros(0, dtype=torch.int64)])
+        deviation = torch.cat([group.deviation for group in drifted] or [values.y[:0]])
+        self._index, self._deviation = index, deviation
         noise = drift.noise[values.sensor]
-        self._A = (values.X @ self._R) / noise[:, None]
+        A = torch.cat([values.X @ problem.root, values.X[:, index] * deviation], 1) / noise[:, None]
         y = values.y / noise
-        self._few = 2 * len(y) <= self._A.shape[1]
+        self._few = 2 * len(y) <= A.shape[1]
         if self._few:
-            self._eigenvalues, self._U = torch.linalg.eigh(self._A @ self._A.t())
+            self._eigenvalues, U = torch.linalg.eigh(A @ A.t())
             self._eigenvalues = self._eigenvalues.clamp(min=0.0)
-            along = self._U @ ((self._U.t() @ y) / (1 + self._eigenvalues))
-            z = self._A.t() @ along
+            self._along = A.t() @ U
+            z = self._along @ ((U.t() @ y) / (1 + self._eigenvalues))
             self.effective = float((self._eigenvalues / (1 + self._eigenvalues)).sum())
         else:
-            M = self._A.t() @ self._A
+            M = A.t() @ A
             M.diagonal().add_(1.0)
             self._L = torch.linalg.cholesky(M)
-            z = torch.cholesky_solve((self._A.t() @ y)[:, None], self._L)[:, 0]
+            z = torch.cholesky_solve((A.t() @ y)[:, None], self._L)[:, 0]
             self.effective = len(M) - float(torch.cholesky_inverse(self._L).trace())
-        self.shift: Tensor = self._R @ z
+        directions = problem.root.shape[1]
+        self.shift = problem.root @ z[:directions]
+        self.shift.index_add_(0, index, deviation * z[directions:])
 
     def root(self) -> Float64[Tensor, "unknowns directions"]:
         """Root of the covariance of the posterior, of not many more directions than there are unknowns."""
+        extra = torch.zeros(len(self._root), len(self._index), dtype=torch.float64)
+        extra[self._index, torch.arange(len(self._index))] = self._deviation
+        R = torch.cat([self._root, extra], 1)
         if not self._few:
-            root: Tensor = torch.linalg.solve_triangular(self._L, self._R.t(), upper=False).t()
+            root: Tensor = torch.linalg.solve_triangular(self._L, R.t(), upper=False).t()
         else:
             # 1 / sqrt(t) - 1 over t - 1 with t = 1 + eigenvalue, without cancellation
             t = 1 + self._eigenvalues
             shrink = -1 / (t.sqrt() * (1 + t.sqrt()))
-            along = self._A.t() @ self._U
-            root = self._R + ((self._R @ along) * shrink) @ along.t()
+            root = R.addmm_((R @ self._along) * shrink, self._along.t())
         if root.shape[1] <= MOST_DIRECTIONS * len(root):
             return root
         scale, factor = factored(root @ root.t())
         return torch.where(root.any(1)[:, None], factor / scale[:, None], 0.0)
-
-
-def _with_drift(
-    root: Float64[Tensor, "unknowns directions"], groups: tuple[DriftGroup, ...]
-) -> Float64[Tensor, "unknowns _directions"]:
-    """A root of the covariance with what the groups have drifted."""
-    drifted = [group for group in groups if group.size > 0]
-    extra = root.new_zeros((len(root), sum(len(group.index) for group in drifted)))
-    first = 0
-    for group in drifted:
-        extra[group.index, first + torch.arange(len(group.index))] = group.deviation
-        first += len(group.index)
-    return torch.cat([root, extra], 1)

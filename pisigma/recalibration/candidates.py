@@ -10,9 +10,8 @@ from torch import Tensor
 
 from pisigma.errors import IdentificationError
 from pisigma.judging.calibration_validation import PredictsErrors, errors_under
-from pisigma.judging.few_rows import fit_where_it_helps
 from pisigma.judging.progress import Progress
-from pisigma.judging.trained_calibrations import Calibrator, judgeable
+from pisigma.judging.trained_calibrations import Calibrator, fit, judgeable
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.splits import k_folds
@@ -22,6 +21,11 @@ from pisigma.recalibration.model_posterior import ModelPosterior
 from pisigma.recalibration.recalibration_problem import Owner, recalibration_problem
 
 Kept = Literal["recalibrated", "old", "scratch"]
+NAMES: dict[Kept, str] = {
+    "recalibrated": "The recalibrated model",
+    "old": "The old model with the frames of the new rows",
+    "scratch": "A calibration from scratch",
+}
 FOLDS = 5
 ABOUT_AS_GOOD = 1.05
 """A model is kept before others whose left-out errors are smaller by no more than this factor."""
@@ -46,21 +50,18 @@ class Gate:
     @property
     def sentence(self) -> str:
         """Which candidate won, and by how much."""
-        names: dict[Kept, str] = {
-            "recalibrated": "The recalibrated model",
-            "old": "The old model with the frames of the new rows",
-            "scratch": "A calibration from scratch",
-        }
-        others = [
-            f"{value / (self.rms[self.kept] or value):.2f} times that under {names[name][:1].lower()}{names[name][1:]}"
-            for name, value in self.rms.items()
-            if value is not None and name != self.kept
-        ]
         if not self.rows:
-            return f"{names[self.kept]} is kept: the rows are too few to leave any out."
-        error = (self.rms[self.kept] or 0.0) * 1e3
-        compared = f"; it is {', and '.join(others)}" if others else ""
-        return f"{names[self.kept]} is kept: the RMS error of {self.rows} left-out rows is {error:.3g} mm{compared}."
+            return f"{NAMES[self.kept]} is kept: the rows are too few to leave any out."
+        sizes = {name: size * 1e3 for name, size in self.rms.items() if size is not None}
+        others = " and ".join(
+            f"{size:.3g} mm under {NAMES[name][:1].lower()}{NAMES[name][1:]}"
+            for name, size in sizes.items()
+            if name != self.kept
+        )
+        return (
+            f"{NAMES[self.kept]} is kept: the RMS error of {self.rows} left-out rows is {sizes[self.kept]:.3g} mm"
+            f"{f', against {others}' if others else ''}."
+        )
 
 
 def gate(
@@ -90,7 +91,7 @@ def gate(
     candidates: dict[Kept, Callable[[Measurements], PredictsErrors]] = {
         "recalibrated": lambda training: adapted(training, True),
         "old": lambda training: adapted(training, False),
-        "scratch": lambda training: fit_where_it_helps(calibrator, training, lambda what: None),
+        "scratch": lambda training: fit(calibrator, training, lambda what: None),
     }
     folds = min(FOLDS, int(groups_to_keep_whole(rows).max()) + 1)
     errors = {name: torch.full((rows.rows,), torch.nan, dtype=torch.float64) for name in candidates}

@@ -219,6 +219,7 @@ def _factor(V: Float64[Tensor, "values values"]) -> Float64[Tensor, "values valu
     """Cholesky factor of a covariance of values; rounding of far larger variances is made up for."""
     jitter = 0.0
     while True:
+        factor: Tensor
         factor, failed = torch.linalg.cholesky_ex(V + jitter * V.diagonal().diag())
         if not failed:
             return factor

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Float64
@@ -47,8 +48,8 @@ class ModelPosterior:
         known = model.uncertainty
         if known is None:
             raise ModelError(
-                f"model '{model.name}' holds no posterior of its parameters, which rows could be added to; make it "
-                "again with `pisigma calibrate ROBOT DATA --out DIR`."
+                f"model '{model.name}' ({model.kind}) holds no posterior of its parameters, which rows could be added "
+                "to; make it again with `pisigma calibrate ROBOT DATA --out DIR`, which calibrates a hybrid."
             )
         if not bool(torch.isfinite(known.geometry.values_of(known.space)).all()):
             raise ModelError(
@@ -61,18 +62,14 @@ class ModelPosterior:
 
     def renamed(self, rows: Measurements) -> Measurements:
         """Name the frame and the target of rows as the model does where one of them has no name for its only one."""
-        names = {
-            "frame": (rows.frame, tuple(self.geometry.bases)),
-            "target": (rows.target, tuple(self.geometry.tools)),
-        }
-        return replace(
-            rows,
-            **{
-                field: known * rows.rows
-                for field, (stated, known) in names.items()
-                if len(known) == len(set(stated)) == 1 and "" in (known[0], stated[0])
-            },
-        )
+        for field, stated, known in (
+            ("frame", rows.frame, tuple(self.geometry.bases)),
+            ("target", rows.target, tuple(self.geometry.tools)),
+        ):
+            if len(known) == len(set(stated)) == 1 and "" in (known[0], stated[0]):
+                names: dict[str, Any] = {field: known * rows.rows}
+                rows = replace(rows, **names)
+        return rows
 
     def positions_in(self, space: ParameterSpace) -> list[int]:
         """Say where the parameters stand in a space that has all of their frames, targets and owners."""

@@ -95,19 +95,23 @@ def _of_frame(adaptation: Adaptation, number: int, kind: str, name: str) -> list
     name = name or next(iter(after))
     if name not in before:
         return []
-    old, new = (transform_from_xyzrpy(torch.from_numpy(np.asarray(one[name]))) for one in (before, after))
-    away, turn = new[:3, 3] - old[:3, 3], rotation_vector(new[:3, :3] @ old[:3, :3].mT)
-    if kind == "base":
-        anchor = problem.setup.anchors.bases[space.frames.index(name), :3, :3]
-        away, turn = anchor.t() @ away, anchor.t() @ turn
-    covariance = torch.zeros(6, 6, dtype=torch.float64)
+    shift, of_members = adaptation.search.shift(number)
     column = group.index - frame_stretch(space, kind, name).start
-    covariance[column[:, None], column] = adaptation.search.shift(number)[1]
+    motion, covariance = torch.zeros(6).double(), torch.zeros(6, 6).double()
+    motion[column], covariance[column[:, None], column] = shift, of_members
+    if group.stands:  # the shift is that from the guess
+        old, new = (transform_from_xyzrpy(torch.from_numpy(np.asarray(one[name]))) for one in (before, after))
+        turn = rotation_vector(new[:3, :3] @ old[:3, :3].mT)
+        motion = torch.cat([new[:3, 3] - old[:3, 3], turn])
+        if kind == "base":
+            motion = (
+                motion.view(2, 3) @ problem.setup.anchors.bases[space.frames.index(name), :3, :3]
+            ).flatten()
     return [
         Moved(group.what, float(vector.norm()) * factor, _along(vector, block) * factor, unit)
         for vector, block, (unit, factor) in (
-            (away, covariance[:3, :3], UNITS["m"]),
-            (turn, covariance[3:, 3:], UNITS["rad"]),
+            (motion[:3], covariance[:3, :3], UNITS["m"]),
+            (motion[3:], covariance[3:, 3:], UNITS["rad"]),
         )
     ]
 

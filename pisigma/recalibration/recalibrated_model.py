@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from pisigma.hybrid.arm import HybridArm
+from pisigma.hybrid.covariance_root import CovarianceRoot
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.measurement.dataset import Measurements
@@ -51,7 +52,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
             dh=dh, base=next(iter(bases.values())), tool=next(iter(tools.values()))
         )
     robot = drawn.with_geometry(base=calibrated.base, tool=calibrated.tool)
-    root = adaptation.root.float().double()
+    root = CovarianceRoot(adaptation.root.float().double())
     space = adaptation.problem.design.problem.space
     noise = {**known.noise, **adaptation.noise}
     return replace(

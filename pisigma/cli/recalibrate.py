@@ -1,0 +1,76 @@
+"""`pisigma recalibrate`: a model brought up to date with few new rows."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pisigma.cli.arguments import AsJson, ModelFolder, Overwrite
+from pisigma.cli.calibrate import AcceptImplausible, saved
+from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
+
+if TYPE_CHECKING:
+    from pisigma.workflow.recalibrate import Recalibration
+
+Data = Annotated[
+    Path, typer.Argument(metavar="ROWS", help="New measurements (CSV), ten poses or more, of any sensors.")
+]
+Out = Annotated[Path | None, typer.Option(help="Model folder to write; needed without --dry-run.")]
+Moved = Annotated[
+    str | None,
+    typer.Option(
+        help="What stands elsewhere since the model was made: base, tool, or base,tool; '' for neither. [default: what "
+        "the rows show]"
+    ),
+]
+DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be kept, and write nothing.")]
+
+
+def recalibrate(
+    context: typer.Context,
+    model: ModelFolder,
+    data: Data,
+    out: Out = None,
+    moved: Moved = None,
+    dry_run: DryRun = False,
+    accept_implausible: AcceptImplausible = False,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Bring a model up to date with new rows, and say what has moved since it was made.
+
+    Left-out rows decide between the old model with the frames of these rows, the recalibrated one, and a calibration
+    from scratch; the folder holds the winner. Exit status 3, and no folder, where the result must not be trusted.
+    """
+    from pisigma.files.output_folder import check_folder
+    from pisigma.workflow import recalibrate as workflow
+
+    if (out is None) is not dry_run:
+        raise typer.BadParameter("either --out DIR or --dry-run was wanted.", param_hint="'--out'")
+    if out is not None:
+        check_folder(out, overwrite, inputs=(model, data))
+    names = None if moved is None else tuple(name.strip() for name in moved.split(",") if name.strip())
+    settings = workflow.RecalibrationSettings(names)
+    with progress_of("recalibration") as progress:
+        recalibration = workflow.recalibrate(model, data, settings, progress)
+    if out is None:
+        _print(recalibration, None, as_json)
+        return
+    with saved(recalibration, out, accept_implausible, overwrite, command=command_line(context)) as folder:
+        _print(recalibration, folder, as_json)
+
+
+def _print(recalibration: "Recalibration", folder: Path | None, as_json: bool) -> None:
+    """Print what has moved and which model was kept."""
+    from pisigma.reporting.recalibration_card import candidate_table
+
+    if as_json:
+        print_json({"model": folder and str(folder), **recalibration.to_json()})
+        return
+    summary = recalibration.summary
+    print_lines([summary.changed, summary.verdict])
+    print_table(f"errors of {summary.left_out} left-out rows", *candidate_table(summary))
+    print_lines(f"Implausible: {one.sentence}" for one in summary.diagnostics)
+    print_lines(f"Warning: {sentence}" for sentence in summary.warnings)
+    if folder is not None:
+        print_lines([f"Model written to {folder} in {recalibration.seconds:.1f} s; read its README.md."])

@@ -1,0 +1,40 @@
+"""The card of a recalibrated model, and its table on card and screen."""
+
+from pathlib import Path
+
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.recalibration.summary import RecalibrationSummary
+from pisigma.reporting.rendering import write_card
+from pisigma.reporting.tables import Table, figure_text
+
+CANDIDATES = {
+    "recalibrated": "recalibrated",
+    "old": "old, frames of these rows",
+    "scratch": "from scratch",
+}
+
+
+def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSummary, folder: Path) -> None:
+    """Write the card into a model folder.
+
+    Args:
+        model: the model of the folder.
+        summary: its figures.
+        folder: where to write.
+    """
+    write_card(
+        folder, "recalibration_card.md.j2", model=model, summary=summary, candidates=candidate_table(summary)
+    )
+
+
+def candidate_table(summary: RecalibrationSummary) -> Table:
+    """One row per candidate: the RMS error of left-out rows, and whether it was kept."""
+    rows = (
+        (
+            CANDIDATES[name],
+            "too few rows" if errors.rms_mm is None else figure_text(errors.rms_mm),
+            "yes" if name == summary.kept else "no",
+        )
+        for name, errors in summary.cross_validation.items()
+    )
+    return Table(("model", "left-out rows, RMS [mm]", "kept"), tuple(rows))

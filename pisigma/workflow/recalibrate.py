@@ -1,0 +1,212 @@
+"""Recalibrate a model with few new rows: typed settings in, a typed result out that writes itself as a model folder."""
+
+import datetime
+import os
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pisigma.errors import IdentificationError, nearest_choice
+from pisigma.files.model_files import model_hash
+from pisigma.hybrid.result import HybridResult
+from pisigma.judging.diagnostic import Diagnostic
+from pisigma.judging.distillation_summary import ParentFigures
+from pisigma.judging.progress import Progress, stage
+from pisigma.judging.trained_calibrations import fit
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import load_model
+from pisigma.model.geometric_model import model_of_hybrid
+from pisigma.model.stated_conditions import condition_warnings
+from pisigma.recalibration.adaptation import Adaptation, adapt
+from pisigma.recalibration.candidates import Gate, gate
+from pisigma.recalibration.elsewhere import owners_elsewhere
+from pisigma.recalibration.model_posterior import ModelPosterior
+from pisigma.recalibration.moved import Moved, moved_by, what_moved
+from pisigma.recalibration.recalibrated_model import KIND, recalibrated_model
+from pisigma.recalibration.recalibration_problem import Owner, recalibration_problem
+from pisigma.recalibration.summary import LeftOutFigures, MovedFigures, RecalibrationSummary
+from pisigma.reporting.recalibration_card import write_recalibration_card
+from pisigma.robot.description import Robot
+from pisigma.workflow.calibrate import CalibrationSettings
+from pisigma.workflow.result import AbstractModelResult
+
+FEW_ROWS = 5
+"""Different poses below which nothing can be said of left-out rows."""
+IMPLAUSIBLE = 0.01
+"""Share of the reach that errors of left-out rows have where the rows are not of this robot."""
+
+
+@dataclass(frozen=True)
+class RecalibrationSettings:
+    """How a model is recalibrated.
+
+    Attributes:
+        moved: which of "base" and "tool" stand elsewhere than when the model was made; None to find it by evidence.
+
+    Raises:
+        IdentificationError: something else is named.
+    """
+
+    moved: tuple[str, ...] | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot stand elsewhere."""
+        for name in self.moved or ():
+            if name not in ("base", "tool"):
+                raise IdentificationError(
+                    f"moved: '{name}' is no choice; {nearest_choice(name, ('base', 'tool'))}"
+                )
+
+
+@dataclass(frozen=True, eq=False)
+class Recalibration(AbstractModelResult):
+    """A model after new rows: the candidate that predicts left-out rows best.
+
+    Attributes:
+        model: what `pisigma.load` would read, with all figures as its metrics.
+        parent: the model that the rows were added to.
+        adaptation: of the parent to all rows.
+        gate: the errors of left-out rows under every candidate.
+        moved: what has moved clearly.
+        summary: all figures.
+        seconds: time it took [s].
+    """
+
+    model: CalibratedModel
+    parent: CalibratedModel
+    adaptation: Adaptation
+    gate: Gate
+    moved: tuple[Moved, ...]
+    summary: RecalibrationSummary
+    seconds: float
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to heed, a sentence each."""
+        return self.summary.warnings
+
+    def _describe(self, model: CalibratedModel, summary: RecalibrationSummary, folder: Path) -> None:
+        write_recalibration_card(model, summary, folder)
+
+
+def recalibrate(
+    model: CalibratedModel | str | os.PathLike[str],
+    data: Measurements | str | os.PathLike[str],
+    settings: RecalibrationSettings = RecalibrationSettings(),
+    progress: Progress = lambda what: None,
+) -> Recalibration:
+    """Add new rows to what a model knows, and keep whichever model predicts left-out rows best.
+
+    Args:
+        model: of `pisigma calibrate` or `pisigma recalibrate`, or its folder.
+        data: new rows of any sensors, or a CSV file of them; those of the set "test" are left out.
+        settings: see `RecalibrationSettings`.
+        progress: called with what is being done.
+
+    Raises:
+        ModelError: the folder holds no model, or the model holds no posterior.
+        MeasurementError: the data cannot be read.
+        IdentificationError: the rows do not determine where something stands.
+        PoseError: the joint values do not fit the robot.
+    """
+    started = time.perf_counter()
+    parent = model if isinstance(model, CalibratedModel) else load_model(model)
+    sha256 = "" if isinstance(model, CalibratedModel) else model_hash(model)
+    posterior = ModelPosterior.of(parent)
+    drawn = posterior.space.robot
+    measurements = data if isinstance(data, Measurements) else Measurements.read_csv(data, drawn)
+    rows = posterior.renamed(measurements.split_sets()[0])
+    progress("what has moved")
+    elsewhere = _elsewhere(parent, posterior, rows, settings)
+    problem = recalibration_problem(parent, posterior, rows, elsewhere)
+    adaptation = adapt(problem, posterior.noise)
+    calibrator = CalibrationSettings().calibrator(drawn, rows.socket or ())
+    judged = gate(parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation"))
+    if judged.kept == "scratch":
+        result = fit(calibrator, rows, stage(progress, "from scratch"))
+        assert isinstance(result, HybridResult)
+        kept = replace(model_of_hybrid(parent.name, drawn, result, rows), kind=KIND)
+    else:
+        chosen = adapt(problem.without_arm(), adaptation.noise) if judged.kept == "old" else adaptation
+        kept = recalibrated_model(parent, chosen, rows)
+    moved = moved_by(adaptation)
+    summary = _summary(parent, rows, adaptation, judged, moved).having(
+        parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=sha256),
+        elsewhere=tuple(" ".join(owner).strip() for owner in sorted(elsewhere)),
+    )
+    kept = replace(kept, metrics=summary.to_json())
+    return Recalibration(
+        kept, parent, adaptation, judged, moved, summary, seconds=time.perf_counter() - started
+    )
+
+
+def _summary(
+    parent: CalibratedModel,
+    rows: Measurements,
+    adaptation: Adaptation,
+    judged: Gate,
+    moved: tuple[Moved, ...],
+) -> RecalibrationSummary:
+    """All figures."""
+    return RecalibrationSummary(
+        command=f"pisigma.recalibrate({parent.name!r}, {Path(rows.source).name!r})",
+        diagnostics=_diagnostics(adaptation.problem.design.problem.space.robot, judged, rows),
+        parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=""),
+        date=datetime.datetime.now(datetime.UTC).date().isoformat(),
+        rows=rows.rows,
+        kept=judged.kept,
+        verdict=judged.sentence,
+        left_out=judged.rows,
+        cross_validation={
+            name: LeftOutFigures(rms_mm=None if rms is None else rms * 1e3)
+            for name, rms in judged.rms.items()
+        },
+        changed=what_moved(moved),
+        moved=tuple(MovedFigures.model_validate(one.to_json()) for one in moved),
+        elsewhere=(),
+        effective_parameters=adaptation.effective,
+        noise=adaptation.noise,
+        warnings=_warnings(parent, judged, rows),
+    )
+
+
+def _elsewhere(
+    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, settings: RecalibrationSettings
+) -> frozenset[Owner]:
+    """Bases and tools that stand elsewhere: all those of the rows that are stated to, or what the evidence says."""
+    if settings.moved is None:
+        return owners_elsewhere(model, posterior, rows, posterior.noise)
+    names = {"base": set(rows.frame), "tool": set(rows.target)}
+    return frozenset((kind, name) for kind in settings.moved for name in names[kind])
+
+
+def _diagnostics(robot: Robot, judged: Gate, rows: Measurements) -> tuple[Diagnostic, ...]:
+    """Rows that no candidate predicts are not of this robot."""
+    error = judged.rms[judged.kept]
+    if error is None or error <= IMPLAUSIBLE * robot.reach:
+        return ()
+    return (
+        Diagnostic(
+            kind="residual",
+            severity="implausible",
+            sentence=f"{rows.source}: left-out rows are missed by {error * 1e3:.3g} mm, more than {IMPLAUSIBLE:.0%} "
+            f"of the reach of robot '{robot.name}': they are not of this robot, or their columns or units are wrong; "
+            "run `pisigma verify` on them.",
+        ),
+    )
+
+
+def _warnings(model: CalibratedModel, judged: Gate, rows: Measurements) -> tuple[str, ...]:
+    """What to heed, a sentence each."""
+    warnings = list(condition_warnings(model, rows))
+    if judged.rows < FEW_ROWS:
+        warnings.append(
+            f"Only {judged.rows} of {rows.rows} rows could be left out and predicted, which says little of the "
+            f"candidates; measure {2 * FEW_ROWS} poses or more."
+        )
+    if model.provenance.data_sha256 == rows.content_hash():
+        warnings.append(
+            "The model was made of these rows already: they count twice, and its uncertainty is too small."
+        )
+    return tuple(warnings)
