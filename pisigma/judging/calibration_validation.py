@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Float64, Int64
@@ -307,6 +307,7 @@ def _judge(
     return _JudgedFold(torch.arange(held_out.rows), errors, distances, spread)
 
 
+@runtime_checkable
 class PredictsErrors(Protocol):
     """A calibration of any kind."""
 

@@ -9,7 +9,6 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.hybrid.design import Rows
-from pisigma.hybrid.normal_equations import factored
 from pisigma.hybrid.refinement import linearised, network
 from pisigma.identification.initial_guess.initial_guess import chosen_rows
 from pisigma.identification.prediction import predicted_poses
@@ -18,14 +17,13 @@ from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import held_out_groups
 from pisigma.recalibration.drift import Drift, DriftGroup, DriftSearch, LinearValues
+from pisigma.recalibration.posterior_update import PosteriorUpdate
 from pisigma.recalibration.recalibration_problem import RecalibrationProblem
 from pisigma.sensors.registry import measured_errors
 
 MOST_ROUNDS = 5
 SETTLED = 0.05
 """Rounds end when predicted values move by less than this share of the noise."""
-MOST_DIRECTIONS = 1.2
-"""Directions of a root that is kept, by the number of unknowns."""
 MOST_VALUES = 360
 """Sizes of the drift are estimated from so many values at most; all values count in the end."""
 FIRST_NOISE = {"m": 1e-4, "rad": 1e-4}
@@ -55,7 +53,7 @@ class Adaptation:
     effective: float
     rounds: int
     search: DriftSearch
-    update: "_Update" = field(repr=False)
+    update: PosteriorUpdate = field(repr=False)
 
     @cached_property
     def root(self) -> Float64[Tensor, "unknowns directions"]:
@@ -111,7 +109,7 @@ def adapt(
         values = linear_values(problem, rows)
         search = _search(problem, values, drift, usual)
         drift = search.estimated()
-        update = _Update(problem, values, drift)
+        update = PosteriorUpdate(problem.root, values, drift)
         step = values.X @ (mean + update.shift - x) / drift.noise[values.sensor]
         x, effective = mean + update.shift, update.effective
         if float(step.square().mean().sqrt()) < SETTLED:
@@ -155,54 +153,3 @@ def _search(
     if len(values.y) > MOST_VALUES:
         chosen = values.select(chosen_rows(len(values.y), MOST_VALUES).sort().values)
     return DriftSearch(chosen, chosen.X @ problem.root, drift.groups, drift.noise, usual)
-
-
-class _Update:
-    """Kalman's update of a root R of a covariance: with A = X R / noise, `R (I + A^T A)^-1/2` is that of the posterior.
-
-    It is worked out from the eigenvalues of `A A^T` where there are few values, else from Cholesky's factor of
-    `I + A^T A`. Source: Bierman 1977, Factorization Methods for Discrete Sequential Estimation, chapter II.
-    """
-
-    def __init__(self, problem: RecalibrationProblem, values: LinearValues, drift: Drift) -> None:
-        self._root = problem.root
-        drifted = [group for group in drift.groups if group.size > 0]
-        index = torch.cat([group.index for group in drifted] or [torch.zeros(0, dtype=torch.int64)])
-        deviation = torch.cat([group.deviation for group in drifted] or [values.y[:0]])
-        self._index, self._deviation = index, deviation
-        noise = drift.noise[values.sensor]
-        A = torch.cat([values.X @ problem.root, values.X[:, index] * deviation], 1) / noise[:, None]
-        y = values.y / noise
-        self._few = 2 * len(y) <= A.shape[1]
-        if self._few:
-            self._eigenvalues, U = torch.linalg.eigh(A @ A.t())
-            self._eigenvalues = self._eigenvalues.clamp(min=0.0)
-            self._along = A.t() @ U
-            z = self._along @ ((U.t() @ y) / (1 + self._eigenvalues))
-            self.effective = float((self._eigenvalues / (1 + self._eigenvalues)).sum())
-        else:
-            M = A.t() @ A
-            M.diagonal().add_(1.0)
-            self._L = torch.linalg.cholesky(M)
-            z = torch.cholesky_solve((A.t() @ y)[:, None], self._L)[:, 0]
-            self.effective = len(M) - float(torch.cholesky_inverse(self._L).trace())
-        directions = problem.root.shape[1]
-        self.shift = problem.root @ z[:directions]
-        self.shift.index_add_(0, index, deviation * z[directions:])
-
-    def root(self) -> Float64[Tensor, "unknowns directions"]:
-        """Root of the covariance of the posterior, of not many more directions than there are unknowns."""
-        extra = torch.zeros(len(self._root), len(self._index), dtype=torch.float64)
-        extra[self._index, torch.arange(len(self._index))] = self._deviation
-        R = torch.cat([self._root, extra], 1)
-        if not self._few:
-            root: Tensor = torch.linalg.solve_triangular(self._L, R.t(), upper=False).t()
-        else:
-            # 1 / sqrt(t) - 1 over t - 1 with t = 1 + eigenvalue, without cancellation
-            t = 1 + self._eigenvalues
-            shrink = -1 / (t.sqrt() * (1 + t.sqrt()))
-            root = R.addmm_((R @ self._along) * shrink, self._along.t())
-        if root.shape[1] <= MOST_DIRECTIONS * len(root):
-            return root
-        scale, factor = factored(root @ root.t())
-        return torch.where(root.any(1)[:, None], factor / scale[:, None], 0.0)

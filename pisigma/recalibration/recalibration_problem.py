@@ -35,6 +35,9 @@ ELSEWHERE = 0.1
 LARGEST_CORRECTION = 10.0
 """Size 1 of the drift of a correction, in root mean squares of its weights."""
 
+WORTH_OF_CORRECTION = 6.0
+"""[nats] Its many weights explain what a model gets wrong of few rows by chance, so it has to show more clearly."""
+
 
 @dataclass(frozen=True, eq=False)
 class RecalibrationProblem:
@@ -218,7 +221,8 @@ def _groups(
                 )
     if len(posterior.weights):
         index = torch.arange(parameters, len(root))
-        groups.append(DriftGroup("correction", index, LARGEST_CORRECTION * _usual_weights(posterior)))
+        scale = LARGEST_CORRECTION * _usual_weights(posterior)
+        groups.append(DriftGroup("correction", index, scale, worth=WORTH_OF_CORRECTION))
     return tuple(group for group in groups if len(group.index))
 
 

@@ -256,8 +256,10 @@ def _uncertainty(
         if wrong:
             raise ValueError(f"{len(own.columns)} values of every {own.name} were wanted, got {wrong.pop()}")
     geometry = IdentifiedGeometry(robot, bases, tools, unknowns)
-    features, root = _weighted(known, hybrid), CovarianceRoot(full)
-    return PositionUncertainty(space, geometry, features, root, known.prior_scale, known.noise)
+    features = _weighted(known, hybrid)
+    return PositionUncertainty(
+        space, geometry, features, CovarianceRoot(full), known.prior_scale, known.noise
+    )
 
 
 def _unknowns_section(groups: Sequence[UnknownGroup]) -> dict[str, object]:

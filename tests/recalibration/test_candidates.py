@@ -1,0 +1,58 @@
+"""Which candidate is kept: by the errors of left-out rows."""
+
+import math
+
+import pytest
+import torch
+from testing.aged import model_before, rows_later
+from testing.closeness import assert_close
+
+from pisigma.recalibration.adaptation import adapt
+from pisigma.recalibration.candidates import ABOUT_AS_GOOD, Gate, _decided, gate
+from pisigma.recalibration.model_posterior import ModelPosterior
+from pisigma.recalibration.recalibration_problem import recalibration_problem
+from pisigma.workflow.calibrate import CalibrationSettings
+
+
+def decided(**errors: list[float]) -> Gate:
+    return _decided({name: torch.tensor(values).double() for name, values in errors.items()})
+
+
+def test_the_recalibrated_model_is_kept_where_it_is_about_as_good():
+    judged = decided(recalibrated=[1.04, 1.04], old=[1.0, 1.0], scratch=[1.0, 3.0])
+    assert judged.kept == "recalibrated"
+    assert decided(recalibrated=[1.06, 1.06], old=[1.0, 1.0], scratch=[0.97, 0.97]).kept == "old"
+    assert decided(recalibrated=[1.06, 1.06], old=[2.0, 1.0], scratch=[1.0, 1.0]).kept == "scratch"
+
+
+def test_a_candidate_that_cannot_be_fitted_is_not_kept():
+    judged = decided(recalibrated=[2.0, 2.0], old=[1.0, 1.0], scratch=[math.inf, 0.9])
+    assert (judged.kept, judged.rms["scratch"]) == ("old", None)
+    assert "scratch" not in judged.sentence
+
+
+def test_a_row_that_every_candidate_misses_does_not_count():
+    judged = decided(recalibrated=[1.0, 1.0, 1.0, 90.0], old=[1.2] * 3 + [80.0], scratch=[3.0] * 3 + [50.0])
+    assert (judged.kept, judged.rows) == ("recalibrated", 3)
+    assert_close(judged.rms["recalibrated"], 1.0)
+
+
+def test_without_left_out_rows_the_recalibrated_model_is_kept():
+    judged = decided(recalibrated=[math.nan] * 2, old=[math.nan] * 2, scratch=[math.nan] * 2)
+    assert (judged.kept, judged.rows) == ("recalibrated", 0)
+    assert judged.sentence == "The recalibrated model is kept: the rows are too few to leave any out."
+
+
+@pytest.mark.parametrize("count", [5, 10])
+def test_left_out_rows_decide(count):
+    model, rows = model_before(), rows_later(count, 2, (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0))
+    posterior = ModelPosterior.of(model)
+    problem = recalibration_problem(model, posterior, rows, frozenset())
+    whole = adapt(problem, posterior.noise)
+    calibrator = CalibrationSettings().calibrator(posterior.space.robot)
+    judged = gate(model, whole, frozenset(), rows, calibrator, lambda what: None)
+    assert (judged.kept, judged.rows) == ("recalibrated", count)
+    kept, old = judged.rms["recalibrated"], judged.rms["old"]
+    assert kept is not None
+    assert old is not None
+    assert ABOUT_AS_GOOD * kept < old

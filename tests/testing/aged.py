@@ -1,0 +1,46 @@
+"""Models of simulated arms, and rows that were measured on the same arms later."""
+
+import functools
+
+import numpy as np
+import torch
+from testing.hybrid import NOISE, hybrid_of, joints_in
+from testing.models import no_type_checker
+
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.geometric_model import model_of_hybrid
+from pisigma.se3 import transform_from_xyzrpy
+
+NAME = "rb5"
+
+
+@functools.cache
+def model_before() -> CalibratedModel:
+    """The hybrid calibration of the arm."""
+    under_test = hybrid_of(NAME)
+    with no_type_checker():
+        return model_of_hybrid(NAME, under_test.true.nominal, under_test.result, under_test.measurements)
+
+
+def rows_later(
+    rows: int,
+    seed: int,
+    moved: tuple[float, ...] = (0.0,) * 6,
+    base: tuple[float, ...] = (0.0,) * 6,
+    noise: float = NOISE,
+) -> Measurements:
+    """Positions of the arm at other joint values.
+
+    Args:
+        rows: how many.
+        seed: of joint values and noise.
+        moved: by how much the zeros of the joints have moved [rad].
+        base: motion of the instrument, x, y, z [m], roll, pitch, yaw [rad].
+        noise: of a coordinate [m].
+    """
+    true = hybrid_of(NAME).true
+    q = joints_in(true.nominal, rows, seed)
+    T = transform_from_xyzrpy(torch.tensor(base).double()) @ true.forward(q + torch.tensor(moved).double())
+    drawn = np.random.default_rng(seed).normal(size=(rows, 3))
+    return Measurements(q=q, position=T[:, :3, 3] + noise * torch.from_numpy(drawn))

@@ -1,0 +1,83 @@
+"""Recalibration as users call it: the result, its folder, and what is refused."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.aged import model_before, rows_later
+from testing.closeness import assert_close
+
+import pisigma
+from pisigma.errors import AcceptanceError, IdentificationError, ModelError
+from pisigma.model.folder.model_folder import load_model, save_model
+from pisigma.recalibration.summary import RecalibrationSummary
+from pisigma.se3 import transform_from_xyzrpy
+from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate
+
+COLLISION = (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def after_collision() -> Recalibration:
+    return recalibrate(model_before(), rows_later(10, 2, COLLISION))
+
+
+def test_it_says_what_moved_and_what_is_kept(after_collision):
+    report = after_collision.to_json()
+    assert report["kept"] == "recalibrated"
+    assert list(report["cross_validation"]) == ["recalibrated", "old", "scratch"]
+    assert report["cross_validation"]["old"]["rms_mm"] > report["cross_validation"]["recalibrated"]["rms_mm"]
+    (moved,) = report["moved"]
+    assert moved["what"] == "joint 3"
+    assert_close(moved["shift_deg"], 0.25, atol=0.02)
+    low, high = moved["interval"]
+    assert low < 0.25 < high
+    assert not report["elsewhere"]
+
+
+def test_its_folder_is_a_model_that_can_be_recalibrated_again(after_collision, tmp_path):
+    after_collision.save(tmp_path / "again")
+    card = (tmp_path / "again" / "README.md").read_text()
+    for sentence in (after_collision.summary.changed, after_collision.summary.verdict):
+        assert sentence in card
+    model = load_model(tmp_path / "again")
+    figures = RecalibrationSummary.read(model)
+    assert figures is not None
+    assert (figures.parent.name, figures.parent.sha256) == ("rb5", "")
+    assert_close(pisigma.load(tmp_path / "again").model.calibrated.dh, model.calibrated.dh)
+    second = recalibrate(tmp_path / "again", rows_later(10, 3, COLLISION))
+    assert second.summary.parent.kind == "recalibration"
+    assert len(second.summary.parent.sha256) == 64
+    assert not second.moved
+
+
+def test_what_is_stated_to_stand_elsewhere_is_identified_anew():
+    motion = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
+    result = recalibrate(
+        model_before(), rows_later(10, 2, base=motion), RecalibrationSettings(moved=("base",))
+    )
+    assert result.summary.elsewhere == ("base",)
+    T = transform_from_xyzrpy(torch.tensor(motion).double())
+    before, after = (torch.from_numpy(one.bases[""][:3].copy()) for one in (model_before(), result.model))
+    assert_close(after, T[:3, :3] @ before + T[:3, 3], atol=1e-3)
+
+
+def test_rows_of_another_arm_are_not_trusted(tmp_path):
+    rows = rows_later(10, 2)
+    result = recalibrate(model_before(), replace(rows, q=rows.q.flip(0)))
+    assert [one.kind for one in result.diagnostics] == ["residual"]
+    with pytest.raises(AcceptanceError, match="must not be trusted"):
+        result.save(tmp_path / "no")
+
+
+def test_what_cannot_be_is_refused(tmp_path):
+    with pytest.raises(IdentificationError, match="moved: 'arm' is no choice"):
+        RecalibrationSettings(moved=("arm",))
+    geometric = tmp_path / "geometric"
+    geometric.mkdir()
+    save_model(
+        replace(model_before(), hybrid=None, uncertainty=None, hybrid_bases={}, hybrid_tools={}), geometric
+    )
+    with pytest.raises(ModelError, match="holds no posterior"):
+        recalibrate(geometric, rows_later(10, 2))
