@@ -13,7 +13,7 @@ from pisigma.cli.distill import distill
 from pisigma.cli.endings import end_with, tell_problems
 from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
-from pisigma.cli.ik import ik
+from pisigma.cli.ik.command import ik
 from pisigma.cli.import_ import import_
 from pisigma.cli.plan import plan
 from pisigma.cli.recalibrate import recalibrate

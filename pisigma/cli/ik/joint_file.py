@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pisigma.cli.solutions import FAILURES, file_units
+from pisigma.cli.ik.solutions import FAILURES, file_units
 from pisigma.files.output_file import writing_whole
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.inverse.path import PathSwitch

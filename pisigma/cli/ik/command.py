@@ -77,7 +77,7 @@ def _print_pose(
     solver: "CorrectedIK", pose: Pose, branch: str | None, all_branches: bool, as_json: bool
 ) -> None:
     """Print the solutions of one pose."""
-    from pisigma.cli.solutions import failure, print_solutions, solution_records
+    from pisigma.cli.ik.solutions import failure, print_solutions, solution_records
 
     T, places = _transform(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
     if all_branches:
@@ -104,7 +104,7 @@ def _write_file(
     as_json: bool,
 ) -> None:
     """Write the joint values of a file of poses, of any length."""
-    from pisigma.cli.joint_file import write_joint_file
+    from pisigma.cli.ik.joint_file import write_joint_file
 
     with progress_of(f"solving {poses}") as tell:
         outcome = write_joint_file(solver, poses, out, branch, tell, accuracy, path)

@@ -206,7 +206,7 @@ def test_rows_that_are_no_poses_do_not_stop_the_others(
     run, models, tmp_path, monkeypatch, one_row_at_fault, rows_at_a_time
 ):
     path, good = one_row_at_fault
-    monkeypatch.setattr("pisigma.cli.joint_file.CHUNK_ROWS", rows_at_a_time)
+    monkeypatch.setattr("pisigma.cli.ik.joint_file.CHUNK_ROWS", rows_at_a_time)
     out = tmp_path / "joints.csv"
     result = run("ik", models / "kiro4", "--poses", path, "--out", out, "--json")
     assert result.exit_code == 2
@@ -261,7 +261,7 @@ def test_metres_are_not_refused(run, models, tmp_path):
 def test_an_interruption_leaves_nothing(run, models, tmp_path, monkeypatch):
     write_poses(tmp_path / "poses.csv", [home_pose("kiro3")] * 5)
     out, chunks = tmp_path / "joints.csv", []
-    monkeypatch.setattr("pisigma.cli.joint_file.CHUNK_ROWS", 2)
+    monkeypatch.setattr("pisigma.cli.ik.joint_file.CHUNK_ROWS", 2)
 
     def interrupted(solver, T, branch, path):
         chunks.append(len(T))
@@ -270,7 +270,7 @@ def test_an_interruption_leaves_nothing(run, models, tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return solver(T, branch=branch), ()
 
-    monkeypatch.setattr("pisigma.cli.joint_file._solve", interrupted)
+    monkeypatch.setattr("pisigma.cli.ik.joint_file._solve", interrupted)
     result = run("ik", models / "kiro3", "--poses", tmp_path / "poses.csv", "--out", out)
     assert result.exit_code == 130
     assert chunks == [2, 2]

@@ -1,0 +1,1 @@
+"""`pisigma ik`: the command, and how solutions are printed and written."""
