@@ -41,7 +41,7 @@ class SessionPanel:
         Args:
             gui: where to.
             robot: gives the joints their names and units.
-            limit: accuracy that is wanted [m], if one is.
+            limit: what 95 % of the errors are to stay below [m]; None for no limit.
         """
         self._robot, self._limit = robot, limit
         environment = template_environment("pisigma.viewing", {"mm": lambda length: f"{length * 1e3:.3f}"})

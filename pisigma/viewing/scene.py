@@ -5,10 +5,12 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import torch
 from jaxtyping import Float64, UInt8
+from scipy.spatial.transform import Rotation
 
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measuring.state import RowsSoFar, SessionState
 from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.se3 import invert
 from pisigma.viewing.body import AbstractBody
 from pisigma.viewing.cell import draw_cell, draw_sight
 from pisigma.viewing.colors import ALARM, LINKS, NEXT, PLANNED, Color, shades
@@ -56,6 +58,16 @@ class SessionScene:
             draw_sight(self._scene, "/next", self._arm.cell, T, self._robot.reach)
         if len(state.remaining):
             self._dots("/next/remaining", self._poses(state.remaining)[:, :3, 3], PLANNED, 0.5)
+
+    def show_sensor(self, T_sensor_base: Float64[np.ndarray, "4 4"]) -> None:
+        """Draw the axes of the frame that was measured in, as the rows determine it."""
+        T = invert(torch.from_numpy(T_sensor_base)).numpy()
+        axes = AXES * self._robot.reach
+        wxyz = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+        self._scene.add_frame(
+            "/sensor", axes_length=axes, axes_radius=axes / 20, wxyz=wxyz, position=T[:3, 3]
+        )
+        self._label("/sensor/label", "frame of the sensor", np.zeros(3))
 
     def show_rows(self, rows: RowsSoFar, top: float, magnification: float) -> None:
         """Draw a point for every row, in the colour of its error, and the error as an arrow.

@@ -22,7 +22,7 @@ if TYPE_CHECKING:  # names in full, which type checkers at run time find without
 
 DRAWN = 0.15
 """Share of the robot's reach that an error at the end of the scale of colours is drawn with."""
-FIELD, RISE, AROUND_ROBOT, CLOSER = 0.8, 0.5, 0.7, 0.8
+FIELD, RISE, AROUND_ROBOT, CLOSER = 0.8, 0.5, 0.7, 0.92
 """Of the first view: its angle [rad], how steeply it looks down, the share of the reach that it shows around, and how
 much nearer than for all of that ball it is."""
 
@@ -49,7 +49,7 @@ class SessionView:
         Args:
             arm: the robot in its cell.
             body: what the robot looks like; None for capsules.
-            limit: accuracy that is wanted [m], if one is.
+            limit: what 95 % of the errors are to stay below [m]; None for no limit.
             host: address to listen at; at 127.0.0.1 only this machine can open the page.
             port: to listen at; where it is taken, the next one that is free.
 
@@ -94,6 +94,8 @@ class SessionView:
                 times = 10 * round(float(np.clip(DRAWN * self._reach / top, 10, 2000)) / 10)
                 self._panel.magnification.value = times  # type: ignore[misc]  # mypy misses its decorated setter
             self._scene.show_robot(state)
+            if state.base is not None:
+                self._scene.show_sensor(state.base)
             self._scene.show_rows(state.rows, top, self._panel.magnification.value)
             self._panel.show(state, top)
         self._server.flush()

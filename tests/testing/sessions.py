@@ -51,9 +51,9 @@ def session_state(arm: ArmInCell, rows: int, wrong: int | None = None) -> Sessio
     position[:kept] = error[:kept] = math.nan
     alarmed = np.arange(rows) == (-1 if wrong is None else wrong)
     error[alarmed] = 0.003, -0.004, 0.0
+    said = "the position is off by 5 mm where 0.3 mm is expected; measure it again."
     alarms = tuple(
-        Alarm(row + 2, "off", "the position is off by 5 mm where 0.3 mm is expected; measure it again.", True)
-        for row in np.flatnonzero(alarmed).tolist()
+        Alarm(row + 2, "off", f"line {row + 2}: {said}", True) for row in np.flatnonzero(alarmed).tolist()
     )
     more = NextPose(rows + 1, POSES, plan[rows], check=rows % 6 == 5) if rows < POSES else None
     measure = Advice("measure", "Measure the next pose: the limit of 0.15 mm is not reached yet.")
