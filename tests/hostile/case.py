@@ -21,12 +21,14 @@ class Case:
         arguments: of the command, which runs in the folder of the case.
         truth: clean measurements whose other rows a model is held against; None where there is no truth.
         healthy: nothing is wrong with it, so that it has to be accepted.
+        check: says what is wrong with what the accepted command wrote into the folder; "" where nothing is.
     """
 
     what: str
     arguments: tuple[str, ...]
     truth: CleanRows | None = None
     healthy: bool = False
+    check: Callable[[Path], str] | None = None
 
 
 Generator = Callable[[Rng, Clean, Path], Case]

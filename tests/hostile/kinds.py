@@ -6,6 +6,7 @@ import numpy as np
 from hostile.case import Case, Generator
 from hostile.clean import Clean
 from hostile.documents import drawn_robot, wrong_recipe, wrong_robot
+from hostile.exports import wrong_export
 from hostile.folders import wrong_model
 from hostile.healthy import healthy_robot, measured_robot
 from hostile.options import wrong_calibrate, wrong_ik, wrong_judging
@@ -27,6 +28,7 @@ KINDS: dict[str, tuple[Generator, int]] = {
     "options of calibrate": (wrong_calibrate, 12),
     "options of ik": (wrong_ik, 16),
     "options of others": (wrong_judging, 14),
+    "exports": (wrong_export, 20),
 }
 """By kind its generator and its share: those that are read or refused at once are most of them."""
 

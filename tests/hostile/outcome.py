@@ -113,6 +113,8 @@ def attempt(case: Case, folder: Path) -> Outcome:
     if result.exit_code:
         ending = Ending.REFUSED if result.exit_code == 2 else Ending.NOT_TRUSTED
         return Outcome(Ending.FALSE_ALARM if case.healthy else ending, result.stderr)
+    if case.check is not None and (wrong := case.check(folder)):
+        return Outcome(Ending.INACCURATE, wrong)
     return _accuracy(case.truth, calibrations[0]) if calibrations and case.truth else Outcome(Ending.RIGHT)
 
 

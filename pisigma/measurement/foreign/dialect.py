@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from typing import get_args
 
 from pisigma.errors import MeasurementError
+from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
 from pisigma.measurement.foreign.number_format import Decimal, NumberFormat, is_missing
 
 SEPARATORS = ("\t", ";", ",", "|", " ")
@@ -49,6 +50,15 @@ class Dialect:
         cells = line.split() if self.separator == " " else line.split(self.separator)
         return [cell.strip() for cell in cells]
 
+    def is_row(self, cells: Sequence[str]) -> bool:
+        """Say whether cells are a row: two numbers or more, or one and else what says that nothing was measured."""
+        if not 2 <= len(cells) <= MOST_COLUMNS:
+            return False
+        if cells[0].startswith(("#", "%", ";", "!")):
+            return cells[0] in SPREADSHEET_ERRORS
+        numeric = sum(map(self.is_number, cells))
+        return numeric >= 2 or (numeric == 1 and sum(map(is_missing, cells)) >= len(cells) - 2)
+
     def is_number(self, cell: str) -> bool:
         """Say whether a cell holds a number."""
         return self.numbers.text(cell) is not None
@@ -85,14 +95,10 @@ def sniff(lines: Sequence[str], source: str, decimal: Decimal | None = None) -> 
 def _score(dialect: Dialect, lines: Sequence[str]) -> float:
     """Share of the lines that are rows of one width, times the share of their cells that are surely numbers."""
     rows = [dialect.split(line) for line in lines]
-    numeric = [row for row in rows if 2 <= len(row) <= MOST_COLUMNS and _numbers(dialect, row) >= 2]
+    numeric = [row for row in rows if dialect.is_row(row)]
     if not numeric:
         return 0.0
     width = Counter(map(len, numeric)).most_common(1)[0][0]
     cells = [cell for row in numeric if len(row) == width for cell in row if not is_missing(cell)]
     certain = sum(map(dialect.numbers.certainty, cells))
     return len([row for row in numeric if len(row) == width]) / len(rows) * certain / len(cells)
-
-
-def _numbers(dialect: Dialect, row: Sequence[str]) -> int:
-    return sum(map(dialect.is_number, row))

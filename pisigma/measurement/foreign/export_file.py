@@ -8,12 +8,14 @@ from dataclasses import dataclass
 from pisigma.errors import MeasurementError, printable
 from pisigma.files.input_file import read_input
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
-from pisigma.measurement.foreign.dialect import COMMENT, MOST_COLUMNS, Dialect, sniff
+from pisigma.measurement.foreign.dialect import COMMENT, Dialect, sniff
 from pisigma.measurement.foreign.headings import is_recognised
-from pisigma.measurement.foreign.number_format import Decimal, is_missing
+from pisigma.measurement.foreign.number_format import Decimal
 from pisigma.measurement.foreign.text_encoding import decoded
 from pisigma.measurement.foreign.units import unit_symbol
 
+LONGEST_LINE = 100_000
+"""Characters of a line; a thousand columns have fewer."""
 _Lines = list[tuple[int, str]]
 
 
@@ -67,14 +69,19 @@ def read_export(path: str | os.PathLike[str], decimal: Decimal | None = None) ->
     source = printable(str(path), cut=False)
     text = decoded(read_input(path, MeasurementError), source)
     lines = [(number, line) for number, line in enumerate(text.split("\n"), start=1) if line.strip()]
+    for number, line in lines:
+        if len(line) > LONGEST_LINE:
+            raise MeasurementError(
+                f"{source}, line {number}: has {len(line):,} characters; one line per measurement was wanted."
+            )
     dialect = sniff([line for _, line in lines], source, decimal)
     rows = [(number, dialect.split(line)) for number, line in lines]
-    width = Counter(len(row) for _, row in rows if _is_row(dialect, row, len(row))).most_common(1)[0][0]
-    first = next(i for i, (_, row) in enumerate(rows) if _is_row(dialect, row, width))
+    width = Counter(len(row) for _, row in rows if dialect.is_row(row)).most_common(1)[0][0]
+    first = next(i for i, (_, row) in enumerate(rows) if len(row) == width and dialect.is_row(row))
     headings, units, comments = _read_top(lines[:first], dialect, width, source)
     records, numbers, skipped = [], [], []
     for (number, row), (_, line) in zip(rows[first:], lines[first:], strict=True):
-        if _is_row(dialect, row, width) or (len(row) == width and _is_content(line, row, headings)):
+        if len(row) == width and (dialect.is_row(row) or _is_content(line, row, headings)):
             records.append(row)
             numbers.append(number)
         elif any(row):
@@ -93,16 +100,6 @@ def read_export(path: str | os.PathLike[str], decimal: Decimal | None = None) ->
         dialect=dialect,
         skipped=tuple(skipped),
     )
-
-
-def _is_row(dialect: Dialect, row: list[str], width: int) -> bool:
-    """Whether cells are a row of a width: two numbers or more, or numbers and what stands for them."""
-    if len(row) != width or not 2 <= width <= MOST_COLUMNS:
-        return False
-    if row[0].startswith(("#", "%", ";", "!")):
-        return row[0] in SPREADSHEET_ERRORS
-    numeric = sum(map(dialect.is_number, row))
-    return numeric >= 2 or (numeric >= 1 and numeric + sum(map(is_missing, row)) >= width - 1)
 
 
 def _is_content(line: str, row: list[str], headings: list[str]) -> bool:
@@ -160,7 +157,7 @@ def _read_top(
 def _heading_cells(line: str, dialect: Dialect, width: int) -> list[str]:
     """The cells of a heading, which may begin as a comment, end with a separator or have blanks before its units."""
     bare = COMMENT.sub("", line, count=1) if COMMENT.match(line) else line
-    for text in (line, bare, re.sub(r"\s+(?=[\[(])", "", bare)):
+    for text in (line, bare, re.sub(r"(?<!\s)\s+(?=[\[(])", "", bare)):
         cells = dialect.split(text)
         if len(cells) == width + 1 and not cells[-1]:
             cells = cells[:-1]

@@ -3,6 +3,7 @@
 import re
 from dataclasses import dataclass
 
+from pisigma.errors import LONGEST_WORD
 from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.foreign.rotations import ROTATIONS
 from pisigma.measurement.foreign.units import unit_symbol
@@ -42,7 +43,9 @@ class Heading:
 
 
 def parse_heading(text: str) -> Heading:
-    """Take a heading apart."""
+    """Take a heading apart; one that is longer than headings are means nothing."""
+    if len(text) > LONGEST_WORD:
+        return Heading(text, "", "")
     column = find_column(text.strip().lower())
     if column is not None:
         return Heading(text, column.quantity, column.unit, is_column=True)

@@ -50,6 +50,9 @@ UNITS: dict[str, ForeignUnit] = {
 }
 """By symbol; a unit more is one line."""
 
+_LONGEST_COMMENT = 500
+"""Characters of a comment that are looked at."""
+
 _SYMBOLS = {name: symbol for symbol, unit in UNITS.items() for name in (symbol, *unit.spellings.split())}
 _SAID = re.compile(
     r"(?i)\b(?:units?|einheit(?:en)?|lengths?|angles?|distances?|joints?|coordinates?|positions?|values)\b(.*)"
@@ -70,7 +73,7 @@ def stated_units(comments: Sequence[str]) -> dict[UnitKind, str]:
     """
     stated: dict[UnitKind, str] = {}
     for comment in comments:
-        rest = comment
+        rest = comment[:_LONGEST_COMMENT]
         while said := _SAID.search(rest):
             rest = said[1]
             for word in re.split(r"[\s,;:=/()\[\]]+", rest):
