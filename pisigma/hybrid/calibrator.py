@@ -18,7 +18,7 @@ from pisigma.hybrid.mini_batches import MANY_ROWS, MiniBatches, batch_checkpoint
 from pisigma.hybrid.refinement import Refined, linearised, refine, with_frames_of
 from pisigma.hybrid.regression import regression
 from pisigma.hybrid.result import HybridResult, LearnedPart
-from pisigma.hybrid.search import LARGEST_EFFECTIVE_SHARE, Choice, Search
+from pisigma.hybrid.search import FIRST_MODEL_SIZES, Choice, Search
 from pisigma.hybrid.sensor_values import sensor_values
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
@@ -41,8 +41,6 @@ SEARCHED_ROWS = 4_000
 """Features are chosen on so many rows at most; everything is fitted to all in the end."""
 GROSS = 50.0
 """[standard deviations of the geometric calibration] Rows that are farther off take no part in the first model."""
-FIRST_MODEL_SIZES = 3
-"""The first model has all features, one that comes in several sizes in the last of so many."""
 
 
 @dataclass(frozen=True)
@@ -136,7 +134,7 @@ class HybridCalibrator:
             refined, trained = refine_in_batches(
                 solved, few, group, batches=batches, progress=progress, checkpoints=kept
             )
-        if refined.regression.effective_share(refined.posterior) > LARGEST_EFFECTIVE_SHARE:
+        if refined.regression.effective_share(refined.posterior) > choice.best.largest_share:
             verdict = (
                 "A joint correction would take up nearly all that the few rows say, so the geometric calibration "
                 "stands; measure more poses."

@@ -102,6 +102,12 @@ class Design:
             following += count
         return GaussianPrior(torch.cat(base), torch.cat(group), torch.cat(sizes), classes)
 
+    def usual_prior(self, prior_scale: Sequence[float]) -> GaussianPrior:
+        """The prior of all unknowns with the weights' `usual_sizes`."""
+        prior = self.prior(prior_scale)
+        sizes = [size for chosen in self.features for size in chosen.usual_sizes]
+        return replace(prior, sizes=torch.cat([prior.sizes[: prior.classes], prior.sizes.new_tensor(sizes)]))
+
     def prior_like(self, other: "Design", prior: GaussianPrior) -> GaussianPrior:
         """The prior with sizes to start from that another design's fit came to; new bands as its last one."""
         prior_here = self.prior(prior.sizes[: prior.classes].tolist())

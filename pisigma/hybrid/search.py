@@ -18,12 +18,20 @@ CLEARLY = 5.0
 """The log evidence has to rise by so much (a Bayes factor of 150: very strong, Kass and Raftery 1995)."""
 LARGEST_EFFECTIVE_SHARE = 0.75
 """Unknowns may use up so much of the values, or the noise cannot be separated from them."""
+LARGEST_USUAL_SHARE = 0.97
+"""The same where the sizes of the weights start with the usual ones, which hold what few values do not determine."""
+USUAL_UPDATES = 5
+"""Updates of the usual sizes: more are not worth their time, as few values say little of them."""
 ROUGHLY = 1.0
 """While features are chosen, a log evidence that rises by less has settled."""
 MOST_GROUPS = 400
 """So many groups of rows are held out at most."""
 FEW_GROUPS = 200
 """Up to so many there are more folds."""
+FEW_TOGETHER = 100
+"""Up to so many groups all features are tried together as well, from the usual sizes of their weights."""
+FIRST_MODEL_SIZES = 3
+"""A model with all features has one that comes in several sizes in the last of so many."""
 FOLDS_OF_FEW = 20
 FAILURES = 3
 """Sizes that do not help before no larger ones are tried."""
@@ -59,10 +67,12 @@ class Fitted:
     Attributes:
         design: the unknowns.
         posterior: of them.
+        largest_share: of the values that the unknowns may use up.
     """
 
     design: Design
     posterior: Posterior
+    largest_share: float = LARGEST_EFFECTIVE_SHARE
 
     @property
     def name(self) -> str:
@@ -152,6 +162,9 @@ class Search:
     ) -> Choice:
         """Geometry alone, then other features, then ever larger ones, as long as it gets better.
 
+        One after the other, features of few rows do not stand out from the noise that the others leave; so these are
+        tried all together as well.
+
         Args:
             growing: of one name, ever larger.
             others: tried before them, and those that did not help once more after them.
@@ -170,6 +183,9 @@ class Search:
         for chosen in others if grown else ():
             if chosen not in before:
                 best = self._tried([chosen, *best.design.features], best)
+        together = [*others, *growing[:FIRST_MODEL_SIZES][-1:]]
+        if len(together) > 1 and self.rows.groups <= FEW_TOGETHER:
+            best = self._from_usual_sizes(together, best)
         for chosen in last:
             gain, sizes = self._regression.first_sizes(best.posterior, best.design, chosen)
             if gain > CLEARLY / 2:
@@ -190,6 +206,28 @@ class Search:
             and left_out < self._least * LEVEL
             and self._regression.effective_share(tried.posterior) < LARGEST_EFFECTIVE_SHARE
         )
+        self._note(tried, left_out / self._unit, began, better)
+        if better:
+            self._least = min(self._least, left_out)
+        return tried if better else best
+
+    def _from_usual_sizes(self, features: Sequence[AbstractFeature], best: Fitted) -> Fitted:
+        """The better of all features with weights of about the usual sizes and the best so far.
+
+        Half the usual evidence is enough, or any with left-out rows that are clearly predicted better: few rows show
+        no more.
+        """
+        self.progress(" + ".join(chosen.label for chosen in features))
+        began = time.monotonic()
+        design = Design(self.rows.problem, tuple(features))
+        fit = self._regression.select(design)
+        posterior = fit.maximise_evidence(design.usual_prior(self.prior_scale), self.noise, USUAL_UPDATES)
+        left_out = fit.left_out(posterior, self._folds).rms(posterior.noise, self.noise)
+        gain = posterior.log_evidence - best.posterior.log_evidence
+        better = fit.effective_share(posterior) < LARGEST_USUAL_SHARE and (
+            gain > CLEARLY / 2 or (gain > 0 and left_out < self._least / LEVEL)
+        )
+        tried = Fitted(design, posterior, LARGEST_USUAL_SHARE)
         self._note(tried, left_out / self._unit, began, better)
         if better:
             self._least = min(self._least, left_out)

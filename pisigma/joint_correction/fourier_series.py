@@ -39,7 +39,7 @@ BAND_SIZES = (
 Between the sizes that maximise the evidence of hybrid calibrations of the measured UR5, UR10 and FANUC R-2000iC and of
 simulated arms whose gears err by 0.26 mrad with harmonics 1, 2 and 7."""
 USUAL_HARMONICS = 56
-"""Series of so many are expected before anything is measured."""
+"""Series of so many are tried with any number of rows, as few rows are fitted with `BAND_SIZES`."""
 
 
 class SeriesSection(FeatureSection):
@@ -149,8 +149,8 @@ class FourierSeries(AbstractFeature):
     def candidates(
         cls, robot: Robot, options: FeatureOptions, state: JointState
     ) -> tuple["FourierSeries", ...]:
-        """Series of ever more harmonics, not many more than there are different joint values."""
-        most = max(2 * options.configurations, min(options.harmonics))
+        """Series of ever more harmonics, from `USUAL_HARMONICS` on not many more than there are joint values."""
+        most = max(2 * options.configurations, min(options.harmonics), USUAL_HARMONICS)
         return tuple(FourierSeries(robot, k) for k in options.harmonics if k <= most)
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
