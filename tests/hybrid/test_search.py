@@ -8,10 +8,11 @@ import torch
 from testing.closeness import assert_close
 from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data
 
-from pisigma.hybrid.search import CLEARLY, Search
+from pisigma.hybrid.search import CLEARLY, LARGEST_USUAL_SHARE, Search
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.input_products import InputProducts
+from pisigma.measurement.conditions import JointState
 from pisigma.robot import Robot
 
 ROBOT = Robot.load("rb5")
@@ -87,6 +88,21 @@ def test_products_come_last_and_stay_where_they_help(products: LinearisedArm) ->
         for values in (moved - expected, expected)
     )
     assert float(off / whole) < 0.3
+
+
+def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
+    """One after the other they do not stand out from the noise that the others leave."""
+    q = drawn_joints(ROBOT, 26, 7)
+    weights = torch.randn(SMALL.used.shape, generator=torch.Generator().manual_seed(0)) * SMALL.used
+    gravity = 2e-4 * (SMALL.columns(JointState(q)) * weights).sum(-1)
+    gears = torch.stack([2e-4 * (k * q + torch.arange(6) * k).sin() for k in (1, 2, 6)]).sum(0)
+    search = search_of(rows_of(gravity + gears, q))
+    best = search.best(SERIES, [SMALL]).best
+    assert best.name == "gravity + series 6"
+    assert best.largest_share == LARGEST_USUAL_SHARE
+    *before, together = search.trials
+    assert together.log_evidence > max(line.log_evidence for line in before) + CLEARLY
+    assert together.left_out < 0.7 * min(line.left_out for line in before if line.kept)
 
 
 def test_what_does_not_help_leaves_the_geometry() -> None:

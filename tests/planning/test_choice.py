@@ -2,13 +2,13 @@
 
 import pytest
 import torch
+from testing.closeness import assert_close
 
 from pisigma.errors import PlanningError
 from pisigma.planning.choice import Choice, Criterion, choose, condensed
 from pisigma.planning.expected_accuracy import curve, p95_of, remaining_errors, rms_of
 from pisigma.planning.knowledge import Knowledge
 from pisigma.robot import Robot
-from tests.testing.closeness import assert_close
 
 
 def random_joints(count: int, seed: int) -> torch.Tensor:

@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 import torch
+from testing.closeness import assert_close
 
 from pisigma.errors import MeasurementError
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.knowledge import Instrument, Knowledge
 from pisigma.robot import Robot
-from tests.testing.closeness import assert_close
+from pisigma.se3 import rotation_from_vector
 
 
 def random_joints(robot: Robot, count: int, seed: int) -> torch.Tensor:
@@ -74,8 +75,6 @@ def test_rows_surprise_as_chi_squared_and_wrong_ones_more(robot: Robot) -> None:
     numbers = torch.randn(spread.shape[2], generator=generator, dtype=torch.float64)
     off = spread @ numbers + torch.randn(400, 6, generator=generator, dtype=torch.float64)
     position = T[:, :3, 3] + off[:, :3] * 1e-4
-    from pisigma.se3 import rotation_from_vector
-
     rotation = rotation_from_vector(off[:, 3:] * 2e-4) @ T[:, :3, :3]
     surprise = knowledge.surprise(Measurements(q=q, position=position, rotation=rotation))
     assert 0.8 < float(surprise.square().mean()) < 1.2
