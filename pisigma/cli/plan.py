@@ -40,7 +40,9 @@ Box = Annotated[
 ]
 Task = Annotated[
     Path | None,
-    typer.Option(help="CSV file of joint values where the robot shall be accurate. [default: everywhere]"),
+    typer.Option(
+        help="CSV file of joint values or poses where the robot shall be accurate. [default: everywhere]"
+    ),
 ]
 Measured = Annotated[Path | None, typer.Option(help="Measurements that are there already (CSV).")]
 SensorKind = Annotated[str, typer.Option("--sensor", help="What is measured: position, pose or distance.")]
@@ -130,6 +132,7 @@ def _print(planned: "Plan", files: list[Path]) -> None:
     settings = planned.stored.settings
     if settings.limit_mm is not None:
         needed = "needs more poses" if planned.needed is None else f"is expected with {planned.needed} poses"
+        needed = needed if planned.needed != 0 else "is expected already, without more poses"
         print_lines([f"An RMS of {settings.limit_mm:g} mm {needed}."])
     print_line("What the expected error will mostly come from:")
     print_lines((f"- {line}" for line in planned.weak), indent="  ")

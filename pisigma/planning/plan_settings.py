@@ -39,7 +39,8 @@ class PlanSettings:
         candidates: poses that are drawn to choose from.
         candidates_from: file of joint values to choose from instead.
         box_mm: lowest and then highest x, y, z in the robot's base frame where the reflector is measured [mm].
-        task: file of joint values at which the robot is to be accurate; None for wherever it can be measured.
+        task: file of joint values, or of poses of the drawing's or the model's tool, where the robot is to be accurate;
+            None for wherever it can be measured.
         measured: file of rows that are measured already.
         seed: of what is drawn.
         speed_deg_s: of the joints that turn, from pose to pose [deg/s].

@@ -16,7 +16,6 @@ from pisigma.export.programs.planned import planned_program
 from pisigma.files.conflicts import Input
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.judging.progress import Progress
-from pisigma.measurement.csv.reading import read_joints
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
@@ -28,6 +27,7 @@ from pisigma.planning.expected_accuracy import ExpectedAccuracy, RemainingError,
 from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_file import StoredPlan, yaml_of
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.task import drawn_model, read_task
 from pisigma.planning.tour import Tour, tour
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert, transform_from_xyzrpy
@@ -36,6 +36,8 @@ STEP = 10
 """Poses between two points of the curve."""
 TASK_POSES = 300
 """Joint values that stand for the task, where more are stated or none."""
+STARTS = 200
+"""Joint values that the inverse kinematics of a drawn robot without a closed form starts from."""
 WEAK = 0.1
 """Share of the variance that remains from which on what causes it is named."""
 ROUNDS = 3
@@ -252,7 +254,7 @@ def plan(
     candidates.check_count(settings.count + settings.check)
     progress("what is known")
     knowledge = subject.knowledge(arm, settings)
-    task = _task(arm, settings, candidates)
+    task = _task(subject, settings, arm, candidates)
     criterion = settings.criterion or ("D" if subject.model is None and settings.measured is None else "I")
     allowed = torch.ones(len(candidates.q), dtype=torch.bool)
     for _ in range(ROUNDS):
@@ -283,9 +285,13 @@ def plan(
     )
 
 
-def _task(arm: ArmInCell, settings: PlanSettings, candidates: Candidates) -> Float64[Tensor, "tasks dof"]:
+def _task(
+    subject: Subject, settings: PlanSettings, arm: ArmInCell, candidates: Candidates
+) -> Float64[Tensor, "tasks dof"]:
     """Joint values [rad or m] where the robot shall be accurate: of the task's file, or where it can be measured."""
-    q = candidates.q if settings.task is None else read_joints(settings.task, arm.robot)
+    q = candidates.q
+    if settings.task is not None:
+        q = read_task(settings.task, subject.model or drawn_model(arm.drawn, q[:STARTS]))
     some = torch.linspace(0, len(q) - 1, min(len(q), TASK_POSES)).round().long()
     return q[some]
 

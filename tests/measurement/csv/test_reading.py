@@ -44,6 +44,17 @@ def test_si_units_stay_as_they_are(write):
     assert_close(measurements.position, [[1.0, 2.0, 3.0]])
 
 
+def test_what_a_plan_says_of_its_poses_is_not_read(write):
+    rows = "q1_deg,order,x_mm,y_mm,z_mm,candidate\n1,1,1,2,3,17\n1,2,1,2,4,\n"
+    plain = "q1_deg,x_mm,y_mm,z_mm\n1,1,2,3\n1,1,2,4\n"
+    assert (
+        Measurements.read_csv(write(rows)).content_hash()
+        == Measurements.read_csv(write(plain)).content_hash()
+    )
+    with pytest.raises(MeasurementError, match="line 4, all columns: the row equals line 2"):
+        Measurements.read_csv(write(rows + "1,3,1,2,3,18\n"))
+
+
 def test_columns_stand_in_any_order(write):
     path = write("set,z_mm,q2_deg,target,x_mm,q1_deg,frame,y_mm\ntrain,3,2,A,1,1,cell,2\n")
     measurements = Measurements.read_csv(path)

@@ -1,0 +1,51 @@
+"""Where a robot is to be accurate: joint values, or poses of its tool, from a file."""
+
+import os
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.errors import PlanningError
+from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.kinematics.status import Status
+from pisigma.measurement.csv.columns import find_column
+from pisigma.measurement.csv.poses import read_poses
+from pisigma.measurement.csv.reading import read_joints
+from pisigma.measurement.csv.table import read_table
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.robot.description import Robot
+
+REACHED = (Status.REACHED, Status.OUTSIDE_DOMAIN)
+
+
+def read_task(path: str | os.PathLike[str], model: CalibratedModel) -> Float64[Tensor, "tasks dof"]:
+    """Read joint values [rad or m], or poses that the inverse kinematics turns into joint values.
+
+    Args:
+        path: a CSV file with the columns of joint values, or of wanted poses (see `read_poses`).
+        model: of the robot; poses are of its tool, in its base frame.
+
+    Raises:
+        MeasurementError: the file cannot be used; the message names file, line and column.
+        PlanningError: a pose cannot be reached; the message names its line.
+    """
+    if any(column.joint for name in read_table(path).header if (column := find_column(name))):
+        return read_joints(path, model.robot)
+    poses = read_poses(path)
+    solution = CorrectedIK(model)(poses.T)
+    for line, status in zip(poses.line, map(Status, solution.status.tolist()), strict=True):
+        if status not in REACHED:
+            raise PlanningError(f"{path}, line {line}: {status.name.lower()}. {status.sentence}")
+    q: Tensor = torch.as_tensor(solution.q)
+    return q
+
+
+def drawn_model(robot: Robot, starts: Float64[Tensor, "starts dof"]) -> CalibratedModel:
+    """A robot as drawn as a model, for its inverse kinematics.
+
+    Args:
+        robot: as drawn.
+        starts: joint values [rad or m] that a numeric inverse starts from.
+    """
+    return CalibratedModel(robot.name, "as drawn", robot, None, None, (), starts)
