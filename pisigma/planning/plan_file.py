@@ -122,7 +122,7 @@ class StoredPlan:
         document["cell"] = self.arm.cell.model_dump(mode="json", exclude_none=True)
         points = enumerate(map(self._in_file_units, self.way_points), start=1)
         document["way_points"] = [{"before": n, "joints": joints} for n, rows in points for joints in rows]
-        return document | {"robot": robot_document(self.arm.robot)}
+        return document | {"robot": robot_document(self.arm.drawn)}
 
 
 def joint_columns(robot: Robot) -> list[str]:

@@ -40,6 +40,7 @@ class RowSection(ParameterSection):
     direction: Literal[1, -1] = 1
     limits_deg: Limits | None = None
     limits_mm: Limits | None = None
+    drawn_at_mm: tuple[Bounded, Bounded, Bounded] = (0.0, 0.0, 0.0)
 
     @model_validator(mode="after")
     def _limits_fit_type(self) -> "RowSection":
@@ -66,7 +67,9 @@ class RowSection(ParameterSection):
             lower, upper = np.array(self.limits_mm) / 1e3
         else:
             lower, upper = -np.inf, np.inf
-        return Row(self.name, self.type, self.direction, float(lower), float(upper))
+        x, y, z = self.drawn_at_mm
+        drawn_at = x / 1e3, y / 1e3, z / 1e3
+        return Row(self.name, self.type, self.direction, float(lower), float(upper), drawn_at)
 
 
 class FrameSection(Section):

@@ -1,7 +1,7 @@
 """What a serial robot is written down as: DH + Hayati rows with their joints, base and tool, in SI units."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -51,6 +51,8 @@ class Row:
         direction: +1 or -1: how the controller counts; the joint moves by `direction · q`.
         lower: smallest joint value [rad or m], as the controller counts; -inf where there is no limit.
         upper: largest joint value [rad or m].
+        drawn_at: where the joint is drawn, in the frame before the row [m], which a URDF file says; the motion does not
+            depend on it.
     """
 
     name: str
@@ -58,6 +60,7 @@ class Row:
     direction: int = 1
     lower: float = -np.inf
     upper: float = np.inf
+    drawn_at: tuple[float, float, float] = field(default=(0.0, 0.0, 0.0), compare=False)
 
     @property
     def file_unit(self) -> str:

@@ -69,12 +69,21 @@ def rows_of_chain(chain: Chain) -> ChainRows:
         name=chain.name,
         maker="not stated",
         source=f"URDF file {Path(chain.source).name}, from link '{chain.base}' to link '{chain.tip}'",
-        rows=tuple(Row(j.name, j.type, _direction(j), j.lower, j.upper) for j in joints),
+        rows=tuple(
+            Row(j.name, j.type, _direction(j), j.lower, j.upper, _drawn_at(frame))
+            for j, frame in zip(joints, frames, strict=True)
+        ),
         dh=np.array(dh),
         base=xyzrpy_of(frame),
         tool=xyzrpy_of(inverse(row_frame(*dh[-1])) @ T_row_tip),
     )
     return ChainRows(drawing, tuple(frames))
+
+
+def _drawn_at(frame: Frame) -> tuple[float, float, float]:
+    """Where a joint's origin is in the frame of its row [m], which is given in that of the joint."""
+    x, y, z = (clean_length(value) for value in inverse(frame)[:3, 3])
+    return x, y, z
 
 
 def _direction(joint: ChainJoint) -> int:

@@ -34,6 +34,7 @@ def robot_document(robot: Robot) -> dict[str, object]:
     rows = []
     for row, parameters in zip(robot.rows, robot.dh, strict=True):
         entry: dict[str, object] = {"name": row.name, "type": row.type, "direction": row.direction}
+        entry |= {"drawn_at_mm": [value * 1e3 for value in row.drawn_at]} if any(row.drawn_at) else {}
         rows.append(entry | _limits_entry(row) | in_file_units(DH_COLUMNS, parameters))
     document: dict[str, object] = {
         "name": robot.name,

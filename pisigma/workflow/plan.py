@@ -155,7 +155,7 @@ class Subject:
     """What is planned for.
 
     Attributes:
-        robot: as drawn, with the tool of the model where there is one.
+        robot: as drawn.
         model: None for a robot that was not calibrated yet.
         folder: of the model; None where it is in memory only, or there is none.
     """
@@ -191,7 +191,13 @@ class Subject:
             raise PlanningError(
                 f"model '{subject.name}' does not say how the robot is drawn; plan for its robot instead."
             )
-        return Subject(subject.drawn.with_geometry(tool=subject.identified.tool), subject)
+        return Subject(subject.drawn, subject)
+
+    def arm(self, cell: Cell | None) -> ArmInCell:
+        """The robot in its cell, with the reflector where the cell says, or else where the model has its tool."""
+        if self.model is None or (cell is not None and cell.tool is not None):
+            return ArmInCell.of(self.robot, cell)
+        return ArmInCell.of(self.robot.with_geometry(tool=self.model.identified.tool), cell)
 
     def knowledge(self, arm: ArmInCell, settings: PlanSettings) -> Knowledge:
         """What is known before the first pose of the plan is measured.
@@ -248,7 +254,7 @@ def plan(
     subject = subject if isinstance(subject, Subject) else Subject.of(subject)
     if cell is not None and not isinstance(cell, Cell):
         cell = read_cell(cell, subject.robot)
-    arm = ArmInCell.of(subject.robot, cell)
+    arm = subject.arm(cell)
     progress("candidates")
     candidates = settings.find_candidates(arm)
     candidates.check_count(settings.count + settings.check)

@@ -46,7 +46,7 @@ def test_a_tour_goes_on_from_where_the_robot_stands():
 
 
 def test_every_motion_touches_nothing():
-    arm = ArmInCell.of(ARM.robot, CELL.model_copy(update={"tracker": None, "reflector": None}))
+    arm = ArmInCell.of(ARM.drawn, CELL.model_copy(update={"tracker": None, "reflector": None}))
     pool = draw_candidates(arm, 60, 0).q
     way = tour(arm, pool[:5], PACE, pool)
     assert not len(way.left_out)

@@ -54,7 +54,8 @@ class ArmInCell:
     """A robot in its cell.
 
     Attributes:
-        robot: as drawn, with the reflector as its tool; its base is that of the cell.
+        drawn: the robot as drawn; its base is that of the cell.
+        robot: the same with the reflector as its tool.
         cell: what stands around it.
         capsules: along its links.
         pairs: of pieces of links that may touch each other.
@@ -63,6 +64,7 @@ class ArmInCell:
         limits: of the joints, with their margins [rad or m].
     """
 
+    drawn: Robot
     robot: Robot
     cell: Cell
     capsules: Capsules
@@ -76,6 +78,7 @@ class ArmInCell:
         cell = cell or Cell()
         capsules = cell.capsules(robot)
         return ArmInCell(
+            robot,
             capsules.robot,
             cell,
             capsules,
@@ -112,6 +115,7 @@ class ArmInCell:
         for index, row in enumerate(self.robot.rows):
             bounds = [abs(bound) for bound in (row.lower, row.upper) if math.isfinite(bound)]
             strokes[index] = max(bounds, default=0.0) if row.type == "prismatic" else 0.0
+            strokes[index] += float(np.linalg.norm(row.drawn_at))
         lengths = np.append(np.hypot(d + strokes, self.robot.dh[:, 2]), np.linalg.norm(self.robot.tool[:3]))
         beyond = np.cumsum(lengths[::-1])[::-1][list(self.robot.joint_rows)]
         return torch.from_numpy(np.where(self.robot.revolute, beyond, 1.0))

@@ -1,7 +1,9 @@
 """Capsules along the links of a robot: what of it must not touch anything."""
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -12,7 +14,7 @@ from pisigma.kinematics.components import as_transform
 from pisigma.kinematics.forward import Geometry, iterate_rows
 from pisigma.planning.cell.distances import segment_distance
 from pisigma.robot.description import Robot
-from pisigma.robot.urdf_frames import turn
+from pisigma.robot.urdf_frames import inverse, row_frame
 
 RADIUS_SHARES = (0.05, 0.05, 0.05, 0.035)
 """Radius of links where none is stated, from the first joint on, as a share of the length of the drawn arm; the last
@@ -30,7 +32,8 @@ class Capsules:
     """Pieces of the links as line segments with a radius, each fixed to two frames of the robot.
 
     A row of the drawing leads from its joint along the joint's axis by d, and then by a to the next row: these are
-    the pieces of its link. The last one is the tool.
+    the pieces of its link. A URDF file says where joints are, so its links are straight from joint to joint. The last
+    piece is the tool.
 
     Attributes:
         robot: as drawn, with the tool.
@@ -51,6 +54,7 @@ class Capsules:
     @staticmethod
     def of(
         robot: Robot,
+        tip: Float64[np.ndarray, " 3"] | None = None,
         radius: float | None = None,
         radii: Mapping[str, float] | None = None,
         tool_radius: float = TOOL_RADIUS,
@@ -58,40 +62,39 @@ class Capsules:
         """Lay capsules along the drawing.
 
         Args:
-            robot: as drawn, with its tool.
+            robot: as drawn, with the reflector as its tool.
+            tip: where the tool of the drawing is in the frame behind the last row [m], between which and the reflector
+                there is the reflector's bracket; None where it is that frame.
             radius: of all links [m]; None for `RADIUS_SHARES` of the arm's length.
             radii: of single links by the names of their rows [m].
             tool_radius: of the tool [m].
         """
-        arm_length = float(np.hypot(robot.dh[:, 1], robot.dh[:, 2]).sum())
-        moving = np.cumsum([row.type != "fixed" for row in robot.rows])
-        zeros = np.zeros(3)
-        pieces = []
-        for i, (row, (_, d, a, alpha, beta)) in enumerate(zip(robot.rows, robot.dh.tolist(), strict=True)):
-            strokes = [
-                bound for bound in (row.lower, row.upper) if row.type == "prismatic" and np.isfinite(bound)
-            ]
-            axis_length = max((abs(d + row.direction * q) for q in strokes), default=abs(d))
-            corner = _turned_back(alpha, beta, np.array([-a, 0.0, 0.0]))
-            share = RADIUS_SHARES[min(max(moving[i], 1), len(RADIUS_SHARES)) - 1]
-            size = (radii or {}).get(row.name, share * arm_length if radius is None else radius)
-            carrier = moving[i] <= 1
-            pieces.append(((i, i + 1), (zeros, corner), moving[i], size, carrier, axis_length))
-            pieces.append(((i + 1, i + 1), (corner, zeros), moving[i], size, False, abs(a)))
-        tool, last = robot.tool[:3], len(robot.rows)
-        length = float(np.linalg.norm(tool))
-        pieces.append(((last, last), (zeros, tool), moving[-1], tool_radius, False, length))
-        frames, points, links, sizes, carriers = zip(
-            *(piece[:-1] for piece in pieces if piece[-1] > SHORTEST), strict=True
-        )
-        return Capsules(
+        tip = np.zeros(3) if tip is None else tip
+        pieces = [*_pieces_of_rows(robot, tip)]
+        last = len(robot.rows)
+        pieces.append(_Piece(last - 1, False, (last, last), (tip, robot.tool[:3])))
+        length = float(np.hypot(robot.dh[:, 1], robot.dh[:, 2]).sum())
+        link = np.cumsum([row.type != "fixed" for row in robot.rows])[[piece.row for piece in pieces]]
+        sizes = length * np.array(RADIUS_SHARES)[np.clip(link, 1, len(RADIUS_SHARES)) - 1]
+        sizes = np.full_like(sizes, radius) if radius is not None else sizes
+        stated = [(radii or {}).get(robot.rows[piece.row].name) for piece in pieces]
+        sizes = np.where([size is None for size in stated], sizes, np.array(stated, dtype=np.float64))
+        sizes[-1] = tool_radius
+        capsules = Capsules(
             robot,
-            torch.tensor(frames),
-            torch.from_numpy(np.array(points)),
-            torch.tensor(np.array(links), dtype=torch.int64),
-            torch.tensor(sizes, dtype=torch.float64),
-            torch.tensor(np.array(carriers, dtype=bool)),
+            torch.tensor([piece.frame for piece in pieces]),
+            torch.from_numpy(np.array([piece.point for piece in pieces])),
+            torch.from_numpy(link),
+            torch.from_numpy(sizes),
+            torch.tensor([piece.carrier for piece in pieces]),
         )
+        segments = capsules.segments(capsules.random_joints())
+        return capsules._of((segments[:, :, 1] - segments[:, :, 0]).norm(dim=-1).amax(0) > SHORTEST)
+
+    def _of(self, kept: Bool[Tensor, " pieces"]) -> "Capsules":
+        """The same with some of the pieces only."""
+        values = (self.frame, self.point, self.link, self.radius, self.carrier)
+        return Capsules(self.robot, *(value[kept] for value in values))
 
     def segments(self, q: Float64[Tensor, "*batch dof"]) -> Float64[Tensor, "*batch pieces 2 3"]:
         """Both ends of every piece [m], in the frame that poses are given in, at joint values q [rad or m]."""
@@ -127,7 +130,43 @@ class Capsules:
         return limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws
 
 
-def _turned_back(alpha: float, beta: float, point: np.ndarray) -> np.ndarray:
-    """A point of the frame before `RotX(alpha) · RotY(beta)` in the frame behind it [m]."""
-    result: np.ndarray = (turn(0, alpha) @ turn(1, beta))[:3, :3].T @ point
+class _Piece(NamedTuple):
+    """One piece of a link.
+
+    Attributes:
+        row: whose link it belongs to.
+        carrier: see `Capsules`.
+        frame: the frames that its ends are fixed to.
+        point: where these are in them [m].
+    """
+
+    row: int
+    carrier: bool
+    frame: tuple[int, int]
+    point: tuple[Float64[np.ndarray, " 3"], Float64[np.ndarray, " 3"]]
+
+
+def _pieces_of_rows(robot: Robot, tip: Float64[np.ndarray, " 3"]) -> Iterator[_Piece]:
+    """Pieces from joint to joint and to the tip: straight where the drawing says where joints are, else by d and a."""
+    has_seats = any(any(row.drawn_at) for row in robot.rows)
+    seats = [np.array(row.drawn_at) for row in robot.rows] + [tip if has_seats else np.zeros(3)]
+    first = robot.joint_rows[0]
+    if has_seats:
+        yield _Piece(0, True, (0, 0), (np.zeros(3), seats[0]))
+    for i, row in enumerate(robot.rows):
+        corners = [(i, seats[i]), (i + 1, seats[i + 1])]
+        if row.type == "prismatic":  # the joint's stroke, and then the link that slides
+            corners.insert(1, (i + 1, _behind(robot, i, seats[i])))
+        elif not has_seats:
+            corners.insert(1, (i + 1, _behind(robot, i, np.array([0.0, 0.0, robot.dh[i, 1]]))))
+        for number, (start, end) in enumerate(itertools.pairwise(corners)):
+            carrier = i < first or (i == first and number == 0 and len(corners) > 2)
+            yield _Piece(i, carrier, (start[0], end[0]), (start[1], end[1]))
+    if not has_seats:
+        yield _Piece(i, False, (i + 1, i + 1), (np.zeros(3), tip))
+
+
+def _behind(robot: Robot, row: int, point: Float64[np.ndarray, " 3"]) -> Float64[np.ndarray, " 3"]:
+    """A point of the frame before a row in the frame behind it, at the joint value 0 [m]."""
+    result: np.ndarray = (inverse(row_frame(*robot.dh[row].tolist())) @ np.append(point, 1.0))[:3]
     return result

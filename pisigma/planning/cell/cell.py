@@ -13,7 +13,7 @@ from pisigma.errors import PlanningError, RecipeError, nearest_choice
 from pisigma.planning.cell.capsules import TOOL_RADIUS, Capsules
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import Bounded, FrameSection, Limits
-from pisigma.se3 import rotation_from_rpy
+from pisigma.se3 import rotation_from_rpy, transform_from_xyzrpy, xyzrpy_from_transform
 from pisigma.simulation.errors.source import stated_joints
 from pisigma.yaml_file import Section, line_of, read_yaml
 
@@ -114,7 +114,7 @@ class LinkSection(Section):
 
 
 class ToolSection(FrameSection):
-    """Where the reflector is mounted, seen from the flange (the frame behind the last row), in mm and deg.
+    """Where the reflector is mounted, seen from the tool of the drawing (a URDF file's tip), in mm and deg.
 
     Attributes:
         radius_mm: of what carries it [mm].
@@ -201,7 +201,12 @@ class Cell(Section):
 
     def robot_with_tool(self, robot: Robot) -> Robot:
         """The robot with the reflector as its tool, where the cell says where that is."""
-        return robot if self.tool is None else robot.with_geometry(tool=self.tool.to_si())
+        if self.tool is None:
+            return robot
+        drawn, reflector = (
+            transform_from_xyzrpy(torch.tensor(tool)) for tool in (robot.tool, self.tool.to_si())
+        )
+        return robot.with_geometry(tool=xyzrpy_from_transform(drawn @ reflector).numpy())
 
     def capsules(self, robot: Robot) -> Capsules:
         """Capsules along the links of a robot and its reflector's bracket."""
@@ -209,7 +214,11 @@ class Cell(Section):
         radii = {name: size / 1e3 for name, size in self.links.radii_mm.items()}
         tool_radius = TOOL_RADIUS if self.tool is None else self.tool.radius_mm / 1e3
         return Capsules.of(
-            self.robot_with_tool(robot), None if radius is None else radius / 1e3, radii, tool_radius
+            self.robot_with_tool(robot),
+            robot.tool[:3],
+            None if radius is None else radius / 1e3,
+            radii,
+            tool_radius,
         )
 
 
