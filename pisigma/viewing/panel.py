@@ -52,7 +52,7 @@ class SessionPanel:
             CURVES,
             title="Accuracy over the task",
             scales=_scales(()),
-            axes=({"label": "poses"}, {"label": "mm"}),
+            axes=({"label": "poses", "incrs": (1, 2, 5, 10, 20, 50, 100, 200, 500)}, {"label": "mm"}),
             aspect=1.6,
             visible=False,
         )

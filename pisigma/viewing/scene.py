@@ -67,7 +67,8 @@ class SessionScene:
         self._scene.add_frame(
             "/sensor", axes_length=axes, axes_radius=axes / 20, wxyz=wxyz, position=T[:3, 3]
         )
-        self._label("/sensor/label", "frame of the sensor", np.zeros(3))
+        if self._arm.cell.tracker is None:
+            self._label("/sensor/label", "frame of the sensor", np.zeros(3))
 
     def show_rows(self, rows: RowsSoFar, top: float, magnification: float) -> None:
         """Draw a point for every row, in the colour of its error, and the error as an arrow.
