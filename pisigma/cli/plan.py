@@ -102,6 +102,7 @@ def plan(
     """
     from pisigma.planning.plan_file import yaml_of
     from pisigma.planning.plan_settings import PlanSettings
+    from pisigma.planning.subject import Subject as PlanningSubject
     from pisigma.workflow import plan as workflow
 
     stated: dict[str, Any] = {"count": count, "check": check, "sensor": sensor, "criterion": criterion}
@@ -110,7 +111,7 @@ def plan(
     files = {"candidates_from": candidates_from, "task": task, "measured": measured}
     stated |= {name: None if file is None else str(file) for name, file in files.items()}
     settings = PlanSettings(**stated)
-    wanted, programs = workflow.Subject.of(subject, base, tip), program or []
+    wanted, programs = PlanningSubject.of(subject, base, tip), program or []
     workflow.check_files(out, programs, settings, wanted.robot, (subject, cell))
     with progress_of("plan") as progress:
         planned = workflow.plan(wanted, settings, cell, progress)

@@ -14,9 +14,40 @@ from pisigma.measurement.csv.poses import read_poses
 from pisigma.measurement.csv.reading import read_joints
 from pisigma.measurement.csv.table import read_table
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.robot.description import Robot
+from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.plan_settings import PlanSettings
 
 REACHED = (Status.REACHED, Status.OUTSIDE_DOMAIN)
+
+
+TASK_POSES = 300
+"""Joint values that stand for the task, where more are stated or none."""
+STARTS = 200
+"""Joint values that the inverse kinematics of a drawn robot without a closed form starts from."""
+
+
+def task_poses(
+    arm: ArmInCell,
+    settings: PlanSettings,
+    q: Float64[Tensor, "candidates dof"],
+    model: CalibratedModel | None = None,
+) -> Float64[Tensor, "tasks dof"]:
+    """Give joint values [rad or m] where the robot shall be accurate: of the task's file, or where it can be measured.
+
+    Args:
+        arm: the robot in its cell.
+        settings: which name the file.
+        q: joint values [rad or m] of candidates.
+        model: of the robot, where there is one.
+
+    Raises:
+        MeasurementError: the file cannot be used; the message names file, line and column.
+        PlanningError: a pose cannot be reached; the message names its line.
+    """
+    if settings.task is not None:
+        drawn = CalibratedModel(arm.drawn.name, "as drawn", arm.drawn, None, None, (), q[:STARTS])
+        q = read_task(settings.task, model or drawn)
+    return q[torch.linspace(0, len(q) - 1, min(len(q), TASK_POSES)).round().long()]
 
 
 def read_task(path: str | os.PathLike[str], model: CalibratedModel) -> Float64[Tensor, "tasks dof"]:
@@ -39,13 +70,3 @@ def read_task(path: str | os.PathLike[str], model: CalibratedModel) -> Float64[T
             raise PlanningError(f"{path}, line {line}: {status.name.lower()}. {status.sentence}")
     q: Tensor = torch.as_tensor(solution.q)
     return q
-
-
-def drawn_model(robot: Robot, starts: Float64[Tensor, "starts dof"]) -> CalibratedModel:
-    """A robot as drawn as a model, for its inverse kinematics.
-
-    Args:
-        robot: as drawn.
-        starts: joint values [rad or m] that a numeric inverse starts from.
-    """
-    return CalibratedModel(robot.name, "as drawn", robot, None, None, (), starts)

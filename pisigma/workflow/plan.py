@@ -3,22 +3,19 @@
 import os
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.errors import PlanningError
 from pisigma.export.programs.languages import LANGUAGES, check_program
 from pisigma.export.programs.planned import planned_program
 from pisigma.files.conflicts import Input
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.judging.progress import Progress
-from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.model_folder import load_model
 from pisigma.planning.candidates import Candidates, spread
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.cell.cell import Cell, read_cell
@@ -27,17 +24,13 @@ from pisigma.planning.expected_accuracy import ExpectedAccuracy, RemainingError,
 from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_file import StoredPlan, yaml_of
 from pisigma.planning.plan_settings import PlanSettings
-from pisigma.planning.task import drawn_model, read_task
+from pisigma.planning.subject import Subject
+from pisigma.planning.task import task_poses
 from pisigma.planning.tour import Tour, tour
 from pisigma.robot.description import Robot
-from pisigma.se3 import invert, transform_from_xyzrpy
 
 STEP = 10
 """Poses between two points of the curve."""
-TASK_POSES = 300
-"""Joint values that stand for the task, where more are stated or none."""
-STARTS = 200
-"""Joint values that the inverse kinematics of a drawn robot without a closed form starts from."""
 WEAK = 0.1
 """Share of the variance that remains from which on what causes it is named."""
 ROUNDS = 3
@@ -150,85 +143,6 @@ def check_files(
         check_program(program, robot, False, None)
 
 
-@dataclass(frozen=True, eq=False)
-class Subject:
-    """What is planned for.
-
-    Attributes:
-        robot: as drawn.
-        model: None for a robot that was not calibrated yet.
-        folder: of the model; None where it is in memory only, or there is none.
-    """
-
-    robot: Robot
-    model: CalibratedModel | None = None
-    folder: Path | None = None
-
-    @staticmethod
-    def of(
-        subject: Robot | CalibratedModel | str | os.PathLike[str],
-        base: str | None = None,
-        tip: str | None = None,
-    ) -> "Subject":
-        """Load what is planned for.
-
-        Args:
-            subject: a robot, a name of the catalogue, a robot file (YAML or URDF), a model or its folder.
-            base: of a URDF file the link that poses are given in.
-            tip: of a URDF file the link that is the tool.
-
-        Raises:
-            RobotError: there is no such robot.
-            ModelError: the folder cannot be used.
-        """
-        if isinstance(subject, Robot):
-            return Subject(subject)
-        if not isinstance(subject, CalibratedModel):
-            if not Path(subject).is_dir():
-                return Subject(Robot.load(subject, base, tip))
-            return replace(Subject.of(load_model(Path(subject))), folder=Path(subject))
-        if subject.drawn is None:
-            raise PlanningError(
-                f"model '{subject.name}' does not say how the robot is drawn; plan for its robot instead."
-            )
-        return Subject(subject.drawn, subject)
-
-    def arm(self, cell: Cell | None) -> ArmInCell:
-        """The robot in its cell, with the reflector where the cell says, or else where the model has its tool."""
-        if self.model is None or (cell is not None and cell.tool is not None):
-            return ArmInCell.of(self.robot, cell)
-        return ArmInCell.of(self.robot.with_geometry(tool=self.model.identified.tool), cell)
-
-    def knowledge(self, arm: ArmInCell, settings: PlanSettings) -> Knowledge:
-        """What is known before the first pose of the plan is measured.
-
-        Raises:
-            IdentificationError: the model does not say how uncertain it is.
-            MeasurementError: the rows that were measured cannot be used.
-            PlanningError: the settings do not go together.
-        """
-        tracker = arm.cell.tracker
-        anchor = None if tracker is None else tracker.position
-        if self.model is not None:
-            instrument = settings.instrument(None if anchor is None else self._in_frame(anchor))
-            knowledge = Knowledge.of_model(self.model, instrument)
-        else:
-            knowledge = Knowledge.of_robot(arm.robot, settings.instrument(anchor))
-        if settings.measured is None:
-            return knowledge
-        rows = Measurements.read_csv(settings.measured, arm.robot).split_sets()[0]
-        return knowledge.after(rows) if self.model is None else knowledge.informed(rows.q)
-
-    def _in_frame(self, point: Float64[Tensor, " 3"]) -> Float64[Tensor, " 3"]:
-        """A point of the drawn robot's base frame in the frame that the model's positions are in [m]."""
-        assert self.model is not None
-        drawn, fitted = (
-            transform_from_xyzrpy(torch.tensor(robot.base)) for robot in (self.robot, self.model.identified)
-        )
-        T = fitted @ invert(drawn)
-        return T[:3, :3] @ point + T[:3, 3]
-
-
 def plan(
     subject: Robot | CalibratedModel | Subject | str | os.PathLike[str],
     settings: PlanSettings | None = None,
@@ -260,110 +174,102 @@ def plan(
     candidates.check_count(settings.count + settings.check)
     progress("what is known")
     knowledge = subject.knowledge(arm, settings)
-    task = _task(subject, settings, arm, candidates)
-    criterion = settings.criterion or ("D" if subject.model is None and settings.measured is None else "I")
-    allowed = torch.ones(len(candidates.q), dtype=torch.bool)
-    for _ in range(ROUNDS):
-        free = allowed.nonzero()[:, 0]
-        progress(f"{settings.count} of {len(free):,} candidates")
-        chosen = free[choose(knowledge, candidates.q[free], settings.count, task, criterion)]
-        check = _check_poses(arm, candidates, free, chosen, settings.check)
-        poses = torch.cat([chosen, check])
-        progress("order of the poses")
-        way = tour(arm, candidates.q[poses], settings.pace, candidates.q)
-        allowed[poses[way.left_out]] = False
-        if not len(way.left_out):
-            break
+    task = task_poses(arm, settings, candidates.q, subject.model)
+    problem = _Problem(subject, settings, arm, candidates, knowledge, task)
+    chosen, stored, way = problem.choose(progress)
     progress("expected accuracy")
-    nothing = subject.model is None and settings.measured is None
-    counts = [*range(STEP if nothing else 0, settings.count, STEP), settings.count]
-    points = curve(knowledge, candidates.q, chosen, task, counts, settings.seed)
-    stored = _stored(subject, settings, arm, candidates, poses, way)
+    points = problem.curve(chosen)
     return Plan(
         stored,
         candidates,
         points,
-        _needed(knowledge, candidates, chosen, task, settings, points),
+        problem.needed(chosen, points),
         remaining_errors(knowledge.informed(candidates.q[chosen]), task),
         way.seconds,
-        _warnings(way, task, settings),
+        _warnings(way),
         time.perf_counter() - started,
     )
 
 
-def _task(
-    subject: Subject, settings: PlanSettings, arm: ArmInCell, candidates: Candidates
-) -> Float64[Tensor, "tasks dof"]:
-    """Joint values [rad or m] where the robot shall be accurate: of the task's file, or where it can be measured."""
-    q = candidates.q
-    if settings.task is not None:
-        q = read_task(settings.task, subject.model or drawn_model(arm.drawn, q[:STARTS]))
-    some = torch.linspace(0, len(q) - 1, min(len(q), TASK_POSES)).round().long()
-    return q[some]
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    """What is planned for, where, and what is known.
 
+    Attributes:
+        subject: the robot or the model.
+        settings: how.
+        arm: the robot in its cell.
+        candidates: poses to choose from.
+        knowledge: before the first of them is measured.
+        task: joint values [rad or m] where the robot shall be accurate.
+    """
 
-def _check_poses(
-    arm: ArmInCell,
-    candidates: Candidates,
-    free: Int64[Tensor, " free"],
-    chosen: Int64[Tensor, " chosen"],
-    count: int,
-) -> Int64[Tensor, " checks"]:
-    """Candidates that are measured besides, spread over what is left."""
-    others = free[~torch.isin(free, chosen)]
-    return others[spread(arm, candidates.q[others], count, candidates.q[chosen])]
+    subject: Subject
+    settings: PlanSettings
+    arm: ArmInCell
+    candidates: Candidates
+    knowledge: Knowledge
+    task: Float64[Tensor, "tasks dof"]
 
+    @property
+    def anything_known(self) -> bool:
+        """Whether something was measured already."""
+        return self.subject.model is not None or self.settings.measured is not None
 
-def _stored(
-    subject: Subject,
-    settings: PlanSettings,
-    arm: ArmInCell,
-    candidates: Candidates,
-    poses: Int64[Tensor, " poses"],
-    way: Tour,
-) -> StoredPlan:
-    """The poses in their order."""
-    ordered = poses[way.order]
-    return StoredPlan(
-        arm,
-        settings,
-        subject.folder,
-        candidates.q[ordered],
-        way.order >= settings.count,
-        candidates.number[ordered],
-        way.before,
-    )
+    def choose(self, progress: Progress) -> tuple[Int64[Tensor, " chosen"], StoredPlan, Tour]:
+        """Choose poses to calibrate with and poses to check with, and order them.
 
-
-def _needed(
-    knowledge: Knowledge,
-    candidates: Candidates,
-    chosen: Int64[Tensor, " chosen"],
-    task: Float64[Tensor, "tasks dof"],
-    settings: PlanSettings,
-    points: Sequence[ExpectedAccuracy],
-) -> int | None:
-    """The least number of the chosen poses with which the limit is expected to be reached."""
-    if settings.limit_mm is None:
-        return None
-    limit = settings.limit_mm / 1e3
-    reached = next((index for index, point in enumerate(points) if point.rms <= limit), None)
-    if reached is None:
-        return None
-    low, high = points[reached - 1].poses if reached else 0, points[reached].poses
-    while high - low > 1:
-        middle = (low + high) // 2
-        (point,) = curve(knowledge, candidates.q, chosen, task, [middle], settings.seed)
-        low, high = (low, middle) if point.rms <= limit else (middle, high)
-    return high
-
-
-def _warnings(way: Tour, task: Float64[Tensor, "tasks dof"], settings: PlanSettings) -> tuple[str, ...]:
-    """What else should be known of a plan."""
-    warnings = []
-    if len(way.left_out):
-        warnings.append(
-            f"{len(way.left_out)} poses were left out, as no motion leads to them that touches nothing; give more "
-            "candidates."
+        Poses that no free motion leads to are replaced by others.
+        """
+        q, count = self.candidates.q, self.settings.count
+        criterion = self.settings.criterion or ("I" if self.anything_known else "D")
+        free = torch.arange(len(q))
+        for _ in range(ROUNDS):
+            progress(f"{count} of {len(free):,} candidates")
+            chosen = free[choose(self.knowledge, q[free], count, self.task, criterion)]
+            others = free[~torch.isin(free, chosen)]
+            check = others[spread(self.arm, q[others], self.settings.check, q[chosen])]
+            poses = torch.cat([chosen, check])
+            progress("order of the poses")
+            way = tour(self.arm, q[poses], self.settings.pace, q)
+            free = free[~torch.isin(free, poses[way.left_out])]
+            if not len(way.left_out) or len(free) < len(poses):
+                break
+        ordered = poses[way.order]
+        is_check, number = way.order >= count, self.candidates.number[ordered]
+        folder = self.subject.folder
+        return (
+            chosen,
+            StoredPlan(self.arm, self.settings, folder, q[ordered], is_check, number, way.before),
+            way,
         )
-    return tuple(warnings)
+
+    def curve(self, chosen: Int64[Tensor, " chosen"]) -> tuple[ExpectedAccuracy, ...]:
+        """Expected accuracy against the number of poses, 0 poses where something is known already."""
+        first, count = 0 if self.anything_known else STEP, self.settings.count
+        return self._curve(chosen, [*range(first, count, STEP), count])
+
+    def needed(self, chosen: Int64[Tensor, " chosen"], points: Sequence[ExpectedAccuracy]) -> int | None:
+        """The least number of the chosen poses with which the limit is expected to be reached."""
+        limit = (self.settings.limit_mm or 0.0) / 1e3  # without a limit one that nothing reaches
+        reached = next((index for index, point in enumerate(points) if point.rms <= limit), None)
+        if reached is None:
+            return None
+        high = points[reached].poses
+        low = points[reached - 1].poses if reached else 0
+        while high - low > 1:
+            middle = (low + high) // 2
+            (point,) = self._curve(chosen, [middle])
+            low, high = (low, middle) if point.rms <= limit else (middle, high)
+        return high
+
+    def _curve(self, chosen: Int64[Tensor, " chosen"], counts: list[int]) -> tuple[ExpectedAccuracy, ...]:
+        return curve(self.knowledge, self.candidates.q, chosen, self.task, counts, self.settings.seed)
+
+
+def _warnings(way: Tour) -> tuple[str, ...]:
+    """What else should be known of a plan."""
+    if not len(way.left_out):
+        return ()
+    left_out = f"{len(way.left_out)} poses were left out, as no motion that touches nothing leads to them"
+    return (f"{left_out}; give more candidates.",)

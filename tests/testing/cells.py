@@ -64,7 +64,7 @@ def is_collision_free(robot: Robot, cell: Cell, q: np.ndarray, radius: np.ndarra
             return False
     far = [(one, other) for other in (3, 6) for one in range(other - 2)]
     return all(
-        np.linalg.norm(lines[i][:, None] - lines[j][None], axis=-1).min() >= radius[i] + radius[j] + room
+        np.linalg.norm(lines[i][:, None] - lines[j][None], axis=-1).min() >= radius[i] + radius[j] + room / 2
         for i, j in far
     )
 

@@ -10,15 +10,13 @@ from testing.closeness import assert_close
 from testing.models import no_type_checker
 from testing.report import hybrid_under_test
 
-from pisigma.errors import PisigmaError, PlanningError
+from pisigma.errors import PlanningError
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.cell.motion import is_free
 from pisigma.planning.plan_file import read_plan
 from pisigma.planning.plan_settings import PlanSettings
-from pisigma.planning.task import drawn_model, read_task
 from pisigma.robot import Robot
-from pisigma.se3 import rpy_from_rotation
 from pisigma.workflow.plan import Plan, plan
 
 SETTINGS = PlanSettings(count=14, check=4, candidates=80, limit_mm=1.0)
@@ -104,35 +102,6 @@ def test_a_model_says_what_to_measure_next():
     assert [point.poses for point in more.curve] == [0, 3]
     assert 0 < more.curve[1].rms < more.curve[0].rms < 1e-3
     assert_close(more.stored.arm.robot.tool, model.identified.tool)
-
-
-@pytest.mark.parametrize("wanted", ["joints", "poses"])
-def test_a_task_may_be_joint_values_or_poses(tmp_path: Path, wanted: str):
-    robot = Robot.load("fanuc_r2000")
-    q = torch.deg2rad(
-        torch.tensor([[10.0, 20, 5, 30, 40, 50], [-20, 10, 15, 30, -40, 50]], dtype=torch.float64)
-    )
-    T = forward_kinematics(robot, q)
-    if wanted == "joints":
-        rows = [
-            ",".join(f"q{n}_deg" for n in range(1, 7)),
-            *(",".join(map(str, row)) for row in q.rad2deg().tolist()),
-        ]
-    else:
-        values = torch.cat([T[:, :3, 3] * 1e3, rpy_from_rotation(T[:, :3, :3]).rad2deg()], 1)
-        rows = [
-            "x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg",
-            *(",".join(map(str, row)) for row in values.tolist()),
-        ]
-    (tmp_path / "task.csv").write_text("\n".join(rows))
-    with no_type_checker():
-        read = read_task(tmp_path / "task.csv", drawn_model(robot, q))
-    assert_close(forward_kinematics(robot, read), T, atol=1e-9)
-    (tmp_path / "task.csv").write_text(
-        "\n".join(rows).replace(",", ",99", 3) if wanted == "poses" else "q1_deg\n1"
-    )
-    with pytest.raises(PisigmaError, match=r"task\.csv, line"), no_type_checker():
-        read_task(tmp_path / "task.csv", drawn_model(robot, q))
 
 
 def test_too_few_candidates_are_refused():

@@ -82,7 +82,7 @@ class ArmInCell:
             capsules.robot,
             cell,
             capsules,
-            capsules.pairs(cell.clearance),
+            capsules.pairs(cell.clearance / 2),
             _beside(capsules, cell.clearance),
             cell.joints.limits(robot),
         )
@@ -138,7 +138,7 @@ class ArmInCell:
         infinite = segments.new_full((len(segments), 1), torch.inf)
         first, second = self.pairs.unbind(-1)
         apart = segment_distance(segments[:, first], segments[:, second]) - radius[first] - radius[second]
-        gaps = {"links of the robot touch each other": _least(apart, infinite) - clearance}
+        gaps = {"links of the robot touch each other": _least(apart, infinite) - clearance / 2}
         moving = ~self.capsules.carrier
         if self.cell.floor_mm is not None:
             height = segments[:, moving, 1, 2] - radius[moving] - self.cell.floor_mm / 1e3

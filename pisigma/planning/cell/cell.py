@@ -160,7 +160,8 @@ class Cell(Section):
     """What stands around a robot: everything is optional, and in the frame of the robot's base in mm and deg.
 
     Attributes:
-        clearance_mm: that links, and the tracker's beam, keep from everything [mm].
+        clearance_mm: that links and the tracker's beam keep from everything, and links half of it from each other
+            [mm].
         floor_mm: height of the floor [mm]; None for no floor.
         joints: margins and limits.
         boxes: that the robot keeps out of.
@@ -196,7 +197,7 @@ class Cell(Section):
 
     @property
     def clearance(self) -> float:
-        """What links and the tracker's beam keep from everything [m]."""
+        """What links and the tracker's beam keep from everything but the robot's other links [m]."""
         return self.clearance_mm / 1e3
 
     def robot_with_tool(self, robot: Robot) -> Robot:

@@ -1,0 +1,53 @@
+"""Where a robot is to be accurate, from files of joint values and of poses."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.models import no_type_checker
+
+from pisigma.errors import PisigmaError
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.task import TASK_POSES, task_poses
+from pisigma.robot import Robot
+from pisigma.se3 import rpy_from_rotation
+
+
+@pytest.mark.parametrize("wanted", ["joints", "poses"])
+def test_a_task_may_be_joint_values_or_poses(tmp_path: Path, wanted: str):
+    robot = Robot.load("fanuc_r2000")
+    q = torch.deg2rad(
+        torch.tensor([[10.0, 20, 5, 30, 40, 50], [-20, 10, 15, 30, -40, 50]], dtype=torch.float64)
+    )
+    T = forward_kinematics(robot, q)
+    if wanted == "joints":
+        rows = [
+            ",".join(f"q{n}_deg" for n in range(1, 7)),
+            *(",".join(map(str, row)) for row in q.rad2deg().tolist()),
+        ]
+    else:
+        values = torch.cat([T[:, :3, 3] * 1e3, rpy_from_rotation(T[:, :3, :3]).rad2deg()], 1)
+        rows = [
+            "x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg",
+            *(",".join(map(str, row)) for row in values.tolist()),
+        ]
+    (tmp_path / "task.csv").write_text("\n".join(rows))
+    arm, settings = ArmInCell.of(robot), PlanSettings(task=str(tmp_path / "task.csv"))
+    with no_type_checker():
+        read = task_poses(arm, settings, q)
+    assert_close(forward_kinematics(robot, read), T, atol=1e-9)
+    (tmp_path / "task.csv").write_text(
+        "\n".join(rows).replace(",", ",99", 3) if wanted == "poses" else "q1_deg\n1"
+    )
+    with pytest.raises(PisigmaError, match=r"task\.csv, line"), no_type_checker():
+        task_poses(arm, settings, q)
+
+
+def test_without_a_task_it_is_wherever_the_robot_can_be_measured():
+    q = torch.arange(4000.0, dtype=torch.float64).reshape(1000, 4)
+    some = task_poses(ArmInCell.of(Robot.load("kiro3")), PlanSettings(), q)
+    assert len(some) == TASK_POSES
+    assert_close(some[[0, -1]], q[[0, -1]])
