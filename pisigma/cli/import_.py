@@ -84,8 +84,14 @@ def import_(
     if as_json:
         print_json({"file": str(out)} | rows.to_json())
         return
-    left_out = [f"Line {row.line} is left out: {row.reason}." for row in rows.content.left_out[:20]]
-    print_lines([*left_out, *rows.unmatched, *rows.warnings, f"{rows.rows} measurements written to {out}."])
+    print_lines(
+        [
+            *rows.content.sentences,
+            *rows.unmatched,
+            *rows.warnings,
+            f"{rows.rows} measurements written to {out}.",
+        ]
+    )
 
 
 def _seconds(text: str) -> float:
@@ -109,6 +115,11 @@ def _confirm(proposal: "ImportProposal", yes: bool, as_json: bool) -> None:
         return
     if as_json:
         print_json({"file": None, "columns": proposal.columns_json()})
-    elif sys.stdin.isatty() and typer.confirm("Import these columns?"):
+    elif _is_asked() and typer.confirm("Import these columns?"):
         return
     fail("nothing was imported: accept the mapping with --yes, or change it with --map.", REFUSED)
+
+
+def _is_asked() -> bool:
+    """Whether somebody can be asked."""
+    return sys.stdin.isatty()

@@ -20,6 +20,14 @@ def test_without_a_terminal_it_shows_the_table_and_ends_with_2(refuses, out):
     assert not out.exists()
 
 
+@pytest.mark.parametrize(("answer", "status"), [(True, 0), (False, 2)])
+def test_on_a_terminal_it_asks(run, out, monkeypatch, answer, status):
+    monkeypatch.setattr("pisigma.cli.import_._is_asked", lambda: True)
+    monkeypatch.setattr("typer.confirm", lambda question: answer)
+    assert run("import", EXPORTS / "kuka.csv", "--out", out).exit_code == status
+    assert out.exists() == answer
+
+
 def test_yes_writes_the_file(run, out):
     result = run("import", EXPORTS / "kuka.csv", "--out", out, "--yes")
     assert result.exit_code == 0

@@ -62,6 +62,11 @@ def test_rows_without_a_measurement_are_left_out_and_named(tmp_path: Path):
         import_rows(write(tmp_path, f"{HEADER}\np1,1,2,3,4,\np4,1,5,6,7,8\n"))
 
 
+def test_a_table_in_which_nothing_is_recognised(tmp_path: Path):
+    with pytest.raises(MeasurementError, match="no column was recognised"):
+        import_rows(write(tmp_path, "Hz,V,D\n100.5,99.2,3.5\n101.5,98.2,3.6\n"))
+
+
 def test_several_files_are_put_behind_each_other(tmp_path: Path):
     paths = write(
         tmp_path, f"{HEADER}\np1,1,2,3,4,5\n", f"{HEADER.replace('mm', 'm')}\np1,1,3,.003,.004,.005\n"

@@ -18,6 +18,8 @@ SEPARATORS = ("\t", ";", ",", "|", " ")
 SAMPLE = 300
 """Lines that are looked at."""
 MOST_COLUMNS = 2000
+_BLANKS = 0.8
+"""Blanks stand in names, too: they separate cells only where no other separator explains nearly as much."""
 COMMENT = re.compile(r"\s*(?://|#|%|!|\*\*|--|;|'|REM\b)\s*")
 """What begins lines that are no rows; a line of cells may begin so, too."""
 
@@ -100,5 +102,5 @@ def _score(dialect: Dialect, lines: Sequence[str]) -> float:
         return 0.0
     width = Counter(map(len, numeric)).most_common(1)[0][0]
     cells = [cell for row in numeric if len(row) == width for cell in row if not is_missing(cell)]
-    certain = sum(map(dialect.numbers.certainty, cells))
+    certain = sum(map(dialect.numbers.certainty, cells)) * (_BLANKS if dialect.separator == " " else 1.0)
     return len([row for row in numeric if len(row) == width]) / len(rows) * certain / len(cells)

@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass
 
 from pisigma.errors import MeasurementError, printable
-from pisigma.files.input_file import read_input
+from pisigma.files.input_file import MOST_BYTES, read_input
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
 from pisigma.measurement.foreign.dialect import COMMENT, Dialect, sniff
 from pisigma.measurement.foreign.headings import is_recognised
@@ -55,71 +55,80 @@ class ExportFile:
         return [float(text) for text in texts if text is not None]
 
 
-def read_export(path: str | os.PathLike[str], decimal: Decimal | None = None) -> ExportFile:
+def read_export(
+    path: str | os.PathLike[str], decimal: Decimal | None = None, most: int = MOST_BYTES
+) -> ExportFile:
     """Read an export: encoding, separator and decimal sign are recognised, headings, unit row and comments told apart.
 
     Args:
         path: the file.
         decimal: the decimal sign, where it is stated.
+        most: bytes that the file may have.
 
     Raises:
         MeasurementError: the file cannot be read, is no text, holds no table of numbers, or a row has another number
             of cells than the others; the message names the line.
     """
     source = printable(str(path), cut=False)
-    text = decoded(read_input(path, MeasurementError), source)
+    lines = _lines_of(decoded(read_input(path, MeasurementError, most), source), source)
+    dialect = sniff([line for _, line in lines], source, decimal)
+    cells = [dialect.split(line) for _, line in lines]
+    width = Counter(len(row) for row in cells if dialect.is_row(row)).most_common(1)[0][0]
+    is_row = [len(row) == width and dialect.is_row(row) for row in cells]
+    first = is_row.index(True)
+    ends_empty = not any(row[-1] for row, sure in zip(cells, is_row, strict=True) if sure)
+    headings, units, comments = _read_top(lines[:first], dialect, width - ends_empty, source)
+    rows, skipped = [], []
+    for i in range(first, len(lines)):
+        if is_row[i] or (len(cells[i]) == width and _is_content(lines[i][1], cells[i], headings)):
+            rows.append(i)
+        elif any(cells[i]) and cells[i][: len(headings)] != headings:
+            if not _is_comment(lines[i][1], cells[i]):
+                _check_skipped(cells[i], dialect, width, f"{source}, line {lines[i][0]}")
+            skipped.append(i)
+    used = [
+        k for k in range(width - ends_empty) if (headings and headings[k]) or any(cells[i][k] for i in rows)
+    ]
+    return ExportFile(
+        source=source,
+        headings=tuple(headings[k] if headings and headings[k] else str(k + 1) for k in used),
+        has_header=bool(headings),
+        units=tuple(units[k] if units else "" for k in used),
+        comments=(*comments, *(lines[i][1] for i in skipped)),
+        records=[[cells[i][k] for k in used] for i in rows],
+        lines=tuple(lines[i][0] for i in rows),
+        dialect=dialect,
+        skipped=tuple(lines[i][0] for i in skipped),
+    )
+
+
+def _lines_of(text: str, source: str) -> _Lines:
+    """The lines that are not blank, each with its number."""
     lines = [(number, line) for number, line in enumerate(text.split("\n"), start=1) if line.strip()]
     for number, line in lines:
         if len(line) > LONGEST_LINE:
             raise MeasurementError(
                 f"{source}, line {number}: has {len(line):,} characters; one line per measurement was wanted."
             )
-    dialect = sniff([line for _, line in lines], source, decimal)
-    rows = [(number, dialect.split(line)) for number, line in lines]
-    width = Counter(len(row) for _, row in rows if dialect.is_row(row)).most_common(1)[0][0]
-    first = next(i for i, (_, row) in enumerate(rows) if len(row) == width and dialect.is_row(row))
-    headings, units, comments = _read_top(lines[:first], dialect, width, source)
-    records, numbers, skipped = [], [], []
-    for (number, row), (_, line) in zip(rows[first:], lines[first:], strict=True):
-        if len(row) == width and (dialect.is_row(row) or _is_content(line, row, headings)):
-            records.append(row)
-            numbers.append(number)
-        elif any(row):
-            skipped.append(number)
-            _check_skipped(line, row, dialect, headings, width, f"{source}, line {number}")
-            comments.append(line)
-    used = [i for i in range(width) if (headings and headings[i]) or any(row[i] for row in records)]
-    return ExportFile(
-        source=source,
-        headings=tuple(headings[i] if headings and headings[i] else str(i + 1) for i in used),
-        has_header=bool(headings),
-        units=tuple(units[i] if units else "" for i in used),
-        comments=tuple(comments),
-        records=[[row[i] for i in used] for row in records],
-        lines=tuple(numbers),
-        dialect=dialect,
-        skipped=tuple(skipped),
-    )
+    return lines
 
 
 def _is_content(line: str, row: list[str], headings: list[str]) -> bool:
     """Whether cells without numbers are a row nevertheless, whose reader will say what is wrong with it."""
-    return any(row) and row != headings and not _is_comment(line, row)
+    return any(row) and row[: len(headings)] != headings and not _is_comment(line, row)
 
 
 def _is_comment(line: str, row: list[str]) -> bool:
     return bool(COMMENT.match(line)) and row[0] not in SPREADSHEET_ERRORS
 
 
-def _check_skipped(
-    line: str, row: list[str], dialect: Dialect, headings: list[str], width: int, place: str
-) -> None:
-    """Refuse a row of another width, which would be lost; comments and headings that come again are none.
+def _check_skipped(row: list[str], dialect: Dialect, width: int, place: str) -> None:
+    """Refuse a row of another width, which would be lost.
 
     Raises:
         MeasurementError: see above.
     """
-    if _is_comment(line, row) or row == headings or sum(map(dialect.is_number, row)) < 2:
+    if sum(map(dialect.is_number, row)) < 2:
         return
     raise MeasurementError(
         f"{place}: {len(row)} cells, but the other rows have {width}; complete or remove the row, or state --decimal "
@@ -145,9 +154,14 @@ def _read_top(
         elif len(cells) == width and (not COMMENT.match(line) or _recognised(cells) >= 0.5):
             headings = cells
         elif len(cells) > 2 and _recognised(cells) >= 0.5:
+            commas = dialect.separator == "," and len(cells) < width
             raise MeasurementError(
-                f"{source}, line {number}: {len(cells)} headings stand over rows of {width} cells; give every column "
-                "one heading."
+                f"{source}, line {number}: {len(cells)} headings stand over rows of {width} cells; "
+                + (
+                    "export decimal points, or semicolons between cells."
+                    if commas
+                    else "give every column one heading."
+                )
             )
         else:
             comments.append(line)
@@ -161,8 +175,6 @@ def _heading_cells(line: str, dialect: Dialect, width: int) -> list[str]:
         cells = dialect.split(text)
         if len(cells) == width + 1 and not cells[-1]:
             cells = cells[:-1]
-        if len(cells) == width - 1:  # rows end with a separator
-            cells = [*cells, ""]
         if len(cells) == width:
             return [cell.lstrip("#%").strip() for cell in cells]
     return dialect.split(bare)

@@ -9,12 +9,11 @@ from pisigma.measurement.foreign.rotations import ROTATIONS
 from pisigma.measurement.foreign.units import unit_symbol
 
 _SIDES = {
-    "commanded": "target cmd command commanded setpoint soll nominal nom ref reference desired",
-    "measured": "actual act meas measured ist",
-    "": "robot tcp tool pos position pose coord coordinate coordinates value values val tracker reflector smr jnt "
-    "trans translation",
+    "commanded": "target cmd command commanded setpoint soll nominal nom ref reference desired robot",
+    "measured": "actual act meas measured ist tracker reflector smr laser",
+    "": "tcp tool pos position pose coord coordinate coordinates value values val jnt trans translation",
 }
-"""Words that may stand beside a name, by what they say: how it came about, or nothing."""
+"""Words that may stand beside a name, by what they say: who stated it, or nothing."""
 _SIDE_OF = {word: side for side, words in _SIDES.items() for word in words.split()}
 _OF_QUATERNION = re.compile(r"^(?:rot|rotation|ori|orient|orientation|quat|quaternion)(?=q[0-4xyzw]$)")
 _BRACKETS = re.compile(r"^(.*?)\s*(?:\[([^\]]*)\]|\(([^)]*)\)|<([^>]*)>)\s*$")
@@ -107,23 +106,8 @@ MAKERS = (
 """An instrument or a controller more is one line; those without names of their own for the joints are recognised by
 their rotations."""
 
-JOINT_NAMES = (
-    "j",
-    "joint",
-    "q",
-    "axis",
-    "ax",
-    "achse",
-    "th",
-    "theta",
-    "gelenk",
-    "axe",
-    "eje",
-    "asse",
-    "jt",
-    "a",
-    "rax",
-)
+_JOINTS = "j joint q axis ax achse th theta gelenk axe eje asse jt a rax position"
+JOINT_NAMES = tuple(_JOINTS.split())
 """What numbers of joints follow, whoever writes it."""
 
 POSITIONS = tuple(

@@ -10,6 +10,9 @@ from pisigma.measurement.foreign.export_file import read_export
 from pisigma.measurement.foreign.mapping import FileMapping, map_columns
 from pisigma.measurement.foreign.quantities import KEYS
 
+_MOST_BYTES = 2**22
+"""Of a file that is looked at, so that a refusal does not take long."""
+
 
 def import_hint(path: str | os.PathLike[str]) -> str:
     """Give a sentence with the command that imports a file as an export; "" where none does.
@@ -20,7 +23,7 @@ def import_hint(path: str | os.PathLike[str]) -> str:
     if _has_columns(path):
         return ""
     try:
-        mapping = map_columns(read_export(path), {}, None, {})
+        mapping = map_columns(read_export(path, most=_MOST_BYTES), {}, None, {})
     except MeasurementError:
         return ""
     is_half = (mapping.has_joints or mapping.has_measured) and set(KEYS) & set(mapping.quantities)

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 from pisigma.errors import MeasurementError, nearest_choice
 from pisigma.measurement.foreign.export_file import ExportFile
-from pisigma.measurement.foreign.headings import Maker
-from pisigma.measurement.foreign.proposal import NO_ROTATION, Proposal, propose
+from pisigma.measurement.foreign.headings import Maker, parse_heading
+from pisigma.measurement.foreign.proposal import NO_ROTATION, UNRECOGNISED, Proposal, propose
 from pisigma.measurement.foreign.quantities import (
     KEYS,
     LEFT_OUT,
@@ -22,7 +22,7 @@ from pisigma.measurement.foreign.quantities import (
 from pisigma.measurement.foreign.rotations import ROTATIONS
 from pisigma.measurement.foreign.units import UNITS, UnitKind, doubt, is_certain, stated_units
 
-_JOINT_LIKE = re.compile(r"(?:e(?:ax|xt)?_?[1-6a-f]|[qj]_?\d.*)")
+_JOINT_LIKE = re.compile(r"e(?:ax|xt)?[1-6a-f]|[qj]\d.*")
 """How external axes are called, and what begins like a joint."""
 
 
@@ -62,9 +62,12 @@ class FileMapping:
 
     @property
     def example_units(self) -> str:
-        """Usual units for the columns without, as `--unit` takes them; "" where none are needed."""
+        """Likely units for the columns without, as `--unit` takes them; "" where none are needed."""
         kinds = {one.target.needs for one in self.without_unit}
-        return ",".join(symbol for symbol in ("mm", "deg", "kg", "c") if UNITS[symbol].kind in kinds)
+        small_angles = is_certain("rad", largest(self.file, joint_columns(self.columns)))
+        length = "m" if is_certain("m", largest(self.file, coordinates(self.columns))) else "mm"
+        likely = (length, "rad" if small_angles else "deg", "kg", "c")
+        return ",".join(symbol for symbol in likely if UNITS[symbol].kind in kinds)
 
     @property
     def title(self) -> str:
@@ -78,8 +81,10 @@ class FileMapping:
     @property
     def possible_joints(self) -> list[MappedColumn]:
         """The columns that are left out, but that are named as joints are."""
-        left_out = [one for one in self.columns if one.target.quantity == LEFT_OUT and not one.is_stated]
-        return [one for one in left_out if _JOINT_LIKE.fullmatch(one.heading.lower())]
+        left_out = [
+            one for one in self.columns if one.target.quantity == LEFT_OUT and one.reason == UNRECOGNISED
+        ]
+        return [one for one in left_out if _JOINT_LIKE.fullmatch(parse_heading(one.heading).name)]
 
     @property
     def doubts(self) -> tuple[str, ...]:

@@ -38,6 +38,17 @@ class MeasurementTable:
     table: Table
     left_out: tuple[LeftOut, ...]
 
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What is to be said of the rows that are left out."""
+        if not self.left_out:
+            return ()
+        lines = ", ".join(str(row.line) for row in self.left_out[:5]) + (
+            ", ..." if len(self.left_out) > 5 else ""
+        )
+        are = "1 row is" if len(self.left_out) == 1 else f"{len(self.left_out)} rows are"
+        return (f"{are} left out, as nothing was measured there (line {lines}).",)
+
     def text(self) -> str:
         """The measurement file."""
         text = io.StringIO()
@@ -54,6 +65,11 @@ def measurement_table(rows: ConvertedRows) -> MeasurementTable:
     names = sorted((name for name in rows.cells if name not in KEYS), key=_order)
     measured = [rows.cells[name] for name in names if _order(name)[0] and _quantity(name) not in _BESIDE]
     filled = [any(texts) for texts in zip(*measured, strict=True)]
+    if not names:
+        raise MeasurementError(
+            f"{rows.source}: no column was recognised as a joint value or a measurement; say what they are with --map, "
+            "such as --map HEADING=q1_deg,OTHER=x_mm."
+        )
     if not any(filled):
         raise MeasurementError(
             f"{rows.source}: holds joint values, but no measurement; name its columns with --map, or join the file "

@@ -3,13 +3,15 @@
 import functools
 import re
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 Decimal = Literal[".", ","]
 MISSING = frozenset(("", "-", "--", "---", "*", "n/a", "na", "nan", "null", "none", "nil", "n.a.", "missing"))
 """What stands in the cell of a value that was not measured, in small letters."""
 _BLANKS = " \u00a0\u2009\u202f'\u2019"
 """What sets groups of thousands apart besides points and commas."""
+_PLAIN = {sign: re.compile(rf"[-+]?[0-9]+(?:\{sign}[0-9]+)?") for sign in get_args(Decimal)}
+"""Numbers of the usual form, which are nearly all."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +26,8 @@ class NumberFormat:
 
     def text(self, cell: str) -> str | None:
         """Write a number with a decimal point and without groups, with every digit of the cell; None if it is none."""
+        if _PLAIN[self.decimal].fullmatch(cell):
+            return cell if self.decimal == "." else cell.replace(",", ".")
         cell = cell.strip().replace("\u2212", "-")
         match = _pattern(self.decimal).fullmatch(cell)
         if match is None:
@@ -49,7 +53,8 @@ def _pattern(decimal: Decimal) -> re.Pattern[str]:
     groups = rf"\d{{1,3}}(?P<group>[{other}{_BLANKS}])\d{{3}}(?:(?P=group)\d{{3}})*"
     return re.compile(
         rf"(?P<sign>[-+]?)(?=\d|\{decimal}\d)(?P<whole>{groups}|\d*)(?P<decimals>\{decimal}\d*)?"
-        r"(?P<exponent>[eE][-+]?\d+)?"
+        r"(?P<exponent>[eE][-+]?\d+)?",
+        re.ASCII,
     )
 
 

@@ -23,6 +23,8 @@ from pisigma.measurement.foreign.units import UNITS, UnitKind
 
 NO_ROTATION = "none"
 """The encoding of rotations that are not wanted."""
+UNRECOGNISED = "not recognised"
+"""Why a column is left out whose heading means nothing."""
 
 _JOINTS_WITHOUT_HEADINGS = (6, 7)
 _Side = Literal["commanded", "measured"]
@@ -219,7 +221,7 @@ def _take_other(proposal: Proposal, name: str, index: int) -> None:
     of_unit = {"temperature": "temperature", "time": "time"}.get(UNITS[unit].kind if unit else "")
     quantity = of_unit or MEANINGS.get(name, LEFT_OUT)
     if quantity == LEFT_OUT:
-        proposal.put(index, LEFT_OUT, "not recognised")
+        proposal.put(index, LEFT_OUT, UNRECOGNISED)
     elif quantity in proposal.quantities:
         proposal.put(index, LEFT_OUT, "there is another such column")
     else:

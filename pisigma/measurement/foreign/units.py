@@ -38,7 +38,7 @@ UNITS: dict[str, ForeignUnit] = {
     "um": ForeignUnit("length", "mm", "1e-3", "µm μm micron microns micrometer micrometers"),
     "in": ForeignUnit("length", "mm", "25.4", 'inch inches "'),
     "ft": ForeignUnit("length", "mm", "304.8", "foot feet"),
-    "deg": ForeignUnit("angle", "deg", "1", "° degree degrees deg. altgrad"),
+    "deg": ForeignUnit("angle", "deg", "1", "° degree degrees deg. grad"),
     "rad": ForeignUnit("angle", "rad", "1", "radian radians"),
     "mrad": ForeignUnit("angle", "rad", "1e-3", "milliradian milliradians"),
     "gon": ForeignUnit("angle", "deg", "0.9", "gons"),

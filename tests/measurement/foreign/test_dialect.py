@@ -20,6 +20,7 @@ from pisigma.measurement.foreign.dialect import sniff
         (["p1|1.5|2.5"], "|", "."),
         (['"1,5","2,5"', '"3,5","4,5"'], ",", ","),
         (["1,2,3", "4,5,6"], ",", "."),
+        (["name\tx\ty", "point 1\t1.5\t2.5", "point 2\t3.5\t4.5"], "\t", "."),
         (["a note, with commas, in it", "1.5 2.5 3.5", "1.5 2.5 3.5"], " ", "."),
     ],
 )

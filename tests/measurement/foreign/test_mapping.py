@@ -58,6 +58,9 @@ def test_units_that_the_file_does_not_state(tmp_path: Path):
     assert "state it, --unit mm,deg if that is right, or --map 'j1=q1_deg'" in refusal(tmp_path, generic)
     assert targets(mapped(tmp_path, generic, length="mm", angle="deg")) == DEGREES_MM
     assert "says mm" in refusal(tmp_path, f"// units m\n{generic}", length="mm")
+    assert "--unit m,rad if that is right, or --map 'j1=q1_rad'" in refusal(
+        tmp_path, "j1,j2,x,y,z\n1.5,-2.5,0.5,1.2,3\n1.6,-2.6,0.6,1.2,3\n"
+    )
     small = "A1,A2,A3,A4,A5,A6,X,Y,Z\n1,-2,0.5,1,2,3,1.2,-0.3,0.4\n"
     assert "no unit is stated of the columns 'A1'" in refusal(tmp_path, small)  # may as well be rad and m
 
@@ -84,6 +87,17 @@ def test_stated_columns(tmp_path: Path):
 
 def test_what_was_commanded_is_no_measurement(tmp_path: Path):
     header = "j1 [deg],j2 [deg],x nom [mm],y nom [mm],z nom [mm],x [mm],y [mm],z [mm]"
+    assert targets(mapped(tmp_path, f"{header}\n1,2,3,4,5,6,7,8\n"))[2:] == [
+        "-",
+        "-",
+        "-",
+        "x_mm",
+        "y_mm",
+        "z_mm",
+    ]
+    header = (
+        "Robot.J1 [deg],Robot.J2 [deg],Robot.X,Robot.Y,Robot.Z,Tracker.X [mm],Tracker.Y [mm],Tracker.Z [mm]"
+    )
     assert targets(mapped(tmp_path, f"{header}\n1,2,3,4,5,6,7,8\n"))[2:] == [
         "-",
         "-",
@@ -137,9 +151,9 @@ def test_cells_that_are_no_numbers_are_named(tmp_path: Path):
 
 def test_doubts_about_units_and_external_axes(tmp_path: Path):
     rows = "".join(f"{170 - i},-20,{i}.5,1200.5,{i},400\n" for i in range(8))
-    doubts = mapped(tmp_path, f"J1 [rad],J2 [rad],E1,X [m],Y [m],Z [m]\n{rows}").doubts
+    doubts = mapped(tmp_path, f"J1 [rad],J2 [rad],E1 [mm],X [m],Y [m],Z [m]\n{rows}").doubts
     assert len(doubts) == 3
-    assert "'E1' moves from 0.5 to 7.5" in doubts[0]
+    assert "'E1 [mm]' moves from 0.5 to 7.5" in doubts[0]
     assert "values up to 170 rad look like degrees" in doubts[1]
     assert "values up to 1200.5 m look like millimetres" in doubts[2]
     assert not mapped(tmp_path, f"J1 [deg],J2 [deg],-,X [mm],Y [mm],Z [mm]\n{rows}").doubts

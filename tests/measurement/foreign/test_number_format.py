@@ -24,6 +24,7 @@ from pisigma.measurement.foreign.number_format import NumberFormat, is_missing
         (".", "1_000", None),
         (".", "inf", None),
         (".", "", None),
+        (".", "１２", None),
         (".", "-", None),
         (".", "12.5 mm", None),
         (".", "1.2.3", None),
