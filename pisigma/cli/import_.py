@@ -39,6 +39,7 @@ Join = Annotated[
 Within = Annotated[str, typer.Option(help="Time stamps that --join time puts together differ by no more.")]
 Yes = Annotated[bool, typer.Option("--yes", "-y", help="Take the proposed mapping without asking.")]
 SaveMap = Annotated[Path | None, typer.Option(help="File to write the mapping to, for --map the next time.")]
+_SIGNS: dict[str | None, Literal[".", ","] | None] = {None: None, "point": ".", "comma": ","}
 
 
 def import_(
@@ -66,14 +67,8 @@ def import_(
     check_output(out, (".csv",), "a measurement file", files)
     if save_map is not None:
         check_output(save_map, (".yaml", ".yml"), "a mapping", [*files, out])
-    sign: Literal[".", ","] | None = None if decimal is None else "." if decimal == "point" else ","
     settings = workflow.ImportSettings(
-        maps=parse_map(mapping) if mapping else (),
-        units=unit,
-        rotation=rotation,
-        decimal=sign,
-        join=join,
-        within=_seconds(within),
+        parse_map(mapping) if mapping else (), unit, rotation, _SIGNS[decimal], join, _seconds(within)
     )
     proposal = workflow.propose_import(files, settings)
     _confirm(proposal, yes, as_json)
@@ -84,14 +79,7 @@ def import_(
     if as_json:
         print_json({"file": str(out)} | rows.to_json())
         return
-    print_lines(
-        [
-            *rows.content.sentences,
-            *rows.unmatched,
-            *rows.warnings,
-            f"{rows.rows} measurements written to {out}.",
-        ]
-    )
+    print_lines([*rows.sentences, f"{rows.rows} measurements written to {out}."])
 
 
 def _seconds(text: str) -> float:

@@ -107,6 +107,11 @@ class ImportedRows:
         return len(self.content.table.records)
 
     @property
+    def sentences(self) -> tuple[str, ...]:
+        """What is to be said of the rows: which are left out, which have no partner, and warnings."""
+        return (*self.content.sentences, *self.unmatched, *self.warnings)
+
+    @property
     def measurements(self) -> Measurements:
         """The measurements."""
         return Measurements.from_fields(fields_of(self.content.table))

@@ -54,14 +54,12 @@ def check_complete(mapping: FileMapping) -> None:
             f"{', '.join(mapping.rotations)}, or none to leave it out."
         )
     if lacking := mapping.without_unit:
-        names = ", ".join(f"'{one.heading}'" for one in lacking)
-        many, example = "s" if len(lacking) > 1 else "", mapping.example_units
-        first = replace(
-            lacking[0].target, unit=example.split(",")[0 if lacking[0].target.needs == "length" else -1]
-        )
+        names, many = ", ".join(f"'{one.heading}'" for one in lacking), "s" if len(lacking) > 1 else ""
+        likely = mapping.likely_units
+        first = next(replace(one.target, unit=likely[kind]) for one in lacking if (kind := one.target.needs))
         raise MeasurementError(
-            f"{source}: no unit is stated of the column{many} {names}; state it, --unit {example} if that is right, or "
-            f"--map '{lacking[0].heading}={first.text}'."
+            f"{source}: no unit is stated of the column{many} {names}; state it, --unit {','.join(likely.values())} if "
+            f"that is right, or --map '{lacking[0].heading}={first.text}'."
         )
 
 

@@ -46,8 +46,8 @@ def _command(mapping: FileMapping) -> str:
         words += ["MEASURED", "--join", "point"]
     elif not mapping.has_joints:
         words += ["JOINTS", "--join", "point"]
-    if units := mapping.example_units:
-        words += ["--unit", units]
+    if units := mapping.likely_units:
+        words += ["--unit", ",".join(units.values())]
     if mapping.rotations:
         words += ["--rotation", "MAKER"]
     return " ".join([*words, "--out", "data.csv"])

@@ -11,7 +11,7 @@ from jaxtyping import Float64, Int64
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement.foreign.conversion import ConvertedRows
-from pisigma.measurement.foreign.quantities import KEYS, joints_of
+from pisigma.measurement.foreign.quantities import KEYS, is_measured, joints_of
 
 JoinBy = Literal["point", "order", "time"]
 WITHIN = 0.2
@@ -44,8 +44,8 @@ def join_rows(
 ) -> JoinedRows:
     """Put a list of measurements and a log of joint values together.
 
-    Rows of the list stay in their order; one without a partner is left out and named. Of a quantity that both have,
-    that of the list is taken.
+    Rows of the list stay in their order; one without a partner is left out and named. Poses of the log are commanded or
+    calculated, and are left out.
 
     Args:
         measured: rows without joint values.
@@ -69,18 +69,17 @@ def join_rows(
         raise MeasurementError(
             f"{measured.source} and {joints.source}: {_nothing(measured, joints, by, within)}"
         )
-    both = [name for name in joints.cells if name in measured.cells and name not in KEYS]
-    cells = {
-        name: tuple(texts[row] for row in partner[matched])
-        for name, texts in joints.cells.items()
-        if name not in (*both, *KEYS)
-    } | {name: tuple(texts[row] for row in matched) for name, texts in measured.cells.items()}
+    left_out = [name for name in joints.cells if is_measured(name)]
+    kept = [name for name in joints.cells if name not in (*left_out, *KEYS, *measured.cells)]
+    cells = {name: tuple(joints.cells[name][row] for row in partner[matched]) for name in kept}
+    cells |= {name: tuple(texts[row] for row in matched) for name, texts in measured.cells.items()}
     rows = ConvertedRows(measured.source, tuple(measured.lines[row] for row in matched), cells)
-    warnings = (
-        [f"{', '.join(both)} of {joints.source} are left out, as {measured.source} has them, too."]
-        if both
-        else []
-    )
+    warnings = []
+    if left_out:
+        names = ", ".join(left_out)
+        warnings.append(
+            f"{joints.source}: {names} are left out, as the measurements are those of {measured.source}."
+        )
     if by == "time":
         warnings += _moving(joints, partner[matched], within)
     unmatched = (
@@ -132,7 +131,7 @@ def _by_point(measured: ConvertedRows, joints: ConvertedRows) -> Int64[np.ndarra
 
 def _plain_name(text: str) -> str:
     """A name without the groups before it, case, and leading zeros."""
-    return re.sub(r"(?<!\d)0+(?=\d)", "", text.rpartition("::")[2].strip().casefold())
+    return re.sub(r"(?<![\d.])0+(?=\d)", "", text.rpartition("::")[2].strip().casefold())
 
 
 def _by_time(measured: ConvertedRows, joints: ConvertedRows, within: float) -> Int64[np.ndarray, " rows"]:
@@ -215,8 +214,10 @@ def _alone(rows: ConvertedRows, alone: Int64[np.ndarray, " _alone"], other: Conv
         for row in alone[:_NAMED].tolist()
     ]
     more = f" and {len(alone) - _NAMED} more" if len(alone) > _NAMED else ""
-    have = "1 row has no partner" if len(alone) == 1 else f"{len(alone)} rows have no partner"
-    return [f"{rows.source}: {have} in {other.source}: {', '.join(named)}{more}."]
+    have, are = ("1 row has", "is") if len(alone) == 1 else (f"{len(alone)} rows have", "are")
+    return [
+        f"{rows.source}: {have} no partner in {other.source} and {are} left out: {', '.join(named)}{more}."
+    ]
 
 
 def _point(rows: ConvertedRows, row: int) -> str:

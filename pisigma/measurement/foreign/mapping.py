@@ -61,13 +61,13 @@ class FileMapping:
         return tuple(one for one in self.columns if one.target.needs not in (None, "time"))
 
     @property
-    def example_units(self) -> str:
-        """Likely units for the columns without, as `--unit` takes them; "" where none are needed."""
+    def likely_units(self) -> dict[UnitKind, str]:
+        """Likely units of the columns without, by what they measure."""
         kinds = {one.target.needs for one in self.without_unit}
         small_angles = is_certain("rad", largest(self.file, joint_columns(self.columns)))
         length = "m" if is_certain("m", largest(self.file, coordinates(self.columns))) else "mm"
         likely = (length, "rad" if small_angles else "deg", "kg", "c")
-        return ",".join(symbol for symbol in likely if UNITS[symbol].kind in kinds)
+        return {UNITS[symbol].kind: symbol for symbol in likely if UNITS[symbol].kind in kinds}
 
     @property
     def title(self) -> str:

@@ -10,20 +10,7 @@ from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.csv.table import Table
 from pisigma.measurement.fields import LeftOut
 from pisigma.measurement.foreign.conversion import ConvertedRows
-from pisigma.measurement.foreign.quantities import KEYS
-
-_BESIDE = (
-    "sigma_position",
-    "sigma_rotation",
-    "payload",
-    "temperature",
-    "target",
-    "frame",
-    "set",
-    "touch_axis",
-    "pair",
-)
-"""Quantities that are no measurement by themselves."""
+from pisigma.measurement.foreign.quantities import KEYS, is_measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +50,7 @@ def measurement_table(rows: ConvertedRows) -> MeasurementTable:
         MeasurementError: the rows are no measurements; the message names the line of the export.
     """
     names = sorted((name for name in rows.cells if name not in KEYS), key=_order)
-    measured = [rows.cells[name] for name in names if _order(name)[0] and _quantity(name) not in _BESIDE]
+    measured = [rows.cells[name] for name in names if is_measured(name)]
     filled = [any(texts) for texts in zip(*measured, strict=True)]
     if not names:
         raise MeasurementError(
@@ -92,12 +79,6 @@ def measurement_table(rows: ConvertedRows) -> MeasurementTable:
     fields_of(table)
     left_out = (line for line, used in zip(rows.lines, filled, strict=True) if not used)
     return MeasurementTable(table, tuple(LeftOut(line, "nothing was measured") for line in left_out))
-
-
-def _quantity(name: str) -> str:
-    column = find_column(name)
-    assert column is not None  # rows are converted to columns of measurement files
-    return column.quantity
 
 
 def _order(name: str) -> tuple[int, int]:

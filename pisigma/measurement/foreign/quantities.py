@@ -14,6 +14,21 @@ LEFT_OUT = "-"
 KEYS = ("point", "time")
 """Quantities by which rows of two files are joined; no measurement file keeps them."""
 
+_BESIDE = frozenset(
+    (
+        "sigma_position",
+        "sigma_rotation",
+        "payload",
+        "temperature",
+        "target",
+        "frame",
+        "set",
+        "touch_axis",
+        "pair",
+    )
+)
+"""Quantities that are no measurement by themselves."""
+
 _KINDS: dict[str, UnitKind] = {
     "mm": "length",
     "m": "length",
@@ -76,6 +91,12 @@ def fits(quantity: str, unit: str) -> bool:
     """Say whether values of a quantity can be in a unit; "" fits all. Joints turn or slide."""
     kinds = {unit_kind(quantity)} | ({"length"} if is_joint(quantity) else set())
     return not unit or UNITS[unit].kind in kinds
+
+
+def is_measured(name: str) -> bool:
+    """Say whether a column of measurement files holds a measurement, and not what is only stated beside one."""
+    column = find_column(name)
+    return column is not None and not (column.joint or column.approach or column.quantity in _BESIDE)
 
 
 def unit_kind(quantity: str) -> UnitKind | None:

@@ -14,14 +14,22 @@ def rows(source: str, **cells: tuple[str, ...]) -> ConvertedRows:
 
 def test_names_differ_in_groups_case_and_zeros():
     measured = rows("points", point=("A::B::P01", "a::p2", "p9"), x_mm=("1", "2", "3"))
-    joints = rows("log", point=("p2", "P1", "p3"), q1_deg=("20", "10", "30"), x_mm=("7", "8", "9"))
+    joints = rows(
+        "log",
+        point=("p2", "P1", "p3"),
+        q1_deg=("20", "10", "30"),
+        roll_deg=("7", "8", "9"),
+        payload_kg=("1", "2", "3"),
+    )
     joined = join_rows(measured, joints, "point")
     assert joined.rows.cells["q1_deg"] == ("10", "20")
     assert joined.rows.cells["x_mm"] == ("1", "2")
     assert joined.rows.lines == (2, 3)
     assert [sentence.partition(":")[0] for sentence in joined.unmatched] == ["points", "log"]
     assert "line 4 (p9)" in joined.unmatched[0]
-    assert "x_mm of log are left out" in joined.warnings[0]
+    assert joined.warnings == ("log: roll_deg are left out, as the measurements are those of points.",)
+    assert joined.rows.cells["payload_kg"] == ("2", "1")
+    assert "roll_deg" not in joined.rows.cells
 
 
 def test_a_point_may_be_measured_several_times_but_stands_at_one_pose():
