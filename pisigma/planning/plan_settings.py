@@ -19,6 +19,8 @@ from pisigma.planning.knowledge import Instrument, SensorKind
 from pisigma.planning.tour import Pace
 from pisigma.yaml_file import MOST_POSES
 
+SHORTEST_MM, LONGEST_MM = 1e-3, 1e3
+"""Of a standard deviation of an instrument, and of an error of a robot: others are slips of the unit."""
 FILES = ("candidates_from", "task", "measured")
 """Settings that are files."""
 
@@ -79,8 +81,10 @@ class PlanSettings:
                 raise PlanningError(f"{name}: {least} to {most:,} was wanted, got {getattr(self, name):,}.")
         for name in ("sigma_mm", "limit_mm"):
             value = getattr(self, name)
-            if value is not None and not 0 < value < math.inf:
-                raise PlanningError(f"{name}: a length above 0 was wanted, got {value:g}.")
+            if value is not None and not SHORTEST_MM <= value <= LONGEST_MM:
+                raise PlanningError(
+                    f"{name}: {SHORTEST_MM:g} to {LONGEST_MM:g} mm was wanted, got {value:g}."
+                )
         box = self.box_mm
         if box is not None and not all(lower < upper for lower, upper in zip(box[:3], box[3:], strict=True)):
             raise PlanningError(

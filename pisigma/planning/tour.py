@@ -17,6 +17,10 @@ ROUNDS = 8
 """So often motions that turn out to be blocked are avoided by another order; what is left gets way points."""
 SAMPLE = 50
 """Poses to which ways are looked for, to tell which of two poses is shut in."""
+SLOWEST = 1e-3
+"""[rad/s or m/s] No robot goes from pose to pose more slowly."""
+LONGEST_SETTLING = 3600.0
+"""[s] At a pose."""
 DETOUR = 3.0
 """A blocked motion counts as this many times its time while the order is looked for."""
 
@@ -37,10 +41,13 @@ class Pace:
 
     def __post_init__(self) -> None:
         """Refuse times that are none."""
-        if not (0 < self.speed < math.inf and 0 < self.slide < math.inf and 0 <= self.settling < math.inf):
+        if not all(SLOWEST <= speed < math.inf for speed in (self.speed, self.slide)) or not (
+            0 <= self.settling <= LONGEST_SETTLING
+        ):
+            slowest = f"{math.degrees(SLOWEST):.2g} deg/s or {SLOWEST * 1e3:g} mm/s"
             raise PlanningError(
-                f"a speed above 0 and a settling time of 0 s or more were wanted, got {math.degrees(self.speed):g} "
-                f"deg/s, {self.slide * 1e3:g} mm/s and {self.settling:g} s."
+                f"speeds of {slowest} and more and a settling time of 0 to {LONGEST_SETTLING:g} s were wanted, got "
+                f"{math.degrees(self.speed):g} deg/s, {self.slide * 1e3:g} mm/s and {self.settling:g} s."
             )
 
     def seconds(

@@ -10,6 +10,7 @@ from hostile.exports import wrong_export
 from hostile.folders import wrong_model
 from hostile.healthy import healthy_robot, measured_robot
 from hostile.options import wrong_calibrate, wrong_ik, wrong_judging
+from hostile.plans import wrong_plan
 from hostile.tables import another_robot, damaged_measurements, wrong_measurements, wrong_poses
 from hostile.urdfs import wrong_urdf
 
@@ -29,6 +30,7 @@ KINDS: dict[str, tuple[Generator, int]] = {
     "options of ik": (wrong_ik, 16),
     "options of others": (wrong_judging, 14),
     "exports": (wrong_export, 20),
+    "plans": (wrong_plan, 2),
 }
 """By kind its generator and its share: those that are read or refused at once are most of them."""
 

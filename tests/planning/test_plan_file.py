@@ -83,9 +83,9 @@ def test_faults_of_the_files_are_named(stored: StoredPlan, tmp_path: Path):
         ({"sensor": "camera"}, "sensor 'camera' is unknown; Valid: distance, pose, position"),
         ({"criterion": "A"}, "criterion 'A' is unknown; Valid: D, I"),
         ({"count": 0}, "count: 1 to 100,000 was wanted, got 0"),
-        ({"sigma_mm": -1.0}, "sigma_mm: a length above 0"),
+        ({"sigma_mm": -1.0}, "sigma_mm: 0.001 to 1000 mm was wanted, got -1"),
         ({"box_mm": (0, 0, 0, 1, -1, 1)}, "box: the lowest x, y, z"),
-        ({"settling_s": -1.0}, "a settling time of 0 s or more"),
+        ({"settling_s": -1.0}, "a settling time of 0 to 3600 s"),
     ],
 )
 @pytest.mark.usefixtures("without_type_checker")

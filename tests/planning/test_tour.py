@@ -71,5 +71,5 @@ def test_a_pose_that_no_motion_leads_to_is_left_out():
 
 
 def test_a_pace_is_a_pace():
-    with pytest.raises(PlanningError, match="a speed above 0"):
+    with pytest.raises(PlanningError, match=r"speeds of 0\.057 deg/s or 1 mm/s and more"):
         Pace(speed=0.0)
