@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Float64
@@ -17,7 +18,6 @@ from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.splits import k_folds
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.recalibration.adaptation import Adaptation, adapt
-from pisigma.recalibration.model_posterior import ModelPosterior
 from pisigma.recalibration.recalibration_problem import Owner, recalibration_problem
 
 Kept = Literal["recalibrated", "old", "scratch"]
@@ -82,26 +82,23 @@ def gate(
         calibrator: from scratch.
         progress: called with the fold that is being judged.
     """
-    posterior, noise = ModelPosterior.of(model), whole.noise
-
-    def adapted(training: Measurements, arm: bool) -> Adaptation:
-        problem = recalibration_problem(model, posterior, training, elsewhere)
-        return adapt(problem if arm else problem.without_arm(), noise, whole.drift if arm else None)
-
-    candidates: dict[Kept, Callable[[Measurements], PredictsErrors]] = {
-        "recalibrated": lambda training: adapted(training, True),
-        "old": lambda training: adapted(training, False),
-        "scratch": lambda training: fit(calibrator, training, lambda what: None),
-    }
+    posterior, noise = whole.problem.posterior, whole.noise
     folds = min(FOLDS, int(groups_to_keep_whole(rows).max()) + 1)
-    errors = {name: torch.full((rows.rows,), torch.nan, dtype=torch.float64) for name in candidates}
+    names = get_args(Kept)
+    errors: dict[Kept, Tensor] = {name: torch.full((rows.rows,), torch.nan).double() for name in names}
     for number, (train, test) in enumerate(k_folds(rows, folds, 0) if folds > 1 else (), 1):
         progress(f"fold {number} of {folds}")
         training = rows.select(train)
         test = test[_predictable(rows, test, training)]
+        problem = recalibration_problem(model, posterior, training, elsewhere)
+        candidates: dict[Kept, Callable[[], PredictsErrors]] = {
+            "recalibrated": partial(adapt, problem, noise, whole.drift),
+            "old": partial(adapt, problem.without_arm(), noise),
+            "scratch": partial(fit, calibrator, training, lambda what: None),
+        }
         for name, candidate in candidates.items():
             try:
-                errors[name][test] = errors_under(candidate(training), rows.select(test)).position
+                errors[name][test] = errors_under(candidate(), rows.select(test)).position
             except IdentificationError:  # so few rows do not determine it
                 errors[name][test] = torch.inf
     return _decided(errors)

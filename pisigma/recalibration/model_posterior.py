@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -59,6 +60,19 @@ class ModelPosterior:
         correction = None if model.hybrid is None else model.hybrid.correction
         weights = known.root.new_zeros(0) if correction is None else _weights(correction, known.features)
         return ModelPosterior(known.space, known.geometry, known.features, weights, known.root, known.noise)
+
+    @cached_property
+    def usual_weights(self) -> Float64[Tensor, " weights"]:
+        """Root mean square of the weights of every prior size, as far as the posterior says [rad or m]."""
+        square = self.weights.square() + self.root[len(self.space.parameters) :].square().sum(1)
+        first, numbers = 0, []
+        for feature in self.features:
+            numbers.append(feature.group[feature.used] + first)
+            first += len(feature.group_names)
+        number = torch.cat(numbers)
+        count = torch.bincount(number, minlength=first).clamp(min=1)
+        mean = torch.zeros(first, dtype=square.dtype).index_add(0, number, square) / count
+        return mean.sqrt()[number]
 
     def renamed(self, rows: Measurements) -> Measurements:
         """Name the frame and the target of rows as the model does where one of them has no name for its only one."""

@@ -221,7 +221,7 @@ def _groups(
                 )
     if len(posterior.weights):
         index = torch.arange(parameters, len(root))
-        scale = LARGEST_CORRECTION * _usual_weights(posterior)
+        scale = LARGEST_CORRECTION * posterior.usual_weights
         groups.append(DriftGroup("correction", index, scale, worth=WORTH_OF_CORRECTION))
     return tuple(group for group in groups if len(group.index))
 
@@ -248,16 +248,3 @@ def _arm_groups(space: ParameterSpace, free: Bool[Tensor, " parameters"]) -> lis
         scale = torch.ones(len(chosen), dtype=torch.float64)
         groups.append(DriftGroup(what, torch.tensor(chosen, dtype=torch.int64), scale))
     return groups
-
-
-def _usual_weights(posterior: ModelPosterior) -> Float64[Tensor, " weights"]:
-    """Root mean square of the weights of every prior size, as far as the posterior says."""
-    square = posterior.weights.square() + posterior.root[len(posterior.space.parameters) :].square().sum(1)
-    first, numbers = 0, []
-    for feature in posterior.features:
-        numbers.append(feature.group[feature.used] + first)
-        first += len(feature.group_names)
-    number = torch.cat(numbers)
-    count = torch.bincount(number, minlength=first).clamp(min=1)
-    mean = torch.zeros(first, dtype=square.dtype).index_add(0, number, square) / count
-    return mean.sqrt()[number]

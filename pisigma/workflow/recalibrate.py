@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.files.model_files import model_hash
+from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.result import HybridResult
 from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.distillation_summary import ParentFigures
@@ -28,7 +29,6 @@ from pisigma.recalibration.recalibration_problem import Owner, recalibration_pro
 from pisigma.recalibration.summary import LeftOutFigures, MovedFigures, RecalibrationSummary
 from pisigma.reporting.recalibration_card import write_recalibration_card
 from pisigma.robot.description import Robot
-from pisigma.workflow.calibrate import CalibrationSettings
 from pisigma.workflow.result import AbstractModelResult
 
 FEW_ROWS = 5
@@ -121,7 +121,7 @@ def recalibrate(
     elsewhere = _elsewhere(parent, posterior, rows, settings)
     problem = recalibration_problem(parent, posterior, rows, elsewhere)
     adaptation = adapt(problem, posterior.noise)
-    calibrator = CalibrationSettings().calibrator(drawn, rows.socket or ())
+    calibrator = HybridCalibrator(drawn)
     judged = gate(parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation"))
     if judged.kept == "scratch":
         result = fit(calibrator, rows, stage(progress, "from scratch"))

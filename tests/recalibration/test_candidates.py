@@ -7,11 +7,11 @@ import torch
 from testing.aged import model_before, rows_later
 from testing.closeness import assert_close
 
+from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.recalibration.adaptation import adapt
 from pisigma.recalibration.candidates import ABOUT_AS_GOOD, Gate, _decided, gate
 from pisigma.recalibration.model_posterior import ModelPosterior
 from pisigma.recalibration.recalibration_problem import recalibration_problem
-from pisigma.workflow.calibrate import CalibrationSettings
 
 
 def decided(**errors: list[float]) -> Gate:
@@ -49,7 +49,7 @@ def test_left_out_rows_decide(count):
     posterior = ModelPosterior.of(model)
     problem = recalibration_problem(model, posterior, rows, frozenset())
     whole = adapt(problem, posterior.noise)
-    calibrator = CalibrationSettings().calibrator(posterior.space.robot)
+    calibrator = HybridCalibrator(posterior.space.robot)
     judged = gate(model, whole, frozenset(), rows, calibrator, lambda what: None)
     assert (judged.kept, judged.rows) == ("recalibrated", count)
     kept, old = judged.rms["recalibrated"], judged.rms["old"]

@@ -1,0 +1,207 @@
+"""Recalibration with few rows: accuracy from one series to another, the gate, a collision, a chain, and its time.
+
+Run `OMP_NUM_THREADS=1 python benchmarks/recalibration.py [PART ...]` with the measured files in `PISIGMA_DATA` and the
+simulator in `PISIGMA_SIMULATED`. A part is one of the names in `PARTS`. Errors are RMS of the positions of all rows
+that were not recalibrated with [mm]; a draw is a random choice of rows.
+"""
+
+import argparse
+import importlib.util
+import math
+import os
+import sys
+import tempfile
+import time
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import torch
+
+from pisigma.errors import IdentificationError
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.judging.trained_calibrations import fit
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.geometric_model import model_of_hybrid
+from pisigma.model.row_poses import poses_of_rows
+from pisigma.recalibration.adaptation import adapt
+from pisigma.robot import Robot
+from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate
+
+DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
+SIMULATED = Path(os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))
+SERIES = {"B": "ur10/series_b.csv", "C": "ur10/series_c_train.csv"}
+DRAWS = 10
+ASKED = {10: 0.42, 20: 0.28, 30: 0.225, 50: 0.165}
+GATE_ROWS = (5, 7, 10, 15, 20, 30, 50, 70, 100)
+COLLISION_SEEDS = range(10)
+
+
+@cache
+def series(name: str) -> Measurements:
+    """All rows of a series of the UR10."""
+    return Measurements.read_csv(DATA / SERIES[name], Robot.load("ur10"))
+
+
+@cache
+def model_of(name: str) -> CalibratedModel:
+    """The hybrid calibration of a series."""
+    robot, rows = Robot.load("ur10"), series(name)
+    return model_of_hybrid(name, robot, HybridCalibrator(robot).fit(rows), rows)
+
+
+def drawn(rows: Measurements, count: int, draw: int) -> tuple[Measurements, Measurements]:
+    """So many rows at random, and all others."""
+    order = torch.randperm(rows.rows, generator=torch.Generator().manual_seed(draw))
+    return rows.select(order[:count].sort().values), rows.select(order[count:].sort().values)
+
+
+def rms_mm(errors: torch.Tensor) -> float:
+    """Root mean square of the lengths of errors [m], in mm."""
+    return float(errors.square().sum(1).mean().sqrt()) * 1e3
+
+
+def error_of(model: CalibratedModel, rows: Measurements) -> float:
+    """RMS position error of a model [mm]."""
+    assert rows.position is not None
+    return rms_mm(rows.position - poses_of_rows(model, rows)[:, :3, 3])
+
+
+def accuracy() -> None:
+    """From series B to few rows of series C."""
+    for moved in (None, ("base", "tool")):
+        for count, asked in ASKED.items():
+            errors = []
+            for draw in range(DRAWS):
+                few, others = drawn(series("C"), count, draw)
+                result = recalibrate(model_of("B"), few, RecalibrationSettings(moved))
+                errors.append(error_of(result.model, others))
+            mean, shown = np.mean(errors), " ".join(f"{error:.3f}" for error in errors)
+            print(
+                f"B to C, moved {moved or 'not stated'}, {count} rows: {mean:.3f} (asked {asked}): {shown}",
+                flush=True,
+            )
+
+
+def candidates_of(result: Recalibration, few: Measurements, others: Measurements) -> dict[str, float]:
+    """RMS position errors of every candidate [mm]; infinite where so few rows do not determine it."""
+    adaptation, errors = result.adaptation, {}
+    errors["recalibrated"] = rms_mm(adaptation.errors_of(others)["position"])
+    old = adapt(adaptation.problem.without_arm(), adaptation.noise)
+    errors["old"] = rms_mm(old.errors_of(others)["position"])
+    try:
+        scratch = fit(HybridCalibrator(Robot.load("ur10")), few, lambda what: None)
+        errors["scratch"] = rms_mm(scratch.errors_of(others)["position"])
+    except IdentificationError:
+        errors["scratch"] = math.inf
+    return errors
+
+
+def gate() -> None:
+    """How much worse than the best candidate the kept one is, in the mean over the draws and at most."""
+    for before, after in (("B", "C"), ("C", "B")):
+        for count in GATE_ROWS:
+            kept, best, ratios, chosen = 0.0, 0.0, [], []
+            for draw in range(DRAWS):
+                few, others = drawn(series(after), count, draw)
+                result = recalibrate(model_of(before), few)
+                errors = candidates_of(result, few, others)
+                kept, best = kept + errors[result.summary.kept], best + min(errors.values())
+                ratios.append(errors[result.summary.kept] / min(errors.values()))
+                chosen.append(result.summary.kept)
+            counts = {name: chosen.count(name) for name in dict.fromkeys(chosen)}
+            print(
+                f"{before} to {after}, {count} rows: {np.mean(ratios):.3f} of the best (means {kept / best:.3f}), "
+                f"at most {max(ratios):.3f}; {counts}",
+                flush=True,
+            )
+
+
+def simulator() -> ModuleType:
+    """The independent simulator."""
+    spec = importlib.util.spec_from_file_location("sim", SIMULATED / "sim.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def collision() -> None:
+    """Joint 3 of the simulated kr10 collides: the error after ten poses over that before."""
+    sim = simulator()
+    with tempfile.TemporaryDirectory() as folder:
+        os.chdir(folder)
+        sim.write_urdf("kr10")
+        robot = Robot.load("kr10.urdf")
+
+    def rows_of(arm: object, q: np.ndarray, noise: bool, seed: int) -> Measurements:
+        position, _ = arm.measure(
+            q, *((3e-5,) if noise else (0.0,)), rng=np.random.default_rng(seed), rep=2e-5 if noise else 0.0
+        )
+        return Measurements(torch.from_numpy(q), torch.from_numpy(position))
+
+    for rows in (60, 120, 300):
+        ratios, joints = [], []
+        for seed in COLLISION_SEEDS:
+            arm = sim.True_("kr10", seed)
+            before = rows_of(arm, arm.sample(rows, 1000 + seed), True, seed)
+            model = model_of_hybrid("kr10", robot, HybridCalibrator(robot).fit(before), before)
+            check = arm.sample(500, 7)
+            error = error_of(model, rows_of(arm, check, False, 0))
+            arm.perturb[2] = math.radians(0.25)
+            result = recalibrate(model, rows_of(arm, arm.sample(10, 500 + seed), True, 77 + seed))
+            ratios.append(error_of(result.model, rows_of(arm, check, False, 0)) / error)
+            joints.append("; ".join(one.sentence for one in result.moved))
+        shown = " ".join(f"{ratio:.2f}" for ratio in ratios)
+        print(
+            f"collision after a calibration with {rows} rows: {np.mean(ratios):.3f} of the error before: {shown}"
+        )
+        print("  " + " | ".join(joints), flush=True)
+
+
+def chain() -> None:
+    """Ten recalibrations with twenty rows each against one with all of them, and a calibration of all rows."""
+    robot, rows = Robot.load("ur10"), series("C")
+    order = torch.randperm(rows.rows, generator=torch.Generator().manual_seed(0))
+    first, test = rows.select(order[:300]), rows.select(order[500:])
+    model = model_of_hybrid("first", robot, HybridCalibrator(robot).fit(first), first)
+    link = model
+    for k in range(10):
+        link = recalibrate(link, rows.select(order[300 + 20 * k : 320 + 20 * k])).model
+    at_once = recalibrate(model, rows.select(order[300:500])).model
+    every = rows.select(order[:500])
+    whole = model_of_hybrid("whole", robot, HybridCalibrator(robot).fit(every), every)
+    models = {"before": model, "chain": link, "at once": at_once, "all rows": whole}
+    print("; ".join(f"{name} {error_of(one, test):.4f}" for name, one in models.items()), flush=True)
+
+
+def seconds() -> None:
+    """Time of a recalibration of the UR10 with ten rows, without start and files."""
+    few, _ = drawn(series("C"), 10, 0)
+    model = model_of("B")
+    for moved in (None, ("base", "tool")):
+        started = time.perf_counter()
+        recalibrate(model, few, RecalibrationSettings(moved))
+        print(f"10 rows, moved {moved or 'not stated'}: {time.perf_counter() - started:.2f} s", flush=True)
+
+
+PARTS = {"accuracy": accuracy, "gate": gate, "collision": collision, "chain": chain, "seconds": seconds}
+
+
+def main() -> None:
+    """Run the parts that are named, or all."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("parts", nargs="*", choices=[*PARTS, []], metavar="PART")
+    torch.set_num_threads(1)
+    for name in parser.parse_args().parts or PARTS:
+        print(f"{name}:", file=sys.stderr)
+        PARTS[name]()
+
+
+if __name__ == "__main__":
+    main()
