@@ -12,8 +12,8 @@ from pisigma.hybrid.evidence import SensorCount
 
 SIZES = torch.logspace(-6, -0.5, 56, dtype=torch.float64)
 """Sizes that are tried: 1 µm to 0.3 m, 0.0001 to 18 deg; of corrections, shares of ten times their usual size."""
-WORTH = 2.0
-"""[nats] By so much a drift has to raise the log evidence: prior odds of about 1 to 7 for a group of the arm."""
+WORTH = 4.0
+"""[nats] By so much a drift has to raise the log evidence: prior odds of about 1 to 50 for a group of the arm."""
 SWEEPS = 3
 NOISE_FACTORS = torch.linspace(-1.0, 1.6, 14, dtype=torch.float64).exp()
 """Factors on the noise of the calibration that are tried."""

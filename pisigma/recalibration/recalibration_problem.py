@@ -35,7 +35,7 @@ ELSEWHERE = 0.1
 LARGEST_CORRECTION = 10.0
 """Size 1 of the drift of a correction, in root mean squares of its weights."""
 
-WORTH_OF_CORRECTION = 6.0
+WORTH_OF_CORRECTION = 12.0
 """[nats] Its many weights explain what a model gets wrong of few rows by chance, so it has to show more clearly."""
 
 
@@ -211,7 +211,7 @@ def _groups(
             elif name in measured:
                 turn = 1 / space.robot.reach
                 scale = torch.tensor([1.0, 1.0, 1.0, turn, turn, turn], dtype=torch.float64)
-                groups.append(DriftGroup(what, index[free[index]], scale[free[index]], worth=0.0))
+                groups.append(DriftGroup(what, index[free[index]], scale[free[index]], worth=1.0))
     for own in space.unknowns:
         for number, owner in enumerate(own.owners):
             if owner not in posterior.geometry.unknowns.get(own.name, {}):
