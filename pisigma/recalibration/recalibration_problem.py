@@ -112,14 +112,19 @@ def recalibration_problem(
 
 
 def _joined_space(space: ParameterSpace, rows: Measurements) -> ParameterSpace:
-    """The parameters of a model and of rows; frames, targets and owners that the model has come first."""
+    """The parameters of a model and of rows.
+
+    Frames and targets that the model has come first. Owners of sensors' unknowns are in the order of the rows, in
+    which the sensors number them, and then those that the rows lack.
+    """
     of_rows = {own.name: own for own in unknown_groups(rows)}
     before = {own.name: own for own in space.unknowns}
     frames = tuple(dict.fromkeys((*space.frames, *rows.frame)))
     groups = []
     for name, own in (of_rows | before).items():
         there = of_rows.get(name, UnknownGroup(name, own.columns, ()))
-        stands = dict.fromkeys(own.owners, frames[0]) | dict(zip(there.owners, there.frames, strict=True))
+        stands = dict(zip(there.owners, there.frames, strict=True))
+        stands |= {owner: frames[0] for owner in own.owners if owner not in stands}
         groups.append(
             UnknownGroup(name, own.columns, tuple(stands), tuple(stands.values()), there.angles or own.angles)
         )
