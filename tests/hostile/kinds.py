@@ -30,7 +30,7 @@ KINDS: dict[str, tuple[Generator, int]] = {
     "options of ik": (wrong_ik, 16),
     "options of others": (wrong_judging, 14),
     "exports": (wrong_export, 20),
-    "plans": (wrong_plan, 2),
+    "plans": (wrong_plan, 1),
 }
 """By kind its generator and its share: those that are read or refused at once are most of them."""
 

@@ -15,12 +15,12 @@ from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot import Robot
 
 ARM = ArmInCell.of(Robot.load("fanuc_r2000"), CELL)
+DRAWN = draw_candidates(ARM, 6, 0)
 
 
 @pytest.fixture
 def stored(tmp_path: Path) -> StoredPlan:
-    drawn = draw_candidates(ARM, 6, 0)
-    points = (drawn.q[:0], drawn.q[4:6], *(drawn.q[:0] for _ in range(2)))
+    points = (DRAWN.q[:0], DRAWN.q[4:6], *(DRAWN.q[:0] for _ in range(2)))
     settings = PlanSettings(
         count=3,
         check=1,
@@ -29,7 +29,7 @@ def stored(tmp_path: Path) -> StoredPlan:
         measured=str(tmp_path / "rows.csv"),
     )
     check = torch.tensor([False, True, False, False])
-    plan = StoredPlan(ARM, settings, tmp_path / "model", drawn.q[:4], check, drawn.number[:4], points)
+    plan = StoredPlan(ARM, settings, tmp_path / "model", DRAWN.q[:4], check, DRAWN.number[:4], points)
     plan.write(tmp_path / "poses.csv")
     return plan
 

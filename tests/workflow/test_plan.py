@@ -19,7 +19,7 @@ from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot import Robot
 from pisigma.workflow.plan import Plan, plan
 
-SETTINGS = PlanSettings(count=14, check=4, candidates=80, limit_mm=1.0)
+SETTINGS = PlanSettings(count=11, check=3, candidates=40, limit_mm=1.0)
 RADIUS = np.array([*(0.05 * 3.534 for _ in range(3)), *(0.035 * 3.534 for _ in range(3)), 0.025])
 
 
@@ -31,7 +31,7 @@ def planned() -> Plan:
 
 def test_every_planned_pose_is_reachable_free_and_seen(planned: Plan):
     robot, q = planned.stored.arm.robot, planned.stored.q.numpy()
-    assert len(q) == 18
+    assert len(q) == 14
     margin = np.deg2rad(5)
     assert (q >= robot.limits[:, 0] + margin - 1e-9).all()
     assert (q <= robot.limits[:, 1] - margin + 1e-9).all()
@@ -57,12 +57,12 @@ def test_every_motion_is_free(planned: Plan):
 
 
 def test_more_poses_are_expected_to_err_less(planned: Plan):
-    assert [point.poses for point in planned.curve] == [10, 14]
+    assert [point.poses for point in planned.curve] == [10, 11]
     assert planned.curve[0].rms > planned.curve[1].rms > 0
     assert planned.curve[1].random_rms > planned.curve[1].rms
     assert planned.needed is not None
-    assert 1 <= planned.needed <= 14
-    assert planned.travel > 18 * 3.0
+    assert 1 <= planned.needed <= 11
+    assert planned.travel > 14 * 3.0
     assert planned.weak
 
 
@@ -75,10 +75,10 @@ def test_the_measured_plan_is_measurements(planned: Plan, tmp_path: Path):
     (tmp_path / "measured.csv").write_text("\n".join([header + ",x_mm,y_mm,z_mm", *lines]))
     train, test = Measurements.read_csv(tmp_path / "measured.csv", robot).split_sets()
     assert test is not None
-    assert (train.rows, test.rows) == (14, 4)
+    assert (train.rows, test.rows) == (11, 3)
     script = (tmp_path / "poses.script").read_text()
-    assert script.count("sleep(3.0)") == 18
-    assert script.count("movej") == 18 + sum(map(len, planned.stored.way_points))
+    assert script.count("sleep(3.0)") == 14
+    assert script.count("movej") == 14 + sum(map(len, planned.stored.way_points))
     assert "WAIT SEC 3.0" in (tmp_path / "poses.src").read_text()
 
 
@@ -87,10 +87,10 @@ def test_what_is_measured_already_counts(planned: Plan, tmp_path: Path):
     header, *rows = (tmp_path / "poses.csv").read_text().splitlines()
     measured = [f"{row},0.0,0.0,0.0" for row in rows]
     (tmp_path / "measured.csv").write_text("\n".join([header + ",x_mm,y_mm,z_mm", *measured[:4]]))
-    settings = PlanSettings(count=3, check=0, candidates=40, measured=str(tmp_path / "measured.csv"))
+    settings = PlanSettings(count=2, check=0, candidates=12, measured=str(tmp_path / "measured.csv"))
     with no_type_checker():
         more = plan("fanuc_r2000", settings, CELL)
-    assert [point.poses for point in more.curve] == [0, 3]
+    assert [point.poses for point in more.curve] == [0, 2]
     assert more.checks == 0
 
 
@@ -98,7 +98,7 @@ def test_a_model_says_what_to_measure_next():
     """It is planned with the tool that it identified, and for poses of it."""
     with no_type_checker():
         _, model = hybrid_under_test()
-        more = plan(model, PlanSettings(count=3, check=1, candidates=60))
+        more = plan(model, PlanSettings(count=3, check=1, candidates=30))
     assert [point.poses for point in more.curve] == [0, 3]
     assert 0 < more.curve[1].rms < more.curve[0].rms < 1e-3
     assert_close(more.stored.arm.robot.tool, model.identified.tool)
