@@ -77,9 +77,9 @@ class AbstractFeature(ABC):
 
     @property
     def usual_sizes(self) -> tuple[float, ...]:
-        """Standard deviations of the weights of every group on usual robots [rad].
+        """Standard deviations of the weights of every group [rad] with which fits of few rows start.
 
-        Fits of few rows start with them, and plans expect them before anything is measured.
+        They are rather too large than too small, as the evidence takes back quickly what is not needed.
         """
         return (USUAL_SIZE,) * len(self.group_names)
 

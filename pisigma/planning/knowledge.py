@@ -18,28 +18,18 @@ from pisigma.identification.problem.noise import PriorGroup, prior_group_of
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.joint_correction.feature import AbstractFeature
-from pisigma.joint_correction.fourier_series import USUAL_HARMONICS, FourierSeries
+from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import Direction, GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.planning.robot_class import RobotClass
 from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_vector
 
 SensorKind = Literal["position", "pose", "distance"]
-USUAL_ERRORS = {
-    PriorGroup.JOINT_OFFSET: 1.0e-3,
-    PriorGroup.LENGTH: 0.4e-3,
-    PriorGroup.NO_LENGTH: 0.25e-3,
-    PriorGroup.BETWEEN_AXES: 0.7e-3,
-}
-"""[m or rad] Standard deviations of the errors of nominal geometries, by class.
-
-Medians of the sizes that maximise the evidence of hybrid calibrations of the robots at hand: the measured UR5, UR10 and
-FANUC R-2000iC with all rows, and simulated kr10, irb120, arm7 and scara arms, two each, with 400 positions.
-"""
 WIDE_LENGTH, WIDE_TOOL, WIDE_ANGLE = 1.0, 0.1, 1.0
 """[m, m, rad] Where base and tool may be before anything is measured: so wide that it does not matter."""
 
@@ -50,14 +40,14 @@ class Instrument:
 
     Attributes:
         kind: "position" of a target, its "pose", or its "distance" from an anchor.
-        sigma: standard deviation of a coordinate or a distance [m]. The default is what hybrid calibrations of the
-            measured UR5 and UR10 leave of a laser tracker's coordinates, 0.028 and 0.043 mm.
+        sigma: standard deviation of a coordinate or a distance [m]. The default lies between what hybrid calibrations
+            of the measured UR5 and UR10 leave of a laser tracker's coordinates, 0.028 and 0.043 mm.
         sigma_rotation: standard deviation of an angle about an axis [rad], of the UR10's target.
         anchor: where distances are from, in the measuring frame [m].
     """
 
     kind: SensorKind = "position"
-    sigma: float = 4e-5
+    sigma: float = 3.5e-5
     sigma_rotation: float = 1.1e-4
     anchor: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
@@ -88,7 +78,7 @@ class Knowledge:
     ) -> "Knowledge":
         """Give what is known of a robot that was never measured: errors of usual sizes around the drawing.
 
-        Geometric errors have the standard deviations `USUAL_ERRORS`, weights the `usual_sizes` of their features.
+        Geometric errors and weights have the standard deviations of the robot's class, see `RobotClass`.
 
         Args:
             robot: as drawn; its tool should be about where the target is.
@@ -97,13 +87,14 @@ class Knowledge:
             gravity: direction in which things fall, in the frame of the robot's base.
         """
         space = ParameterSpace(robot)
+        usual, sizes = RobotClass.of(robot), [_geometric_sizes(space)]
         features: tuple[AbstractFeature, ...] = ()
         if hybrid:
-            features = (
-                GravityTorques(robot, in_first_row(robot, gravity)),
-                FourierSeries(robot, USUAL_HARMONICS),
-            )
-        root = CovarianceRoot(torch.diag(torch.cat([_usual_errors(space), *map(_usual_weights, features)])))
+            torques = GravityTorques(robot, in_first_row(robot, gravity))
+            series = FourierSeries(robot, usual.harmonics)
+            sizes += [_weight_sizes(torques, (usual.gravity,)), _weight_sizes(series, usual.bands)]
+            features = torques, series
+        root = CovarianceRoot(torch.diag(torch.cat(sizes)))
         geometry = IdentifiedGeometry(robot, {"": robot.base}, {"": robot.tool}, {})
         return Knowledge(PositionUncertainty(space, geometry, features, root, 1.0), None, instrument)
 
@@ -225,18 +216,19 @@ class Knowledge:
         return surprise
 
 
-def _usual_errors(space: ParameterSpace) -> Float64[Tensor, " parameters"]:
+def _geometric_sizes(space: ParameterSpace) -> Float64[Tensor, " parameters"]:
     """Standard deviations of all parameters of a robot that was never measured [m or rad]."""
-    sizes = []
-    for parameter, value in zip(space.parameters, space.robot.dh.ravel().tolist(), strict=False):
-        drawn = abs(value) > USUAL_ERRORS[PriorGroup.LENGTH]
-        sizes.append(USUAL_ERRORS[PriorGroup(prior_group_of(parameter.group, drawn))])
+    usual, sizes = RobotClass.of(space.robot), []
+    arm = zip(space.parameters[: space.arm_size], space.robot.dh.ravel().tolist(), strict=True)
+    for parameter, value in arm:
+        group = PriorGroup(prior_group_of(parameter.group, abs(value) > usual.length))
+        sizes.append(usual.geometric(group))
     sizes += [WIDE_LENGTH] * 3 + [WIDE_ANGLE] * 3 + [WIDE_TOOL] * 3 + [WIDE_ANGLE] * 3
     return torch.tensor(sizes, dtype=torch.float64)
 
 
-def _usual_weights(feature: AbstractFeature) -> Float64[Tensor, " weights"]:
+def _weight_sizes(feature: AbstractFeature, of_groups: tuple[float, ...]) -> Float64[Tensor, " weights"]:
     """Standard deviations of the used weights of a feature [rad, or m of prismatic joints]."""
-    sizes = torch.tensor(feature.usual_sizes, dtype=torch.float64)[feature.group]
+    sizes = torch.tensor(of_groups, dtype=torch.float64)[feature.group]
     unit = torch.where(torch.tensor(feature.robot.revolute), 1.0, feature.robot.reach)
     return (sizes * unit[:, None])[feature.used]
