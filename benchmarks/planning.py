@@ -1,0 +1,207 @@
+"""Accuracy of calibrations from chosen poses beside random ones, and what was predicted of it.
+
+Run `OMP_NUM_THREADS=1 python benchmarks/planning.py [PART ...]` with the measured files in `PISIGMA_DATA`, and the
+simulator of arms (`sim.py`) in `PISIGMA_SIMULATED`. Measured: pools of 400 random rows, of which some are chosen; all
+other rows judge. Simulated: candidates are drawn in the joint limits; 400 poses without noise judge. Every figure is a
+root mean square of position errors [mm].
+"""
+
+import argparse
+import contextlib
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.judging.few_rows import fit_where_it_helps
+from pisigma.judging.trained_calibrations import Calibrator
+from pisigma.measurement.dataset import Measurements
+from pisigma.planning.choice import Criterion, choose
+from pisigma.planning.expected_accuracy import rms_of
+from pisigma.planning.knowledge import Instrument, Knowledge
+from pisigma.robot import Robot
+
+DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
+SIMULATED = Path(os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))
+POOL = 400
+ARMS = ("kr10", "irb120", "arm7")
+NOISE = 3.6e-5
+"""[m] Of the simulated sensor and the robot's repeatability together."""
+LIMIT = 0.1
+"""[mm] Accuracy to which poses are counted."""
+STEPS = (14, 18, 22, 26, 30, 34, 38, 42, 46, 50, 56, 62, 70, 80)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """Of one choice: true and predicted RMS [mm]."""
+
+    true: float
+    predicted: float
+
+
+def judged(calibrator: Calibrator, rows: Measurements, test: Measurements) -> float:
+    """True RMS of what is calibrated from some rows [mm]."""
+    result = fit_where_it_helps(calibrator, rows, lambda what: None)
+    return float(result.errors_of(test)["position"].square().sum(1).mean().sqrt()) * 1e3
+
+
+def pools(name: str, draws: range) -> Iterator[tuple[Measurements, Measurements]]:
+    """Pools of measured rows, and all others."""
+    file = {"ur10": "ur10/series_c_train.csv", "ur5": "ur5/grid.csv"}[name]
+    data = Measurements.read_csv(DATA / file, Robot.load(name))
+    for draw in draws:
+        order = torch.randperm(data.rows, generator=torch.Generator().manual_seed(draw))
+        yield data.select(order[:POOL]), data.select(order[POOL:])
+
+
+def measured(
+    name: str, counts: tuple[int, ...], hybrid: bool, draws: range, criteria: tuple[Criterion, ...]
+) -> None:
+    """Random rows of a pool beside chosen ones."""
+    robot = Robot.load(name)
+    knowledge = Knowledge.of_robot(robot, hybrid=hybrid)
+    calibrator: Calibrator = HybridCalibrator(robot) if hybrid else GeometricCalibrator(robot)
+    table: dict[tuple[int, str], list[float]] = {}
+    for pool, test in pools(name, draws):
+        for count in counts:
+            rows: dict[str, Tensor] = {"random": torch.arange(count)}
+            rows |= {one: choose(knowledge, pool.q, count, pool.q[:300], one) for one in criteria}
+            for how, chosen in rows.items():
+                result = calibrator.fit(pool.select(chosen))
+                rms = float(result.errors_of(test)["position"].square().sum(1).mean().sqrt()) * 1e3
+                table.setdefault((count, how), []).append(rms)
+    for (count, how), values in table.items():
+        spread = f"{min(values):.3f} to {max(values):.3f}"
+        print(f"{name} {count:3d} poses {how:6s} {np.mean(values):.4f}  ({spread})", flush=True)
+
+
+class Arm:
+    """A simulated arm: what is drawn, what can be measured, and what is true."""
+
+    def __init__(self, name: str, seed: int) -> None:
+        sys.path.insert(0, str(SIMULATED))
+        import sim  # type: ignore[import-not-found]
+
+        self.true: Any = sim.True_(name, seed=seed)
+        with TemporaryDirectory() as folder:
+            with contextlib.chdir(folder):
+                sim.write_urdf(name)
+            self.drawn = Robot.load(f"{folder}/{name}.urdf")
+        self.planned = self.drawn.with_geometry(tool=np.array([*self.true.tool, 0.0, 0.0, 0.0]))
+        self.seed = seed
+        joints = torch.from_numpy(self.true.sample(400, 2000 + seed))
+        self.test = self.rows(joints, 0.0)
+
+    def rows(self, q: Tensor, noise: float = 3e-5) -> Measurements:
+        """What a tracker measures; the repeatability of the robot is 0.02 mm."""
+        rng, repeatability = np.random.default_rng(self.seed + 5), 2e-5 if noise else 0.0
+        position, _ = self.true.measure(q.numpy(), noise=noise, rng=rng, rep=repeatability)
+        return Measurements(q=q, position=torch.from_numpy(position))
+
+    def candidates(self, count: int) -> Tensor:
+        """Joint values that the tool stays above the floor with."""
+        return torch.from_numpy(self.true.sample(count, 1000 + self.seed))
+
+    def figures(self, q: Tensor, knowledge: Knowledge) -> Figures:
+        """Of poses that are measured."""
+        predicted = rms_of(knowledge.informed(q).tool(self.test.q)) * 1e3
+        return Figures(judged(HybridCalibrator(self.drawn), self.rows(q), self.test), predicted)
+
+
+def predicted(seeds: range) -> None:
+    """Predicted over true RMS at 15, 30 and 60 chosen poses."""
+    ratios: dict[int, list[float]] = {}
+    for seed in seeds:
+        arm = Arm(ARMS[seed % len(ARMS)], seed)
+        knowledge, q = Knowledge.of_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
+        for count in (15, 30, 60):
+            chosen = q[choose(knowledge, q, count, q[:300], "D")]
+            one = arm.figures(chosen, knowledge)
+            ratios.setdefault(count, []).append(one.predicted / one.true)
+    for count, values in ratios.items():
+        print(
+            f"predicted over true RMS, {count} chosen poses, {len(values)} arms: median {np.median(values):.2f}, "
+            f"{min(values):.2f} to {max(values):.2f}",
+            flush=True,
+        )
+
+
+def needed(seeds: range) -> None:
+    """Poses to 0.1 mm, chosen over random."""
+    ratios = []
+    for name in ARMS:
+        for seed in seeds:
+            arm = Arm(name, seed)
+            knowledge, q = Knowledge.of_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
+            order = choose(knowledge, q, STEPS[-1], q[:300], "D")
+            poses = [first(arm, rows, knowledge) for rows in (q, q[order])]
+            ratios.append(poses[1] / poses[0])
+            print(f"{name} seed {seed}: {poses[0]:.0f} random, {poses[1]:.0f} chosen", flush=True)
+    print(f"poses to {LIMIT} mm, chosen over random: {np.mean(ratios):.2f} ({len(ratios)} arms)")
+
+
+def first(arm: Arm, q: Tensor, knowledge: Knowledge) -> float:
+    """The number of poses with which errors pass the limit, between two of `STEPS` on a logarithmic line."""
+    before: tuple[float, float] | None = None
+    for count in STEPS:
+        error = arm.figures(q[:count], knowledge).true
+        if error <= LIMIT:
+            if before is None:
+                return float(count)
+            share = np.log(before[1] / LIMIT) / np.log(before[1] / error)
+            return float(before[0] + share * (count - before[0]))
+        before = (float(count), error)
+    return float(STEPS[-1])
+
+
+def speed() -> None:
+    """100 of 5,000 candidates."""
+    robot = Robot.load("ur10")
+    generator = torch.Generator().manual_seed(0)
+    q = (torch.rand(5000, robot.dof, generator=generator, dtype=torch.float64) * 2 - 1) * np.pi
+    knowledge = Knowledge.of_robot(robot)
+    for criterion in ("D", "I"):
+        began = time.perf_counter()
+        choose(knowledge, q, 100, q[:300], criterion)  # type: ignore[arg-type]
+        seconds = time.perf_counter() - began
+        unknowns = len(knowledge.uncertainty.root)
+        print(
+            f"100 of 5,000 candidates, {unknowns} unknowns, criterion {criterion}: {seconds:.1f} s",
+            flush=True,
+        )
+
+
+def main() -> None:
+    """Print the figures of the parts that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parts = ("ur10", "ur5", "predicted", "needed", "speed")
+    parser.add_argument("parts", nargs="*", default=list(parts), metavar="PART", help=", ".join(parts))
+    parser.add_argument("--draws", type=int, default=10, help="pools, or simulated arms of a kind")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first of them")
+    arguments = parser.parse_args()
+    seeds = range(arguments.first, arguments.first + arguments.draws)
+    both: tuple[Criterion, ...] = ("D", "I")
+    run: dict[str, Callable[[], None]] = {
+        "ur10": lambda: measured("ur10", (15, 30, 50, 100), True, seeds, both),
+        "ur5": lambda: measured("ur5", (10, 15), False, seeds, both),
+        "predicted": lambda: predicted(seeds),
+        "needed": lambda: needed(seeds),
+        "speed": speed,
+    }
+    for part in arguments.parts:
+        run[part]()
+
+
+if __name__ == "__main__":
+    main()
