@@ -130,14 +130,10 @@ def _print(planned: "Plan", files: list[Path]) -> None:
         for point in planned.curve
     ]
     print_table("expected errors of the tool's position by number of poses", columns, rows)
-    settings = planned.stored.settings
-    if settings.limit_mm is not None:
-        needed = "needs more poses" if planned.needed is None else f"is expected with {planned.needed} poses"
-        needed = needed if planned.needed != 0 else "is expected already, without more poses"
-        print_lines([f"An RMS of {settings.limit_mm:g} mm {needed}."])
+    print_lines(_limit_lines(planned))
     print_line("What the expected error will mostly come from:")
     print_lines((f"- {line}" for line in planned.weak), indent="  ")
-    points = sum(map(len, planned.stored.way_points))
+    points, settings = sum(map(len, planned.stored.way_points)), planned.stored.settings
     print_lines(
         [
             planned.candidates.sentence,
@@ -147,6 +143,17 @@ def _print(planned: "Plan", files: list[Path]) -> None:
             f"Written to {', '.join(map(str, files))}.",
         ]
     )
+
+
+def _limit_lines(planned: "Plan") -> list[str]:
+    """How many poses the limit needs, where there is one."""
+    limit = planned.stored.settings.limit_mm
+    if limit is None:
+        return []
+    if planned.needed is None:
+        return [f"An RMS of {limit:g} mm needs more than {planned.poses} poses."]
+    needed = f"with {planned.needed} poses" if planned.needed else "already, without more poses"
+    return [f"An RMS of {limit:g} mm is expected {needed}."]
 
 
 def _box(stated: str | None) -> Any:

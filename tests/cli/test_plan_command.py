@@ -35,7 +35,7 @@ def test_people_read_a_table_and_what_stays_uncertain(run, folder):
     assert max(map(len, result.stdout.splitlines())) <= 80
     for words in (
         "RMS [mm]",
-        "needs more poses",
+        "needs more than 8 poses",
         "minutes at 30 deg/s",
         "again.plan.yaml",
         "mostly come from",
