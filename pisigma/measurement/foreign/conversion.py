@@ -46,7 +46,7 @@ def check_complete(mapping: FileMapping) -> None:
         if other != column:
             raise MeasurementError(
                 f"{source}: the columns '{column.heading}' and '{other.heading}' are both {column.target.quantity}; "
-                f"say which one is wanted, such as --map '{column.heading}=-'."
+                f"say which one is wanted, such as --map '{mapping.key(column)}=-'."
             )
     if mapping.rotations:
         raise MeasurementError(
@@ -59,7 +59,7 @@ def check_complete(mapping: FileMapping) -> None:
         first = next(replace(one.target, unit=likely[kind]) for one in lacking if (kind := one.target.needs))
         raise MeasurementError(
             f"{source}: no unit is stated of the column{many} {names}; state it, --unit {','.join(likely.values())} if "
-            f"that is right, or --map '{lacking[0].heading}={first.text}'."
+            f"that is right, or --map '{mapping.key(lacking[0])}={first.text}'."
         )
 
 

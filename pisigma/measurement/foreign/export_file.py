@@ -146,7 +146,9 @@ def _read_top(
     for number, line in reversed(lines):
         cells = _heading_cells(line, dialect, width)
         symbols = [unit_symbol(cell) for cell in cells]
-        is_units = any(symbols) and all(symbols[i] or not cell for i, cell in enumerate(cells))
+        others = [cell for cell, symbol in zip(cells, symbols, strict=True) if cell and not symbol]
+        count = sum(map(bool, symbols))
+        is_units = count >= (max(2, len(others)) if others else 1) and not any(map(is_recognised, others))
         if headings or not any(cells) or set(line) <= set("-=+|_ \t"):
             comments.append(line)
         elif len(cells) == width and is_units and not units:

@@ -125,14 +125,14 @@ POSITIONS = tuple(
 """Names of the coordinates of a position; a way to name them is one text."""
 
 _MEANINGS = {
-    "point": "point pos name pointname pointid punkt punktname pt ptname no nr num id index label number measurement",
+    "point": "point pointname punkt punktname pt ptname pos name label pointid id measurement no nr num number index",
     "time": "time timestamp zeit datetime date_time utc stamp systemtime",
-    "temperature": "temperature temp temperatur t1 ambient",
-    "payload": "payload load last mass",
+    "temperature": "temperature temp temperatur",
+    "payload": "payload",
     "set": "set split",
 }
 MEANINGS = {name: quantity for quantity, names in _MEANINGS.items() for name in names.split()}
-"""Names of what is no joint, position or rotation; a name more is one word."""
+"""Names of what is no joint, position or rotation, the better ones first; a name more is one word."""
 _OTHERS = {
     name
     for names in (

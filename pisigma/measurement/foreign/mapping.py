@@ -55,6 +55,10 @@ class FileMapping:
         """Whether it holds anything else that is kept, besides names and times of the rows."""
         return bool(set(self.quantities) - {*KEYS, *joints_of(self.quantities)})
 
+    def key(self, column: MappedColumn) -> str:
+        """Name a column as mappings do: by its heading, or by its number where several have that."""
+        return column.heading if self.file.headings.count(column.heading) == 1 else str(column.index + 1)
+
     @property
     def without_unit(self) -> tuple[MappedColumn, ...]:
         """The columns whose unit is not known; a time without one is in s."""

@@ -33,7 +33,8 @@ class NumberFormat:
         if match is None:
             return None
         whole = re.sub(rf"[.,{_BLANKS}]", "", match["whole"] or "")
-        return f"{match['sign']}{whole}{(match['decimals'] or '').replace(',', '.')}{match['exponent'] or ''}"
+        decimals, exponent = (match["decimals"] or "").replace(",", "."), (match["exponent"] or "").upper()
+        return f"{match['sign']}{whole}{decimals}{exponent.replace('D', 'E')}"
 
     def certainty(self, cell: str) -> float:
         """Say how surely a cell is a number of this format: 0 where it is none, less than 1 where it could be another.
@@ -53,7 +54,7 @@ def _pattern(decimal: Decimal) -> re.Pattern[str]:
     groups = rf"\d{{1,3}}(?P<group>[{other}{_BLANKS}])\d{{3}}(?:(?P=group)\d{{3}})*"
     return re.compile(
         rf"(?P<sign>[-+]?)(?=\d|\{decimal}\d)(?P<whole>{groups}|\d*)(?P<decimals>\{decimal}\d*)?"
-        r"(?P<exponent>[eE][-+]?\d+)?",
+        r"(?P<exponent>[eEdD][-+]?\d+)?",
         re.ASCII,
     )
 

@@ -111,7 +111,8 @@ def propose(proposal: Proposal, rotation: str | None) -> None:
     _take_joints(proposal)
     _take_position(proposal)
     _take_rotation(proposal, rotation)
-    for name, indices in proposal.names().items():
+    ranks = {name: rank for rank, name in enumerate(MEANINGS)}
+    for name, indices in sorted(proposal.names().items(), key=lambda one: ranks.get(one[0], len(ranks))):
         for index in indices:
             _take_other(proposal, name, index)
 

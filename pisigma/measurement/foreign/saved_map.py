@@ -71,5 +71,5 @@ def save_map(mappings: Sequence[FileMapping], path: str | os.PathLike[str]) -> N
     Raises:
         OutputError: the file cannot be written.
     """
-    files = [{one.heading: one.target.text for one in mapping.columns} for mapping in mappings]
+    files = [{mapping.key(one): one.target.text for one in mapping.columns} for mapping in mappings]
     write_whole(Path(path), yaml_text({"files": files}))

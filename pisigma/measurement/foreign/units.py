@@ -119,16 +119,15 @@ def scaled(number: str, symbol: str) -> str:
             value = decimal.Decimal(number) * decimal.Decimal(factor)
     except decimal.DecimalException:
         return number
-    if not value or abs(value.adjusted()) > _LONGEST_PLAIN or not value.is_finite():
-        return str(value)
-    return f"{value:f}"
+    is_plain = value.is_finite() and abs(value.adjusted()) <= _LONGEST_PLAIN
+    return "0" if not value else f"{value:f}" if is_plain else str(value)
 
 
 def doubt(symbol: str, largest: float, rows: int) -> str:
     """Say why values can hardly be in their unit; "" where nothing speaks against it.
 
-    A joint turns at most twice, nothing is measured from beyond 200 m, and a robot that is measured moves by more than
-    a few degrees and some 20 mm.
+    A joint turns at most two or three times, nothing is measured from beyond 200 m, and a robot that is measured moves by
+    more than a few degrees and some 20 mm.
 
     Args:
         symbol: of the unit.
@@ -144,6 +143,8 @@ def doubt(symbol: str, largest: float, rows: int) -> str:
         "mm": (not few and 0 < largest < 20, "metres"),
     }
     doubted, other = doubts.get(symbol, (False, ""))
+    if symbol == "deg" and largest > 1000:
+        doubted, other = True, "lengths"
     return f"values up to {largest:.6g} {symbol} look like {other}" if doubted else ""
 
 

@@ -28,6 +28,11 @@ def test_what_stands_around_the_rows(tmp_path: Path):
     assert file.comments[:2] == ("Report of 2 March", "// units mm")
 
 
+def test_first_lines_of_spreadsheets_and_unit_rows_with_dashes(tmp_path: Path):
+    file = read(tmp_path, "sep=;\nPoint;x;y;Note\n[-];[mm];[mm];[text]\np1;1,5;2,5;ok\n")
+    assert (file.headings, file.units) == (("Point", "x", "y", "Note"), ("", "mm", "mm", ""))
+
+
 def test_headings_that_come_again_and_blanks_before_units(tmp_path: Path):
     file = read(tmp_path, "J1 [deg]  J2 [deg]  x [mm]\n1 2 3\n4 5 6\nJ1 [deg]  J2 [deg]  x [mm]\n7 8 9\n")
     assert file.headings == ("J1[deg]", "J2[deg]", "x[mm]")

@@ -85,6 +85,17 @@ def test_stated_columns(tmp_path: Path):
     assert "are both q1" in refusal(tmp_path, text, stated | {"2": "q1_deg"})
 
 
+def test_equal_headings_are_told_apart_by_their_numbers(tmp_path: Path):
+    text = "j1 [deg],j2 [deg],X [mm],Y [mm],Z [mm],X [mm]\n1,2,3,4,5,6\n"
+    assert "such as --map '3=-'" in refusal(tmp_path, text)
+    assert targets(mapped(tmp_path, text, {"3": "-"}))[2:] == ["-", "y_mm", "z_mm", "x_mm"]
+
+
+def test_a_name_is_a_better_point_than_a_number(tmp_path: Path):
+    text = "No,Name,X [mm],Y [mm],Z [mm]\n1,p7,3,4,5\n2,p8,3,4,6\n"
+    assert targets(mapped(tmp_path, text))[:2] == ["-", "point"]
+
+
 def test_what_was_commanded_is_no_measurement(tmp_path: Path):
     header = "j1 [deg],j2 [deg],x nom [mm],y nom [mm],z nom [mm],x [mm],y [mm],z [mm]"
     assert targets(mapped(tmp_path, f"{header}\n1,2,3,4,5,6,7,8\n"))[2:] == [

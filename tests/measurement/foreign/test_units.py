@@ -68,6 +68,7 @@ def test_stated_units():
 def test_values_that_cannot_be_in_a_unit():
     assert "degrees" in doubt("rad", 170.0, 20)
     assert "radians" in doubt("deg", 3.1, 20)
+    assert "lengths" in doubt("deg", 2103.0, 20)
     assert "millimetres" in doubt("m", 2103.0, 20)
     assert "metres" in doubt("mm", 2.9, 20)
     assert not any(doubt(*case, 20) for case in (("rad", 6.2), ("deg", 170.0), ("m", 2.9), ("mm", 2103.0)))
