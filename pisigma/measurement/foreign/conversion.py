@@ -11,7 +11,7 @@ from torch import Tensor
 from pisigma.errors import MeasurementError
 from pisigma.measurement.csv.columns import QUATERNION, RPY, find_column
 from pisigma.measurement.foreign.export_file import ExportFile
-from pisigma.measurement.foreign.mapping import FileMapping
+from pisigma.measurement.foreign.mapping import FileMapping, angles, coordinates, joint_columns
 from pisigma.measurement.foreign.number_format import is_missing
 from pisigma.measurement.foreign.quantities import KEYS, LEFT_OUT, MappedColumn, measurement_column
 from pisigma.measurement.foreign.rotations import ROTATIONS, RotationEncoding
@@ -35,7 +35,7 @@ class ConvertedRows:
 
 
 def check_complete(mapping: FileMapping) -> None:
-    """Make sure that every column that is kept is in a unit, and is the only one of its quantity.
+    """Make sure that every column that is kept is the only one of its quantity, and that units are stated and agree.
 
     Raises:
         MeasurementError: see above, or the encoding of a rotation is open.
@@ -48,6 +48,13 @@ def check_complete(mapping: FileMapping) -> None:
                 f"{source}: the columns '{column.heading}' and '{other.heading}' are both {column.target.quantity}; "
                 f"say which one is wanted, such as --map '{mapping.key(column)}=-'."
             )
+    for group in (coordinates(mapping.columns), joint_columns(mapping.columns), angles(mapping.columns)):
+        for column in group:
+            if column.target.unit and group[0].target.unit not in ("", column.target.unit):
+                raise MeasurementError(
+                    f"{source}: '{group[0].heading}' is in {group[0].target.unit}, but '{column.heading}' in "
+                    f"{column.target.unit}; correct the headings, or say with --map what both are."
+                )
     if mapping.rotations:
         raise MeasurementError(
             f"{source}: the headings do not say how the rotation is written; state --rotation "

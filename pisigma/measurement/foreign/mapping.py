@@ -203,7 +203,7 @@ def _units_of_maker(
     if maker is None:
         return {}
     kinds: tuple[tuple[UnitKind, str, list[MappedColumn]], ...] = (
-        ("angle", maker.angle, joint_columns(columns) or rotations(columns)),
+        ("angle", maker.angle, joint_columns(columns) or angles(columns)),
         ("length", maker.length, coordinates(columns)),
     )
     return {
@@ -222,7 +222,7 @@ def coordinates(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
     return [one for one in columns if one.target.quantity in ("x", "y", "z")]
 
 
-def rotations(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
+def angles(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
     """The columns of angles of rotations."""
     return [
         one

@@ -74,6 +74,14 @@ def test_a_unit_in_a_heading_that_is_unknown_or_does_not_fit(tmp_path: Path):
     )
 
 
+def test_a_position_is_in_one_unit(tmp_path: Path):
+    text = "j1 [deg],j2 [deg],X [m],Y [mm],Z [mm]\n1,2,3,4,5\n"
+    assert "'X [m]' is in m, but 'Y [mm]' in mm" in refusal(tmp_path, text)
+    assert "'j1 [deg]' is in deg, but 'j2 [rad]' in rad" in refusal(
+        tmp_path, text.replace("j2 [deg]", "j2 [rad]")
+    )
+
+
 def test_stated_columns(tmp_path: Path):
     text = f"a,b,c,d,e,f,u,v,w,note\n{ROW},warm\n{ROW},\n"
     stated = {str(i + 1): name for i, name in enumerate([*DEGREES_MM, "-"])}
