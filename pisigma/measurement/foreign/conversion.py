@@ -53,7 +53,7 @@ def check_complete(mapping: FileMapping) -> None:
             if column.target.unit and group[0].target.unit not in ("", column.target.unit):
                 raise MeasurementError(
                     f"{source}: '{group[0].heading}' is in {group[0].target.unit}, but '{column.heading}' in "
-                    f"{column.target.unit}; correct the headings, or say with --map what both are."
+                    f"{column.target.unit}; give both in one unit."
                 )
     if mapping.rotations:
         raise MeasurementError(

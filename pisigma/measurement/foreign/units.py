@@ -126,8 +126,8 @@ def scaled(number: str, symbol: str) -> str:
 def doubt(symbol: str, largest: float, rows: int) -> str:
     """Say why values can hardly be in their unit; "" where nothing speaks against it.
 
-    A joint turns at most two or three times, nothing is measured from beyond 200 m, and a robot moves by more than a few
-    degrees and some 20 mm while it is measured.
+    A joint turns at most two or three times, nothing is measured from beyond 200 m, and a measured robot moves by
+    more than three degrees and 20 mm.
 
     Args:
         symbol: of the unit.

@@ -78,7 +78,7 @@ def test_a_position_is_in_one_unit(tmp_path: Path):
     text = "j1 [deg],j2 [deg],X [m],Y [mm],Z [mm]\n1,2,3,4,5\n"
     assert "'X [m]' is in m, but 'Y [mm]' in mm" in refusal(tmp_path, text)
     assert "'j1 [deg]' is in deg, but 'j2 [rad]' in rad" in refusal(
-        tmp_path, text.replace("j2 [deg]", "j2 [rad]")
+        tmp_path, text.replace("j2 [deg]", "j2 [rad]").replace("[m]", "[mm]")
     )
 
 
