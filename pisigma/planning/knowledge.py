@@ -94,6 +94,8 @@ class Knowledge:
             series = FourierSeries(robot, usual.harmonics)
             sizes += [_weight_sizes(torques, (usual.gravity,)), _weight_sizes(series, usual.bands)]
             features = torques, series
+        if instrument.kind == "distance":  # no distance changes when all is turned about the anchor
+            sizes[0][[*space.of("base")][3:]] = 0.0
         root = CovarianceRoot(torch.diag(torch.cat(sizes)))
         geometry = IdentifiedGeometry(robot, {"": robot.base}, {"": robot.tool}, {})
         return Knowledge(PositionUncertainty(space, geometry, features, root, 1.0), None, instrument)
@@ -160,8 +162,15 @@ class Knowledge:
         return self.uncertainty.columns(JointState(q), self.moved(q))
 
     def tool(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses 3 directions"]:
-        """Derivative D of the target's position by independent standard normal numbers: its covariance is `D D^T`."""
-        return self.uncertainty.covariance_root.along(self.columns(q)[:, :3])
+        """Derivative D of the target's position by independent standard normal numbers: its covariance is `D D^T`.
+
+        The position is that in the measuring frame, or where distances are measured in the robot's base frame, as these
+        do not say where the robot stands.
+        """
+        columns = self.columns(q)[:, :3]
+        if self.instrument.kind == "distance":
+            columns[..., [*self.uncertainty.space.of("base")]] = 0.0
+        return self.uncertainty.covariance_root.along(columns)
 
     def measured(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
         """Derivative B of what is measured, over its noise, by these numbers; values have covariance `B B^T + 1`."""

@@ -86,3 +86,11 @@ def test_what_cannot_be_known_is_refused(robot: Robot) -> None:
     rows = Measurements(q=random_joints(robot, 2, 0), position=torch.zeros(2, 3).double())
     with pytest.raises(MeasurementError, match="positions were wanted"):
         Knowledge.of_robot(robot, Instrument("distance")).surprise(rows)
+
+
+def test_distances_say_nothing_of_where_the_robot_stands(robot: Robot) -> None:
+    known = Knowledge.of_robot(robot, Instrument("distance", anchor=(1.5, -1.0, 0.3)), hybrid=False)
+    q = torch.rand(40, robot.dof, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    after = known.informed(q).deviation(q)
+    assert bool((after < 0.5 * known.deviation(q)).all())
+    assert float(after.max()) < 5e-3
