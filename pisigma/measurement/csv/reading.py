@@ -65,7 +65,7 @@ def read_fields(
         layout = read_header(table, robot)
     except MeasurementError as problem:
         raise MeasurementError(f"{problem}{import_hint(path)}") from None
-    return _fields_of(table, layout, robot, on_bad_row)
+    return _complete(_sound_rows(table, layout, robot), on_bad_row)
 
 
 def fields_of(table: Table) -> MeasuredFields:
@@ -74,31 +74,48 @@ def fields_of(table: Table) -> MeasuredFields:
     Raises:
         MeasurementError: its header or a row cannot be used.
     """
-    return _fields_of(table, read_header(table, None), None, "error")
+    return _complete(sound_rows(table, None), "error")
 
 
-def _fields_of(table: Table, layout: Layout, robot: Robot | None, on_bad_row: OnBadRow) -> MeasuredFields:
-    """Check all rows and turn them into fields."""
+def sound_rows(table: Table, robot: Robot | None) -> MeasuredFields:
+    """Read the rows of a table that can be used, which may be none; all others are listed in `left_out`.
+
+    Args:
+        table: of one row or more.
+        robot: see `read_fields`.
+
+    Raises:
+        MeasurementError: the header cannot be used.
+    """
+    return _sound_rows(table, read_header(table, robot), robot)
+
+
+def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFields:
+    """Check all rows and turn those without a fault into fields."""
     rows = check_cells(table, layout, robot)
     data, labels, faults = _fields(table, layout, rows), _labels(layout), rows.faults
     faults.add(row_faults(data, labels))
     check_equal_rows(rows, layout, table)
     lines = [f"line {line}" for line in table.lines]
     faults.add(group_faults(data, labels, faults.sound(data.rows), lines.__getitem__))
-    if faults.reasons and (on_bad_row == "error" or len(faults.reasons) == data.rows):
-        raise MeasurementError(_complaint(table, faults.reasons))
     sound = data.select(torch.from_numpy(np.flatnonzero(faults.sound(data.rows))))
-    numbers = {name: values for name, values in sound.numbers.items() if not bool(values.isnan().all())}
+    numbers = {
+        name: values
+        for name, values in sound.numbers.items()
+        if name == "q" or not bool(values.isnan().all())
+    }
     left_out = tuple(LeftOut(table.lines[row], faults.reasons[row]) for row in sorted(faults.reasons))
     return replace(sound, numbers=numbers, left_out=left_out)
 
 
-def _complaint(table: Table, faults: dict[int, str]) -> str:
-    """Say what the first fault is, where, and how many rows more have one."""
-    row = min(faults)
-    more = len(faults) - 1
+def _complete(data: MeasuredFields, on_bad_row: OnBadRow) -> MeasuredFields:
+    """Say what the first fault is, where, and how many rows more have one, unless such rows may be left out."""
+    if not data.left_out or (on_bad_row == "leave_out" and data.rows):
+        return data
+    more = len(data.left_out) - 1
     others = f" ({more} more row{'s have' if more > 1 else ' has'} a fault)" if more else ""
-    return f"{table.source}, line {table.lines[row]}, {faults[row]}{others}."
+    first = data.left_out[0]
+    raise MeasurementError(f"{data.source}, line {first.line}, {first.reason}{others}.")
 
 
 def _labels(layout: Layout) -> Labels:

@@ -47,16 +47,24 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     Raises:
         MeasurementError: the file cannot be read, is too large, not UTF-8, empty, or holds nothing but a header.
     """
-    source = printable(str(path), cut=False)
-    text = read_text(path, MeasurementError, "CSV").replace("\r\n", "\n").replace("\r", "\n")
-    lines = content_lines(text.split("\n"), source)
+    table = table_of(read_text(path, MeasurementError, "CSV"), printable(str(path), cut=False))
+    if not table.records:
+        raise MeasurementError(
+            f"{table.source}, line {table.header_line}: the file ends after its header; add one row per measurement."
+        )
+    return table
+
+
+def table_of(text: str, source: str) -> Table:
+    """Split the text of a CSV file into a header and any number of rows.
+
+    Raises:
+        MeasurementError: there is no header, or it is no valid CSV.
+    """
+    lines = content_lines(text.replace("\r\n", "\n").replace("\r", "\n").split("\n"), source)
     header_line, line = next(lines)
     header = header_names(line, f"{source}, line {header_line}")
     content = list(lines)
-    if not content:
-        raise MeasurementError(
-            f"{source}, line {header_line}: the file ends after its header; add one row per measurement."
-        )
     split = [split_line(line) for _, line in content]
     return Table(
         source=source,

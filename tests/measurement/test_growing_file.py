@@ -1,0 +1,133 @@
+"""A file that grows while it is read."""
+
+import os
+
+import pytest
+from testing.closeness import assert_close
+
+from pisigma import Robot
+from pisigma.errors import MeasurementError
+from pisigma.measurement.growing_file import GrowingFile
+
+HEADER = "q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,x_mm,y_mm,z_mm\n"
+ROBOT = Robot.load("rb5")
+
+
+def line(number, joint=1.0, x=None):
+    return f"{number},{joint},2,3,4,5,{100 + number if x is None else x},200,300\n"
+
+
+@pytest.fixture
+def file(tmp_path):
+    return tmp_path / "rows.csv"
+
+
+def read(growing, final=False):
+    growth = growing.read(final)
+    rows = growth.rows
+    return [] if rows is None else [round(value) for value in rows.q[:, 0].rad2deg().tolist()]
+
+
+def test_rows_are_read_once_and_in_order(file):
+    growing = GrowingFile(file, ROBOT)
+    assert "does not exist yet" in growing.read().waiting
+    file.write_text(HEADER[:10])
+    assert "no complete header" in growing.read().waiting
+    file.write_text(HEADER)
+    assert growing.read().rows is None
+    for number in range(1, 4):
+        with file.open("a") as out:
+            out.write(line(number))
+        assert read(growing) == [number]
+        assert read(growing) == []
+
+
+def test_a_half_written_line_is_waited_for(file):
+    growing = GrowingFile(file, ROBOT)
+    file.write_text(HEADER + line(1) + line(2)[:-4])
+    assert read(growing) == [1]
+    assert "not complete" in growing.read().waiting
+    with file.open("a") as out:
+        out.write(line(2)[-4:])
+    growth = growing.read()
+    assert growth.waiting == ""
+    assert_close(growth.rows.position, [[0.102, 0.2, 0.3]], rtol=1e-12)
+    assert growth.rows.line == (3,)
+
+
+def test_the_last_line_needs_no_end_when_nothing_comes_any_more(file):
+    file.write_text((HEADER + line(1) + line(2)).rstrip())
+    assert read(GrowingFile(file, ROBOT), final=True) == [1, 2]
+
+
+@pytest.mark.parametrize("newline", ["\r\n", "\r"])
+def test_other_ends_of_lines(file, newline):
+    growing = GrowingFile(file, ROBOT)
+    text = (HEADER + line(1) + line(2)).replace("\n", newline)
+    rows = []
+    for end in range(0, len(text) + 1, 7):
+        file.write_bytes(text[:end].encode())
+        rows += read(growing)
+    file.write_bytes(text.encode())
+    assert rows + read(growing) == [1, 2]
+
+
+def test_a_truncated_file_loses_no_row_and_gives_none_twice(file):
+    growing = GrowingFile(file, ROBOT)
+    file.write_text(HEADER + line(1) + line(2))
+    assert read(growing) == [1, 2]
+    file.write_text(HEADER + line(1))
+    (notice,) = growing.read().notices
+    assert "was truncated" in notice
+    assert "2 rows" in notice
+    file.write_text(HEADER + line(1) + line(2) + line(3))
+    growth = growing.read()
+    assert growth.notices == ()
+    assert growth.rows.line == (4,)
+
+
+def test_a_replaced_file_gives_only_its_new_rows(file, tmp_path):
+    """As a spreadsheet saves it: columns in another order, numbers written otherwise."""
+    growing = GrowingFile(file, ROBOT)
+    file.write_text(HEADER + line(1) + line(2))
+    assert read(growing) == [1, 2]
+    other = tmp_path / "other.csv"
+    other.write_text(
+        "x_m,y_m,z_m,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n0.103,0.2,0.3,3,1,2,3,4,5\n0.101,.2,.3,1.00,1,2,3,4,5\n"
+    )
+    os.replace(other, file)
+    growth = growing.read()
+    assert "was replaced" in growth.notices[0]
+    assert growth.rows.line == (2,)
+
+
+def test_a_bad_row_is_said_once_and_the_others_go_on(file):
+    growing = GrowingFile(file, ROBOT)
+    file.write_text(HEADER + "1,1,2,3,4,5,,,\n")
+    (bad,) = growing.read().left_out
+    assert bad.line == 2
+    assert "nothing was measured" in bad.reason
+    with file.open("a") as out:
+        out.write("2,1,2,3,4,5,abc,200,300\n" + line(3) + line(3) + "4,1,2\n")
+    growth = growing.read()
+    assert [one.line for one in growth.left_out] == [3, 5, 6]
+    assert "equals line 4" in growth.left_out[1].reason
+    assert growth.rows.line == (4,)
+
+
+def test_a_pair_counts_when_both_rows_are_there(file):
+    growing = GrowingFile(file, ROBOT)
+    header = HEADER.replace("x_mm,y_mm,z_mm", "distance_mm,pair")
+    file.write_text(header + "1,1,2,3,4,5,50,a\n")
+    assert growing.read().rows is None
+    with file.open("a") as out:
+        out.write("2,1,2,3,4,5,50,a\n")
+    assert growing.read().rows.line == (2, 3)
+
+
+def test_a_header_that_cannot_be_used_is_refused(file):
+    file.write_text("q1_deg,force\n")
+    with pytest.raises(MeasurementError, match="'force'"):
+        GrowingFile(file, ROBOT).read()
+    with pytest.raises(MeasurementError, match="no such file"):
+        GrowingFile(file.with_name("none.csv"), ROBOT).read(final=True)
