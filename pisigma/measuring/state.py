@@ -1,15 +1,17 @@
 """What a measuring session has come to, as terminals and pages show it."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
-AlarmKind = Literal["unreadable", "duplicate", "frozen", "swapped", "off", "pose"]
+AlarmKind = Literal["unreadable", "duplicate", "frozen", "swapped", "off", "pose", "cleared"]
 """The row cannot be read; it equals another one; the sensor shows an old value; the values of two poses are swapped;
-the value is off; the joint values are not those of a pose of the plan (a remark: the row counts)."""
+the value is off; the joint values are not those of a pose of the plan (a remark: the row counts); an
+alarm was taken back, as the rows that came since agree with the row."""
 
 
 @dataclass(frozen=True)
@@ -20,13 +22,15 @@ class Alarm:
         line: the row's line in the file.
         kind: what is wrong.
         sentence: what was expected, what came, and whether to measure the pose again.
-        repeat: whether the pose is to be measured again; the row does not count then.
+        repeat: whether the pose is to be measured again.
+        counts: whether the row counts nevertheless.
     """
 
     line: int
     kind: AlarmKind
     sentence: str
     repeat: bool
+    counts: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +43,7 @@ class RowsSoFar:
         position: where the target is predicted, in the robot's base frame [m]; NaN while base and tool are unknown.
         error: measured - predicted position in the base frame [m]; NaN where it cannot be judged.
         check: rows of the set "test", which judge the calibration and are not calibrated with.
-        alarmed: rows that do not count, as the pose is to be measured again.
+        alarmed: rows that do not count.
     """
 
     line: tuple[int, ...]
@@ -94,6 +98,8 @@ class AccuracyPoint:
         predicted_p95: what 95 % of the poses stay below, from the posterior.
         cross_validated_rms: root mean square of the errors of left-out rows, which hold the noise of the sensor too.
         cross_validated_p95: what 95 % of them stay below.
+        checked_rms: root mean square of the errors of the poses that check the calibration, likewise with noise.
+        checked_p95: what 95 % of them stay below.
         random_rms: predicted root mean square of as many poses drawn at random.
     """
 
@@ -102,7 +108,14 @@ class AccuracyPoint:
     predicted_p95: float
     cross_validated_rms: float = math.nan
     cross_validated_p95: float = math.nan
+    checked_rms: float = math.nan
+    checked_p95: float = math.nan
     random_rms: float = math.nan
+
+    def to_json(self) -> dict[str, float | int | None]:
+        """Return the figures [mm] as plain values, None for those that are unknown."""
+        lengths = {f"{name}_mm": value * 1e3 for name, value in asdict(self).items() if name != "poses"}
+        return {"poses": self.poses, **{name: _number(value) for name, value in lengths.items()}}
 
 
 @dataclass(frozen=True)
@@ -131,6 +144,7 @@ class SessionState:
         reached: accuracy so far, a point for each time that it was worked out, the last one holds.
         expected: accuracy that the poses that are left would bring.
         advice: whether to go on.
+        revolute: per joint, whether it turns (values in rad) or slides (in m).
         base: `T_sensor_base`, where the robot's base is in the frame of the sensor [m]; None as long as it is unknown.
     """
 
@@ -142,6 +156,7 @@ class SessionState:
     reached: tuple[AccuracyPoint, ...]
     expected: tuple[AccuracyPoint, ...]
     advice: Advice
+    revolute: tuple[bool, ...]
     base: Float64[np.ndarray, "4 4"] | None = None
 
     @property
@@ -149,7 +164,54 @@ class SessionState:
         """Accuracy so far; None as long as it could not be worked out."""
         return self.reached[-1] if self.reached else None
 
+    def to_json(self) -> dict[str, object]:
+        """Return the figures as plain values: the result of `pisigma measure --json`; None for what is unknown."""
+        counting = ~self.rows.alarmed
+        sizes = np.linalg.norm(self.rows.error, axis=1) * 1e3
+        following = self.next_pose
+        return {
+            "rows": len(self.rows.line),
+            "rows_counting": int(counting.sum()),
+            "check_rows": int((self.rows.check & counting).sum()),
+            "errors_mm": [_number(size) for size in sizes.tolist()],
+            "alarms": [asdict(alarm) for alarm in self.alarms],
+            "poses_left": len(self.remaining),
+            "next_pose": None
+            if following is None
+            else {
+                "number": following.number,
+                "of": following.count,
+                "set": "test" if following.check else "train",
+                "joints": self.in_file_units(following.q),
+            },
+            "coverage": [
+                {"joint": span.name, "lower": lower, "upper": upper, "share_of_plan": span.planned}
+                for span, lower, upper in zip(
+                    self.coverage,
+                    self.in_file_units([span.lower for span in self.coverage]),
+                    self.in_file_units([span.upper for span in self.coverage]),
+                    strict=True,
+                )
+            ],
+            "accuracy": None if self.accuracy is None else self.accuracy.to_json(),
+            "curve": [point.to_json() for point in (*self.reached, *self.expected)],
+            "action": self.advice.action,
+            "advice": self.advice.sentence,
+        }
+
+    def in_file_units(self, q: Iterable[float]) -> list[float]:
+        """Joint values in deg, or mm of joints that slide; of any number of the first joints."""
+        return [
+            float(np.rad2deg(value) if turns else value * 1e3)
+            for value, turns in zip(q, self.revolute, strict=False)
+        ]
+
     @property
     def finished(self) -> bool:
         """Whether more poses would not help, or none are left."""
         return self.advice.action == "stop"
+
+
+def _number(value: float) -> float | None:
+    """A number for JSON, which has no NaN."""
+    return value if math.isfinite(value) else None

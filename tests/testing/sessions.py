@@ -66,6 +66,7 @@ def session_state(arm: ArmInCell, rows: int, wrong: int | None = None) -> Sessio
         reached=tuple(_point(poses) for poses in range(JUDGED_FROM, rows + 1, 4)),
         expected=tuple(_point(poses, 1.5) for poses in range(max(rows, JUDGED_FROM), POSES + 1, 4)),
         advice=measure if more else Advice("stop", "Stop: the limit is reached."),
+        revolute=arm.robot.revolute,
     )
 
 
