@@ -1,0 +1,46 @@
+"""When more poses would not help."""
+
+from collections.abc import Sequence
+
+from pisigma.measuring.state import AccuracyPoint, Advice
+
+AHEAD = 10
+"""What more poses bring is judged by so many, or all that are left."""
+
+
+def advice(
+    limit_mm: float | None,
+    least_gain_mm: float,
+    reached: Sequence[AccuracyPoint],
+    expected: Sequence[AccuracyPoint],
+    left: int,
+) -> Advice:
+    """Say whether to go on, and why.
+
+    Args:
+        limit_mm: 95 % of the errors are to stay below [mm]; None for no limit.
+        least_gain_mm: by which the next `AHEAD` poses have to lower that [mm].
+        reached: accuracy so far; the last point holds.
+        expected: accuracy that the poses that are left would bring.
+        left: number of poses that are left.
+    """
+    limit = "" if limit_mm is None else f"; the limit is {limit_mm:g} mm"
+    if reached:
+        point = reached[-1]
+        now = f"95 % of the errors are expected below {point.predicted_p95 * 1e3:.3f} mm"
+        if limit_mm is not None and point.predicted_p95 * 1e3 <= limit_mm:
+            return Advice("stop", f"Stop: with {point.poses} poses {now}{limit}.")
+        ahead = next((one for one in expected if one.poses >= point.poses + AHEAD), None) or next(
+            reversed(expected), None
+        )
+        gain = 0.0 if ahead is None else (point.predicted_p95 - ahead.predicted_p95) * 1e3
+        if ahead is not None and gain < least_gain_mm:
+            more = f"{ahead.poses - point.poses} more poses would lower that by {max(gain, 0.0):.4f} mm only"
+            return Advice("stop", f"Stop: {now}{limit}; {more}.")
+    if not left:
+        return Advice("stop", f"Stop: all poses of the plan are measured{limit}.")
+    if not reached:
+        return Advice(
+            "measure", f"{left} poses are left; there are too few rows to say how accurate they are."
+        )
+    return Advice("measure", f"{left} poses are left; {now}{limit}.")

@@ -1,0 +1,61 @@
+"""Following a file while it grows."""
+
+import pytest
+from testing.measured_plans import header, measured_plan, row_lines
+from testing.models import no_type_checker
+
+from pisigma.errors import MeasurementError, OutputError
+from pisigma.measurement.growing_file import GrowingFile
+from pisigma.workflow.follow import follow, rest_file
+from pisigma.workflow.measure import MeasureSettings, MeasuringSession
+
+PLAN = measured_plan("kiro3", poses=9)
+ROBOT = PLAN.stored.arm.robot
+
+
+def session(every=1000):
+    return MeasuringSession(PLAN.stored, MeasureSettings(least_gain_mm=0.0, every=every, replan=False))
+
+
+def test_rows_are_judged_as_they_come_until_all_are_measured(tmp_path, monkeypatch):
+    file = tmp_path / "rows.csv"
+    lines = [header(ROBOT), *row_lines(ROBOT, PLAN.rows(9))]
+
+    def measure_one(seconds: float) -> None:
+        with file.open("a") as out:
+            out.write(lines.pop(0))
+
+    monkeypatch.setattr("pisigma.workflow.follow.time.sleep", measure_one)
+    seen, waited = [], []
+    with no_type_checker():
+        for step in follow(session(), GrowingFile(file, ROBOT)):
+            waited.append(step.growth.waiting)
+            seen += [] if step.growth.rows is None else step.growth.rows.line
+    assert "does not exist yet" in waited[1]
+    assert seen == list(range(2, 11))
+    assert step.state.finished
+    assert "all poses of the plan are measured" in step.state.advice.sentence
+
+
+def test_the_accuracy_is_worked_out_beside(tmp_path, monkeypatch):
+    monkeypatch.setattr("pisigma.workflow.follow.PAUSE", 0.01)
+    file = tmp_path / "rows.csv"
+    file.write_text(header(ROBOT) + "".join(row_lines(ROBOT, PLAN.rows(9))))
+    with no_type_checker():
+        *_, last = follow(session(every=3), GrowingFile(file, ROBOT))
+    assert last.state.accuracy.poses == 9
+
+
+def test_a_file_that_cannot_be_used_ends_it(tmp_path):
+    with pytest.raises(MeasurementError, match="no such file"):
+        list(follow(session(), GrowingFile(tmp_path / "rows.csv", ROBOT), once=True))
+
+
+def test_the_rest_is_never_written_over_what_is_read(tmp_path):
+    plan, rows = tmp_path / "poses.csv", tmp_path / "rows.csv"
+    plan.write_text("")
+    assert rest_file(plan, rows, None) == tmp_path / "poses.rest.csv"
+    assert rest_file(tmp_path / "poses.plan.yaml", rows, None) == tmp_path / "poses.rest.csv"
+    for taken in (plan, tmp_path / "poses.plan.yaml"):
+        with pytest.raises(OutputError):
+            rest_file(plan, rows, taken)

@@ -1,0 +1,89 @@
+"""Sessions of measuring, from rows to what to do next."""
+
+import json
+
+import pytest
+import torch
+from testing.measured_plans import CHECKS, measured_plan, with_offset
+from testing.models import no_type_checker
+
+from pisigma.errors import PlanningError
+from pisigma.measurement.fields import LeftOut
+from pisigma.planning.plan_file import read_plan
+from pisigma.workflow.measure import MeasureSettings, MeasuringSession
+
+PLAN = measured_plan("kiro3")
+
+
+@pytest.fixture(scope="module")
+def session():
+    """A session after 18 rows, of which the 15th is wrong."""
+    session = MeasuringSession(PLAN.stored, MeasureSettings(limit_mm=1e-3, least_gain_mm=0.0))
+    rows = with_offset(PLAN.rows(18), 14, (0.003, -0.004, 0.0))
+    session.add(rows.select(torch.arange(14)))
+    (alarm,) = session.add(rows.select(torch.tensor([14])), [LeftOut(20, "column 'q1_deg': empty")])[:1]
+    assert alarm.line == 16
+    assert session.state.advice.action == "repeat"
+    session.add(rows.select(torch.arange(15, 18)))
+    with no_type_checker():
+        session.work_out()
+    return session
+
+
+def test_before_anything_is_measured():
+    state = MeasuringSession(PLAN.stored).state
+    assert state.next_pose is not None
+    assert (state.next_pose.number, state.next_pose.count) == (1, 24)
+    assert (len(state.remaining), state.accuracy, state.base) == (24, None, None)
+    assert state.advice.action == "measure"
+    json.dumps(state.to_json(), allow_nan=False)
+
+
+def test_the_state_says_what_counts_and_what_is_next(session):
+    state = session.state
+    assert len(state.rows.line) == 18
+    assert state.rows.alarmed.tolist() == [row == 14 for row in range(18)]
+    assert [alarm.line for alarm in state.alarms] == [16, 20]
+    assert int(state.rows.check.sum()) == CHECKS - 1
+    assert state.base.shape == (4, 4)
+    assert abs(state.rows.error[~state.rows.alarmed]).max() < 3e-3
+    assert state.rows.error[14].tolist() != [0, 0, 0]
+    for span in state.coverage:
+        assert span.lower < span.upper
+        assert 0 < span.planned <= 1
+
+
+def test_the_rest_is_planned_again_with_as_many_poses(session, tmp_path):
+    assert session.replanned
+    assert len(session.state.remaining) == 24 - 17
+    session.write_rest(tmp_path / "rest.csv")
+    rest = read_plan(tmp_path / "rest.csv")
+    assert len(rest.q) == 7
+    assert int(rest.check.sum()) == 1
+
+
+def test_the_accuracy_so_far_and_that_of_the_rest(session):
+    state = session.state
+    point = state.accuracy
+    assert point.poses == 15
+    for lower, higher in (
+        (point.predicted_rms, point.predicted_p95),
+        (point.cross_validated_rms, point.cross_validated_p95),
+        (point.checked_rms, point.checked_p95),
+    ):
+        assert 1e-6 < lower <= higher < 5e-3
+    assert state.expected[-1].poses == 15 + 6
+    assert state.expected[-1].predicted_rms < point.predicted_rms
+    figures = json.loads(json.dumps(state.to_json(), allow_nan=False))
+    assert figures["accuracy"]["predicted_rms_mm"] == point.predicted_rms * 1e3
+    assert figures["rows_counting"] == 17
+
+
+def test_settings_that_cannot_be_are_refused():
+    for wrong, words in (
+        ({"limit_mm": 0.0}, "limit"),
+        ({"least_gain_mm": -1.0}, "least gain"),
+        ({"every": 0}, "every"),
+    ):
+        with pytest.raises(PlanningError, match=words):
+            MeasureSettings(**wrong)
