@@ -15,6 +15,7 @@ from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
 from pisigma.cli.ik.command import ik
 from pisigma.cli.import_ import import_
+from pisigma.cli.measure import measure
 from pisigma.cli.plan import plan
 from pisigma.cli.recalibrate import recalibrate
 from pisigma.cli.report import report
@@ -35,6 +36,7 @@ for command in (
     robots,
     simulate,
     plan,
+    measure,
     import_,
     calibrate,
     recalibrate,

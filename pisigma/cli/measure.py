@@ -1,0 +1,112 @@
+"""`pisigma measure`: follow the rows that are measured with a plan."""
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pisigma.cli.arguments import AsJson
+from pisigma.cli.output import print_json, print_line, print_lines
+
+if TYPE_CHECKING:
+    from pisigma.workflow.follow import SessionStep
+    from pisigma.workflow.measure import MeasuringSession
+
+PlanFile = Annotated[
+    Path, typer.Argument(metavar="PLAN", help="Poses that `pisigma plan` wrote (CSV, or the YAML beside it).")
+]
+RowsFile = Annotated[Path, typer.Option("--rows", help="Measurements (CSV) that grow row by row.")]
+LimitMm = Annotated[
+    float | None, typer.Option(help="Stop where 95 % of the errors are expected below this [mm].")
+]
+LeastGainMm = Annotated[
+    float, typer.Option(help="Stop where the next 10 poses would lower these 95 % by less than this [mm].")
+]
+Every = Annotated[
+    int, typer.Option(help="Rows after which the accuracy is worked out and the rest planned again.")
+]
+Replan = Annotated[bool, typer.Option("--replan/--no-replan", help="Plan what is left again.")]
+RestFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--rest", help="CSV file of the poses that are left. [default: PLAN.rest.csv beside the plan]"
+    ),
+]
+Once = Annotated[bool, typer.Option("--once", help="Judge the rows that are there, and end.")]
+
+
+def measure(
+    plan: PlanFile,
+    rows: RowsFile,
+    limit_mm: LimitMm = None,
+    least_gain_mm: LeastGainMm = 0.005,
+    every: Every = 3,
+    replan: Replan = True,
+    rest: RestFile = None,
+    once: Once = False,
+    as_json: AsJson = False,
+) -> None:
+    """Follow the rows that are measured with a plan: wrong rows, the next pose, the accuracy so far, and when to stop.
+
+    Ends when more poses would not help, or with Ctrl-C. The poses of the plan are never overwritten: where the rest is
+    planned again, it is written beside them. With --json, sentences go to stderr, and one JSON object to stdout at the
+    end.
+    """
+    from pisigma.measurement.growing_file import GrowingFile
+    from pisigma.workflow.follow import follow, rest_file
+    from pisigma.workflow.measure import MeasureSettings, MeasuringSession
+
+    settings = MeasureSettings(limit_mm, least_gain_mm, every, replan)
+    session = MeasuringSession.read(plan, settings)
+    rest = rest_file(plan, rows, rest)
+    with _printer(session, f"measure {plan}", as_json) as show:
+        try:
+            for step in follow(session, GrowingFile(rows, session.plan.arm.robot), once):
+                show(step)
+                if step.replanned:
+                    session.write_rest(rest)
+        except KeyboardInterrupt:
+            pass
+    _print_summary(session, rest, as_json)
+
+
+@contextmanager
+def _printer(
+    session: "MeasuringSession", title: str, as_json: bool
+) -> Iterator[Callable[["SessionStep"], None]]:
+    """Give what prints a step: on a page that changes where there is a terminal, else in lines."""
+    from rich.console import Console
+    from rich.live import Live
+
+    from pisigma.cli.session_lines import page, step_lines
+
+    console = Console(stderr=as_json)
+    if console.is_terminal:
+        with Live(page(None, session.state, title), console=console, auto_refresh=False) as live:
+            yield lambda step: live.update(page(step, step.state, title), refresh=True)
+        return
+    judged = 0
+
+    def show(step: "SessionStep") -> None:
+        nonlocal judged
+        for line in step_lines(step, judged):
+            print_line(line, to_stderr=as_json)
+        judged = len(step.state.reached)
+
+    yield show
+
+
+def _print_summary(session: "MeasuringSession", rest: Path, as_json: bool) -> None:
+    """Print what the session has come to."""
+    from pisigma.cli.session_lines import summary_lines
+
+    state = session.state
+    written = str(rest) if session.replanned else None
+    if as_json:
+        print_json({"rest": written, **state.to_json()})
+        return
+    print_lines(summary_lines(state))
+    if written is not None:
+        print_lines([f"The poses that are left were planned again: {written}."])

@@ -1,0 +1,82 @@
+"""`pisigma measure`: what it prints and writes."""
+
+import json
+from pathlib import Path
+
+import pytest
+from testing.measured_plans import header, measured_plan, row_lines, with_offset
+
+PLAN = measured_plan("kiro3", poses=15)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    """A plan, and a file with twelve rows of which the ninth is wrong and the last one is half written."""
+    folder = tmp_path_factory.mktemp("session")
+    PLAN.stored.write(folder / "poses.csv")
+    rows = row_lines(PLAN.stored.arm.robot, with_offset(PLAN.rows(12), 8, (0.003, -0.004, 0.0)))
+    (folder / "rows.csv").write_text(header(PLAN.stored.arm.robot) + "".join(rows) + "1,2\n")
+    return folder
+
+
+def test_once_judges_the_rows_that_are_there(run, folder):
+    before = (folder / "poses.csv").read_bytes()
+    result = run(
+        "measure", folder / "poses.csv", "--rows", folder / "rows.csv", "--once", "--limit-mm", "0.001"
+    )
+    assert result.exit_code == 0, result.output
+    printed = " ".join(result.stdout.split())
+    for words in (
+        "line 2: 0.",
+        "ALARM: line 10: the measured value is 5.",
+        "ALARM: line 14, column",
+        "Next: pose",
+        "12 rows were read, 11 of them count",
+        "RMS and 95 % of the errors: expected",
+        "the limit is 0.001 mm",
+        "planned again",
+    ):
+        assert words in printed
+    assert (folder / "poses.csv").read_bytes() == before
+    assert (folder / "poses.rest.csv").exists()
+
+
+def test_json_is_one_object_and_sentences_go_to_stderr(run, folder):
+    arguments = ("--rows", folder / "rows.csv", "--once", "--json", "--no-replan")
+    result = run("measure", folder / "poses.plan.yaml", *arguments)
+    assert result.exit_code == 0, result.output
+    figures = json.loads(result.stdout)
+    assert figures["rest"] is None
+    assert (figures["rows"], figures["rows_counting"]) == (12, 11)
+    assert [alarm["line"] for alarm in figures["alarms"]] == [10, 14]
+    assert figures["accuracy"]["poses"] == 9
+    assert figures["action"] in ("measure", "repeat", "stop")
+    assert "ALARM: line 10" in result.stderr
+
+
+def test_ctrl_c_ends_with_the_summary(run, folder, monkeypatch):
+    def interrupt(seconds: float) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("pisigma.workflow.follow.time.sleep", interrupt)
+    result = run("measure", folder / "poses.csv", "--rows", folder / "rows.csv", "--every", "100")
+    assert result.exit_code == 0, result.output
+    assert "12 rows were read, 11 of them count" in " ".join(result.stdout.split())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("none.csv", "--rows", "rows.csv"), "none"),
+        (("rows.csv", "--rows", "rows.csv"), "rows.plan.yaml"),
+        (("poses.csv", "--rows", "none.csv", "--once"), "no such file"),
+        (("poses.csv", "--rows", "rows.csv", "--limit-mm", "0"), "limit"),
+        (("poses.csv", "--rows", "rows.csv", "--rest", "rows.csv"), "rows.csv"),
+    ],
+)
+def test_what_cannot_be_used_is_one_sentence(run, folder, monkeypatch, arguments, message):
+    monkeypatch.chdir(folder)
+    result = run("measure", *arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert result.stderr.count("\n") == 1
