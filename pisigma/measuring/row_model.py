@@ -18,7 +18,7 @@ from pisigma.identification.problem.setup import CalibrationSetup, IdentifiedGeo
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.measurement.dataset import Measurements
-from pisigma.planning.knowledge import USUAL_ERRORS
+from pisigma.planning.robot_class import RobotClass
 from pisigma.robot.description import Robot
 from pisigma.se3 import (
     invert,
@@ -28,8 +28,6 @@ from pisigma.se3 import (
     xyzrpy_from_transform,
 )
 
-HARMONICS = 24
-"""Of the series with which joints may err before anything is learned of them."""
 REPEATABILITY = {"m": 8e-5, "rad": 1e-4}
 """What a robot of any class does not do again, beside the noise of the sensor."""
 USUAL_NOISE = {"m": 5e-5, "rad": 2e-4}
@@ -106,7 +104,7 @@ class RowModel:
         active = [*setup.free_unknowns, *calibrator.candidates(setup.problem.space)]
         setup = replace(setup, problem=setup.problem.with_active(active))
         gravity = GravityTorques(robot, in_first_row(robot, USUAL))
-        design = Design(setup.problem, (gravity, FourierSeries(robot, HARMONICS)))
+        design = Design(setup.problem, (gravity, FourierSeries(robot, RobotClass.of(robot).harmonics)))
         point, rounds = setup.start, LINEARISATIONS
         if not bool(kept.all()):
             of_kept = RowModel.of(robot, rows.select(kept), sigma, kept[kept])
@@ -229,8 +227,12 @@ class RowModel:
     @cached_property
     def _size(self) -> Float64[Tensor, " unknowns"]:
         """Standard deviation of the unknowns before anything is measured; infinite where nothing is known."""
-        usual = [USUAL_ERRORS[group] / USUAL_LENGTH for group in PriorGroup]
-        return self.design.usual_prior(usual).precision.rsqrt()
+        usual = RobotClass.of(self.setup.problem.space.robot)
+        prior = self.design.prior([usual.geometric(group) / USUAL_LENGTH for group in PriorGroup])
+        sizes = torch.cat(
+            [prior.sizes[: prior.classes], prior.sizes.new_tensor([usual.gravity, *usual.bands])]
+        )
+        return replace(prior, sizes=sizes).precision.rsqrt()
 
 
 def _start_at(setup: CalibrationSetup, geometry: IdentifiedGeometry) -> Float64[Tensor, " parameters"]:

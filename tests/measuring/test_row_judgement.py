@@ -32,7 +32,7 @@ def test_right_rows_count():
 def test_rows_of_a_robot_that_does_not_repeat_well_count():
     rows = PLAN.rows(16)
     assert rows.position is not None
-    noise = torch.from_numpy(np.random.default_rng(1).normal(size=(16, 3))) * 4e-4
+    noise = torch.from_numpy(np.random.default_rng(1).normal(size=(16, 3))) * 2e-4
     rows = Measurements(q=rows.q, position=rows.position + noise)
     assert counting(rows, 15) == list(range(16))
 
