@@ -1,6 +1,7 @@
 """Measure with a plan: rows in as they come; what is wrong with them, the next pose, and when to stop out."""
 
 import math
+import os
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -118,7 +119,9 @@ class MeasuringSession:
         self._poses = int((~plan.check).sum())
 
     @staticmethod
-    def read(path: Path, settings: MeasureSettings = MeasureSettings()) -> "MeasuringSession":
+    def read(
+        path: str | os.PathLike[str], settings: MeasureSettings = MeasureSettings()
+    ) -> "MeasuringSession":
         """Begin with the plan in a file.
 
         Raises:
