@@ -1,5 +1,6 @@
 """Which model predicts left-out rows best: the old one with new frames, the recalibrated one, or one from scratch."""
 
+import math
 from collections.abc import Callable, Mapping, Set
 from dataclasses import dataclass
 from functools import partial
@@ -28,7 +29,7 @@ NAMES: dict[Kept, str] = {
 }
 FOLDS = 5
 ABOUT_AS_GOOD = 1.05
-"""A model is kept before others whose left-out errors are smaller by no more than this factor."""
+"""The recalibrated model is kept where left-out errors of others are smaller by no more than this factor."""
 STRAY = 5.0
 """Rows that every candidate misses by so many times the usual error say nothing of the candidates."""
 
@@ -38,7 +39,7 @@ class Gate:
     """Errors of left-out rows under every candidate, and the one that is kept.
 
     Attributes:
-        kept: the first of recalibrated, old and scratch whose error is at most 1.05 times the smallest.
+        kept: recalibrated, unless another one is better by more than 5 % and more than chance.
         rms: by candidate the root mean square of the errors of left-out rows [m]; None where the rows are too few.
         rows: number of rows that count.
     """
@@ -113,9 +114,25 @@ def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> Gate:
     for name, lengths in errors.items():
         size = float(lengths[counted].square().mean().sqrt()) if bool(counted.any()) else float("inf")
         rms[name] = size if size < float("inf") else None
-    best = min((size for size in rms.values() if size is not None), default=0.0)
-    within = (name for name, size in rms.items() if size is not None and size <= ABOUT_AS_GOOD * best)
-    return Gate(next(within, "recalibrated"), rms, int(counted.sum()))
+    first = errors["recalibrated"][counted]
+    better = [
+        (size, name)
+        for name, size in rms.items()
+        if size is not None and _clearly_better(errors[name][counted], first)
+    ]
+    return Gate(min(better)[1] if better else "recalibrated", rms, int(counted.sum()))
+
+
+def _clearly_better(errors: Float64[Tensor, " rows"], than: Float64[Tensor, " rows"]) -> bool:
+    """Whether errors are smaller by more than 5 %, and the rows' squares by more than chance: t-test, 2.5 %."""
+    count = len(errors)
+    if not bool(torch.isfinite(than).all()):
+        return True
+    gain = than.square() - errors.square()
+    if count < 2 or ABOUT_AS_GOOD**2 * float(errors.square().sum()) >= float(than.square().sum()):
+        return False
+    quantile = 1.96 + 3 / (count - 1)  # of Student's distribution, to 3 % from two degrees of freedom on
+    return float(gain.mean()) > quantile * float(gain.std()) / math.sqrt(count)
 
 
 def _predictable(rows: Measurements, test: Tensor, training: Measurements) -> Tensor:

@@ -19,14 +19,19 @@ def decided(**errors: list[float]) -> Gate:
 
 
 def test_the_recalibrated_model_is_kept_where_it_is_about_as_good():
-    judged = decided(recalibrated=[1.04, 1.04], old=[1.0, 1.0], scratch=[1.0, 3.0])
+    near = [0.99, 1.01] * 10
+    scaled = {factor: [factor * error for error in near] for factor in (1.04, 1.06, 0.9)}
+    assert decided(recalibrated=scaled[1.04], old=near, scratch=near).kept == "recalibrated"
+    assert decided(recalibrated=scaled[1.06], old=near, scratch=scaled[1.04]).kept == "old"
+    assert decided(recalibrated=scaled[1.06], old=near, scratch=scaled[0.9]).kept == "scratch"
+    by_chance = [0.5, 1.5] * 10
+    judged = decided(recalibrated=by_chance, old=[2.0] * 20, scratch=near)
     assert judged.kept == "recalibrated"
-    assert decided(recalibrated=[1.06, 1.06], old=[1.0, 1.0], scratch=[0.97, 0.97]).kept == "old"
-    assert decided(recalibrated=[1.06, 1.06], old=[2.0, 1.0], scratch=[1.0, 1.0]).kept == "scratch"
+    assert judged.rms["scratch"] < judged.rms["recalibrated"]
 
 
 def test_a_candidate_that_cannot_be_fitted_is_not_kept():
-    judged = decided(recalibrated=[2.0, 2.0], old=[1.0, 1.0], scratch=[math.inf, 0.9])
+    judged = decided(recalibrated=[2.0, 2.1] * 5, old=[1.0, 1.1] * 5, scratch=[math.inf, 0.9] * 5)
     assert (judged.kept, judged.rms["scratch"]) == ("old", None)
     assert "scratch" not in judged.sentence
 
