@@ -20,6 +20,10 @@ LARGEST_EFFECTIVE_SHARE = 0.75
 """Unknowns may use up so much of the values, or the noise cannot be separated from them."""
 LARGEST_USUAL_SHARE = 0.97
 """The same where the sizes of the weights start with the usual ones, which hold what few values do not determine."""
+LEAST_USUAL_SCALE = 0.4
+"""Prior sizes of the geometry, as shares of the stated ones, that are tried where the estimated ones are smaller:
+without features a geometric calibration of few rows takes what they do for noise, and small errors of the geometry for
+none."""
 USUAL_UPDATES = 5
 """Updates of the usual sizes: more are not worth their time, as few values say little of them."""
 ROUGHLY = 1.0
@@ -185,7 +189,9 @@ class Search:
                 best = self._tried([chosen, *best.design.features], best)
         together = [*others, *growing[:FIRST_MODEL_SIZES][-1:]]
         if len(together) > 1 and self.rows.groups <= FEW_TOGETHER:
-            best = self._from_usual_sizes(together, best)
+            usual = tuple(max(scale, LEAST_USUAL_SCALE) for scale in self.prior_scale)
+            for scale in dict.fromkeys((tuple(self.prior_scale), usual)):
+                best = self._from_usual_sizes(together, scale, best)
         for chosen in last:
             gain, sizes = self._regression.first_sizes(best.posterior, best.design, chosen)
             if gain > CLEARLY / 2:
@@ -211,7 +217,9 @@ class Search:
             self._least = min(self._least, left_out)
         return tried if better else best
 
-    def _from_usual_sizes(self, features: Sequence[AbstractFeature], best: Fitted) -> Fitted:
+    def _from_usual_sizes(
+        self, features: Sequence[AbstractFeature], prior_scale: Sequence[float], best: Fitted
+    ) -> Fitted:
         """The better of all features with weights of about the usual sizes and the best so far.
 
         Half the usual evidence is enough, or any with left-out rows that are clearly predicted better: few rows show
@@ -221,7 +229,7 @@ class Search:
         began = time.monotonic()
         design = Design(self.rows.problem, tuple(features))
         fit = self._regression.select(design)
-        posterior = fit.maximise_evidence(design.usual_prior(self.prior_scale), self.noise, USUAL_UPDATES)
+        posterior = fit.maximise_evidence(design.usual_prior(prior_scale), self.noise, USUAL_UPDATES)
         left_out = fit.left_out(posterior, self._folds).rms(posterior.noise, self.noise)
         gain = posterior.log_evidence - best.posterior.log_evidence
         better = fit.effective_share(posterior) < LARGEST_USUAL_SHARE and (

@@ -100,7 +100,8 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
     best = search.best(SERIES, [SMALL]).best
     assert best.name == "gravity + series 6"
     assert best.largest_share == LARGEST_USUAL_SHARE
-    *before, together = search.trials
+    *before, together, wider = search.trials
+    assert not wider.kept  # the geometry is as drawn here
     assert together.log_evidence > max(line.log_evidence for line in before) + CLEARLY
     assert together.left_out < 0.7 * min(line.left_out for line in before if line.kept)
 
