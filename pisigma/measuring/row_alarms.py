@@ -30,6 +30,12 @@ def unreadable(row: LeftOut) -> Alarm:
     return Alarm(row.line, kind, f"line {row.line}, {row.reason}.", repeat)  # type: ignore[arg-type]
 
 
+def cleared(line: int) -> Alarm:
+    """Take an alarm back."""
+    text = f"line {line}: the rows that came since agree with it, so it counts after all."
+    return Alarm(line, "cleared", text, repeat=False, counts=True)
+
+
 def stale_readings(rows: Measurements, start: int) -> Iterator[Alarm]:
     """Find rows from one on whose positions are those of an earlier row: written twice, or from a frozen sensor."""
     if rows.position is None:

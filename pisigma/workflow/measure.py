@@ -20,6 +20,7 @@ from pisigma.measurement.fields import LeftOut
 from pisigma.measuring.reached import Reached, expected, reached, reached_with
 from pisigma.measuring.row_alarms import (
     NEAR_POSE,
+    cleared,
     contradicted,
     is_wrong,
     joint_differences,
@@ -183,6 +184,11 @@ class MeasuringSession:
             self._reached = [*self._reached, came_to.point]
 
     @property
+    def rows(self) -> Measurements | None:
+        """The rows that count; None where there are none."""
+        return None if self._rows is None else self._rows.select(self._counting)
+
+    @property
     def state(self) -> SessionState:
         """What the session has come to."""
         with self._lock:
@@ -243,20 +249,10 @@ class MeasuringSession:
             int(numbers[row]): contradicted(usable, judgement, row, self._planned, self._names)
             for row in is_wrong(judgement).nonzero()[:, 0].tolist()
         }
-        cleared = [
-            Alarm(
-                rows.line[row],
-                "cleared",
-                f"line {rows.line[row]}: the rows that came since agree with it, so it counts after all.",
-                repeat=False,
-                counts=True,
-            )
-            for row in self._contradicted
-            if row not in wrong
-        ]
+        agreed = [cleared(rows.line[row]) for row in self._contradicted if row not in wrong]
         alarms = [alarm for row, alarm in wrong.items() if row not in self._contradicted]
         self._contradicted = {row: self._contradicted.get(row, alarm) for row, alarm in wrong.items()}
-        return [*alarms, *cleared]
+        return [*alarms, *agreed]
 
     def _planned_again(self, came_to: Reached, remaining: Int64[Tensor, " remaining"]) -> StoredPlan | None:
         """Choose the poses that are left anew, by what is known by now; the next one and those to check with stay."""

@@ -1,0 +1,146 @@
+"""Sessions of measuring simulated arms: wrong rows that are called so, and poses until the limit is reached.
+
+Run `OMP_NUM_THREADS=1 python benchmarks/measuring.py [PART ...] [--seeds N]` with the simulator of arms (`sim.py`) in
+`PISIGMA_SIMULATED`. "alarms": among 40 random rows one is 5 mm off, or the points of two are swapped; printed are the
+share that is called wrong at once, the same from the seventh row on and in the end, and the share of right rows that
+are called wrong at once. "sessions": poses until 95 % of the errors are expected below the limit, planned and at
+random, and what 95 % of the errors truly stay below.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+
+import numpy as np
+import torch
+from planning import ARMS, NOISE, Arm
+
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.judging.few_rows import fit_where_it_helps
+from pisigma.measurement.dataset import Measurements
+from pisigma.measuring.row_judgement import judge_rows
+from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.plan_settings import PlanSettings
+from pisigma.workflow.measure import MeasureSettings, MeasuringSession
+from pisigma.workflow.plan import plan
+
+ROWS, JUDGED = 40, 6
+LIMIT_MM = 0.15
+POSES = {"planned": 80, "random": 150}
+
+
+def alarms(names: list[str], seeds: range) -> None:
+    """Print the shares of wrong and right rows that are called wrong."""
+    wrong: list[tuple[int, bool, bool]] = []
+    false = total = 0
+    slowest = 0.0
+    for name in names:
+        for seed in seeds:
+            arm = Arm(name, seed)
+            rows = arm.rows(torch.from_numpy(arm.true.sample(ROWS, 100 + seed)))
+            for kind in ("off", "swapped"):
+                changed, at = with_error(rows, kind, np.random.default_rng(seed))
+                trusted, at_once = torch.zeros(0, dtype=torch.bool), []
+                for row in range(ROWS):
+                    began = time.perf_counter()
+                    some = changed.select(torch.arange(row + 1))
+                    known = torch.cat([trusted, torch.tensor([False])])
+                    trusted = judge_rows(arm.drawn, some, NOISE, known).counts
+                    at_once.append(not bool(trusted[row]))
+                    slowest = max(slowest, time.perf_counter() - began)
+                wrong += [(row, at_once[row], not bool(trusted[row])) for row in at]
+                false += sum(at_once) - sum(at_once[row] for row in at)
+                total += ROWS - len(at)
+    late = [one for one in wrong if one[0] >= JUDGED]
+    print(
+        f"{len(wrong)} wrong rows: {share([one[1] for one in wrong])} at once, {share([one[1] for one in late])} of "
+        f"{len(late)} from row {JUDGED + 1} on, {share([one[2] for one in wrong])} in the end; {false} of {total} "
+        f"right rows at once; slowest row {slowest:.2f} s",
+        flush=True,
+    )
+
+
+def with_error(rows: Measurements, kind: str, rng: np.random.Generator) -> tuple[Measurements, list[int]]:
+    """Rows of which one is 5 mm off, or two are swapped, and which."""
+    assert rows.position is not None
+    position = rows.position.clone()
+    one, other = rng.choice(ROWS, 2, replace=False).tolist()
+    if kind == "swapped":
+        position[[one, other]] = position[[other, one]]
+        return replace(rows, position=position), [one, other]
+    direction = rng.normal(size=3)
+    position[one] += torch.from_numpy(5e-3 * direction / np.linalg.norm(direction))
+    return replace(rows, position=position), [one]
+
+
+def share(flags: list[bool]) -> str:
+    """Write a share in per cent."""
+    return f"{100 * np.mean(flags):.0f} %" if flags else "none"
+
+
+def sessions(names: list[str], seeds: range) -> None:
+    """Print poses and true errors of sessions that stop at the limit."""
+    for name in names:
+        for seed in seeds:
+            for how in ("planned", "random"):
+                arm = Arm(name, seed)
+                began = time.perf_counter()
+                poses, p95 = session(arm, how)
+                seconds = time.perf_counter() - began
+                print(
+                    f"{name} {seed} {how:8s} {poses:3d} poses, 95 % {p95:.3f} mm, {seconds:.0f} s", flush=True
+                )
+
+
+def session(arm: Arm, how: str) -> tuple[int, float]:
+    """Measure until the session says stop; gives the number of poses and what 95 % of the errors stay below [mm]."""
+    count = POSES[how]
+    settings = PlanSettings(count=count, check=0, candidates=1000, sigma_mm=NOISE * 1e3)
+    if how == "planned":
+        stored = plan(arm.planned, settings).stored
+    else:
+        q = torch.from_numpy(arm.true.sample(count, 100 + arm.seed))
+        few = plan(arm.planned, replace(settings, count=1)).stored
+        stored = replace(
+            few,
+            arm=ArmInCell.of(arm.planned),
+            q=q,
+            check=torch.zeros(count, dtype=torch.bool),
+            candidate=torch.arange(count),
+            way_points=(q[:0],) * count,
+        )
+    rule = MeasureSettings(limit_mm=LIMIT_MM, least_gain_mm=0.0, replan=how == "planned")
+    measuring, rows = MeasuringSession(stored, rule), None
+    while not (state := measuring.state).finished:
+        assert state.next_pose is not None
+        line = len(state.rows.line) + 2
+        x, _ = arm.true.measure(state.next_pose.q[None], rng=np.random.default_rng(1000 * arm.seed + line))
+        row = Measurements(
+            q=torch.from_numpy(state.next_pose.q[None]), position=torch.from_numpy(x), line=(line,)
+        )
+        measuring.add(row)
+        if measuring.is_due:
+            measuring.work_out()
+    rows = measuring.rows
+    assert rows is not None
+    errors = fit_where_it_helps(HybridCalibrator(arm.drawn), rows, lambda what: None).errors_of(arm.test)
+    return rows.rows, float(errors["position"].norm(dim=1).quantile(0.95)) * 1e3
+
+
+PARTS = {"alarms": alarms, "sessions": sessions}
+
+
+def main() -> None:
+    """Run the parts that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", default=list(PARTS), metavar="PART", help=", ".join(PARTS))
+    parser.add_argument("--arms", default=",".join(ARMS))
+    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--first-seed", type=int, default=30)
+    stated = parser.parse_args()
+    for part in stated.parts:
+        PARTS[part](stated.arms.split(","), range(stated.first_seed, stated.first_seed + stated.seeds))
+
+
+if __name__ == "__main__":
+    main()
