@@ -31,13 +31,44 @@ FIRST_NOISE = {"m": 1e-4, "rad": 1e-4}
 
 
 @dataclass(frozen=True, eq=False)
+class AdaptedArm:
+    """Geometry, frames and correction for some values of the unknowns.
+
+    Attributes:
+        geometry: in the user's coordinates.
+        correction: of the joints; None where the model has none.
+    """
+
+    geometry: IdentifiedGeometry
+    correction: JointCorrection | None
+
+    @staticmethod
+    def at(problem: RecalibrationProblem, x: Float64[Tensor, " unknowns"]) -> "AdaptedArm":
+        """Put unknowns of a problem into the arm, parameters counted from `design.problem.nominal`."""
+        design = problem.design
+        point = design.problem.nominal.index_add(0, design.problem.active, x[: design.active])
+        return AdaptedArm(
+            identified_geometry(problem.setup, point), network(design, x) if design.features else None
+        )
+
+    def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
+        """Measured - predicted values of any measurements; see `CalibrationResult.errors_of`."""
+        moved = measurements
+        if self.correction is not None:
+            with torch.no_grad():
+                moved = replace(moved, q=moved.q + self.correction.of_rows(moved))
+        geometry = self.geometry
+        T = predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)
+        return measured_errors(T, measurements, geometry.unknowns)
+
+
+@dataclass(frozen=True, eq=False)
 class Adaptation:
     """A model as new rows have it.
 
     Attributes:
         problem: that it solves.
-        geometry: in the user's coordinates.
-        correction: of the joints; None where the model has none.
+        arm: geometry, frames and correction.
         drift: sizes of what has drifted, and the noise.
         shift: change of all unknowns, parameters relative to the anchors.
         effective: how many directions the new rows determine.
@@ -46,8 +77,7 @@ class Adaptation:
     """
 
     problem: RecalibrationProblem
-    geometry: IdentifiedGeometry
-    correction: JointCorrection | None
+    arm: AdaptedArm
     drift: Drift
     shift: Float64[Tensor, " unknowns"]
     effective: float
@@ -70,13 +100,7 @@ class Adaptation:
 
     def errors_of(self, measurements: Measurements) -> dict[str, Float64[Tensor, "rows components"]]:
         """Measured - predicted values of any measurements; see `CalibrationResult.errors_of`."""
-        moved = measurements
-        if self.correction is not None:
-            with torch.no_grad():
-                moved = replace(moved, q=moved.q + self.correction.of_rows(moved))
-        geometry = self.geometry
-        T = predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)
-        return measured_errors(T, measurements, geometry.unknowns)
+        return self.arm.errors_of(measurements)
 
 
 def adapt(
@@ -90,14 +114,7 @@ def adapt(
         start: sizes and noise to start from, such as those of other rows of the session.
     """
     design, mean = problem.design, problem.mean
-    sensors = design.problem.sensors
-    usual = torch.tensor(
-        [
-            usual_noise.get(sensor.name, 1.0 if sensor.sigma is not None else FIRST_NOISE[sensor.unit])
-            for sensor in sensors
-        ],
-        dtype=torch.float64,
-    )
+    usual = noise_of_sensors(problem, usual_noise)
     group = held_out_groups(problem.setup.measurements)
     x, effective = mean, 0.0
     drift = start or Drift(problem.groups, usual)
@@ -114,17 +131,28 @@ def adapt(
         x, effective = mean + update.shift, update.effective
         if float(step.square().mean().sqrt()) < SETTLED:
             break
-    point = design.problem.nominal.index_add(0, design.problem.active, x[: design.active])
     return Adaptation(
         problem=problem,
-        geometry=identified_geometry(problem.setup, point),
-        correction=network(design, x) if design.features else None,
+        arm=AdaptedArm.at(problem, x),
         drift=drift,
         shift=update.shift,
         effective=effective,
         rounds=rounds,
         search=search,
         update=update,
+    )
+
+
+def noise_of_sensors(
+    problem: RecalibrationProblem, usual_noise: Mapping[str, float]
+) -> Float64[Tensor, " sensors"]:
+    """Usual noise of all sensors of a problem [m or rad], or a factor where the rows state it."""
+    return torch.tensor(
+        [
+            usual_noise.get(sensor.name, 1.0 if sensor.sigma is not None else FIRST_NOISE[sensor.unit])
+            for sensor in problem.design.problem.sensors
+        ],
+        dtype=torch.float64,
     )
 
 

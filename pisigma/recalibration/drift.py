@@ -113,7 +113,7 @@ class DriftSearch:
         """
         self._values, self._K = values, A @ A.t()
         self._groups, self._noise, self._usual = list(groups), noise.clone(), usual_noise
-        self._Z = [_fewest_columns(values.X[:, one.index] * one.scale) for one in groups]
+        self._Z = [fewest_columns(values.X[:, one.index] * one.scale) for one in groups]
         self._V = self._K + self._variances().diag()
         for one, Z in zip(self._groups, self._Z, strict=True):
             self._V += one.size**2 * Z @ Z.t()
@@ -152,15 +152,14 @@ class DriftSearch:
         return (covariance @ (W.t() @ a)) * group.scale, covariance * group.scale * group.scale[:, None]
 
     def _best_size(self, number: int) -> float:
-        gains = _gains(SIZES, *self._coordinates(number))
-        best = int(gains.argmax())
-        return float(SIZES[best]) if float(gains[best]) > self._groups[number].worth else 0.0
+        raised = gains(SIZES, *self._coordinates(number))
+        best = int(raised.argmax())
+        return float(SIZES[best]) if float(raised[best]) > self._groups[number].worth else 0.0
 
     def _coordinates(self, number: int) -> tuple[Tensor, Tensor]:
         """Eigenvalues of a group's covariance in the metric of the rest, and squared coordinates of the values."""
         _, a, W = self._beside(number)
-        U, S, _ = torch.linalg.svd(W, full_matrices=False)
-        return S.square(), (U.t() @ a).square()
+        return coordinates(W, a)
 
     def _beside(self, number: int, reduced: bool = True) -> tuple[Tensor, Tensor, Tensor]:
         """A group's columns, and values and columns in the metric of everything else."""
@@ -168,7 +167,7 @@ class DriftSearch:
         V = self._V - group.size**2 * Z @ Z.t()
         if not reduced:
             Z = self._values.X[:, group.index] * group.scale
-        both = torch.linalg.solve_triangular(_factor(V), torch.cat([y[:, None], Z], 1), upper=False)
+        both = torch.linalg.solve_triangular(covariance_factor(V), torch.cat([y[:, None], Z], 1), upper=False)
         return Z, both[:, 0], both[:, 1:]
 
     def _resize(self, number: int, size: float) -> None:
@@ -192,22 +191,32 @@ class DriftSearch:
         return self._noise.square()[self._values.sensor]
 
     def _log_evidence(self, V: Tensor) -> float:
-        factor = _factor(V)
+        factor = covariance_factor(V)
         a = torch.linalg.solve_triangular(factor, self._values.y[:, None], upper=False)
         odds = sum(one.worth for one in self._groups if one.size > 0 and not one.stands)
         return -0.5 * float(a.square().sum()) - float(factor.diagonal().log().sum()) - odds
 
 
-def _gains(
-    sizes: Float64[Tensor, " sizes"], eigenvalues: Float64[Tensor, " k"], squares: Float64[Tensor, " k"]
-) -> Float64[Tensor, " sizes"]:
-    """By how much sizes of a group raise the log evidence; see `DriftSearch`."""
-    ratio = sizes.square()[:, None] * eigenvalues
-    gains: Tensor = 0.5 * (ratio / (1 + ratio) * squares - ratio.log1p()).sum(1)
-    return gains
+def coordinates(
+    W: Float64[Tensor, "values columns"], a: Float64[Tensor, " values"]
+) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
+    """Eigenvalues of a group's covariance, and squared coordinates of the values, in the metric of everything else."""
+    U, S, _ = torch.linalg.svd(W, full_matrices=False)
+    return S.square(), (U.t() @ a).square()
 
 
-def _fewest_columns(Z: Float64[Tensor, "values members"]) -> Float64[Tensor, "values columns"]:
+def gains(
+    sizes: Float64[Tensor, "sizes *#groups"],
+    eigenvalues: Float64[Tensor, "*groups k"],
+    squares: Float64[Tensor, "*groups k"],
+) -> Float64[Tensor, "sizes *groups"]:
+    """By how much sizes of a group, or of several, raise the log evidence; see `DriftSearch`."""
+    ratio = sizes.square()[..., None] * eigenvalues
+    raised: Tensor = 0.5 * (ratio / (1 + ratio) * squares - ratio.log1p()).sum(-1)
+    return raised
+
+
+def fewest_columns(Z: Float64[Tensor, "values members"]) -> Float64[Tensor, "values columns"]:
     """Columns with the same `Z Z^T`, no more than there are values."""
     if Z.shape[1] <= len(Z):
         return Z
@@ -215,7 +224,7 @@ def _fewest_columns(Z: Float64[Tensor, "values members"]) -> Float64[Tensor, "va
     return columns
 
 
-def _factor(V: Float64[Tensor, "values values"]) -> Float64[Tensor, "values values"]:
+def covariance_factor(V: Float64[Tensor, "values values"]) -> Float64[Tensor, "values values"]:
     """Cholesky factor of a covariance of values; rounding of far larger variances is made up for."""
     jitter = 0.0
     while True:

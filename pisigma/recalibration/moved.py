@@ -9,8 +9,10 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.recalibration.adaptation import Adaptation
-from pisigma.recalibration.recalibration_problem import frame_stretch
+from pisigma.recalibration.drift import DriftGroup
+from pisigma.recalibration.recalibration_problem import RecalibrationProblem, frame_stretch
 from pisigma.se3 import rotation_vector, transform_from_xyzrpy
 
 CLEAR = 3.3
@@ -58,22 +60,40 @@ def moved_by(adaptation: Adaptation) -> tuple[Moved, ...]:
 
     A joint's shift is estimated with no prior, beside all else that has drifted.
     """
-    space = adaptation.problem.design.problem.space
-    moved = []
+    moved: list[Moved] = []
     for number, group in enumerate(adaptation.drift.groups):
-        if not group.size or group.what == "correction":
-            continue
-        kind, _, name = group.what.partition(" ")
-        if kind in ("base", "tool"):
-            moved += _of_frame(adaptation, number, kind, name)
-        elif kind in ("joint", "lengths", "angles"):
-            shift, covariance = adaptation.search.shift(number, held=kind != "joint")
-            for index, by, variance in zip(group.index, shift, covariance.diagonal(), strict=True):
-                parameter = space.parameters[int(index)]
-                unit, factor = UNITS[parameter.unit]
-                what = group.what if kind == "joint" else parameter.name
-                moved.append(Moved(what, float(by) * factor, float(variance) ** 0.5 * factor, unit))
+        if group.size and group.what.split()[0] in ("base", "tool", "joint", "lengths", "angles"):
+            estimate = adaptation.search.shift(number, held=not group.what.startswith("joint"))
+            moved += moved_of_group(adaptation.problem, adaptation.arm.geometry, group, *estimate)
     return tuple(one for one in moved if abs(one.shift) > CLEAR * one.deviation)
+
+
+def moved_of_group(
+    problem: RecalibrationProblem,
+    after: IdentifiedGeometry,
+    group: DriftGroup,
+    shift: Float64[Tensor, " members"],
+    covariance: Float64[Tensor, "members members"],
+) -> list[Moved]:
+    """Give the motion of parameters of the arm, one by one, or of a base or a tool.
+
+    Args:
+        problem: of the rows.
+        after: the geometry with what moved.
+        group: that moved.
+        shift: of its unknowns [m or rad].
+        covariance: of the shift.
+    """
+    kind, _, name = group.what.partition(" ")
+    if kind in ("base", "tool"):
+        return _of_frame(problem, after, group, name, shift, covariance)
+    space, moved = problem.design.problem.space, []
+    for index, by, variance in zip(group.index, shift, covariance.diagonal(), strict=True):
+        parameter = space.parameters[int(index)]
+        unit, factor = UNITS[parameter.unit]
+        what = group.what if kind == "joint" else parameter.name
+        moved.append(Moved(what, float(by) * factor, float(variance) ** 0.5 * factor, unit))
+    return moved
 
 
 def what_moved(moved: tuple[Moved, ...]) -> str:
@@ -84,18 +104,22 @@ def what_moved(moved: tuple[Moved, ...]) -> str:
     return f"{clauses[:1].upper()}{clauses[1:]}; nothing else moved beyond its uncertainty."
 
 
-def _of_frame(adaptation: Adaptation, number: int, kind: str, name: str) -> list[Moved]:
+def _of_frame(
+    problem: RecalibrationProblem,
+    geometry: IdentifiedGeometry,
+    group: DriftGroup,
+    name: str,
+    shift: Float64[Tensor, " members"],
+    of_members: Float64[Tensor, "members members"],
+) -> list[Moved]:
     """How far a base or a tool has moved, and by what angle it has turned."""
-    problem, group = adaptation.problem, adaptation.drift.groups[number]
-    space = problem.design.problem.space
+    space, kind = problem.design.problem.space, group.what.split()[0]
     before, after = (
-        geometry.bases if kind == "base" else geometry.tools
-        for geometry in (problem.posterior.geometry, adaptation.geometry)
+        one.bases if kind == "base" else one.tools for one in (problem.posterior.geometry, geometry)
     )
     name = name or next(iter(after))
     if name not in before:
         return []
-    shift, of_members = adaptation.search.shift(number)
     column = group.index - frame_stretch(space, kind, name).start
     motion, covariance = torch.zeros(6).double(), torch.zeros(6, 6).double()
     motion[column], covariance[column[:, None], column] = shift, of_members

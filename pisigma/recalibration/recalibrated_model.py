@@ -36,15 +36,15 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
     known, drawn = model.uncertainty, model.drawn
     assert known is not None
     assert drawn is not None
-    solved = adaptation.geometry
+    solved = adaptation.arm.geometry
     geometry = IdentifiedGeometry(solved.robot, solved.bases, solved.tools, solved.unknowns)
     calibrated, bases, tools = geometry.robot, geometry.bases, geometry.tools
     starts = spread_rows(torch.unique(torch.cat([model.starts.double(), rows.q.cpu()]), dim=0))
     hybrid = None
-    if model.hybrid is not None and adaptation.correction is not None:
+    if model.hybrid is not None and adaptation.arm.correction is not None:
         assert model.calibrated is not None
         coverage = model.hybrid.coverage.with_rows(rows.q)
-        hybrid = HybridArm(geometry.robot, adaptation.correction, coverage)
+        hybrid = HybridArm(geometry.robot, adaptation.arm.correction, coverage)
         bases = _taken_along(model.bases, model.hybrid_bases, geometry.bases, before=True)
         tools = _taken_along(model.tools, model.hybrid_tools, geometry.tools, before=False)
         dh = model.calibrated.dh + geometry.robot.dh - model.hybrid.robot.dh

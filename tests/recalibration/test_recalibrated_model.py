@@ -42,7 +42,7 @@ def test_it_is_the_same_after_writing_and_reading(tmp_path):
     assert loaded.uncertainty.noise == model.uncertainty.noise
     again = ModelPosterior.of(loaded)
     assert_close(again.weights, ModelPosterior.of(model).weights, atol=1e-12)
-    at = adaptation.geometry.robot.dh - model_before().hybrid.robot.dh
+    at = adaptation.arm.geometry.robot.dh - model_before().hybrid.robot.dh
     assert_close(loaded.calibrated.dh - model_before().calibrated.dh, at, atol=1e-12)
 
 
