@@ -55,6 +55,7 @@ class Measurements:
         pair: per row, the pair that it belongs to; a pair has exactly two rows, in one frame.
         approach: per row and joint, from which side the joint came to its value: +1 as it grew, -1 as it fell,
             NaN where that is not stated.
+        date: per row, the day it was measured (ISO 8601, such as "2026-11-22"); "" where it is not stated.
         readings: what registered sensors measured (see `pisigma.sensors.register_sensor`), by column: one number
             [SI] or one name a row.
         line: per row, the line in the file it came from (0 where it came from none).
@@ -83,6 +84,7 @@ class Measurements:
     anchor_place: Float64[Tensor, "rows 3"] | None = None
     pair: tuple[str, ...] | None = None
     approach: Float64[Tensor, "rows dof"] | None = None
+    date: tuple[str, ...] | None = None
     readings: Mapping[str, Tensor | tuple[str, ...]] = field(default_factory=dict)
     line: tuple[int, ...] = ()
     source: str = "memory"
@@ -98,7 +100,7 @@ class Measurements:
             object.__setattr__(self, name, tuple(getattr(self, name)) or (default,) * self.rows)
         if self.split is not None:
             object.__setattr__(self, "split", tuple(self.split))
-        for name in ("socket", "touch_axis", "anchor", "pair"):
+        for name in ("socket", "touch_axis", "anchor", "pair", "date"):
             names = getattr(self, name) or ()
             object.__setattr__(self, name, tuple(names) if any(names) else None)
         check_fields(self.as_fields())

@@ -26,7 +26,7 @@ NUMBERS: dict[str, tuple[int, ...]] = {
     "approach": (-1,),
 }
 """Fields that are numbers, with the shape of a row; -1 stands for the number of joints."""
-TEXTS = ("target", "frame", "split", "socket", "touch_axis", "anchor", "pair")
+TEXTS = ("target", "frame", "split", "socket", "touch_axis", "anchor", "pair", "date")
 """Fields that are texts."""
 
 OnBadRow = Literal["error", "leave_out"]

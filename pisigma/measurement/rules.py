@@ -1,5 +1,6 @@
 """The rules that rows of measurements follow, alone and together, in files and in memory."""
 
+import datetime
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -157,6 +158,14 @@ def row_faults(data: MeasuredFields, labels: Labels) -> Iterator[Fault]:
         )
 
 
+def is_date(text: str) -> bool:
+    """Whether a text is a day as ISO 8601 writes it, such as "2026-11-22"."""
+    try:
+        return datetime.date.fromisoformat(text).isoformat() == text
+    except ValueError:
+        return False
+
+
 def rows_where(bad: Bool[np.ndarray, " rows"]) -> list[int]:
     """The numbers of the rows where something is true."""
     rows: list[int] = np.flatnonzero(bad).tolist()
@@ -164,7 +173,7 @@ def rows_where(bad: Bool[np.ndarray, " rows"]) -> list[int]:
 
 
 def _value_faults(data: MeasuredFields, labels: Labels) -> Iterator[Fault]:
-    """Rows with values that cannot be: of standard deviations, payloads, directions of approach, and sets."""
+    """Rows with values that cannot be: of standard deviations, payloads, directions of approach, sets and dates."""
     for name, least, most in (
         ("sigma_position", SMALLEST_SIGMA, math.inf),
         ("sigma_rotation", SMALLEST_SIGMA, math.inf),
@@ -192,6 +201,13 @@ def _value_faults(data: MeasuredFields, labels: Labels) -> Iterator[Fault]:
             yield (
                 row,
                 f"{labels('split')}: '{split}' stands where train or test was wanted; write one of them",
+            )
+    for row, date in enumerate(data.texts.get("date", ())):
+        if date and not is_date(date):
+            yield (
+                row,
+                f"{labels('date')}: '{date}' stands where a day such as 2026-11-22 was wanted; correct it or leave it "
+                "empty",
             )
 
 

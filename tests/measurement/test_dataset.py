@@ -31,6 +31,7 @@ def make_measurements(rows: int = 4, dof: int = 3, seed: int = 0) -> Measurement
         payload=random(rows),
         temperature=random(rows),
         approach=random(rows, dof).round() * 2 - 1,
+        date=tuple(f"2026-11-{row + 1:02d}" for row in range(rows)),
         line=tuple(range(2, rows + 2)),
         source="tracker.csv",
         left_out=(LeftOut(9, "column 'x_mm': empty"),),
@@ -95,6 +96,7 @@ def test_no_poses_without_position_and_rotation(missing: str, word: str):
         ("approach", zeros(4, 3), r"line 2.*stands where \+1"),
         ("frame", ("a",), "'frame' has 1 entries for 4 rows"),
         ("line", (1, 2), "'line' has 2 entries for 4 rows"),
+        ("date", ("2026-11-01", "", "1.11.2026", ""), r"line 4.*'1.11.2026' stands where a day"),
         ("split", ("train", "test", "trian", "test"), r"line 4.*'trian' stands where train or test"),
     ],
 )
