@@ -28,6 +28,7 @@ _NAMES = {
     "workflow.distill": "Distillation DistillationSettings distill",
     "workflow.evaluate": "EvaluationSettings Limits evaluate",
     "workflow.import_rows": "ImportSettings import_rows",
+    "workflow.monitor": "Monitoring MonitorSettings monitor",
     "workflow.plan": "Plan plan",
     "workflow.recalibrate": "Recalibration RecalibrationSettings recalibrate",
     "workflow.report": "report",

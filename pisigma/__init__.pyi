@@ -27,6 +27,9 @@ from pisigma.workflow.evaluate import Limits as Limits
 from pisigma.workflow.evaluate import evaluate as evaluate
 from pisigma.workflow.import_rows import ImportSettings as ImportSettings
 from pisigma.workflow.import_rows import import_rows as import_rows
+from pisigma.workflow.monitor import Monitoring as Monitoring
+from pisigma.workflow.monitor import MonitorSettings as MonitorSettings
+from pisigma.workflow.monitor import monitor as monitor
 from pisigma.workflow.plan import Plan as Plan
 from pisigma.workflow.plan import plan as plan
 from pisigma.workflow.recalibrate import Recalibration as Recalibration

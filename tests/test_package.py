@@ -47,6 +47,7 @@ LAYERS = (
     "export",
     "judging",
     "recalibration",
+    "monitoring",
     "verification",
     "measuring",
     "recipes",

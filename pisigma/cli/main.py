@@ -16,6 +16,7 @@ from pisigma.cli.export import export
 from pisigma.cli.ik.command import ik
 from pisigma.cli.import_ import import_
 from pisigma.cli.measure import measure
+from pisigma.cli.monitor import monitor
 from pisigma.cli.plan import plan
 from pisigma.cli.recalibrate import recalibrate
 from pisigma.cli.report import report
@@ -40,6 +41,7 @@ for command in (
     import_,
     calibrate,
     recalibrate,
+    monitor,
     train,
     evaluate,
     report,

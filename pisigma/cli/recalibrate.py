@@ -49,8 +49,7 @@ def recalibrate(
         raise typer.BadParameter("either --out DIR or --dry-run was wanted.", param_hint="'--out'")
     if out is not None:
         check_folder(out, overwrite, inputs=(model, data))
-    names = None if moved is None else tuple(name.strip() for name in moved.split(",") if name.strip())
-    settings = workflow.RecalibrationSettings(names)
+    settings = workflow.RecalibrationSettings(stated_to_move(moved))
     with progress_of("recalibration") as progress:
         recalibration = workflow.recalibrate(model, data, settings, progress)
     if out is None:
@@ -58,6 +57,11 @@ def recalibrate(
         return
     with saved(recalibration, out, accept_implausible, overwrite, command=command_line(context)) as folder:
         _print(recalibration, folder, as_json)
+
+
+def stated_to_move(moved: str | None) -> tuple[str, ...] | None:
+    """Names of what stands elsewhere, from "base,tool"; None where that is not stated."""
+    return None if moved is None else tuple(name.strip() for name in moved.split(",") if name.strip())
 
 
 def _print(recalibration: "Recalibration", folder: Path | None, as_json: bool) -> None:

@@ -178,7 +178,7 @@ def draw_figures(content: ReportContent) -> ReportFigures:
 def draw_dependence(dependence: Dependence) -> Drawing:
     """Draw errors over one quantity: every row a dot, and the RMS errors of its bins."""
     with drawing_style():
-        figure, axes = _panel()
+        figure, axes = panel()
         if "before" in dependence.errors:
             _lengths(axes, dependence)
         else:
@@ -191,7 +191,7 @@ def draw_dependence(dependence: Dependence) -> Drawing:
 def draw_correction(curve: CorrectionCurve) -> Drawing:
     """Draw what a joint is corrected by over its own value, measured values shaded."""
     with drawing_style():
-        figure, axes = _panel()
+        figure, axes = panel()
         for low, high in _stretches(curve.values, curve.measured):
             axes.axvspan(low, high, color="0.92", linewidth=0)
         dots = axes.plot(curve.dot_values, curve.dots, ".", color=OTHER, alpha=0.5, markersize=3)
@@ -232,7 +232,7 @@ def _correlations(title: str, table: Correlations) -> Drawing:
 def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
     """Draw errors of held-out rows over the number of rows to calibrate with, both logarithmic."""
     with drawing_style():
-        figure, axes = _panel()
+        figure, axes = panel()
         rows = [point.rows for point in points]
         for name in points[0].models:
             line, mark = STYLES[name]
@@ -272,7 +272,7 @@ def draw_map(error_map: ErrorMap) -> Drawing:
     return Drawing("error_map", "map", "Errors over the workspace from above and from the side.", figure)
 
 
-def _panel() -> tuple[Figure, Axes]:
+def panel() -> tuple[Figure, Axes]:
     """A panel with fixed margins: working them out would take as long as drawing it."""
     figure = Figure(figsize=SIZE)
     figure.subplots_adjust(left=0.155, right=0.985, bottom=0.165, top=0.9)

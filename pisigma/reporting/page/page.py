@@ -32,11 +32,11 @@ def render_page(content: ReportContent, figures: ReportFigures) -> str:
         figures=figures,
         labels=LABELS,
         parameter_table=parameter_table,
-        image=_image,
+        image=image,
         png=lambda png: _address("png", png),
         map_data=script_json(map_data(content.map, content.model.robot)),
-        style=Markup(_resource("style.css")),  # ours
-        script=Markup(_resource("viewer.js")),
+        style=Markup(resource("style.css")),  # ours
+        script=Markup(resource("viewer.js")),
     )
 
 
@@ -64,7 +64,8 @@ def map_data(error_map: ErrorMap, robot: Robot) -> dict[str, Any]:
     }
 
 
-def _resource(name: str) -> str:
+def resource(name: str) -> str:
+    """Read a file of this folder, such as the style of all pages."""
     return files(_PACKAGE).joinpath(name).read_text(encoding="utf-8")
 
 
@@ -72,7 +73,7 @@ def _packed(values: Any) -> str:
     return base64.b64encode(np.ascontiguousarray(values, dtype="<f4").tobytes()).decode()
 
 
-def _image(drawing: Drawing) -> str:
+def image(drawing: Drawing) -> str:
     """Give the address of an image that holds a figure."""
     return _address("svg+xml", drawing.svg().encode())
 

@@ -1,0 +1,81 @@
+"""`pisigma monitor`: whether a robot still is as its model says, what moved, and how it drifts over the months."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pisigma.cli.arguments import AsJson, ModelFolder
+from pisigma.cli.endings import NOT_ACCEPTED
+from pisigma.cli.output import print_json, print_lines, print_table, progress_of
+from pisigma.cli.recalibrate import Moved, stated_to_move
+
+if TYPE_CHECKING:
+    from pisigma.workflow.monitor import Monitoring
+
+Sessions = Annotated[
+    list[Path],
+    typer.Argument(
+        metavar="SESSION...", help="Measurements (CSV), one file a session; five poses or more each."
+    ),
+]
+Dates = Annotated[
+    str | None,
+    typer.Option(
+        metavar="DAY,...",
+        help="Days of the files, such as 2026-10-01,2026-11-01. [default: column date, name of the file, its change]",
+    ),
+]
+LimitMm = Annotated[
+    float | None, typer.Option(help="RMS error to stay below [mm]; says when it will be passed.")
+]
+Page = Annotated[Path | None, typer.Option(help="HTML page to write, with charts of all sessions.")]
+NoHistory = Annotated[bool, typer.Option("--no-history", help="Neither read nor write MODEL.history.sqlite.")]
+
+
+def monitor(
+    model: ModelFolder,
+    sessions: Sessions,
+    dates: Dates = None,
+    moved: Moved = None,
+    limit_mm: LimitMm = None,
+    page: Page = None,
+    no_history: NoHistory = False,
+    as_json: AsJson = False,
+) -> None:
+    """Say of every session whether the robot is unchanged or what moved, and follow it over the months.
+
+    The sessions are kept in MODEL.history.sqlite beside the model folder, so that each month's call adds one. Exit
+    status 3 where something is to be done: recalibrating pays, a chart is outside its limits, or the error is.
+    """
+    from pisigma.workflow import monitor as workflow
+
+    if page is not None:
+        workflow.check_page(page, (model, *sessions))
+    days = tuple(day.strip() for day in dates.split(",")) if dates else ()
+    settings = workflow.MonitorSettings(days, stated_to_move(moved), limit_mm, not no_history)
+    with progress_of("monitor") as progress:
+        monitoring = workflow.monitor(model, sessions, settings, progress)
+        if page is not None:
+            monitoring.save_page(page)
+    if as_json:
+        print_json(monitoring.to_json())
+    else:
+        _print(monitoring, page)
+    if monitoring.action:
+        raise typer.Exit(NOT_ACCEPTED)
+
+
+def _print(monitoring: "Monitoring", page: Path | None) -> None:
+    """Print a line for every session, what each says, and what they say together."""
+    from pisigma.reporting.monitoring_tables import chart_table, session_table
+
+    print_table(f"sessions of {monitoring.model.name}", *session_table(monitoring.sessions))
+    said = [one for one in monitoring.sessions if one.session.verdict != "unchanged"]
+    print_lines((f"{one.date}: {one.session.sentence}" for one in said), indent="  ")
+    print_lines(dict.fromkeys(line for one in monitoring.sessions for line in one.session.unobservable))
+    if len(monitoring.records) > 1:
+        print_table(f"charts of {len(monitoring.records)} sessions", *chart_table(monitoring.charts))
+    print_lines([*monitoring.sentences, *(f"Warning: {one}" for one in monitoring.warnings)])
+    if page is not None:
+        print_lines([f"Page written to {page}."])

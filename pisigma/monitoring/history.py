@@ -1,0 +1,126 @@
+"""What a model's sessions were judged to be, in a small SQLite file beside the model folder."""
+
+import io
+import os
+import sqlite3
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from pydantic import TypeAdapter, ValidationError
+
+from pisigma.errors import OutputError
+from pisigma.monitoring.session import JointZeros, Session
+
+SUFFIX = ".history.sqlite"
+LONGEST_WAIT = 10.0
+"""[s] For another process that writes."""
+_TABLE = """CREATE TABLE IF NOT EXISTS sessions (
+    model TEXT NOT NULL, rows TEXT NOT NULL, file TEXT NOT NULL, date TEXT NOT NULL, temperature_c REAL,
+    session TEXT NOT NULL, zeros BLOB NOT NULL, PRIMARY KEY (model, rows))"""
+_SESSION = TypeAdapter(Session)
+
+
+@dataclass(frozen=True, eq=False)
+class Record:
+    """A session with its day.
+
+    Attributes:
+        file: that the rows came from.
+        date: of the measurement, as ISO 8601 writes it.
+        rows_sha256: of the rows.
+        temperature_c: mean of the rows [deg C]; None where they do not state it.
+        session: what it says.
+        zeros: of the joints.
+    """
+
+    file: str
+    date: str
+    rows_sha256: str
+    temperature_c: float | None
+    session: Session
+    zeros: JointZeros
+
+
+def history_path(model: str | os.PathLike[str]) -> Path:
+    """Where the history of a model folder is kept: `MODEL.history.sqlite` beside it."""
+    folder = Path(os.path.realpath(model))
+    return folder.with_name(folder.name + SUFFIX)
+
+
+def remember(path: Path, model: str, records: Sequence[Record]) -> tuple[Record, ...]:
+    """Add sessions to a history and give all of it.
+
+    All are added in one transaction, or none where the process ends before. A session with the same rows takes the
+    place of the one that is there.
+
+    Args:
+        path: of the history; made where missing.
+        model: hash of the model, whose sessions alone are given back.
+        records: to add.
+
+    Returns:
+        All sessions of the model, by their dates.
+
+    Raises:
+        OutputError: the file is no history or cannot be written.
+    """
+    with _opened(path) as database:
+        with database:  # one transaction
+            database.execute(_TABLE)
+            database.executemany(
+                "INSERT OR REPLACE INTO sessions VALUES (?, ?, ?, ?, ?, ?, ?)",
+                [
+                    (
+                        *(model, one.rows_sha256, one.file, one.date, one.temperature_c),
+                        *(_SESSION.dump_json(one.session).decode(), _packed(one.zeros)),
+                    )
+                    for one in records
+                ],
+            )
+        rows = database.execute(
+            "SELECT file, date, rows, temperature_c, session, zeros FROM sessions WHERE model = ?", (model,)
+        )
+        records = [
+            Record(file, date, sha256, temperature, _SESSION.validate_json(session), _unpacked(zeros))
+            for file, date, sha256, temperature, session, zeros in rows
+        ]
+    return in_order(records)
+
+
+def in_order(records: Sequence[Record]) -> tuple[Record, ...]:
+    """Sessions by their dates; of one day by their files."""
+    return tuple(sorted(records, key=lambda one: (one.date, one.file, one.rows_sha256)))
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[sqlite3.Connection]:
+    try:
+        with closing(sqlite3.connect(path, timeout=LONGEST_WAIT)) as database:
+            yield database
+    except (sqlite3.Error, ValidationError, ValueError, KeyError) as problem:
+        raise OutputError(
+            f"{path}: the history of the model cannot be used ({problem}); move the file away to begin a new one, or "
+            "monitor without a history (--no-history)."
+        ) from None
+
+
+def _packed(zeros: JointZeros) -> bytes:
+    stream = io.BytesIO()
+    np.savez(
+        stream,
+        shift=zeros.shift.numpy(),
+        deviation=zeros.deviation.numpy(),
+        influence=zeros.influence.numpy().astype("<f4"),  # seven digits are plenty for a covariance
+        own=zeros.own.numpy(),
+    )
+    return stream.getvalue()
+
+
+def _unpacked(content: bytes) -> JointZeros:
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        names = ("shift", "deviation", "influence", "own")
+        return JointZeros(*(torch.from_numpy(arrays[name].astype(np.float64)) for name in names))

@@ -1,0 +1,329 @@
+"""One session of measurements against a model: unchanged, or what moved, and whether recalibrating pays."""
+
+import math
+from collections.abc import Set
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.errors import IdentificationError
+from pisigma.hybrid.refinement import linearised
+from pisigma.judging.calibration_validation import errors_under
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import held_out_groups
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.monitoring.evidence import CORRECTION, Explanation, Motion, SessionEvidence
+from pisigma.recalibration.adaptation import AdaptedArm, linear_values, noise_of_sensors
+from pisigma.recalibration.drift import Drift, DriftGroup, LinearValues
+from pisigma.recalibration.elsewhere import FAR
+from pisigma.recalibration.model_posterior import ModelPosterior
+from pisigma.recalibration.moved import Moved, moved_of_group
+from pisigma.recalibration.posterior_update import PosteriorUpdate
+from pisigma.recalibration.recalibration_problem import Owner, RecalibrationProblem, recalibration_problem
+
+Verdict = Literal["unchanged", "moved", "unclear"]
+ANYWHERE = 0.02
+"""[rad, or of the reach] Prior standard deviation of a joint's zero that is estimated for the chart: about 1 deg."""
+UNOBSERVABLE = 0.005
+"""[rad, or of the reach] A zero that is known no better after a session is called unobservable: about 0.3 deg."""
+PAYS = 1.05
+"""Recalibrating pays where it is expected to make errors smaller by this factor or more."""
+USUAL = 2.0
+"""Factor on the noise of the calibration up to which an explanation is complete."""
+LEAST_NAMED = 0.05
+"""Probability from which on an unclear explanation is mentioned."""
+MOST_ROUNDS = 4
+SETTLED = 1.0
+"""Rounds end when predicted values move by less than this share of the noise."""
+
+
+@dataclass(frozen=True)
+class Shifted:
+    """One thing that moved, with its probability against all other explanations."""
+
+    moved: Moved
+    probability: float
+
+    def to_json(self) -> dict[str, object]:
+        """Return it as plain values."""
+        return {**self.moved.to_json(), "probability": self.probability}
+
+
+@dataclass(frozen=True, eq=False)
+class JointZeros:
+    """Shifts of all joints' zeros in a session, each estimated beside all others, for charts over many sessions.
+
+    Attributes:
+        shift: [rad or m].
+        deviation: standard deviations, with the uncertainty of the model and the prior of about 1 deg.
+        influence: derivatives of the shifts by the directions of the model's uncertainty, which all sessions share.
+        own: covariance of what else makes the shifts err: the noise of this session, and what stands elsewhere in it.
+    """
+
+    shift: Float64[Tensor, " dof"]
+    deviation: Float64[Tensor, " dof"]
+    influence: Float64[Tensor, "dof directions"]
+    own: Float64[Tensor, "dof dof"]
+
+
+@dataclass(frozen=True)
+class Session:
+    """What a session says of a robot.
+
+    Attributes:
+        rows: number of rows.
+        unchanged: probability that nothing moved.
+        moved: what moved, the arm first.
+        candidates: names and probabilities of what may have moved where that is unclear, else none.
+        rms: root mean square of the errors under the model, with frames as they stand now [m].
+        rms_after: the same expected after recalibrating [m].
+        error_score: root mean square of the errors over their standard deviations; 1 is usual.
+        values: number of measured values.
+        standing: names of bases and tools that stand elsewhere than when the model was made.
+        observable: per joint, whether the rows say anything of its zero.
+    """
+
+    rows: int
+    unchanged: float
+    moved: tuple[Shifted, ...]
+    candidates: tuple[tuple[str, float], ...]
+    rms: float
+    rms_after: float
+    error_score: float
+    values: int
+    standing: tuple[str, ...]
+    observable: tuple[bool, ...]
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether nothing moved, something did, or something did and it is not clear what."""
+        if self.moved:
+            return "moved"
+        return "unclear" if self.candidates else "unchanged"
+
+    @property
+    def recalibrate(self) -> bool:
+        """Whether the arm changed so much that recalibrating pays."""
+        arm = any(not is_frame(one.moved.what) for one in self.moved) or bool(self.candidates)
+        return arm and self.rms > PAYS * self.rms_after
+
+    @property
+    def sentence(self) -> str:
+        """The verdict in words."""
+        if self.verdict == "unclear":
+            named = (f"{what} ({share:.0%})" for what, share in self.candidates[:3] if share >= LEAST_NAMED)
+            return f"something changed, and these rows do not show what: {' or '.join(named)}."
+        if self.verdict == "unchanged":
+            return "nothing moved beyond its uncertainty."
+        moved = (f"{one.moved.sentence} ({shown_probability(one.probability)})" for one in self.moved)
+        return f"{'; '.join(moved)}."
+
+    @property
+    def unobservable(self) -> tuple[str, ...]:
+        """Sentences on the joints whose zeros these rows cannot determine, and why."""
+        last, sentences = len(self.observable), []
+        for number, observable in enumerate(self.observable, 1):
+            frame = {1: "base", last: "tool"}.get(number, "")
+            if not observable and frame and any(name.split()[0] == frame for name in self.standing):
+                sentences.append(
+                    f"Joint {number} cannot be told from the {frame}, which stands elsewhere than when the model was "
+                    "made."
+                )
+            elif not observable:
+                sentences.append(f"Joint {number} is unobservable: these rows do not determine its zero.")
+        return tuple(sentences)
+
+    @property
+    def gain(self) -> float:
+        """By how much recalibrating is expected to make the errors of such rows smaller [m]."""
+        return max(self.rms - self.rms_after, 0.0)
+
+
+def judge_session(
+    model: CalibratedModel,
+    posterior: ModelPosterior,
+    rows: Measurements,
+    stated: Set[Owner] | None = None,
+) -> tuple[Session, JointZeros]:
+    """Compare everything that can have moved since a model was made.
+
+    Args:
+        model: the model.
+        posterior: of it.
+        rows: of one session, frames and targets by the names of the model.
+        stated: bases and tools that stand elsewhere than when the model was made; None to find them by evidence.
+
+    Raises:
+        IdentificationError: nothing usable was measured, or too little to guess where something stands.
+        PoseError: the joint values do not fit the robot.
+    """
+    solved = _solve(model, posterior, rows, stated or frozenset())
+    probabilities = dict.fromkeys(stated or (), 1.0)
+    if stated is None and solved.frame_moved:
+        solved, probabilities = _elsewhere(model, posterior, rows, solved)
+    return _judged(solved, solved.problem.setup.measurements, probabilities), _zeros(solved)
+
+
+def _elsewhere(
+    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, still: "_Solved"
+) -> tuple["_Solved", dict[Owner, float]]:
+    """Find which bases and tools stand elsewhere: the base, the tool, or both where neither explains the rows."""
+    geometry = posterior.geometry
+    bases = frozenset(("base", name) for name in rows.frame if name in geometry.bases)
+    tools = frozenset(("tool", name) for name in rows.target if name in geometry.tools)
+    tried: dict[frozenset[Owner], _Solved] = {frozenset(): still}
+    for owners in (bases, tools, bases | tools):
+        if not owners or (owners == bases | tools and any(one.fits for one in tried.values())):
+            continue
+        with suppress(IdentificationError):  # so few rows cannot say where these stand
+            tried[owners] = _solve(model, posterior, rows, owners)
+    log = torch.tensor([one.explanation.log_evidence for one in tried.values()])
+    share = dict(zip(tried, log.softmax(0).tolist(), strict=True))
+    best = max(tried, key=lambda owners: share[owners])
+    return tried[best], {owner: sum(share[those] for those in tried if owner in those) for owner in best}
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """A session, linearised where the most probable explanation puts it."""
+
+    problem: RecalibrationProblem
+    values: LinearValues
+    noise: Float64[Tensor, " sensors"]
+    evidence: SessionEvidence
+    explanation: Explanation
+
+    @property
+    def fits(self) -> bool:
+        """Whether the rows err about as much as they usually do."""
+        return self.explanation.noise_factor <= USUAL
+
+    @property
+    def suspected(self) -> tuple[Motion, ...]:
+        """What moved, or the likeliest where that is unclear."""
+        return self.explanation.motions or self.explanation.candidates[:1]
+
+    @property
+    def frame_moved(self) -> bool:
+        """Whether a base or a tool seems to stand so far off that its motion is not linear."""
+        return any(is_frame(one.group.what) and one.size >= FAR for one in self.suspected)
+
+    def arm_with(self, motions: tuple[DriftGroup, ...]) -> AdaptedArm:
+        """The arm with what stands elsewhere, and some motions, as these rows have it; all else as in the model."""
+        return AdaptedArm.at(self.problem, self.unknowns(motions))
+
+    def unknowns(self, motions: tuple[DriftGroup, ...]) -> Float64[Tensor, " unknowns"]:
+        """Most probable unknowns with what stands elsewhere and some motions; all else as in the model."""
+        standing = tuple(group for group in self.problem.groups if group.stands)
+        drift = Drift((*standing, *motions), self.noise * self.explanation.noise_factor)
+        shift: Tensor = PosteriorUpdate(self.problem.root[:, :0], self.values, drift).shift
+        return self.problem.mean + shift
+
+
+def _solve(
+    model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, elsewhere: Set[Owner]
+) -> _Solved:
+    """Linearise, explain, and go on from there until the linearisation holds."""
+    problem = recalibration_problem(model, posterior, rows, elsewhere)
+    noise = noise_of_sensors(problem, posterior.noise)
+    group = held_out_groups(problem.setup.measurements)
+    x = problem.mean
+    for _ in range(MOST_ROUNDS):
+        values = linear_values(problem, linearised(problem.design, x, 0.0, group))
+        evidence = SessionEvidence(problem, values, noise)
+        solved = _Solved(problem, values, noise, evidence, evidence.explain())
+        there = solved.unknowns(tuple(_sized(one) for one in solved.suspected))
+        step = values.X @ (there - x) / noise[values.sensor]
+        x = there
+        if float(step.square().mean().sqrt()) < SETTLED or (solved.frame_moved and not elsewhere):
+            break
+    return solved
+
+
+def _sized(motion: Motion) -> DriftGroup:
+    return replace(motion.group, size=motion.size)
+
+
+def _judged(solved: _Solved, rows: Measurements, elsewhere: dict[Owner, float]) -> Session:
+    """Work out what there is to say."""
+    explanation, evidence = solved.explanation, solved.evidence
+    motions = tuple(_sized(one) for one in solved.suspected)
+    of_arm = tuple(group for group in motions if not is_frame(group.what))
+    frames = tuple(group for group in motions if is_frame(group.what))
+    before = solved.arm_with(frames)
+    rms = rms_after = _rms(before, rows)
+    if of_arm:
+        count = len(solved.values.y)
+        determined = sum(len(group.index) for group in of_arm if group.what != CORRECTION)
+        rms_after = _rms(solved.arm_with(motions), rows) * math.sqrt(count / max(count - determined, 1))
+    return Session(
+        rows=rows.rows,
+        unchanged=explanation.unchanged,
+        moved=_moved(solved, elsewhere),
+        candidates=tuple((one.group.what, one.probability) for one in explanation.candidates),
+        rms=rms,
+        rms_after=rms_after,
+        error_score=evidence.error_score(),
+        values=len(solved.values.y),
+        standing=tuple(" ".join(owner).strip() for owner in elsewhere),
+        observable=tuple(
+            float(evidence.shift([group], explanation.noise_factor)[1].sqrt())
+            < UNOBSERVABLE * float(group.scale)
+            for group in _joints(solved)
+        ),
+    )
+
+
+def _moved(solved: _Solved, elsewhere: dict[Owner, float]) -> tuple[Shifted, ...]:
+    """How far everything that moved has, all estimated together; the arm first."""
+    problem, explanation = solved.problem, solved.explanation
+    found = [
+        (replace(one.group, size=max(one.size, ANYWHERE)), one.probability) for one in explanation.motions
+    ]
+    for (kind, name), probability in elsewhere.items():
+        whats = (kind, f"{kind} {name}")
+        found += [(one, probability) for one in problem.groups if one.stands and one.what in whats]
+    if not found:
+        return ()
+    shift, covariance = solved.evidence.shift([group for group, _ in found], explanation.noise_factor)
+    geometry = solved.arm_with(tuple(_sized(one) for one in explanation.motions)).geometry
+    moved, first = [], 0
+    for group, probability in found:
+        members = slice(first, first + len(group.index))
+        first = members.stop
+        parts = moved_of_group(problem, geometry, group, shift[members], covariance[members, members])
+        moved += [Shifted(part, probability) for part in parts]
+    return tuple(sorted(moved, key=lambda one: is_frame(one.moved.what)))
+
+
+def _zeros(solved: _Solved) -> JointZeros:
+    """Zeros of all joints together."""
+    evidence, noise_factor = solved.evidence, solved.explanation.noise_factor
+    shift, covariance = evidence.shift(_joints(solved), noise_factor)
+    influence, own = evidence.influence(_joints(solved), noise_factor)
+    return JointZeros(shift, covariance.diagonal().sqrt(), influence, own)
+
+
+def _joints(solved: _Solved) -> list[DriftGroup]:
+    """The zeros of all joints, which may stand anywhere."""
+    groups = solved.problem.groups
+    return [replace(group, size=ANYWHERE) for group in groups if group.what.startswith("joint ")]
+
+
+def shown_probability(probability: float) -> str:
+    """Write a probability as a percentage that is never rounded to 100 %."""
+    return "more than 99.9 %" if probability > 0.999 else f"{100 * probability:.1f} %"
+
+
+def is_frame(what: str) -> bool:
+    """Whether what moved is a base or a tool."""
+    return what.split()[0] in ("base", "tool")
+
+
+def _rms(arm: AdaptedArm, rows: Measurements) -> float:
+    lengths = errors_under(arm, rows).position
+    return float(lengths[torch.isfinite(lengths)].square().mean().sqrt())

@@ -1,0 +1,208 @@
+"""Sessions over the months: charts of joints and errors, drift with time and temperature, a limit's forecast."""
+
+import datetime
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.monitoring.charts import Chart, innovations, limits_of
+from pisigma.monitoring.history import Record
+from pisigma.recalibration.drift import NOISE_SPREAD
+from pisigma.recalibration.moved import CLEAR, NORMAL_95, UNITS
+
+DAYS_PER_MONTH = 365.25 / 12
+FEWEST = 4
+"""Sessions on different days that a drift is estimated from."""
+FEWEST_KELVINS = 3.0
+"""Standard deviation of the temperatures from which on a dependence on them is estimated."""
+MOST_MONTHS = 120.0
+"""Beyond ten years no forecast is made."""
+
+
+@dataclass(frozen=True)
+class Trend:
+    """How a joint's zero, or the error, changes.
+
+    Attributes:
+        what: changes.
+        over: "month" or "kelvin".
+        unit: of the change for one of these.
+        slope: the change.
+        deviation: its standard deviation.
+    """
+
+    what: str
+    over: Literal["month", "kelvin"]
+    unit: Literal["deg", "mm"]
+    slope: float
+    deviation: float
+
+    @property
+    def clear(self) -> bool:
+        """Whether it is more than chance."""
+        return abs(self.slope) > CLEAR * self.deviation
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """95 % interval of the change."""
+        half = NORMAL_95 * self.deviation
+        return self.slope - half, self.slope + half
+
+    @property
+    def sentence(self) -> str:
+        """It in words."""
+        half = NORMAL_95 * self.deviation
+        return f"{self.what} drifts by {self.slope:.4f} ± {half:.4f} {self.unit} a {self.over}"
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """When the error passes a limit.
+
+    Attributes:
+        limit_mm: the limit.
+        passed: whether the error of the last session is above it.
+        date: when the trend passes it; None where it does not within ten years.
+        earliest: beginning of the 95 % interval of that; None likewise.
+    """
+
+    limit_mm: float
+    passed: bool
+    date: str | None
+    earliest: str | None
+
+    @property
+    def sentence(self) -> str:
+        """It in words."""
+        if self.passed:
+            return f"The RMS error of the last session is above the limit of {self.limit_mm:g} mm."
+        if self.date is None:
+            return f"No trend says that the RMS error will pass {self.limit_mm:g} mm within ten years."
+        return (
+            f"The RMS error will pass {self.limit_mm:g} mm about {self.date}, or as early as {self.earliest}."
+        )
+
+
+def charts_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Chart, ...]:
+    """Chart the zeros of all joints and the error.
+
+    Args:
+        revolute: per joint of the robot, whether it turns.
+        records: by their dates.
+    """
+    count = len(revolute) + 1
+    charts = []
+    for joint in range(len(revolute)):
+        values, covariance = _joint_values(records, joint)
+        unit, factor = UNITS["rad" if revolute[joint] else "m"]
+        scores = innovations(values, covariance)
+        deviations = covariance.diagonal().sqrt() * factor
+        charts.append(
+            Chart(f"joint {joint + 1}", unit, values * factor, deviations, scores, limits_of(count))
+        )
+    rms, scores, spread = (
+        torch.tensor([of(one) for one in records], dtype=torch.float64)
+        for of in (lambda one: one.session.rms * 1e3, _error_score, _log_spread)
+    )
+    charts.append(Chart("error", "mm", rms, rms * spread, scores, limits_of(count, True), one_sided=True))
+    return tuple(charts)
+
+
+def trends_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Trend, ...]:
+    """Estimate how the zeros of the joints change with time, and with temperature where the sessions state it.
+
+    Args:
+        revolute: per joint of the robot, whether it turns.
+        records: by their dates.
+    """
+    months = months_of(records)
+    if len(torch.unique(months)) < FEWEST:
+        return ()
+    temperature = torch.tensor(
+        [math.nan if one.temperature_c is None else one.temperature_c for one in records], dtype=torch.float64
+    )
+    overs: list[tuple[Literal["month", "kelvin"], Tensor]] = [("month", months)]
+    if bool(torch.isfinite(temperature).all()) and float(temperature.std()) >= FEWEST_KELVINS:
+        overs.append(("kelvin", temperature))
+    trends = []
+    for joint in range(len(revolute)):
+        unit, factor = UNITS["rad" if revolute[joint] else "m"]
+        values, covariance = _joint_values(records, joint)
+        there = torch.isfinite(values).nonzero()[:, 0]
+        if len(there) < FEWEST + len(overs) - 1:
+            continue
+        columns = torch.stack([torch.ones_like(months), *(over - over.mean() for _, over in overs)], 1)
+        slopes, deviations = _fitted(values[there], columns[there], covariance[there[:, None], there])
+        trends += [
+            Trend(f"joint {joint + 1}", over, unit, slope * factor, deviation * factor)
+            for (over, _), slope, deviation in zip(overs, slopes[1:], deviations[1:], strict=True)
+        ]
+    return tuple(trends)
+
+
+def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
+    """Forecast when the RMS error of a session passes a limit, by a straight line through those of all sessions."""
+    months, last = months_of(records), records[-1]
+    rms = torch.tensor([one.session.rms * 1e3 for one in records], dtype=torch.float64)
+    passed = bool(rms[-1] > limit_mm)
+    date = earliest = None
+    if not passed and len(torch.unique(months)) >= FEWEST:
+        columns = torch.stack([torch.ones_like(months), months - months[-1]], 1)
+        spread = rms * torch.tensor([math.sqrt(0.5 / one.session.values) for one in records]).double()
+        (now, slope), (_, deviation) = _fitted(rms, columns, spread.square().diag())
+        left = ((rms - columns @ torch.tensor([now, slope]).double()) / spread).square().sum()
+        deviation *= max(
+            1.0, math.sqrt(float(left) / (len(rms) - 2))
+        )  # sessions scatter by more than few rows do
+        if slope > NORMAL_95 * deviation:
+            date = _after(last.date, (limit_mm - now) / slope)
+            earliest = _after(last.date, (limit_mm - now) / (slope + NORMAL_95 * deviation))
+    return Forecast(limit_mm, passed, date, earliest if date else None)
+
+
+def months_of(records: Sequence[Record]) -> Float64[Tensor, " sessions"]:
+    """Months since the first session."""
+    days = [datetime.date.fromisoformat(one.date).toordinal() for one in records]
+    return (torch.tensor(days, dtype=torch.float64) - days[0]) / DAYS_PER_MONTH
+
+
+def _joint_values(records: Sequence[Record], joint: int) -> tuple[Tensor, Tensor]:
+    """Shifts of a joint's zero in all sessions [rad or m], NaN where unobservable, and their covariance.
+
+    Sessions have the model's uncertainty in common, so that their shifts err together.
+    """
+    values = [float(one.zeros.shift[joint]) if one.session.observable[joint] else math.nan for one in records]
+    influence = torch.stack([one.zeros.influence[joint] for one in records])
+    own = torch.stack([one.zeros.own[joint, joint] for one in records])
+    return torch.tensor(values, dtype=torch.float64), influence @ influence.t() + own.diag()
+
+
+def _error_score(record: Record) -> float:
+    """Logarithm of the errors over what was expected, over its standard deviation."""
+    return math.log(max(record.session.error_score, 1e-9)) / _log_spread(record)
+
+
+def _log_spread(record: Record) -> float:
+    """Standard deviation of the logarithm of a session's error: that of its noise, and of its few values."""
+    return math.sqrt(NOISE_SPREAD**2 + 0.5 / record.session.values)
+
+
+def _fitted(values: Tensor, columns: Tensor, covariance: Tensor) -> tuple[list[float], list[float]]:
+    """Generalised least squares: coefficients of the columns, and their standard deviations."""
+    L = torch.linalg.cholesky(covariance)
+    y, A = (torch.linalg.solve_triangular(L, one, upper=False) for one in (values[:, None], columns))
+    of_coefficients = torch.linalg.inv(A.t() @ A)
+    return (of_coefficients @ A.t() @ y)[:, 0].tolist(), of_coefficients.diagonal().sqrt().tolist()
+
+
+def _after(date: str, months: float) -> str | None:
+    """The day some months after another; None beyond what is forecast."""
+    if months > MOST_MONTHS:
+        return None
+    days = datetime.timedelta(days=max(months, 0.0) * DAYS_PER_MONTH)
+    return (datetime.date.fromisoformat(date) + days).isoformat()

@@ -1,0 +1,32 @@
+"""Sessions and control charts as tables."""
+
+from collections.abc import Sequence
+
+from pisigma.monitoring.charts import Chart
+from pisigma.monitoring.history import Record
+from pisigma.reporting.tables import Table
+
+
+def session_table(records: Sequence[Record]) -> Table:
+    """One row per session: its verdict, and whether recalibrating pays."""
+    rows = tuple(
+        (
+            *(one.date, one.file, str(one.session.rows), one.session.verdict, f"{one.session.rms * 1e3:.3f}"),
+            "yes" if one.session.recalibrate else "no",
+        )
+        for one in records
+    )
+    return Table(("date", "file", "rows", "verdict", "RMS [mm]", "recalibrate"), rows)
+
+
+def chart_table(charts: Sequence[Chart]) -> Table:
+    """One row per chart: the last value, and both statistics as shares of their limits."""
+    columns = ("chart", "last", "unit", "EWMA / limit", "CUSUM / limit", "alarm")
+    return Table(columns, tuple(_chart_row(one) for one in charts))
+
+
+def _chart_row(chart: Chart) -> tuple[str, ...]:
+    last = float(chart.values[-1])
+    shares = (f"{float(share[-1]):.2f}" for share in (chart.ewma_share, chart.cusum_share))
+    value = f"{last:.4f}" if last == last else "unobservable"
+    return (chart.what, value, chart.unit, *shares, " and ".join(chart.kinds) or "no")

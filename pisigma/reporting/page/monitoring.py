@@ -1,0 +1,104 @@
+"""The sessions of a robot and their control charts as one page that loads nothing from elsewhere."""
+
+import datetime
+from collections.abc import Sequence
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.axes import Axes
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
+
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
+from pisigma.monitoring.history import Record
+from pisigma.recalibration.moved import NORMAL_95
+from pisigma.reporting.monitoring_tables import chart_table, session_table
+from pisigma.reporting.page.figures import AFTER, BEFORE, OTHER, Drawing, drawing_style, panel
+from pisigma.reporting.page.page import image, resource
+from pisigma.reporting.rendering import render
+
+
+def monitoring_page(
+    model: CalibratedModel,
+    records: Sequence[Record],
+    charts: Sequence[Chart],
+    sentences: Sequence[str],
+    warnings: Sequence[str],
+) -> str:
+    """Lay sessions and charts out as HTML; every text is shown as it is, whatever it holds.
+
+    Args:
+        model: that the sessions were compared with.
+        records: all sessions, by their dates.
+        charts: over them.
+        sentences: what they say together.
+        warnings: what to heed.
+    """
+    days = [datetime.date.fromisoformat(one.date) for one in records]
+    return render(
+        "monitoring.html.j2",
+        model=model,
+        records=records,
+        sentences=sentences,
+        warnings=warnings,
+        alarm=any(chart.alarm is not None for chart in charts),
+        values=[draw_values(chart, days) for chart in charts],
+        statistics=[draw_statistics(chart, days) for chart in charts],
+        sessions=session_table(records),
+        charts=chart_table(charts),
+        rate=f"{FALSE_ALARMS_PER_YEAR:g}",
+        per_year=SESSIONS_PER_YEAR,
+        image=image,
+        style=Markup(resource("style.css")),  # ours
+    )
+
+
+def draw_values(chart: Chart, days: Sequence[datetime.date]) -> Drawing:
+    """Draw a quantity over the sessions with its 95 % intervals."""
+    with drawing_style():
+        figure, axes = panel()
+        values, half = chart.values.numpy(), NORMAL_95 * chart.deviations.numpy()
+        axes.errorbar(days, values, half, fmt="o", color=AFTER, markersize=4, capsize=2, linewidth=1.2)  # type: ignore[arg-type]
+        if chart.alarm is not None:
+            late = slice(chart.alarm, None)
+            axes.plot(days[late], values[late], "s", color=BEFORE, markersize=6, label="outside the limits")  # type: ignore[arg-type]
+            axes.legend(loc="upper left")
+        if not chart.one_sided:
+            axes.axhline(0.0, color="black", linewidth=0.6)
+        quantity = "RMS error" if chart.one_sided else f"shift of {chart.what}"
+        axes.set(ylabel=f"{quantity} [{chart.unit}]")
+        _dates(axes)
+    alt = (
+        f"{quantity} of {len(days)} sessions with 95 % intervals; the last is {values[-1]:.4f} {chart.unit}."
+    )
+    return Drawing(f"{_key(chart)}_values", chart.what, alt, figure)
+
+
+def draw_statistics(chart: Chart, days: Sequence[datetime.date]) -> Drawing:
+    """Draw both statistics of a chart as shares of their limits."""
+    with drawing_style():
+        figure, axes = panel()
+        for share, name, color, line in (
+            (chart.ewma_share, "EWMA", AFTER, "o-"),
+            (chart.cusum_share, "CUSUM", OTHER, "s--"),
+        ):
+            axes.plot(days, share.numpy(), line, color=color, label=name, markersize=3.5)  # type: ignore[arg-type]
+        axes.axhline(1.0, color=BEFORE, linewidth=1.2, label="limit")
+        axes.set(ylabel="share of the limit", ylim=(min(0.0, float(chart.ewma_share.min()) * 1.1), None))
+        axes.legend(ncols=3, loc="lower left", bbox_to_anchor=(0, 1), borderaxespad=0.1)
+        _dates(axes)
+    largest = float(np.maximum(chart.ewma_share.numpy()[-1], chart.cusum_share.numpy()[-1]))
+    alt = (
+        f"EWMA and CUSUM of {chart.what} over their limits; the larger is {largest:.2f} at the last session."
+    )
+    return Drawing(f"{_key(chart)}_statistics", chart.what, alt, figure)
+
+
+def _key(chart: Chart) -> str:
+    return chart.what.replace(" ", "_")
+
+
+def _dates(axes: Axes) -> None:
+    locator = AutoDateLocator(minticks=2, maxticks=6)  # type: ignore[no-untyped-call]
+    axes.xaxis.set_major_locator(locator)
+    axes.xaxis.set_major_formatter(ConciseDateFormatter(locator))  # type: ignore[no-untyped-call]

@@ -1,0 +1,296 @@
+"""Monitor a robot: sessions of few rows against its model, one by one and over the months."""
+
+import datetime
+import os
+import re
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from pisigma.errors import IdentificationError, MeasurementError
+from pisigma.files.model_files import model_hash
+from pisigma.files.output_file import check_output, write_whole
+from pisigma.judging.progress import Progress
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.rules import is_date
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import load_model
+from pisigma.model.stated_conditions import condition_warnings
+from pisigma.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
+from pisigma.monitoring.history import Record, history_path, in_order, remember
+from pisigma.monitoring.session import judge_session
+from pisigma.monitoring.trends import Forecast, Trend, charts_of, forecast_of, trends_of
+from pisigma.recalibration.model_posterior import ModelPosterior
+from pisigma.recalibration.recalibration_problem import Owner
+from pisigma.workflow.recalibrate import RecalibrationSettings
+
+FEWEST_ROWS = 5
+"""Rows of a session below which it says little."""
+_DATE = re.compile(r"(?<!\d)(\d{4})[-_.]?(\d{2})[-_.]?(\d{2})(?!\d)")
+
+
+@dataclass(frozen=True)
+class MonitorSettings:
+    """How sessions are judged.
+
+    Attributes:
+        dates: of the files, one each, as ISO 8601 writes them; () to take them from the column `date`, else from the
+            name of the file, else from its time of change.
+        moved: which of "base" and "tool" stand elsewhere than when the model was made; None to find it by evidence.
+        limit_mm: RMS error that is forecast; None for no forecast.
+        history: whether the sessions are kept beside the model folder, and those kept before count.
+
+    Raises:
+        IdentificationError: something else is named in `moved`, or the limit is no length.
+        MeasurementError: a date is none.
+    """
+
+    dates: tuple[str, ...] = ()
+    moved: tuple[str, ...] | None = None
+    limit_mm: float | None = None
+    history: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse what makes no sense."""
+        RecalibrationSettings(self.moved)
+        for date in self.dates:
+            if not is_date(date):
+                raise MeasurementError(f"dates: a day such as 2026-11-22 was wanted, got '{date}'.")
+        if self.limit_mm is not None and not self.limit_mm > 0:
+            raise IdentificationError(
+                f"limit_mm: a length above 0 was wanted, got {self.limit_mm:g}; give the RMS error to stay below."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class Monitoring:
+    """Sessions of a robot, and what they say over the months.
+
+    Attributes:
+        model: that they were compared with.
+        sessions: of this call.
+        records: all sessions of the model, those of its history among them, by their dates.
+        charts: of the zeros of all joints and of the error, over all sessions.
+        trends: of the zeros of all joints.
+        forecast: of the error; None where no limit was stated.
+        warnings: what to heed, a sentence each.
+        seconds: time it took [s].
+    """
+
+    model: CalibratedModel
+    sessions: tuple[Record, ...]
+    records: tuple[Record, ...]
+    charts: tuple[Chart, ...]
+    trends: tuple[Trend, ...]
+    forecast: Forecast | None
+    warnings: tuple[str, ...]
+    seconds: float = field(default=0.0)
+
+    @property
+    def action(self) -> bool:
+        """Whether something is to be done: recalibrating pays, a chart is outside its limits, or an error above its."""
+        alarmed = any(chart.alarm is not None for chart in self.charts)
+        passed = self.forecast is not None and self.forecast.passed
+        return alarmed or passed or any(one.session.recalibrate for one in self.sessions)
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What the sessions say together: alarms, clear trends, the forecast, and what to do."""
+        alarms = (
+            f"{'the RMS error' if chart.one_sided else chart.what} has been outside the limits "
+            f"({' and '.join(chart.kinds)}) since {self.records[chart.alarm].date}."
+            for chart in self.charts
+            if chart.alarm is not None
+        )
+        trends = (f"{one.sentence}." for one in self.trends if one.clear)
+        forecast = () if self.forecast is None else (self.forecast.sentence,)
+        advice: tuple[str, ...] = ()
+        if any(one.session.recalibrate for one in self.sessions):
+            best = max(self.sessions, key=lambda one: one.session.gain)
+            advice = (
+                f"Recalibrating pays: errors like those of {best.file} are expected to fall from "
+                f"{best.session.rms * 1e3:.3f} to {best.session.rms_after * 1e3:.3f} mm; run `pisigma recalibrate "
+                f"{self.model.name} {best.file} --out DIR`.",
+            )
+        lines = (*alarms, *trends, *forecast, *advice)
+        return tuple(f"{line[:1].upper()}{line[1:]}" for line in lines)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all figures as plain values, in mm and deg."""
+        return {
+            "seconds": round(self.seconds, 3),
+            "model": self.model.name,
+            "action": self.action,
+            "sessions": [_session_json(one) for one in self.sessions],
+            "history": [_session_json(one) for one in self.records],
+            "charts": [_chart_json(one, self.records) for one in self.charts],
+            "false_alarms_per_year": FALSE_ALARMS_PER_YEAR,
+            "sessions_per_year": SESSIONS_PER_YEAR,
+            "trends": [
+                {
+                    "what": one.what,
+                    f"{one.unit}_per_{one.over}": one.slope,
+                    "interval": list(one.interval),
+                    "clear": one.clear,
+                }
+                for one in self.trends
+            ],
+            "forecast": None if self.forecast is None else vars(self.forecast),
+            "says": list(self.sentences),
+            "warnings": list(self.warnings),
+        }
+
+    def save_page(self, page: str | os.PathLike[str]) -> None:
+        """Write the sessions and charts as one HTML page.
+
+        Raises:
+            OutputError: the page is no .html file or cannot be written.
+        """
+        from pisigma.reporting.page.monitoring import monitoring_page  # matplotlib takes a second
+
+        check_page(page)
+        lines = (self.sentences, self.warnings)
+        write_whole(Path(page), monitoring_page(self.model, self.records, self.charts, *lines))
+
+
+def check_page(page: str | os.PathLike[str], inputs: Sequence[str | os.PathLike[str]] = ()) -> None:
+    """Make sure that a page may be written; see `pisigma.files.output_file.check_output`."""
+    check_output(Path(page), (".html", ".htm"), "a page", [Path(one) for one in inputs])
+
+
+def monitor(
+    model: CalibratedModel | str | os.PathLike[str],
+    sessions: Sequence[Measurements | str | os.PathLike[str]],
+    settings: MonitorSettings = MonitorSettings(),
+    progress: Progress = lambda what: None,
+) -> Monitoring:
+    """Say of every session whether the robot is unchanged or what moved, and chart all sessions.
+
+    Args:
+        model: of `pisigma calibrate` or `pisigma recalibrate`, or its folder; only a folder has a history.
+        sessions: rows of any sensors, or their files; one with several days in the column `date` is several sessions.
+        settings: see `MonitorSettings`.
+        progress: called with what is being done.
+
+    Raises:
+        ModelError: the folder holds no model, or the model holds no posterior.
+        MeasurementError: the rows cannot be read, or there are more or fewer dates than sessions.
+        IdentificationError: the rows do not determine where something stands.
+        PoseError: the joint values do not fit the robot.
+        OutputError: the history cannot be used.
+    """
+    started = time.perf_counter()
+    loaded = model if isinstance(model, CalibratedModel) else load_model(model)
+    posterior = ModelPosterior.of(loaded)
+    rows = [
+        one if isinstance(one, Measurements) else Measurements.read_csv(one, posterior.space.robot)
+        for one in sessions
+    ]
+    warnings: list[str] = []
+    judged = []
+    for date, day in _by_day(rows, settings.dates):
+        progress(f"{Path(day.source).name}, {date}")
+        judged.append(_record(loaded, posterior, day, date, settings.moved))
+        warnings += [f"{judged[-1].file}: {one}" for one in condition_warnings(loaded, day)]
+        if day.rows < FEWEST_ROWS:
+            warnings.append(
+                f"{judged[-1].file}: {day.rows} rows say little of what moved; measure {FEWEST_ROWS} poses or more."
+            )
+    new = in_order(judged)
+    records = new
+    if settings.history and not isinstance(model, CalibratedModel):
+        records = remember(history_path(model), model_hash(model), new)
+    return Monitoring(
+        model=loaded,
+        sessions=new,
+        records=records,
+        charts=charts_of(loaded.robot.revolute, records),
+        trends=trends_of(loaded.robot.revolute, records),
+        forecast=None if settings.limit_mm is None else forecast_of(records, settings.limit_mm),
+        warnings=tuple(dict.fromkeys(warnings)),
+        seconds=time.perf_counter() - started,
+    )
+
+
+def _by_day(sessions: Sequence[Measurements], dates: Sequence[str]) -> list[tuple[str, Measurements]]:
+    """Every session with its day; rows of several days are several sessions."""
+    if dates and len(dates) != len(sessions):
+        raise MeasurementError(
+            f"dates: {len(sessions)} were wanted, one for every file, but there are {len(dates)}."
+        )
+    days: list[tuple[str, Measurements]] = []
+    for number, rows in enumerate(sessions):
+        if dates or rows.date is None:
+            days.append((dates[number] if dates else _date_of_file(rows.source), rows))
+            continue
+        for date in sorted(set(rows.date)):
+            chosen = torch.tensor([one == date for one in rows.date])
+            days.append((date or _date_of_file(rows.source), rows.select(chosen)))
+    return days
+
+
+def _date_of_file(source: str) -> str:
+    """The day in the name of a file, or that of its last change; today for rows that come from no file."""
+    match = _DATE.search(Path(source).name)
+    if match and is_date("-".join(match.groups())):
+        return "-".join(match.groups())
+    path = Path(source)
+    moment = path.stat().st_mtime if path.is_file() else time.time()
+    return datetime.date.fromtimestamp(moment).isoformat()
+
+
+def _record(
+    model: CalibratedModel,
+    posterior: ModelPosterior,
+    rows: Measurements,
+    date: str,
+    moved: tuple[str, ...] | None,
+) -> Record:
+    """Judge a session."""
+    rows = posterior.renamed(rows)
+    names = {"base": set(rows.frame), "tool": set(rows.target)}
+    stated: frozenset[Owner] | None = None
+    if moved is not None:
+        stated = frozenset((kind, name) for kind in moved for name in names[kind])
+    session, zeros = judge_session(model, posterior, rows, stated)
+    temperature = None if rows.temperature is None else float(rows.temperature.nanmean())
+    return Record(Path(rows.source).name, date, rows.content_hash(), temperature, session, zeros)
+
+
+def _session_json(record: Record) -> dict[str, Any]:
+    session = record.session
+    return {
+        "file": record.file,
+        "date": record.date,
+        "rows": session.rows,
+        "verdict": session.verdict,
+        "unchanged_probability": session.unchanged,
+        "moved": [one.to_json() for one in session.moved],
+        "candidates": [{"what": what, "probability": share} for what, share in session.candidates],
+        "unobservable": [f"joint {k}" for k, seen in enumerate(session.observable, 1) if not seen],
+        "remarks": list(session.unobservable),
+        "rms_mm": session.rms * 1e3,
+        "expected_gain_mm": session.gain * 1e3,
+        "recalibrate": session.recalibrate,
+    }
+
+
+def _chart_json(chart: Chart, records: Sequence[Record]) -> dict[str, Any]:
+    """A chart as plain values; what is no number is None."""
+    values = {
+        f"values_{chart.unit}": chart.values,
+        f"deviations_{chart.unit}": chart.deviations,
+        "scores": chart.scores,
+        "ewma_of_limit": chart.ewma_share,
+        "cusum_of_limit": chart.cusum_share,
+    }
+    return {
+        "what": chart.what,
+        **{name: [None if one != one else one for one in those.tolist()] for name, those in values.items()},
+        "limits": vars(chart.limits),
+        "alarm": None if chart.alarm is None else records[chart.alarm].date,
+    }

@@ -1,0 +1,54 @@
+"""`pisigma monitor`."""
+
+import json
+import math
+
+import pytest
+from testing.aged import model_before, rows_later
+
+from pisigma.model.folder.model_folder import save_model
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with a model and files of sessions, of which the last came after a collision."""
+    folder = tmp_path_factory.mktemp("monitor")
+    (folder / "model").mkdir()
+    save_model(model_before(), folder / "model")
+    for month in (1, 2, 3):
+        moved = (0.0, 0.0, math.radians(0.25) * (month == 3), 0.0, 0.0, 0.0)
+        rows_later(8, month, moved).write_csv(folder / f"2026-0{month}-01.csv", model_before().robot)
+    return folder
+
+
+def test_each_call_adds_a_session(run, folder):
+    first = run("monitor", folder / "model", folder / "2026-01-01.csv", "--json")
+    assert first.exit_code == 0, first.output
+    second = run("monitor", folder / "model", folder / "2026-02-01.csv", "--json")
+    report = json.loads(second.stdout)
+    assert [one["file"] for one in report["sessions"]] == ["2026-02-01.csv"]
+    assert [one["date"] for one in report["history"]] == ["2026-01-01", "2026-02-01"]
+    again = run("monitor", folder / "model", folder / "2026-02-01.csv", "--json")
+    assert len(json.loads(again.stdout)["history"]) == 2
+    assert (folder / "model.history.sqlite").is_file()
+
+
+def test_a_collision_is_said_and_ends_with_3(run, folder):
+    page = folder / "page.html"
+    done = run(
+        *("monitor", folder / "model", folder / "2026-03-01.csv", folder / "2026-01-01.csv"),
+        *("--no-history", "--page", page, "--dates", "2026-05-01,2026-04-01", "--limit-mm", "0.2"),
+    )
+    assert done.exit_code == 3, done.output
+    assert "2026-05-01: joint 3 moved by 0.2" in done.stdout
+    assert "Recalibrating pays" in done.stdout
+    assert all(len(line) <= 80 for line in done.stdout.splitlines())
+    text = page.read_text(encoding="utf-8")
+    assert "joint 3 moved by 0.2" in text
+    assert 'src="http' not in text
+
+
+def test_a_page_has_to_be_html(run, folder):
+    done = run("monitor", folder / "model", folder / "2026-01-01.csv", "--page", folder / "page.pdf")
+    assert done.exit_code == 2
+    assert ".html" in done.stderr

@@ -1,0 +1,75 @@
+"""Sessions over the months: drifts with time and temperature, and when a limit is passed."""
+
+import math
+
+import pytest
+import torch
+from testing.closeness import assert_close
+
+from pisigma.monitoring.history import Record
+from pisigma.monitoring.session import JointZeros, Session
+from pisigma.monitoring.trends import charts_of, forecast_of, trends_of
+
+REVOLUTE = (True, False)
+DEVIATION = 4e-5
+
+
+def records(months, per_month=0.0, per_kelvin=0.0, rms=lambda month: 1e-4, warm=lambda month: None):
+    noise = torch.randn(months, 2, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
+    made = []
+    for month in range(months):
+        temperature = warm(month)
+        shift = DEVIATION * noise[month]
+        shift[0] += math.radians(per_month) * month + math.radians(per_kelvin) * (temperature or 0.0)
+        session = Session(10, 0.9, (), (), rms(month), rms(month), 1.0, 30, (), (True, month != 1))
+        zeros = JointZeros(
+            shift,
+            torch.full((2,), DEVIATION).double(),
+            torch.zeros(2, 3).double(),
+            DEVIATION**2 * torch.eye(2).double(),
+        )
+        made.append(
+            Record(f"{month}.csv", f"2026-{month + 1:02d}-01", str(month), temperature, session, zeros)
+        )
+    return made
+
+
+def test_a_drift_is_charted_and_measured():
+    drifting = records(8, per_month=0.01)
+    joint, other, error = charts_of(REVOLUTE, drifting)
+    assert (joint.what, joint.unit, other.unit, error.unit) == ("joint 1", "deg", "mm", "mm")
+    assert joint.alarm is not None
+    assert joint.alarm <= 4
+    assert other.alarm is error.alarm is None
+    assert bool(other.values[1].isnan())
+    clear = [one for one in trends_of(REVOLUTE, drifting) if one.clear]
+    assert [(one.what, one.over) for one in clear] == [("joint 1", "month")]
+    low, high = clear[0].interval
+    assert low < 0.01 < high
+    assert "joint 1 drifts by 0.01" in clear[0].sentence
+
+
+def test_warming_is_no_drift_in_time():
+    warmed = records(10, per_kelvin=0.002, warm=lambda month: 20.0 + 8.0 * math.sin(month))
+    clear = [one for one in trends_of(REVOLUTE, warmed) if one.clear]
+    assert [(one.what, one.over) for one in clear] == [("joint 1", "kelvin")]
+    assert_close(clear[0].slope, 0.002, rtol=0.3)
+
+
+def test_few_sessions_say_nothing_of_a_drift():
+    assert trends_of(REVOLUTE, records(3, per_month=0.1)) == ()
+
+
+@pytest.mark.parametrize(
+    ("slope", "limit", "passed", "date"),
+    [(0.0, 0.5, False, None), (2e-5, 0.5, False, "2026-1"), (2e-5, 0.2, True, None)],
+)
+def test_a_limit_is_forecast(slope, limit, passed, date):
+    forecast = forecast_of(records(10, rms=lambda month: 3e-4 + slope * month), limit)
+    if date is None:
+        assert forecast.date is None
+    else:
+        assert forecast.date.startswith(date)
+        assert forecast.earliest <= forecast.date
+    assert forecast.passed is passed
+    assert forecast.sentence.endswith(".")
