@@ -15,10 +15,10 @@ from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
 from pisigma.cli.ik.command import ik
 from pisigma.cli.import_ import import_
+from pisigma.cli.lifetime.monitor import monitor
+from pisigma.cli.lifetime.recalibrate import recalibrate
 from pisigma.cli.measure import measure
-from pisigma.cli.monitor import monitor
 from pisigma.cli.plan import plan
-from pisigma.cli.recalibrate import recalibrate
 from pisigma.cli.report import report
 from pisigma.cli.robots import robots
 from pisigma.cli.simulate import simulate

@@ -7,8 +7,8 @@ import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder
 from pisigma.cli.endings import NOT_ACCEPTED
+from pisigma.cli.lifetime.recalibrate import Moved, stated_to_move
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of
-from pisigma.cli.recalibrate import Moved, stated_to_move
 
 if TYPE_CHECKING:
     from pisigma.workflow.monitor import Monitoring

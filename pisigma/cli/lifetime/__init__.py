@@ -1,0 +1,1 @@
+"""Commands for a model over the years: recalibrate and monitor."""
