@@ -33,7 +33,7 @@ STEP = 10
 """Poses between two points of the curve."""
 WEAK = 0.1
 """Share of the variance that remains from which on what causes it is named."""
-ROUNDS = 3
+ROUNDS = 2
 """So often poses that cannot be reached are replaced."""
 
 

@@ -9,7 +9,7 @@ from pisigma.planning.cell.arm_in_cell import ArmInCell
 FINEST = 1e-3
 """[m] Pieces of a motion in which no point of the robot moves farther are not divided, nor those of half the
 clearance."""
-TRIED = 200
+TRIED = 60
 """Poses that are tried as way points of a motion, and ten times as many pairs of them."""
 BATCH = 20
 """Of these are looked at together."""
