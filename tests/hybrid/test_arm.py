@@ -112,3 +112,14 @@ def test_the_correction_holds_where_joints_were_measured_and_beyond() -> None:
     T = arm.forward(q)
     assert_close(T, forward_kinematics(geometry, q + correction(q)), atol=1e-15)
     assert_close(arm.forward(q[-1]), T[-1], atol=1e-14)
+
+
+def test_more_rows_widen_the_measured_stretches():
+    before = coverage_of(line((-150.0, -120.0), (0.0, 30.0)))
+    q = torch.zeros(2, 6, dtype=torch.float64)
+    q[:, 0] = torch.tensor([60.0, 80.0]).double().deg2rad()
+    after = before.with_rows(q)
+    everywhere = torch.zeros(5, 6, dtype=torch.float64)
+    everywhere[:, 0] = torch.tensor([-135.0, 15.0, 70.0, 110.0, -60.0]).double().deg2rad()
+    assert before.contains(everywhere).tolist() == [True, True, False, False, False]
+    assert after.contains(everywhere).tolist() == [True, True, True, False, False]

@@ -107,3 +107,10 @@ def test_no_weights_give_no_units() -> None:
     assert factors.shape == (6, 0, 12)
     q = drawn_joints(products.robot, 4, 0)
     assert_close(network_of(products, torch.zeros(products.used.numel()).double())(q), torch.zeros(4, 6))
+
+
+def test_weights_come_back_from_the_factors():
+    products = InputProducts(Robot.load("ur5"))
+    weights = normal(int(products.used.sum()), seed=3)
+    assert_close(products.weights(products.factors(weights)), weights, atol=1e-12)
+    assert_close(products.weights(normal(6, 0, products.inputs)), torch.zeros_like(weights))
