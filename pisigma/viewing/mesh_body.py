@@ -150,7 +150,7 @@ def _mesh(shape: Any, path: Path) -> "trimesh.Trimesh":
         case "sphere":
             mesh = trimesh.creation.icosphere(radius=_numbers(shape, "radius")[0])
         case _:
-            file = _mesh_file(shape.get("filename"), path)
+            file = _mesh_file(shape.get("filename", ""), path)
             mesh = trimesh.load_mesh(io.BytesIO(read_input(file, RobotError)), file.suffix[1:].lower())
             mesh.apply_transform(np.diag((*_numbers(shape, "scale", "1 1 1"), 1.0)))
     return mesh

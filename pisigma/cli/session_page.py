@@ -1,0 +1,78 @@
+"""The page in the browser that `pisigma measure --view` shows a session on."""
+
+import sys
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pisigma.cli.output import print_line
+
+if TYPE_CHECKING:
+    from pisigma.measuring.state import SessionState
+    from pisigma.planning.cell.arm_in_cell import ArmInCell
+
+View = Annotated[
+    bool, typer.Option("--view", help="Show robot, rows and errors on a page in the browser too.")
+]
+ViewHost = Annotated[str, typer.Option(help="Where the page is served; 0.0.0.0: for other machines too.")]
+ViewPort = Annotated[
+    int,
+    typer.Option(min=1, max=65535, help="Port of the page; where it is taken, the next one that is free."),
+]
+ViewUrdf = Annotated[
+    Path | None, typer.Option(help="URDF file of the robot, whose meshes the page shows instead of capsules.")
+]
+
+
+@dataclass(frozen=True)
+class PageOptions:
+    """How a session is shown in the browser.
+
+    Attributes:
+        host: address to serve at.
+        port: to serve at.
+        urdf: file whose meshes are shown; None for capsules.
+    """
+
+    host: str
+    port: int
+    urdf: Path | None
+
+
+@contextmanager
+def shown_in_browser(
+    arm: "ArmInCell", limit_mm: float | None, options: PageOptions | None
+) -> Iterator[Callable[["SessionState"], None]]:
+    """Serve the page of a session, and give what shows a state on it.
+
+    On a terminal the page stays, when the session has ended by itself, until Ctrl-C.
+
+    Args:
+        arm: the robot in its cell.
+        limit_mm: what 95 % of the errors are to stay below [mm]; None for no limit.
+        options: how; None for no page.
+
+    Raises:
+        ImportError: viser is not installed.
+        OutputError: the host is no address of this machine.
+        RobotError: the meshes cannot be shown.
+    """
+    if options is None:
+        yield lambda state: None
+        return
+    from pisigma.viewing.mesh_body import MeshBody
+    from pisigma.viewing.session_view import SessionView
+
+    body = None if options.urdf is None else MeshBody(arm.robot, options.urdf)
+    limit = None if limit_mm is None else limit_mm / 1e3
+    with SessionView(arm, body, limit, options.host, options.port) as view:
+        print_line(f"The session is shown at {view.url}", to_stderr=True)
+        yield view.show
+        if sys.stderr.isatty():
+            print_line("The page stays until Ctrl-C.", to_stderr=True)
+            threading.Event().wait()

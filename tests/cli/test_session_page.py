@@ -1,0 +1,47 @@
+"""The page of `pisigma measure --view`."""
+
+import sys
+import urllib.request
+
+import pytest
+from testing.models import no_type_checker
+from testing.sessions import arm_beside_tracker, session_state
+
+from pisigma.cli.session_page import PageOptions, shown_in_browser
+from pisigma.errors import RobotError, missing_extra
+
+OPTIONS = PageOptions("127.0.0.1", 8080, None)
+
+
+def test_without_the_option_nothing_is_served(capsys):
+    with shown_in_browser(arm_beside_tracker(), None, None) as show:
+        show(session_state(arm_beside_tracker(), 3))
+    assert capsys.readouterr() == ("", "")
+
+
+def test_the_address_is_said_beside_the_results(capsys):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    arm = arm_beside_tracker()
+    with no_type_checker(), shown_in_browser(arm, 0.15, OPTIONS) as show:
+        out, err = capsys.readouterr()
+        assert out == ""
+        with urllib.request.urlopen(err.split()[-1]) as page:
+            assert b"<html" in page.read()
+        show(session_state(arm, 3))
+    assert "Ctrl-C" not in capsys.readouterr().err  # nobody could press it here
+
+
+def test_the_extra_is_named_where_it_is_missing(monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ImportError) as raised, shown_in_browser(arm_beside_tracker(), None, OPTIONS):
+        pass
+    assert 'pip install "pisigma[view]"' in str(missing_extra(raised.value))
+
+
+def test_meshes_that_cannot_be_shown_are_refused(tmp_path):
+    options = PageOptions("127.0.0.1", 8080, tmp_path / "absent.urdf")
+    with (
+        pytest.raises(RobotError, match=r"absent\.urdf"),
+        shown_in_browser(arm_beside_tracker(), None, options),
+    ):
+        pass
