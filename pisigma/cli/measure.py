@@ -9,6 +9,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson
 from pisigma.cli.output import print_json, print_line, print_lines
+from pisigma.cli.session_page import PageOptions, View, ViewHost, ViewPort, ViewUrdf, shown_in_browser
 
 if TYPE_CHECKING:
     from pisigma.workflow.follow import SessionStep
@@ -46,6 +47,10 @@ def measure(
     replan: Replan = True,
     rest: RestFile = None,
     once: Once = False,
+    view: View = False,
+    view_host: ViewHost = "127.0.0.1",
+    view_port: ViewPort = 8080,
+    view_urdf: ViewUrdf = None,
     as_json: AsJson = False,
 ) -> None:
     """Follow the rows that are measured with a plan: wrong rows, the next pose, the accuracy so far, and when to stop.
@@ -61,14 +66,19 @@ def measure(
     settings = MeasureSettings(limit_mm, least_gain_mm, every, replan)
     session = MeasuringSession.read(plan, settings)
     rest = rest_file(plan, rows, rest)
-    with _printer(session, f"measure {plan}", as_json) as show:
-        try:
+    page = PageOptions(view_host, view_port, view_urdf) if view else None
+    try:
+        with (
+            shown_in_browser(session.plan.arm, limit_mm, page) as show_page,
+            _printer(session, f"measure {plan}", as_json) as show,
+        ):
             for step in follow(session, GrowingFile(rows, session.plan.arm.robot), once):
                 show(step)
+                show_page(step.state)
                 if step.replanned:
                     session.write_rest(rest)
-        except KeyboardInterrupt:
-            pass
+    except KeyboardInterrupt:
+        pass
     _print_summary(session, rest, as_json)
 
 
