@@ -17,7 +17,7 @@ from pisigma.cli.ik.command import ik
 from pisigma.cli.import_ import import_
 from pisigma.cli.lifetime.monitor import monitor
 from pisigma.cli.lifetime.recalibrate import recalibrate
-from pisigma.cli.measure import measure
+from pisigma.cli.measure.command import measure
 from pisigma.cli.plan import plan
 from pisigma.cli.report import report
 from pisigma.cli.robots import robots

@@ -9,7 +9,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson
 from pisigma.cli.output import print_json, print_line, print_lines
-from pisigma.cli.session_page import PageOptions, View, ViewHost, ViewPort, ViewUrdf, shown_in_browser
+from pisigma.cli.measure.session_page import PageOptions, View, ViewHost, ViewPort, ViewUrdf, shown_in_browser
 
 if TYPE_CHECKING:
     from pisigma.workflow.follow import SessionStep
@@ -90,7 +90,7 @@ def _printer(
     from rich.console import Console
     from rich.live import Live
 
-    from pisigma.cli.session_lines import page, step_lines
+    from pisigma.cli.measure.session_lines import page, step_lines
 
     console = Console(stderr=as_json)
     if console.is_terminal:
@@ -110,7 +110,7 @@ def _printer(
 
 def _print_summary(session: "MeasuringSession", rest: Path, as_json: bool) -> None:
     """Print what the session has come to."""
-    from pisigma.cli.session_lines import summary_lines
+    from pisigma.cli.measure.session_lines import summary_lines
 
     state = session.state
     written = str(rest) if session.replanned else None
