@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
-from pisigma.cli.output import print_json, print_line, print_lines
 from pisigma.cli.measure.session_page import PageOptions, View, ViewHost, ViewPort, ViewUrdf, shown_in_browser
+from pisigma.cli.output import print_json, print_line, print_lines
 
 if TYPE_CHECKING:
     from pisigma.workflow.follow import SessionStep
