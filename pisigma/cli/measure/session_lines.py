@@ -87,7 +87,7 @@ def page(step: SessionStep | None, state: SessionState, title: str) -> "Renderab
     from rich.text import Text
 
     def table(name: str, columns: Sequence[str], rows: Sequence[Sequence[str]]) -> Table:
-        laid_out = Table(*columns, title=name, title_justify="left", box=None, pad_edge=False)
+        laid_out = Table(*columns, title=Text(name), title_justify="left", box=None, pad_edge=False)
         for row in rows:
             laid_out.add_row(*(Text(printable(cell, cut=False)) for cell in row))
         return laid_out
