@@ -235,6 +235,7 @@ class _Problem:
             free = free[~torch.isin(free, poses[way.left_out])]
             if not len(way.left_out) or len(free) < len(poses):
                 break
+        chosen = chosen[~torch.isin(chosen, poses[way.left_out])]
         ordered = poses[way.order]
         is_check, number = way.order >= count, self.candidates.number[ordered]
         folder = self.subject.folder
@@ -246,7 +247,7 @@ class _Problem:
 
     def curve(self, chosen: Int64[Tensor, " chosen"]) -> tuple[ExpectedAccuracy, ...]:
         """Expected accuracy against the number of poses, 0 poses where something is known already."""
-        first, count = 0 if self.anything_known else STEP, self.settings.count
+        first, count = 0 if self.anything_known else STEP, len(chosen)
         return self._curve(chosen, [*range(first, count, STEP), count])
 
     def needed(self, chosen: Int64[Tensor, " chosen"], points: Sequence[ExpectedAccuracy]) -> int | None:
