@@ -154,20 +154,30 @@ def _ends_with_matrices(file: ExportFile, leading: int) -> bool:
 
 
 def _take_joints(proposal: Proposal) -> None:
-    """The largest group of columns that are named as joints are; of equally large ones that with a maker's names."""
-    if joints_of(proposal.quantities):
+    """The largest group of columns that are named as joints are; of equally large ones that with a maker's names.
+
+    Joints that are stated count with the number in their heading, or else with their own.
+    """
+    stated = [one for one in proposal.columns.values() if joints_of([one.target.quantity])]
+    if not all(one.is_stated for one in stated):
         return
     names = proposal.names("angle", "length")
     makers = [one for one in MAKERS if one.joints and (not one.position or one.position in names)]
     general = (Maker("", f"{name}#") for name in JOINT_NAMES)
     best: dict[str, int] = {}
+    shift = 0
     for maker in (*makers, *general):
         numbers = {name: number for name in names if (number := joint_of(name, maker.joints)) is not None}
-        counted = sorted(numbers.values())
+        beside = [joint_of(proposal.headings[one.index].name, maker.joints) for one in stated]
+        others = [
+            int(one.target.quantity[1:]) if number is None else number
+            for one, number in zip(stated, beside, strict=True)
+        ]
+        counted = sorted([*numbers.values(), *others])
         consecutive = counted in (list(range(1, len(counted) + 1)), list(range(len(counted))))
-        if consecutive and len(counted) > max(1, len(best)):
+        if consecutive and numbers and len(counted) > max(1, len(best)):
             best, proposal.maker = numbers, maker if maker.name else None
-    shift = 1 - min(best.values(), default=1)
+            shift = 1 - counted[0]
     reason = f"name of {proposal.maker.name}" if proposal.maker else "heading"
     reason += ", counted from 0" if shift else ""
     group = {name: f"q{number + shift}" for name, number in best.items()}
@@ -178,15 +188,21 @@ def _take_position(proposal: Proposal) -> None:
     """The coordinates that were measured; a position that was only commanded is none."""
     for group in POSITIONS:
         names = proposal.names("length")
-        there = {name: names[name] for name in group if name in names}
-        if len(there) < len(group) or POSITION[0] in proposal.quantities:
+        decided = {
+            proposal.headings[index].name: column.target.quantity
+            for index, column in proposal.columns.items()
+            if column.target.quantity in POSITION
+        }
+        wanted = {name: one for name, one in zip(group, POSITION, strict=True) if decided.get(name) != one}
+        there = {name: names[name] for name in wanted if name in names}
+        if not there or len(there) < len(wanted) or len(wanted) + len(decided) > len(POSITION):
             continue
         if {proposal.headings[index].side for indices in there.values() for index in indices} == {
             "commanded"
         }:
             proposal.leave_out(there, names, "commanded, not measured")
         else:
-            proposal.put_group(dict(zip(group, POSITION, strict=True)), names, "measured", "heading")
+            proposal.put_group(wanted, names, "measured", "heading")
 
 
 def _take_rotation(proposal: Proposal, rotation: str | None) -> None:

@@ -93,6 +93,18 @@ def test_stated_columns(tmp_path: Path):
     assert "are both q1" in refusal(tmp_path, text, stated | {"2": "q1_deg"})
 
 
+@pytest.mark.parametrize(
+    "stated",
+    [{"A1": "q1_deg"}, {"A1": "q1_deg", "X": "x_mm", "note": "-"}, {"A6": "q6_deg", "Y": "y_mm", "Z": "z_mm"}],
+)
+def test_the_rest_is_proposed_beside_stated_columns(tmp_path: Path, stated: dict[str, str]):
+    text = f"A1,A2,A3,A4,A5,A6,X,Y,Z,note\n{ROW},warm\n{ROW},\n"
+    assert targets(mapped(tmp_path, text, stated, length="mm", angle="deg")) == [*DEGREES_MM, "-"]
+    from_zero = text.replace("A1,A2,A3,A4,A5,A6", "axis0,axis1,axis2,axis3,axis4,axis5")
+    mapping = mapped(tmp_path, from_zero, {"axis0": "q1_deg"}, length="mm", angle="deg")
+    assert targets(mapping) == [*DEGREES_MM, "-"]
+
+
 def test_equal_headings_are_told_apart_by_their_numbers(tmp_path: Path):
     text = "j1 [deg],j2 [deg],X [mm],Y [mm],Z [mm],X [mm]\n1,2,3,4,5,6\n"
     assert "such as --map '3=-'" in refusal(tmp_path, text)
