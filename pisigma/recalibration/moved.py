@@ -58,7 +58,8 @@ class Moved:
 def moved_by(adaptation: Adaptation) -> tuple[Moved, ...]:
     """Give what moved clearly: joints first, then lengths and angles of the arm, bases and tools.
 
-    A joint's shift is estimated with no prior, beside all else that has drifted.
+    A joint's shift is estimated with no prior, beside all else that has drifted, and counts in the joint's positive
+    direction: by so much the joint stands beyond the value that its controller shows.
     """
     moved: list[Moved] = []
     for number, group in enumerate(adaptation.drift.groups):
@@ -91,8 +92,10 @@ def moved_of_group(
     for index, by, variance in zip(group.index, shift, covariance.diagonal(), strict=True):
         parameter = space.parameters[int(index)]
         unit, factor = UNITS[parameter.unit]
-        what = group.what if kind == "joint" else parameter.name
-        moved.append(Moved(what, float(by) * factor, float(variance) ** 0.5 * factor, unit))
+        what, sign = parameter.name, 1
+        if kind == "joint":
+            what, sign = group.what, int(space.robot.directions[int(name) - 1])
+        moved.append(Moved(what, sign * float(by) * factor, float(variance) ** 0.5 * factor, unit))
     return moved
 
 

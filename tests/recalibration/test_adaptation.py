@@ -1,11 +1,13 @@
 """A model adapted to new rows: after a collision, with a moved instrument, and row after row as with all at once."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from testing.aged import model_before, rows_later
 from testing.closeness import assert_close
+from testing.linearised import with_directions
 from testing.models import hand_made_model
 
 from pisigma.errors import ModelError
@@ -34,6 +36,14 @@ def rms_of(model, rows) -> float:
     return rms(rows.position - poses_of_rows(model, rows)[:, :3, 3])
 
 
+def with_turned_joint_3(adaptation: Adaptation) -> Adaptation:
+    """The same of a robot whose joint 3 counts the other way round, as about an axis 0 0 -1 of a URDF file."""
+    design = adaptation.problem.design
+    robot = with_directions(design.problem.space.robot, (1, 1, -1, 1, 1, 1))
+    problem = replace(design.problem, space=replace(design.problem.space, robot=robot))
+    return replace(adaptation, problem=replace(adaptation.problem, design=replace(design, problem=problem)))
+
+
 def test_a_collision_is_found_and_repaired():
     model = model_before()
     before = rms_of(model, rows_later(300, 50, noise=0.0))
@@ -46,6 +56,8 @@ def test_a_collision_is_found_and_repaired():
     assert low < 0.25 < high
     assert high - low < 0.05
     assert what_moved(moved).startswith("Joint 3 moved by 0.2")
+    (turned,) = moved_by(with_turned_joint_3(adaptation))
+    assert_close(turned.shift, -moved[0].shift)
 
 
 def test_nothing_moved_is_said_where_nothing_moved():

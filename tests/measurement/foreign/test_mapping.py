@@ -95,7 +95,11 @@ def test_stated_columns(tmp_path: Path):
 
 @pytest.mark.parametrize(
     "stated",
-    [{"A1": "q1_deg"}, {"A1": "q1_deg", "X": "x_mm", "note": "-"}, {"A6": "q6_deg", "Y": "y_mm", "Z": "z_mm"}],
+    [
+        {"A1": "q1_deg"},
+        {"A1": "q1_deg", "X": "x_mm", "note": "-"},
+        {"A6": "q6_deg", "Y": "y_mm", "Z": "z_mm"},
+    ],
 )
 def test_the_rest_is_proposed_beside_stated_columns(tmp_path: Path, stated: dict[str, str]):
     text = f"A1,A2,A3,A4,A5,A6,X,Y,Z,note\n{ROW},warm\n{ROW},\n"
