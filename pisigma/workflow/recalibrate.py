@@ -1,8 +1,10 @@
 """Recalibrate a model with few new rows: typed settings in, a typed result out that writes itself as a model folder."""
 
 import datetime
+import math
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -35,6 +37,9 @@ FEW_ROWS = 5
 """Different poses below which nothing can be said of left-out rows."""
 IMPLAUSIBLE = 0.01
 """Share of the reach that errors of left-out rows have where the rows are not of this robot."""
+
+SUSPICIOUS = 5.0
+"""Left-out errors that are so many times the noise of the calibration are warned of."""
 
 
 @dataclass(frozen=True)
@@ -167,7 +172,7 @@ def _summary(
         elsewhere=(),
         effective_parameters=adaptation.effective,
         noise=adaptation.noise,
-        warnings=_warnings(parent, judged, rows),
+        warnings=_warnings(parent, judged, rows, adaptation.problem.posterior.noise),
     )
 
 
@@ -197,9 +202,19 @@ def _diagnostics(robot: Robot, judged: Gate, rows: Measurements) -> tuple[Diagno
     )
 
 
-def _warnings(model: CalibratedModel, judged: Gate, rows: Measurements) -> tuple[str, ...]:
-    """What to heed, a sentence each."""
+def _warnings(
+    model: CalibratedModel, judged: Gate, rows: Measurements, noise: Mapping[str, float]
+) -> tuple[str, ...]:
+    """What to heed, a sentence each; `noise` is that of the calibration, per sensor."""
     warnings = list(condition_warnings(model, rows))
+    error, usual = judged.rms[judged.kept], math.sqrt(3) * noise.get("position", math.inf)
+    if error is not None and error > SUSPICIOUS * usual:
+        warnings.append(
+            f"Left-out rows are missed by {error * 1e3:.3g} mm, while single positions scattered by "
+            f"{usual * 1e3:.2g} mm when the model was made, so that what is said to have moved may be wrong: rows "
+            "may be wrong or of another specimen, or more has changed than so few rows can say. Check the rows with "
+            "`pisigma verify`, or measure more of them."
+        )
     if judged.rows < FEW_ROWS:
         warnings.append(
             f"Only {judged.rows} of {rows.rows} rows could be left out and predicted, which says little of the "

@@ -63,6 +63,15 @@ def test_what_is_stated_to_stand_elsewhere_is_identified_anew():
     assert_close(after, T[:3, :3] @ before + T[:3, 3], atol=1e-3)
 
 
+def test_a_wrong_row_beside_a_collision_is_warned_of(after_collision):
+    assert not after_collision.warnings
+    rows = rows_later(10, 2, COLLISION)
+    wrong = rows.position.clone()
+    wrong[3, 0] += 0.005
+    (warning,) = recalibrate(model_before(), replace(rows, position=wrong)).warnings
+    assert "what is said to have moved may be wrong" in warning
+
+
 def test_rows_of_another_arm_are_not_trusted(tmp_path):
     rows = rows_later(10, 2)
     result = recalibrate(model_before(), replace(rows, q=rows.q.flip(0)))
