@@ -81,6 +81,7 @@ class Session:
         candidates: names and probabilities of what may have moved where that is unclear, else none.
         rms: root mean square of the errors under the model, with frames as they stand now [m].
         rms_after: the same expected after recalibrating [m].
+        rotation_ratio: errors of the orientation by those expected after recalibrating; 1 where none was measured.
         error_score: root mean square of the errors over their standard deviations; 1 is usual.
         values: number of measured values.
         standing: names of bases and tools that stand elsewhere than when the model was made.
@@ -93,6 +94,7 @@ class Session:
     candidates: tuple[tuple[str, float], ...]
     rms: float
     rms_after: float
+    rotation_ratio: float
     error_score: float
     values: int
     standing: tuple[str, ...]
@@ -109,7 +111,7 @@ class Session:
     def recalibrate(self) -> bool:
         """Whether the arm changed so much that recalibrating pays."""
         arm = any(not is_frame(one.moved.what) for one in self.moved) or bool(self.candidates)
-        return arm and self.rms > PAYS * self.rms_after
+        return arm and (self.rms > PAYS * self.rms_after or self.rotation_ratio > PAYS)
 
     @property
     def sentence(self) -> str:
@@ -255,18 +257,18 @@ def _judged(solved: _Solved, rows: Measurements, elsewhere: dict[Owner, float]) 
     of_arm = tuple(group for group in motions if not is_frame(group.what))
     frames = tuple(group for group in motions if is_frame(group.what))
     before = solved.arm_with(frames)
-    rms = rms_after = _rms(before, rows)
-    if of_arm:
-        count = len(solved.values.y)
-        determined = sum(len(group.index) for group in of_arm if group.what != CORRECTION)
-        rms_after = _rms(solved.arm_with(motions), rows) * math.sqrt(count / max(count - determined, 1))
+    (rms, angle), (rms_after, angle_after) = (_rms(arm, rows) for arm in (before, solved.arm_with(motions)))
+    count = len(solved.values.y)
+    determined = sum(len(group.index) for group in of_arm if group.what != CORRECTION)
+    optimism = math.sqrt(count / max(count - determined, 1))  # the rows themselves determined what moved
     return Session(
         rows=rows.rows,
         unchanged=explanation.unchanged,
         moved=_moved(solved, elsewhere),
         candidates=tuple((one.group.what, one.probability) for one in explanation.candidates),
         rms=rms,
-        rms_after=rms_after,
+        rms_after=rms_after * optimism,
+        rotation_ratio=1.0 if angle_after == 0 else angle / (angle_after * optimism),
         error_score=evidence.error_score(),
         values=len(solved.values.y),
         standing=tuple(" ".join(owner).strip() for owner in elsewhere),
@@ -324,6 +326,12 @@ def is_frame(what: str) -> bool:
     return what.split()[0] in ("base", "tool")
 
 
-def _rms(arm: AdaptedArm, rows: Measurements) -> float:
-    lengths = errors_under(arm, rows).position
-    return float(lengths[torch.isfinite(lengths)].square().mean().sqrt())
+def _rms(arm: AdaptedArm, rows: Measurements) -> tuple[float, float]:
+    """Root mean squares of the errors of lengths [m] and of angles [rad], 0 where none was measured."""
+    errors = errors_under(arm, rows)
+    return _root_mean_square(errors.position), _root_mean_square(errors.rotation)
+
+
+def _root_mean_square(sizes: Tensor | None) -> float:
+    measured = torch.zeros(0) if sizes is None else sizes[torch.isfinite(sizes)]
+    return float(measured.square().mean().sqrt()) if len(measured) else 0.0

@@ -151,7 +151,7 @@ def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
     rms = torch.tensor([one.session.rms * 1e3 for one in records], dtype=torch.float64)
     passed = bool(rms[-1] > limit_mm)
     date = earliest = None
-    if not passed and len(torch.unique(months)) >= FEWEST:
+    if not passed and bool((rms > 0).all()) and len(torch.unique(months)) >= FEWEST:
         columns = torch.stack([torch.ones_like(months), months - months[-1]], 1)
         spread = rms * torch.tensor([math.sqrt(0.5 / one.session.values) for one in records]).double()
         (now, slope), (_, deviation) = _fitted(rms, columns, spread.square().diag())
