@@ -222,8 +222,8 @@ class Search:
     ) -> Fitted:
         """The better of all features with weights of about the usual sizes and the best so far.
 
-        Half the usual evidence is enough, or any with left-out rows that are clearly predicted better: few rows show
-        no more.
+        Where something was kept already, half the usual evidence is enough, or any with left-out rows that are clearly
+        predicted better: few rows show no more. That there is anything beyond the geometry needs the usual evidence.
         """
         self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()
@@ -231,9 +231,9 @@ class Search:
         fit = self._regression.select(design)
         posterior = fit.maximise_evidence(design.usual_prior(prior_scale), self.noise, USUAL_UPDATES)
         left_out = fit.left_out(posterior, self._folds).rms(posterior.noise, self.noise)
-        gain = posterior.log_evidence - best.posterior.log_evidence
+        gain, clearly = posterior.log_evidence - best.posterior.log_evidence, left_out < self._least / LEVEL
         better = fit.effective_share(posterior) < LARGEST_USUAL_SHARE and (
-            gain > CLEARLY / 2 or (gain > 0 and left_out < self._least / LEVEL)
+            gain > CLEARLY or (best.design.features != () and (gain > CLEARLY / 2 or (gain > 0 and clearly)))
         )
         tried = Fitted(design, posterior, LARGEST_USUAL_SHARE)
         self._note(tried, left_out / self._unit, began, better)

@@ -36,7 +36,7 @@ def test_people_read_a_table_and_what_stays_uncertain(run, folder):
     for words in (
         "RMS [mm]",
         "needs more than 8 poses",
-        "minutes at 30 deg/s",
+        "min at 30 deg/s",
         "again.plan.yaml",
         "mostly come from",
     ):

@@ -30,6 +30,11 @@ def test_the_recalibrated_model_is_kept_where_it_is_about_as_good():
     assert judged.rms["scratch"] < judged.rms["recalibrated"]
 
 
+def test_a_row_that_is_off_by_far_does_not_save_a_candidate_that_is_worse_everywhere():
+    hopeless = [30.0] * 9 + [5_000.0]
+    assert decided(recalibrated=hopeless, old=[31.0] * 10, scratch=[0.9, 1.1] * 5).kept == "scratch"
+
+
 def test_a_candidate_that_cannot_be_fitted_is_not_kept():
     judged = decided(recalibrated=[2.0, 2.1] * 5, old=[1.0, 1.1] * 5, scratch=[math.inf, 0.9] * 5)
     assert (judged.kept, judged.rms["scratch"]) == ("old", None)
