@@ -27,14 +27,22 @@ MEASURED = [
 @pytest.mark.parametrize(("robot", "file"), MEASURED)
 def test_scaled_measurements_are_recognised(shared_data, robot, file, factor, severity):
     rows = Measurements.read_csv(shared_data / file)
-    rows = rows.select(torch.arange(0, rows.rows, 6))
+    rows = rows.select(torch.arange(0, rows.rows, 15))
     calibrator = GeometricCalibrator(Robot.load(robot))
     diagnostics: list[Diagnostic] = list(ScaleCheck().diagnose(checked(calibrator, rows)))
     assert diagnostics == []
     rows = replace(rows, position=rows.position * factor)
     scale = common_scale(calibrator.fit(rows))
     assert_close(scale.factor, factor, atol=1.5e-3)
-    assert ("scale", severity) in kinds_of(calibrator, rows)
+    (diagnostic,) = ScaleCheck().diagnose(checked(calibrator, rows))
+    assert (diagnostic.kind, diagnostic.severity) == ("scale", severity)
+
+
+def test_a_scale_is_looked_for_in_every_calibration(shared_data):
+    rows = Measurements.read_csv(shared_data / "ur5/grid.csv")
+    rows = rows.select(torch.arange(0, rows.rows, 15))
+    rows = replace(rows, position=rows.position * 0.9)
+    assert ("scale", "implausible") in kinds_of(GeometricCalibrator(Robot.load("ur5")), rows)
 
 
 @pytest.mark.parametrize("seed", range(5))
