@@ -25,6 +25,10 @@ FILES = ("candidates_from", "task", "measured")
 """Settings that are files."""
 
 
+FEW_POSES = 18
+"""Up to so many cannot determine all unknowns of a robot that was never measured."""
+
+
 @dataclass(frozen=True)
 class PlanSettings:
     """What is to be planned.
@@ -36,7 +40,7 @@ class PlanSettings:
         sigma_mm: standard deviation of a measured length [mm]; None for that of laser trackers, see
             `pisigma.planning.knowledge.Instrument`.
         criterion: "D": what lowers the uncertainty of all unknowns most; "I": what lowers that of the tool's position
-            over the task most; None for D without, and I with a model.
+            over the task most; None for I with a model, with measured rows or of up to `FEW_POSES` poses, else for D.
         limit_mm: RMS of the tool's position that is wanted [mm]; None for no limit.
         candidates: poses that are drawn to choose from.
         candidates_from: file of joint values to choose from instead.

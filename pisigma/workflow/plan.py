@@ -23,7 +23,7 @@ from pisigma.planning.choice import choose
 from pisigma.planning.expected_accuracy import ExpectedAccuracy, RemainingError, curve, remaining_errors
 from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_file import StoredPlan, yaml_of
-from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.plan_settings import FEW_POSES, PlanSettings
 from pisigma.planning.subject import Subject
 from pisigma.planning.task import task_poses
 from pisigma.planning.tour import Tour, tour
@@ -222,7 +222,7 @@ class _Problem:
         Poses that no free motion leads to are replaced by others.
         """
         q, count = self.candidates.q, self.settings.count
-        criterion = self.settings.criterion or ("I" if self.anything_known else "D")
+        criterion = self.settings.criterion or ("I" if self.anything_known or count <= FEW_POSES else "D")
         free = torch.arange(len(q))
         for _ in range(ROUNDS):
             progress(f"{count} of {len(free):,} candidates")
