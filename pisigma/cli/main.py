@@ -74,8 +74,8 @@ def run() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # whatever letters a terminal knows, nothing fails for them
             stream.reconfigure(errors="backslashreplace")
-    # Threads that wait for work sleep: while they spin, what others do beside them makes both many times slower.
-    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # Threads that wait for work soon sleep: while they spin, what runs beside them makes both many times slower.
+    os.environ.setdefault("GOMP_SPINCOUNT", "2000")
     try:
         try:
             app()
