@@ -32,7 +32,7 @@ MOST_GROUPS = 400
 """So many groups of rows are held out at most."""
 FEW_GROUPS = 200
 """Up to so many there are more folds."""
-FEW_TOGETHER = 100
+FEW_TOGETHER = 60
 """Up to so many groups all features are tried together as well, from the usual sizes of their weights."""
 FIRST_MODEL_SIZES = 3
 """A model with all features has one that comes in several sizes in the last of so many."""
