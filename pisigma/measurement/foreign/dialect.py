@@ -77,7 +77,7 @@ def sniff(lines: Sequence[str], source: str, decimal: Decimal | None = None) -> 
         decimal: the decimal sign where it is stated.
 
     Raises:
-        MeasurementError: no reading gives a table of numbers.
+        MeasurementError: no reading gives a table of numbers, or its commas may be either sign.
     """
     sample = [*lines[: SAMPLE // 2], *lines[SAMPLE // 2 :][-SAMPLE // 2 :]]
     signs = (decimal,) if decimal else get_args(Decimal)
@@ -91,7 +91,17 @@ def sniff(lines: Sequence[str], source: str, decimal: Decimal | None = None) -> 
             f"{source}: no lines of equally many numbers were recognised; a table with one measurement per line was "
             "wanted, its cells separated by tabs, semicolons, commas or blanks."
         )
-    return choices[scores.index(best)]
+    dialect = choices[scores.index(best)]
+    rows = filter(dialect.is_row, map(dialect.split, sample))
+    if decimal is None and dialect.separator == dialect.numbers.decimal == ",":
+        cells = [cell for row in rows for cell in row if dialect.is_number(cell)]
+        if dialect.numbers.is_ambiguous(cells):
+            example = next(cell for cell in cells if "," in cell)
+            raise MeasurementError(
+                f"{source}: the comma of '{example}', which also separates the cells, may set thousands apart or "
+                "decimals; state --decimal point or --decimal comma."
+            )
+    return dialect
 
 
 def _score(dialect: Dialect, lines: Sequence[str]) -> float:

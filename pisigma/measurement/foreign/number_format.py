@@ -2,6 +2,7 @@
 
 import functools
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -46,6 +47,14 @@ class NumberFormat:
             return 0.0
         other = "," if self.decimal == "." else "."
         return 0.5 if cell.count(other) == 1 and self.decimal not in cell else 1.0
+
+    def is_ambiguous(self, cells: Iterable[str]) -> bool:
+        """Say whether the sign before decimals may set thousands apart in every cell that has it, such as 1,234."""
+        sign = re.escape(self.decimal)
+        signed = [cell for cell in cells if self.decimal in cell]
+        return bool(signed) and all(
+            re.fullmatch(rf"[-+]?[1-9]\d{{0,2}}{sign}\d{{3}}", cell) for cell in signed
+        )
 
 
 @functools.cache

@@ -33,6 +33,14 @@ def test_a_stated_sign_counts():
     assert sniff(["1,250;2,125"], "a.csv", ".").numbers.decimal == "."
 
 
+def test_commas_that_may_set_thousands_apart_are_refused_where_they_separate_cells():
+    lines = ["q1,x", '10,"1,234"', '11,"-2,345"']
+    with pytest.raises(MeasurementError, match="state --decimal point or --decimal comma"):
+        sniff(lines, "a.csv")
+    assert sniff(lines, "a.csv", ".").numbers.text("1,234") == "1234"
+    assert sniff([*lines, '12,"0,345"'], "a.csv").numbers.text("1,234") == "1.234"
+
+
 @pytest.mark.parametrize("lines", [[], ["only words here", "and here"], ["1.5", "2.5"]])
 def test_no_table_is_refused(lines: list[str]):
     with pytest.raises(MeasurementError, match="table with one measurement per line"):
