@@ -16,6 +16,8 @@ LEVEL = 1.03
 """Features that the evidence is for are kept unless the left-out RMS rises above so many times the least so far."""
 CLEARLY = 5.0
 """The log evidence has to rise by so much (a Bayes factor of 150: very strong, Kass and Raftery 1995)."""
+STRONGLY = 3.0
+"""A rise of the log evidence that is strong: a Bayes factor of 20, same source."""
 LARGEST_EFFECTIVE_SHARE = 0.75
 """Unknowns may use up so much of the values, or the noise cannot be separated from them."""
 LARGEST_USUAL_SHARE = 0.97
@@ -222,8 +224,8 @@ class Search:
     ) -> Fitted:
         """The better of all features with weights of about the usual sizes and the best so far.
 
-        Where something was kept already, half the usual evidence is enough, or any with left-out rows that are clearly
-        predicted better: few rows show no more. That there is anything beyond the geometry needs the usual evidence.
+        Where something was kept already, strong evidence is enough, as few rows show no more. That there is anything
+        beyond the geometry needs the usual evidence.
         """
         self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()
@@ -231,9 +233,11 @@ class Search:
         fit = self._regression.select(design)
         posterior = fit.maximise_evidence(design.usual_prior(prior_scale), self.noise, USUAL_UPDATES)
         left_out = fit.left_out(posterior, self._folds).rms(posterior.noise, self.noise)
-        gain, clearly = posterior.log_evidence - best.posterior.log_evidence, left_out < self._least / LEVEL
-        better = fit.effective_share(posterior) < LARGEST_USUAL_SHARE and (
-            gain > CLEARLY or (best.design.features != () and (gain > CLEARLY / 2 or (gain > 0 and clearly)))
+        better = (
+            posterior.log_evidence - best.posterior.log_evidence
+            > (STRONGLY if best.design.features else CLEARLY)
+            and left_out < self._least * LEVEL
+            and fit.effective_share(posterior) < LARGEST_USUAL_SHARE
         )
         tried = Fitted(design, posterior, LARGEST_USUAL_SHARE)
         self._note(tried, left_out / self._unit, began, better)
