@@ -70,6 +70,10 @@ class PoseError(PisigmaError, ValueError):
     """A wanted pose is no pose, or joint values do not fit the robot."""
 
 
+class RequestError(PisigmaError, ValueError):
+    """A request to a server cannot be answered as it stands."""
+
+
 class UnreachablePoseError(PisigmaError, ValueError):
     """The robot cannot take a wanted pose as asked; the message gives the status."""
 
@@ -98,7 +102,7 @@ class MissingExtraError(PisigmaError, ImportError):
     """A package that comes with an extra of pisigma is not installed."""
 
 
-EXTRAS = {"lightning": "train", "onnx": "onnx", "numba": "compile", "viser": "view"}
+EXTRAS = {"lightning": "train", "onnx": "onnx", "numba": "compile", "viser": "view", "pyzmq": "serve"}
 """By the package that is imported on use, the extra that it comes with."""
 
 

@@ -54,6 +54,7 @@ LAYERS = (
     "reporting",
     "workflow",
     "viewing",
+    "serve",
     "cli",
 )
 """Every module or package may import those before it, and itself."""

@@ -21,6 +21,7 @@ from pisigma.cli.measure.command import measure
 from pisigma.cli.plan import plan
 from pisigma.cli.report import report
 from pisigma.cli.robots import robots
+from pisigma.cli.serve.command import serve
 from pisigma.cli.simulate import simulate
 from pisigma.cli.train import train
 from pisigma.cli.upgrade import upgrade
@@ -46,6 +47,7 @@ for command in (
     evaluate,
     report,
     ik,
+    serve,
     distill,
     export,
     verify,

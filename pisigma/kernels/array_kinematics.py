@@ -173,6 +173,20 @@ def transform_of(xyzrpy: Any) -> np.ndarray:
     )
 
 
+def xyzrpy_of(T: Any) -> tuple[float, ...]:
+    """x, y, z [m], roll, pitch and yaw [rad] of a transform `(4, 4)`: the inverse of `transform_of`.
+
+    The pitch lies within ±90 deg; at ±90 deg yaw is taken as 0.
+    """
+    rows = np.asarray(T).tolist()
+    (a, b, _, x), (c, d, _, y), (e, f, g, z), _ = rows
+    horizontal = math.hypot(a, c)
+    pitch = math.atan2(-e, horizontal)
+    if horizontal > 1e-12:
+        return x, y, z, math.atan2(c, a), pitch, math.atan2(f, g)
+    return x, y, z, math.atan2(-b, d), pitch, 0.0
+
+
 def _cosine_sine(angle: float) -> tuple[float, float]:
     """Cosine and sine; within 1e-15 rad of a multiple of 90 deg they are exactly 0 and ±1."""
     quarter = angle / (math.pi / 2)

@@ -1,0 +1,1 @@
+"""`pisigma serve`: the command."""

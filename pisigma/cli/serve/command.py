@@ -1,0 +1,67 @@
+"""`pisigma serve`: answer requests of other programs for corrected joint values."""
+
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pisigma.cli.arguments import complete_model
+from pisigma.cli.output import print_json, print_line
+
+if TYPE_CHECKING:
+    from pisigma.serve.models import ServedModels
+
+Model = Annotated[Path | None, typer.Argument(help="Model folder.", autocompletion=complete_model)]
+Models = Annotated[
+    Path | None, typer.Option("--models", help="Folder of model folders, which are all served, by name.")
+]
+Host = Annotated[
+    str, typer.Option(help="Address to listen at; other than that of this machine only with --token-file.")
+]
+Port = Annotated[
+    int, typer.Option("--port", min=0, max=65535, help="Port for lines of JSON; 0 for a free one.")
+]
+BinaryPort = Annotated[int, typer.Option(min=0, max=65535, help="Port for binary frames; 0 for a free one.")]
+TokenFile = Annotated[
+    Path | None, typer.Option(help="File with the token that every client has to send first.")
+]
+
+
+def serve(
+    model: Model = None,
+    models: Models = None,
+    host: Host = "127.0.0.1",
+    port: Port = 0,
+    binary_port: BinaryPort = 0,
+    token_file: TokenFile = None,
+) -> None:
+    """Answer requests for corrected joint values, paths and poses, until SIGTERM or Ctrl-C.
+
+    When it is ready, it prints one JSON line with its ports. SIGHUP loads models again whose folders have changed.
+    """
+    from pisigma.errors import OutputError
+    from pisigma.files.input_file import read_input
+    from pisigma.serve.server import Server, ServeSettings
+
+    token = (
+        None if token_file is None else read_input(token_file, OutputError).decode(errors="replace").strip()
+    )
+    server = Server(_load(model, models), ServeSettings(host, port, binary_port, token))
+    for name in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(name, lambda *_: server.stop())
+    if hasattr(signal, "SIGHUP"):
+        signal.signal(signal.SIGHUP, lambda *_: server.reload(lambda line: print_line(line, to_stderr=True)))
+    print_json({"json_port": server.json_port, "binary_port": server.binary_port})
+    server.run()
+
+
+def _load(model: Path | None, models: Path | None) -> "ServedModels":
+    """Load the model, or those of a folder."""
+    from pisigma.serve.models import ServedModels, model_folders
+
+    if model is not None and models is None:
+        return ServedModels([model])
+    if models is None or model is not None:
+        raise typer.BadParameter("give either a model folder or --models", param_hint="'MODEL' / '--models'")
+    return ServedModels(model_folders(models), within=models)

@@ -1,0 +1,140 @@
+"""The models that a server answers for; they are loaded again without a call being dropped."""
+
+import threading
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pisigma.errors import ModelError, PisigmaError, RequestError, nearest_choice
+from pisigma.files.model_files import is_model, model_hash
+from pisigma.inverse.corrected_ik import CorrectedIK, load
+
+
+@dataclass(frozen=True, eq=False)
+class ServedModel:
+    """One model.
+
+    Attributes:
+        folder: that it was read from.
+        ik: its corrected inverse kinematics.
+        sha256: of its `model.yaml`.
+        per_file_unit: `(dof,)`: degrees in a radian, or millimetres in a metre.
+    """
+
+    folder: Path
+    ik: CorrectedIK
+    sha256: str
+    per_file_unit: np.ndarray
+
+    @staticmethod
+    def read(folder: Path) -> "ServedModel":
+        """Load a model folder, and solve one pose so that the first request does not wait for the kernels.
+
+        Raises:
+            ModelError: the folder is no whole model.
+        """
+        sha256 = (
+            model_hash(folder) if is_model(folder) else ""
+        )  # before it is loaded: it may be written anew meanwhile
+        ik = load(folder)
+        ik(np.eye(4), near=np.zeros(len(ik.joints)), throw=False)
+        return ServedModel(folder, ik, sha256, np.where(ik.revolute, 180 / np.pi, 1e3))
+
+    @property
+    def name(self) -> str:
+        """What requests call it: the name of its folder."""
+        return self.folder.name
+
+    @property
+    def joints_key(self) -> str:
+        """What messages call its joint values: `q_deg` where all joints turn, else `q` [deg or mm]."""
+        return "q_deg" if self.ik.revolute.all() else "q"
+
+    @property
+    def quick(self) -> bool:
+        """Whether the compiled kernels solve its poses, in microseconds."""
+        return self.ik.compiled is not None
+
+
+def model_folders(folder: Path) -> list[Path]:
+    """Give the model folders in a folder, by name.
+
+    Raises:
+        ModelError: there are none.
+    """
+    folders = (
+        sorted(path for path in folder.iterdir() if path.is_dir() and is_model(path))
+        if folder.is_dir()
+        else []
+    )
+    if not folders:
+        raise ModelError(f"{folder}: holds no model folders; give the folder that your model folders lie in.")
+    return folders
+
+
+class ServedModels:
+    """Models by index and by name; an index stays that of its model for as long as the server runs."""
+
+    def __init__(self, folders: Iterable[Path], within: Path | None = None) -> None:
+        """Load model folders.
+
+        Args:
+            folders: of the models.
+            within: folder that is searched for further models when they are loaded again.
+
+        Raises:
+            ModelError: a folder is no whole model.
+        """
+        self._within, self._lock = within, threading.Lock()
+        self._models: Sequence[ServedModel] = [ServedModel.read(folder) for folder in folders]
+
+    def __len__(self) -> int:
+        return len(self._models)
+
+    def __getitem__(self, index: int) -> ServedModel:
+        return self._models[index]
+
+    def find(self, name: object) -> ServedModel:
+        """Give the model of a name or an index; without one the only model.
+
+        Raises:
+            RequestError: there is none, or there are several and None is given.
+        """
+        models = self._models
+        if name is None and len(models) == 1:
+            return models[0]
+        if type(name) is int and 0 <= name < len(models):
+            return models[name]
+        names = [model.name for model in models]
+        if isinstance(name, str) and name in names:
+            return models[names.index(name)]
+        raise RequestError(
+            f"'model' is {name!r}; give the name or the index of a model. {nearest_choice(str(name), names)}"
+        )
+
+    def reload(self) -> list[str]:
+        """Load the models whose folders have changed and, with `within`, new ones; give what went wrong.
+
+        The others, and those that cannot be loaded, answer on as they are.
+        """
+        with self._lock:
+            problems: list[str] = []
+            models = [self._newest(model, problems) for model in self._models]
+            there = {model.folder for model in models}
+            try:
+                new = [] if self._within is None else model_folders(self._within)
+                models += [ServedModel.read(folder) for folder in new if folder not in there]
+            except (PisigmaError, OSError) as problem:
+                problems.append(str(problem))
+            self._models = models
+        return problems
+
+    @staticmethod
+    def _newest(model: ServedModel, problems: list[str]) -> ServedModel:
+        try:
+            return model if model_hash(model.folder) == model.sha256 else ServedModel.read(model.folder)
+        except (PisigmaError, OSError) as problem:
+            problems.append(str(problem))
+            return model

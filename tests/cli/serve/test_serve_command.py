@@ -1,0 +1,35 @@
+"""`pisigma serve` as a process: the line that says it is ready, signals, and what it refuses."""
+
+import json
+import signal
+import subprocess
+import sys
+
+from testing.serving import client
+
+POSE = [800.0, 200.0, 600.0, 10.0, -80.0, 170.0]
+
+
+def test_it_says_its_ports_answers_and_ends_with_sigterm(repository):
+    command = [sys.executable, "-m", "pisigma", "serve", "--models", str(repository / "models")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        ports = json.loads(process.stdout.readline())
+        assert set(ports) == {"json_port", "binary_port"}
+        lines = client.JsonClient(ports["json_port"])
+        assert [model["name"] for model in lines.ask(ask="models")["models"]] == ["kiro3", "kiro4"]
+        process.send_signal(signal.SIGHUP)
+        assert lines.ask(pose=POSE, model="kiro4")["status"] == "reached"
+        process.send_signal(signal.SIGTERM)
+        assert process.communicate(timeout=10) == ("", "")
+        lines.close()
+    assert process.returncode == 0
+
+
+def test_what_cannot_be_served_is_refused(refuses, run, repository, tmp_path):
+    model = repository / "models" / "kiro4"
+    assert "there is no such model folder" in refuses("serve", tmp_path / "none")
+    assert "holds no model folders" in refuses("serve", "--models", tmp_path)
+    assert "clients have to send a token" in refuses("serve", model, "--host", "0.0.0.0")
+    (tmp_path / "token").write_text("\n")
+    assert "the token is empty" in refuses("serve", model, "--token-file", tmp_path / "token")
+    assert run("serve").exit_code == run("serve", model, "--models", tmp_path).exit_code == 2

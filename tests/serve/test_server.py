@@ -1,0 +1,146 @@
+"""The server as a whole: tokens, slow clients, models that change, and its end."""
+
+import json
+import shutil
+import socket
+import threading
+import time
+
+import pytest
+from testing.models import no_type_checker
+from testing.serving import frame_client, json_client, running
+
+from pisigma.errors import ModelError, OutputError
+from pisigma.serve import json_lines
+from pisigma.serve.models import ServedModels, model_folders
+from pisigma.serve.server import Server, ServeSettings
+
+POSE = [800.0, 200.0, 600.0, 10.0, -80.0, 170.0]
+
+
+@pytest.fixture(scope="module")
+def kiro4(repository):
+    return repository / "models" / "kiro4"
+
+
+def test_other_machines_are_served_with_a_token_only(kiro4):
+    models = ServedModels([kiro4])
+    for host in ("0.0.0.0", "::"):
+        with pytest.raises(OutputError, match="clients have to send a token"):
+            Server(models, ServeSettings(host))
+    with pytest.raises(OutputError, match="is no address"):
+        Server(models, ServeSettings("no.such.host.invalid"))
+    with pytest.raises(OutputError, match="the token is empty"):
+        Server(models, ServeSettings("0.0.0.0", token=" "))
+
+
+def test_a_port_that_is_taken_is_refused(served, kiro4):
+    with pytest.raises(OutputError, match=f"port {served.json_port} of '127.0.0.1' cannot be served"):
+        Server(ServedModels([kiro4]), ServeSettings(json_port=served.json_port))
+
+
+def test_nothing_is_answered_before_the_token(kiro4):
+    with running(kiro4, settings=ServeSettings("0.0.0.0", token="secret")) as server:
+        with json_client(server, token="secret") as client:
+            assert client.ask(pose=POSE)["status"] == "reached"
+        with frame_client(server, token="secret") as client:
+            assert client.solve([1.0] * 16)[0] == 6
+        for token in (None, "Secret", ""):
+            with (
+                pytest.raises(RuntimeError, match="the first line has to be"),
+                json_client(server, token=token) as client,
+            ):
+                client.ask(pose=POSE)
+        with pytest.raises(ConnectionError, match="not the right one"), frame_client(server, token="wrong"):
+            pass
+
+
+def test_slow_clients_are_cut_off_and_the_others_served(kiro4):
+    with running(kiro4, settings=ServeSettings(patience=0.2)) as server, json_client(server) as patient:
+        stalled = [socket.create_connection(("127.0.0.1", server.json_port), 5) for _ in range(20)]
+        for stream in stalled:
+            stream.sendall(b'{"id": 1, "pose": [')
+        for stream in stalled:
+            assert stream.recv(100) == b""
+            stream.close()
+        assert patient.ask(pose=POSE)["status"] == "reached"
+        assert patient.ask(ask="health")["cut_off"] == 20
+
+
+def _send_for_ever(stream, line):
+    while True:
+        stream.sendall(line)
+
+
+def test_a_client_that_takes_no_answers_is_cut_off(kiro4):
+    with running(kiro4, settings=ServeSettings(patience=0.2)) as server, json_client(server) as other:
+        greedy = socket.create_connection(("127.0.0.1", server.json_port), 5)
+        line = b'{"ask": "models"}\n' * 1000
+        with pytest.raises(OSError, match=r"Broken pipe|reset|timed out"):
+            _send_for_ever(greedy, line)
+        greedy.close()
+        assert other.ask(ask="health")["cut_off"] == 1
+
+
+def test_a_model_that_is_written_anew_is_loaded_without_a_call_being_dropped(kiro4, repository, tmp_path):
+    shutil.copytree(kiro4, tmp_path / "arm")
+    with running(tmp_path / "arm", within=tmp_path) as server, json_client(server) as client:
+        before = client.ask(ask="models")["models"]
+        answered, stop = [], threading.Event()
+
+        def call():
+            with json_client(server) as beside:
+                while not stop.is_set():
+                    answered.append(beside.ask(pose=POSE, model=0)["status"])
+
+        thread = threading.Thread(target=call)
+        thread.start()
+        shutil.copytree(repository / "models" / "kiro3", tmp_path / "other")
+        text = (tmp_path / "arm" / "model.yaml").read_text()
+        (tmp_path / "arm" / "model.yaml").write_text(text.replace("name: kiro4", "name: kiro4b", 1))
+        answer = client.ask(ask="reload")
+        stop.set()
+        thread.join()
+        assert set(answered) == {"reached"}
+        after = client.ask(ask="models")["models"]
+        assert [model["name"] for model in after] == ["arm", "other"]
+        assert answer["problems"] or after[0]["sha256"] != before[0]["sha256"]
+        (tmp_path / "arm" / "model.yaml").unlink()
+        assert "model.yaml" in client.ask(ask="reload")["problems"][0]
+        assert client.ask(pose=POSE, model="arm")["status"] == "reached"
+
+
+def test_what_was_begun_is_finished_when_the_server_stops(kiro4, monkeypatch):
+    begun = threading.Event()
+    follow = json_lines._follow
+
+    def slowly(*arguments):
+        begun.set()
+        time.sleep(0.3)
+        return follow(*arguments)
+
+    monkeypatch.setattr(json_lines, "_follow", slowly)
+    with running(kiro4) as server:
+        stream = socket.create_connection(("127.0.0.1", server.json_port), 5)
+        path = json.dumps({"id": 1, "path": [POSE] * 3}).encode() + b"\n"
+        pose = json.dumps({"id": 2, "pose": POSE}).encode() + b"\n"
+        stream.sendall(path + pose)
+        assert begun.wait(5)
+    with stream, stream.makefile("rb") as file:
+        assert [json.loads(line)["id"] for line in file] == [1, 2]
+
+
+def test_a_folder_without_models_is_refused(tmp_path):
+    with pytest.raises(ModelError, match="holds no model folders"):
+        model_folders(tmp_path)
+
+
+def test_a_defect_is_told_and_ends_nothing(served, monkeypatch):
+    def broken(*arguments):
+        raise ZeroDivisionError("oh")
+
+    monkeypatch.setattr(json_lines, "_solve", broken)
+    with json_client(served) as client, no_type_checker():
+        with pytest.raises(RuntimeError, match="a defect of pisigma"):
+            client.ask(pose=POSE, model=0)
+        assert client.ask(ask="health")["connections"] > 0
