@@ -16,8 +16,8 @@ if TYPE_CHECKING:
 Out = Annotated[
     Path,
     typer.Option(
-        help="File to write: .urdf; .csv or .yaml for dh and offsets; for targets .csv, .script (URScript), "
-        ".src (KUKA), .mod (ABB) or .ls (FANUC); .onnx."
+        help="File to write: .urdf; .csv or .yaml for dh and offsets; .conf, .yaml, .cfx, .xacro or .csv for "
+        "controllers' own files; for targets .csv, .script (URScript), .src (KUKA), .mod (ABB) or .ls (FANUC); .onnx."
     ),
 ]
 Form = Annotated[
@@ -31,7 +31,8 @@ Form = Annotated[
 Like = Annotated[
     Path | None,
     typer.Option(
-        help="With urdf: the URDF file that the robot was loaded from; its links, meshes and limits stay."
+        help="File whose other content stays: with urdf and xacro the URDF file that the robot was loaded from, with "
+        "ur-calibration and staubli the controller's own file."
     ),
 ]
 Tip = Annotated[
@@ -55,6 +56,16 @@ Config = Annotated[
     str | None,
     typer.Option(help="With .ls and --targets cartesian: the arm's configuration, such as 'N U T, 0, 0, 0'."),
 ]
+CountsPerTurn = Annotated[
+    str | None,
+    typer.Option(
+        help="With epson and fanuc-mastering: encoder counts for a turn of every joint, with the gear, or for 1 mm "
+        "where it slides, such as 8388608,8388608,524288,1048576."
+    ),
+]
+PresentCounts = Annotated[
+    str | None, typer.Option(help="With epson and fanuc-mastering: the counts that the controller has now.")
+]
 
 
 def export(
@@ -67,6 +78,8 @@ def export(
     targets: TargetKind = None,
     branch: Branch = None,
     config: Config = None,
+    counts_per_turn: CountsPerTurn = None,
+    present_counts: PresentCounts = None,
     payload_kg: PayloadKg = None,
     temperature_c: TemperatureC = None,
     as_json: AsJson = False,
@@ -79,7 +92,20 @@ def export(
     from pisigma.export.export_format import ExportRequest
     from pisigma.export.registry import export_format, export_model
 
-    request = ExportRequest(model, out, like, tip, poses, targets, branch, config, payload_kg, temperature_c)
+    request = ExportRequest(
+        model=model,
+        out=out,
+        like=like,
+        tip=tip,
+        poses=poses,
+        targets=targets,
+        branch=branch,
+        config=config,
+        counts_per_turn=counts_per_turn,
+        present_counts=present_counts,
+        payload_kg=payload_kg,
+        temperature_c=temperature_c,
+    )
     exported = export_model(form, request)
     _print(exported, form, out, export_format(form).contents, as_json)
 

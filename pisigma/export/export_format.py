@@ -16,12 +16,14 @@ class ExportRequest:
     Attributes:
         model: the model folder.
         out: the file to write.
-        like: with urdf, the URDF file that the robot was loaded from.
+        like: the file whose other content stays: with urdf and xacro the URDF file that the robot was loaded from.
         tip: with `like`, the link that is the tool.
         poses: with targets, the file of poses.
         targets: with targets, "joints" or "cartesian".
         branch: with targets, the branch to take instead of the trained one.
         config: with FANUC's Cartesian targets, the arm's configuration.
+        counts_per_turn: with counts, encoder counts a turn of every joint, with commas between.
+        present_counts: with counts, those that the controller has now.
         payload_kg: what the robot carries [kg].
         temperature_c: of the robot [deg C].
     """
@@ -34,6 +36,8 @@ class ExportRequest:
     targets: str | None = None
     branch: str | None = None
     config: str | None = None
+    counts_per_turn: str | None = None
+    present_counts: str | None = None
     payload_kg: float | None = None
     temperature_c: float | None = None
 
@@ -66,7 +70,18 @@ class ExportRequest:
         return under_stated_conditions(model, **self.conditions) if self.conditions else model
 
 
-OPTIONS = ("like", "tip", "poses", "targets", "branch", "config", "payload_kg", "temperature_c")
+OPTIONS = (
+    "like",
+    "tip",
+    "poses",
+    "targets",
+    "branch",
+    "config",
+    "counts_per_turn",
+    "present_counts",
+    "payload_kg",
+    "temperature_c",
+)
 """Options of which every format declares those that it takes."""
 
 

@@ -60,9 +60,10 @@ def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
 
 def offsets_between(nominal: Robot, moved: Robot) -> Float64[np.ndarray, " dof"]:
     """Joint offsets [rad or m] of a robot against another, as the controller counts."""
-    parameters = list(joint_offsets(nominal))
-    difference: np.ndarray = (moved.dh - nominal.dh).reshape(-1)[parameters]
-    return nominal.directions * difference
+    offsets: np.ndarray = (moved.dh - nominal.dh).reshape(-1)[
+        list(joint_offsets(nominal))
+    ] * nominal.directions
+    return offsets
 
 
 MEANING = (
@@ -71,16 +72,19 @@ MEANING = (
 )
 
 
-def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
-    """What the offsets mean and what they give up."""
-    lost, nominal = offsets.lost, offsets.nominal
-    said = [
-        MEANING,
-        f"Offsets alone are off the whole model by {lost.mean_mm:.4g} mm in the mean, {lost.p95_mm:.4g} mm in 95 "
+def departure_sentence(what: str, lost: Departure, nominal: Departure) -> str:
+    """How far off the whole model something is, and for comparison the robot as drawn."""
+    return (
+        f"{what} off the whole model by {lost.mean_mm:.4g} mm in the mean, {lost.p95_mm:.4g} mm in 95 "
         f"% of its poses, {lost.max_mm:.4g} mm at most, and {lost.mean_mrad:.4g} mrad in the mean (the robot as "
         f"drawn, on the model's base and tool: {nominal.mean_mm:.4g}, {nominal.p95_mm:.4g}, "
-        f"{nominal.max_mm:.4g} mm and {nominal.mean_mrad:.4g} mrad).",
-    ]
+        f"{nominal.max_mm:.4g} mm and {nominal.mean_mrad:.4g} mrad)."
+    )
+
+
+def offset_sentences(offsets: JointOffsets) -> tuple[str, ...]:
+    """What the offsets mean and what they give up."""
+    said = [MEANING, departure_sentence("Offsets alone are", offsets.lost, offsets.nominal)]
     if offsets.unobservable:
         said.append(f"Base or tool take in the offset of {', '.join(offsets.unobservable)}, which is 0 here.")
     return tuple(said)

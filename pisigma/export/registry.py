@@ -14,9 +14,19 @@ BUILT_IN = {
         "the best joint offsets alone, with the accuracy that this gives up",
     ),
     "targets": ("pisigma.export.targets", "corrected targets for --poses"),
+    "ur-calibration": (
+        "pisigma.export.controllers.universal_robots",
+        "calibration.conf of Universal Robots",
+    ),
+    "ur-ros": ("pisigma.export.controllers.ur_ros", "kinematics YAML of their ROS driver"),
+    "staubli": ("pisigma.export.controllers.staubli", "dhOffset of a Staubli arm.cfx"),
+    "xacro": ("pisigma.export.controllers.xacro", "calibrated origins laid over the URDF of --like"),
+    "epson": ("pisigma.export.controllers.counts:EPSON", "home offsets of Epson in counts"),
+    "fanuc-mastering": ("pisigma.export.controllers.counts:FANUC", "mastering counts of FANUC"),
     "onnx": ("pisigma.export.onnx_model", "the network alone"),
 }
-"""By name the module whose `FORMAT` it is, imported on use, and what the help says of it."""
+"""By name the module whose `FORMAT` (or what is named behind the colon) it is, imported on use, and what the help says
+of it."""
 
 _REGISTERED: dict[str, ExportFormat] = {}
 
@@ -50,7 +60,8 @@ def export_format(name: str) -> ExportFormat:
         return _REGISTERED[name]
     if name not in BUILT_IN:
         raise OutputError(f"--format '{name}' is unknown; {nearest_choice(name, export_names())}")
-    form = import_module(BUILT_IN[name][0]).FORMAT
+    module, _, attribute = BUILT_IN[name][0].partition(":")
+    form = getattr(import_module(module), attribute or "FORMAT")
     assert isinstance(form, ExportFormat)
     return form
 

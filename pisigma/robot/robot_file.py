@@ -136,7 +136,7 @@ def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None)
     """Read a robot by catalogue name, from a YAML or from a URDF file. See `Robot.load`."""
     name = os.fspath(robot)
     suffix = Path(name).suffix.lower()
-    if suffix == ".urdf" and name not in catalogue():
+    if suffix in (".urdf", ".xacro") and name not in catalogue():
         from pisigma.robot.urdf_chain import read_chain
         from pisigma.robot.urdf_rows import rows_of_chain
 
@@ -152,8 +152,6 @@ def read_robot(robot: str | os.PathLike[str], base: str | None, tip: str | None)
         return parse_yaml(text, RobotDocument, RobotError, source=f"catalogue/{name}.yaml").drawing()
     if suffix in (".yaml", ".yml"):
         return read_yaml(name, RobotDocument, RobotError).drawing()
-    if suffix == ".xacro":
-        raise RobotError(f"{name}: is xacro, which is not read; expand it first (`xacro FILE > robot.urdf`).")
     raise UnknownRobotError(
         f"'{name}' is no robot of the catalogue and no .yaml or .urdf file: {nearest_choice(name, catalogue())}"
     )

@@ -91,11 +91,36 @@ def parse_xml(path: str | os.PathLike[str], everything: bool = False) -> Any:
         raise RobotError(
             f"{path}{line}: is truncated or no XML ({what}); a whole URDF file was wanted."
         ) from None
-    if any("xacro" in str(element.tag) for element in root.iter()):
-        raise _is_xacro(path)
+    if any(_is_of_xacro(element) for element in root.iter()):
+        _insert_properties(root, path)
     if etree.QName(root).localname != "robot":
         raise RobotError(f"{path}: the root is <{root.tag}>; a URDF starts with <robot name=...>.")
     return root
+
+
+XACRO = "http://www.ros.org/wiki/xacro"
+
+
+def _is_of_xacro(element: Any) -> bool:
+    return "xacro" in str(element.tag)
+
+
+def _insert_properties(root: Any, path: str | os.PathLike[str]) -> None:
+    """Put the values of xacro's plain properties where they are named, as in files of `pisigma export`."""
+    from lxml import etree
+
+    values: dict[str, str] = {}
+    for element in filter(_is_of_xacro, list(root.iter())):
+        if etree.QName(element).localname != "property" or set(element.attrib) != {"name", "value"}:
+            raise _is_xacro(path)
+        values[element.get("name")] = element.get("value")
+        element.getparent().remove(element)
+    for element in root.iter():
+        for key, text in element.attrib.items():
+            filled = re.sub(r"\$\{(\w+)\}", lambda name: values.get(name[1], name[0]), text)
+            if "$" in filled:
+                raise _is_xacro(path)
+            element.set(key, filled)
 
 
 def _is_xacro(path: str | os.PathLike[str]) -> RobotError:

@@ -47,11 +47,15 @@ class ChainRows:
     frames: tuple[Frame, ...]
 
 
-def rows_of_chain(chain: Chain) -> ChainRows:
+def rows_of_chain(chain: Chain, nearly_parallel: float = NEARLY_PARALLEL) -> ChainRows:
     """The chain as DH + Hayati rows, base and tool, equal in its forward kinematics to rounding.
 
     Joints count as in the file. Where an axis points along the negative side of its largest coordinate, its
     row has direction -1. The last row takes in the tip where that stands on its axis, else the tool does.
+
+    Args:
+        chain: the chain.
+        nearly_parallel: sine of the angle between two axes below which their row is Hayati's.
     """
     joints = chain.joints
     axes = [_direction(joint) * joint.axis for joint in joints]
@@ -60,7 +64,7 @@ def rows_of_chain(chain: Chain) -> ChainRows:
     for i in range(len(joints) - 1):
         T_row_next = inverse(frames[i]) @ joints[i + 1].origin
         point = _point_of_axis(joints, axes, i + 1, T_row_next)
-        parameters = _row_to(T_row_next[:3, :3] @ axes[i + 1], point)
+        parameters = _row_to(T_row_next[:3, :3] @ axes[i + 1], point, nearly_parallel)
         dh.append(parameters)
         frames.append(inverse(T_row_next) @ row_frame(*parameters))
     T_row_tip = inverse(frames[-1]) @ chain.end
@@ -132,10 +136,10 @@ def _point_of_axis(joints: tuple[ChainJoint, ...], axes: list[Vector], index: in
     return np.zeros(3)
 
 
-def _row_to(z: Vector, point: Vector) -> Parameters:
+def _row_to(z: Vector, point: Vector, nearly_parallel: float) -> Parameters:
     """Row that leads from the z axis to a line, given by its direction and a point, in the row's frame."""
     sine = math.hypot(z[0], z[1])
-    if sine < NEARLY_PARALLEL:
+    if sine < nearly_parallel:
         foot = point - point[2] / z[2] * z
         a = clean_length(math.hypot(foot[0], foot[1]))
         theta, d = (math.atan2(foot[1], foot[0]) if a else 0.0), 0.0
@@ -148,7 +152,7 @@ def _row_to(z: Vector, point: Vector) -> Parameters:
         d = clean_length(point[2] - (z[0] * point[0] + z[1] * point[1]) / sine**2 * z[2])
     theta = clean_angle(theta)
     x, y, up = turn(2, -theta)[:3, :3] @ z
-    beta = clean_angle(math.atan2(x, math.hypot(y, up))) if sine < NEARLY_PARALLEL else 0.0
+    beta = clean_angle(math.atan2(x, math.hypot(y, up))) if sine < nearly_parallel else 0.0
     return theta, d, a, clean_angle(math.atan2(-y, up)), beta
 
 

@@ -154,7 +154,7 @@ def test_a_learned_correction_is_said_to_be_missing(run, models, tmp_path, form,
         (("--format", "dh", "--out", "x.urdf"), "x.urdf: a DH table goes into a .csv or .yaml or .yml file"),
         (
             ("--format", "dh", "--out", "x.csv", "--like", "x.urdf"),
-            "--like goes with --format urdf, not with dh",
+            "--like goes with --format urdf or ur-calibration or staubli or xacro, not with dh",
         ),
         (
             ("--format", "urdf", "--out", "x.urdf", "--tip", "a"),

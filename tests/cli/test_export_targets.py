@@ -87,7 +87,7 @@ def test_targets_for_a_payload(run, refuses, poses, tmp_path):
         "export", tmp_path / "arm", *options, -1
     )
     table = ("--format", "dh", "--out", tmp_path / "dh.csv", "--payload-kg", 5)
-    assert "--payload-kg goes with --format offsets or targets, not with dh" in refuses(
+    assert "--payload-kg goes with --format offsets or targets or ur-calibration" in refuses(
         "export", tmp_path / "arm", *table
     )
 

@@ -227,8 +227,11 @@ def test_files_that_are_not_there_or_no_urdf(tmp_path):
     (tmp_path / "folder.urdf").mkdir()
     with pytest.raises(RobotError, match="cannot be read"):
         Robot.load(tmp_path / "folder.urdf")
+    (tmp_path / "arm.urdf.xacro").write_text(
+        '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:include filename="a"/></robot>'
+    )
     with pytest.raises(RobotError, match=r"is xacro, which is not read; expand it first"):
-        Robot.load("arm.urdf.xacro")
+        Robot.load(tmp_path / "arm.urdf.xacro")
     with pytest.raises(UnknownRobotError, match=r"no \.yaml or \.urdf file"):
         Robot.load("arm.sdf")
 

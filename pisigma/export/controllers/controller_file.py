@@ -1,0 +1,146 @@
+"""What a controller's own file is: what it can hold, how it is written and read, and what it gives up."""
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, field
+
+import numpy as np
+
+from pisigma.errors import RobotError
+from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
+from pisigma.export.geometry import condition_remarks, corrects_joints, frame_remarks
+from pisigma.export.joint_offsets import departure_sentence
+from pisigma.export.projection import project_model, whole_geometry
+from pisigma.robot.description import Robot
+from pisigma.robot.row import FRAME_COLUMNS, in_file_units
+
+UNTRIED = "Written from the published description ({source}), not tried on a controller."
+CONDITIONS = frozenset(("payload_kg", "temperature_c"))
+_NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
+
+
+@dataclass(frozen=True)
+class FileText:
+    """What the text of a file is made from.
+
+    Attributes:
+        robot: with the geometry that the file is to hold.
+        nominal: the robot as the controller has it without the file.
+        request: the model, the file and the options.
+        said: sentences for its comments.
+    """
+
+    robot: Robot
+    nominal: Robot
+    request: ExportRequest
+    said: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class ControllerFile:
+    """One kind of file.
+
+    Attributes:
+        name: what `--format` calls it.
+        contents: what a file holds, with its article.
+        suffixes: endings that its files may have.
+        source: where it is described.
+        relies: sentences on what has to be true of the controller.
+        text: gives the text of a file.
+        read: gives the robot that a text says, from the nominal one; the second argument is the file's name.
+        check: refuses robots that the file cannot hold; raises a `PisigmaError`.
+        parameters: indices into the flattened `Robot.dh` that the file can hold.
+        options: those of `OPTIONS` that it takes.
+        refuse: refuses requests before anything is loaded; raises a `PisigmaError`.
+    """
+
+    name: str
+    contents: str
+    suffixes: tuple[str, ...]
+    source: str
+    relies: tuple[str, ...]
+    text: Callable[[FileText], str]
+    read: Callable[[str, str, Robot], Robot]
+    check: Callable[[Robot], None]
+    parameters: Callable[[Robot], Sequence[int]] = whole_geometry
+    options: frozenset[str] = field(default_factory=frozenset)
+    refuse: Callable[[ExportRequest], None] = lambda request: None
+
+    def export_format(self) -> ExportFormat:
+        """The format of `pisigma export`."""
+        return ExportFormat(
+            self.name, self.contents, self.suffixes, self.write, self.options | CONDITIONS, self.refuse
+        )
+
+    def write(self, request: ExportRequest) -> Exported:
+        """Project the model on what the file can hold, and state what that gives up, judged by reading the file back.
+
+        Raises:
+            PisigmaError: the model cannot be loaded or projected, or the file cannot hold its robot.
+        """
+        model = request.load()
+        nominal = model.robot
+        self.check(nominal)
+        parameters = self.parameters(nominal)
+        whole = len(parameters) == nominal.dh.size
+        start = model.calibrated if whole and model.calibrated is not None else nominal
+        fit = project_model(model, start, parameters)
+        held = self.read(self.text(FileText(fit.robot, nominal, request)), str(request.out), nominal)
+        lost, drawn = fit.departure(held), fit.departure(nominal)
+        title = f"{self.contents[0].upper()}{self.contents[1:]} of model {model.name} (robot {nominal.name})."
+        said = [title, UNTRIED.format(source=self.source), departure_sentence("This file is", lost, drawn)]
+        if corrects_joints(model):
+            said.append(
+                "It holds no learned joint correction: its geometry is the one that comes nearest to both."
+            )
+        said += [*self.relies, *condition_remarks(model), *frame_remarks(model)]
+        frames = {part: in_file_units(FRAME_COLUMNS, getattr(held, part)) for part in ("base", "tool")}
+        facts = {"off_the_whole_model": asdict(lost), "robot_as_drawn": asdict(drawn), **frames}
+        text = self.text(FileText(fit.robot, nominal, request, tuple(said)))
+        return Exported(text, model_facts(model) | facts, tuple(said))
+
+
+def frame_sentences(robot: Robot) -> tuple[str, ...]:
+    """Base and tool as comments, which the files themselves cannot hold; `with_frames` reads them back."""
+    sentences = []
+    for part in ("base", "tool"):
+        values = in_file_units(FRAME_COLUMNS, getattr(robot, part)).items()
+        sentences.append(f"{part}: " + ", ".join(f"{column} {value + 0.0!r}" for column, value in values))
+    return tuple(sentences)
+
+
+def with_frames(robot: Robot, text: str) -> Robot:
+    """The robot with the base and the tool that stand in the comments of a text; its own where there are none."""
+    frames: dict[str, np.ndarray] = {}
+    for part in ("base", "tool"):
+        columns = in_file_units(FRAME_COLUMNS, np.zeros(6))
+        pattern = f"{part}: " + ", ".join(f"{column} ({_NUMBER})" for column in columns)
+        if found := re.search(pattern, text):
+            values = [float(value) for value in found.groups()]
+            frames[part] = np.array([*(value / 1e3 for value in values[:3]), *np.deg2rad(values[3:])])
+    return robot.with_geometry(base=frames.get("base"), tool=frames.get("tool"))
+
+
+def check_plain_joints(robot: Robot, kind: str, count: int | None = None) -> None:
+    """Refuse robots that have anything but joints in their rows, or other than so many that turn.
+
+    Args:
+        robot: the robot.
+        kind: what the file is called, for the complaint.
+        count: joints that are wanted, all turning and counting as their axes turn; None for any.
+
+    Raises:
+        RobotError: it is no such robot.
+    """
+    turning = sum(robot.revolute)
+    if count is not None and ((turning, robot.dof) != (count, count) or (robot.directions < 0).any()):
+        raise RobotError(
+            f"{kind} is for robots with {count} joints that turn and count as their axes do; robot '{robot.name}' has "
+            f"{turning} that turn and {robot.dof - turning} that slide, {int((robot.directions < 0).sum())} counted "
+            "the other way. Take another --format."
+        )
+    if len(robot.rows) != robot.dof:
+        raise RobotError(
+            f"{kind} has one row a joint; robot '{robot.name}' has {len(robot.rows) - robot.dof} fixed rows besides. "
+            "Take --format urdf or dh."
+        )

@@ -1,0 +1,50 @@
+"""A xacro file that lays calibrated origins over a URDF: every origin is a property, and all else is the URDF's."""
+
+import re
+
+from pisigma.errors import OutputError
+from pisigma.export.export_format import Exported, ExportFormat, ExportRequest
+from pisigma.export.urdf import FORMAT as URDF
+from pisigma.robot.urdf_chain import XACRO
+
+SENTENCE = (
+    "The origins of the joints are properties, so one calibration can be exchanged for another; `xacro FILE` expands "
+    "it. Written from the published description (wiki.ros.org/xacro) and expanded with the package xacro 2.1.1."
+)
+
+
+def with_properties(urdf: str) -> str:
+    """URDF text with the origins of its joints as properties on top."""
+    from lxml import etree
+
+    root = etree.fromstring(urdf.encode())
+    top = etree.Element("robot", root.attrib, nsmap={**root.nsmap, "xacro": XACRO})
+    properties = []
+    for joint in root.iterchildren("{*}joint"):
+        for origin in joint.iterchildren("{*}origin"):
+            for key in ("xyz", "rpy"):
+                name = re.sub(r"\W", "_", f"{joint.get('name')}_{key}")
+                value = origin.get(key, "0 0 0")
+                properties.append(etree.Element(f"{{{XACRO}}}property", name=name, value=value))
+                origin.set(key, f"${{{name}}}")
+    comments = [node for node in root if node.tag is etree.Comment]
+    top.extend([*comments, *properties, *[node for node in root if node.tag is not etree.Comment]])
+    etree.indent(top)
+    return f'<?xml version="1.0"?>\n{etree.tostring(top, encoding="unicode")}\n'
+
+
+def _check(request: ExportRequest) -> None:
+    URDF.check(request)
+    if request.like is None:
+        raise OutputError(
+            "--format xacro lays origins over a URDF file; give the one of the robot with --like."
+        )
+
+
+def _write(request: ExportRequest) -> Exported:
+    exported = URDF.write(request)
+    assert isinstance(exported.content, str)
+    return Exported(with_properties(exported.content), exported.facts, (*exported.remarks, SENTENCE))
+
+
+FORMAT = ExportFormat("xacro", "a xacro overlay", (".xacro",), _write, frozenset(("like", "tip")), _check)

@@ -1,0 +1,34 @@
+"""`pisigma robots`: the catalogue, and controllers' own files as robot files."""
+
+import json
+
+import torch
+from testing.closeness import assert_close
+from testing.identified import geometric_model
+
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.model.folder.model_folder import save_model
+from pisigma.robot import Robot
+
+
+def test_a_calibration_goes_to_the_controller_and_comes_back(run, refuses, tmp_path):
+    model = geometric_model("ur10")
+    (tmp_path / "arm").mkdir()
+    save_model(model, tmp_path / "arm")
+    conf, out = tmp_path / "calibration.conf", tmp_path / "arm.yaml"
+    written = run("export", tmp_path / "arm", "--format", "ur-calibration", "--out", conf, "--json")
+    stated = json.loads(written.stdout)
+    assert stated["off_the_whole_model"]["max_mm"] < 1e-6 < stated["robot_as_drawn"]["mean_mm"]
+    assert any("forum.universal-robots.com" in remark for remark in stated["remarks"])
+    read = run("robots", "--read", conf, "--like", "ur10", "--out", out)
+    assert (read.exit_code, read.stdout) == (0, f"Robot file written to {out}.\n")
+    q = torch.rand((50, 6), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    assert model.calibrated is not None
+    assert_close(forward_kinematics(Robot.load(out), q), forward_kinematics(model.calibrated, q), atol=1e-9)
+    assert json.loads(run("robots", "--read", conf, "--like", "ur10", "--out", out, "--json").stdout) == {
+        "file": str(out),
+        "robot": "ur10",
+        "joints": 6,
+    }
+    assert "--read, --like and --out go together" in refuses("robots", "--read", conf)
+    assert "is an input of this command" in refuses("robots", "--read", out, "--like", "ur10", "--out", out)
