@@ -17,7 +17,8 @@ Out = Annotated[
     Path,
     typer.Option(
         help="File to write: .urdf; .csv or .yaml for dh and offsets; .conf, .yaml, .cfx, .xacro or .csv for "
-        "controllers' own files; for targets .csv, .script (URScript), .src (KUKA), .mod (ABB) or .ls (FANUC); .onnx."
+        "controllers' own files; for targets .csv, .script (URScript), .src (KUKA), .mod (ABB) or .ls (FANUC); .onnx; "
+        "for library a folder."
     ),
 ]
 Form = Annotated[

@@ -90,7 +90,7 @@ class Exported:
     """A file's content and what to say about it.
 
     Attributes:
-        content: of the file.
+        content: of the file, or of several by their names in a folder.
         facts: what `--json` prints, by key.
         remarks: sentences that a reader of the file should know.
         doubts: sentences on what may not be as wanted; they go to stderr.
@@ -99,7 +99,7 @@ class Exported:
         failure: why the input is at fault though the file was written; None where all is well.
     """
 
-    content: str | bytes
+    content: str | bytes | Mapping[str, bytes]
     facts: Mapping[str, object]
     remarks: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
@@ -115,7 +115,7 @@ class ExportFormat:
     Attributes:
         name: what `--format` calls it.
         contents: what a file holds, such as "a DH table".
-        suffixes: endings that its files may have.
+        suffixes: endings that its files may have; () where it writes a folder.
         write: makes the content of a file; raises a `PisigmaError` where it cannot.
         options: those of `OPTIONS` that it takes.
         check: refuses requests before anything is loaded; raises a `PisigmaError`.

@@ -1,9 +1,12 @@
 """The registry of exports: which formats there are and where each is made."""
 
+from collections.abc import Mapping
 from importlib import import_module
+from pathlib import Path
 
 from pisigma.errors import OutputError, nearest_choice
 from pisigma.export.export_format import OPTIONS, Exported, ExportFormat, ExportRequest
+from pisigma.files.conflicts import check_apart
 from pisigma.files.output_file import check_output, write_whole
 
 BUILT_IN = {
@@ -24,6 +27,7 @@ BUILT_IN = {
     "epson": ("pisigma.export.controllers.counts:EPSON", "home offsets of Epson in counts"),
     "fanuc-mastering": ("pisigma.export.controllers.counts:FANUC", "mastering counts of FANUC"),
     "onnx": ("pisigma.export.onnx_model", "the network alone"),
+    "library": ("pisigma.export.library.c_library", "a shared library for C with a header"),
 }
 """By name the module whose `FORMAT` (or what is named behind the colon) it is, imported on use, and what the help says
 of it."""
@@ -67,7 +71,7 @@ def export_format(name: str) -> ExportFormat:
 
 
 def export_model(name: str, request: ExportRequest) -> Exported:
-    """Write a model in a format, whole or not at all.
+    """Write a model in a format, every file whole or not at all.
 
     Args:
         name: of the format.
@@ -85,7 +89,30 @@ def export_model(name: str, request: ExportRequest) -> Exported:
                 f"--{option.replace('_', '-')} goes with --format {takers}, not with {name}; leave it out."
             )
     form.check(request)
-    check_output(request.out, form.suffixes, form.contents, (request.model, request.like, request.poses))
+    inputs = (request.model, request.like, request.poses)
+    if form.suffixes:
+        check_output(request.out, form.suffixes, form.contents, inputs)
+    else:
+        check_apart(request.out, inputs)
     exported = form.write(request)
-    write_whole(request.out, exported.content)
+    if isinstance(exported.content, str | bytes):
+        write_whole(request.out, exported.content)
+    else:
+        _write_folder(request.out, exported.content)
     return exported
+
+
+def _write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Write files into a folder, which is made if it is missing.
+
+    Raises:
+        OutputError: it cannot be made or written to.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as problem:
+        raise OutputError(
+            f"{folder}: no folder can be made there ({problem.strerror}); choose another --out."
+        ) from None
+    for name, content in files.items():
+        write_whole(folder / name, content)

@@ -68,11 +68,7 @@ def load_kernels(wanted: KernelForms = _NOTHING) -> Callable[..., int]:
 def _load(forms: KernelForms) -> Callable[..., int]:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    name = f"kernels-{_key(forms)}.o"
-    code = next((kept for folder in cache_folders() if (kept := read_code(folder / name)) is not None), None)
-    if code is None:
-        code = optimised_object(_intermediate_code(forms), _native_machine())
-        any(write_code(folder / name, code) for folder in cache_folders())
+    code = _code(forms, _native_machine(), "kernels")
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _native_machine())
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
@@ -80,6 +76,35 @@ def _load(forms: KernelForms) -> Callable[..., int]:
     kinds = [ctypes.c_void_p if kind == "p" else ctypes.c_int64 for kind in ARGUMENTS]
     prototype = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *kinds)
     return functools.partial(_call, prototype(engine.get_function_address(ENTRY)))
+
+
+def _code(forms: KernelForms, machine: Any, use: str) -> bytes:
+    """Object code, from a file or made now."""
+    name = f"{use}-{_key(forms)}.o"
+    code = next((kept for folder in cache_folders() if (kept := read_code(folder / name)) is not None), None)
+    if code is None:
+        code = optimised_object(_intermediate_code(forms), machine)
+        any(write_code(folder / name, code) for folder in cache_folders())
+    return code
+
+
+def library_object(wanted: KernelForms) -> bytes:
+    """Object code of the kernels for a shared library, on any processor of the kind of this one.
+
+    Args:
+        wanted: what they have to evaluate.
+
+    Raises:
+        ModelError: see `load_kernels`.
+    """
+    with _lock:
+        llvm.initialize_native_target()
+        llvm.initialize_native_asmprinter()
+        triple = llvm.get_process_triple()
+        machine = llvm.Target.from_triple(triple).create_target_machine(
+            opt=3, reloc="pic", codemodel="default"
+        )
+        return _code(kernel_forms(wanted), machine, "library")
 
 
 def _call(native: Any, *arguments: int) -> int:

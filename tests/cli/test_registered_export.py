@@ -72,7 +72,7 @@ def test_names_and_options_are_checked_when_registering():
 
 def test_shells_complete_names_of_robots_models_and_formats(models, monkeypatch):
     assert complete_export("") == list(export_names())
-    assert complete_export("li") == ["limits"]
+    assert complete_export("lim") == ["limits"]
     assert complete_robot("kiro") == ["kiro3", "kiro4"]
     monkeypatch.chdir(models.parent)
     assert f"{models.name}/" in complete_model(models.name[:3])

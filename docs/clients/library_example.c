@@ -1,0 +1,40 @@
+/* Reads poses and prints joint values, without Python:
+ *
+ *     gcc -I DIR library_example.c -L DIR -lpisigma_ik -lm -Wl,-rpath,DIR -o example && ./example DIR/model.psik < poses.txt
+ *
+ * A line holds 16 numbers of a pose T_base_tool, row by row [m], and a joint value to be near to for every joint [rad or
+ * m], or nan for none. Printed are the status, the joint values and the two residuals; and where the arm is then.
+ */
+#include <math.h>
+#include <stdio.h>
+
+#include "pisigma_ik.h"
+
+static int read_numbers(double *numbers, int count) {
+    for (int i = 0; i < count; i++)
+        if (scanf("%lf", &numbers[i]) != 1) return 0;
+    return 1;
+}
+
+int main(int count, char **words) {
+    char error[500] = "give a model file.";
+    pisigma_model *model = count > 1 ? pisigma_load(words[1], error, sizeof error) : NULL;
+    if (!model) {
+        fprintf(stderr, "%s\n", error);
+        return 2;
+    }
+    int joints = pisigma_joints(model);
+    double pose[16], near_q[PISIGMA_MOST_JOINTS], reached[16];
+    pisigma_solution solution;
+    while (read_numbers(pose, 16) && read_numbers(near_q, joints)) {
+        int status = pisigma_solve(model, pose, isnan(near_q[0]) ? NULL : near_q, NULL, PISIGMA_ANY_BRANCH, &solution);
+        printf("%d", status);
+        for (int j = 0; j < joints; j++) printf(" %.17g", solution.q[j]);
+        printf(" %.17g %.17g", solution.position_residual, solution.rotation_residual);
+        int known = pisigma_forward(model, solution.q, NULL, reached) == 0;
+        for (int i = 0; known && i < 16; i++) printf(" %.17g", reached[i]);
+        printf("\n");
+    }
+    pisigma_free(model);
+    return 0;
+}

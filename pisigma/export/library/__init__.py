@@ -1,0 +1,1 @@
+"""Corrected inverse kinematics as a shared library for C."""
