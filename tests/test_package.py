@@ -48,6 +48,7 @@ LAYERS = (
     "judging",
     "recalibration",
     "monitoring",
+    "comparison",
     "verification",
     "measuring",
     "recipes",

@@ -44,11 +44,16 @@ class Moved:
         return self.shift - half, self.shift + half
 
     @property
-    def sentence(self) -> str:
-        """It in words, with half the 95 % interval."""
+    def size(self) -> str:
+        """The shift with half its 95 % interval and the unit."""
         half = NORMAL_95 * self.deviation
         digits = min(max(1 - math.floor(math.log10(max(half, 1e-6))), 0), 4)
-        return f"{self.what} moved by {self.shift:.{digits}f} ± {half:.{digits}f} {self.unit}"
+        return f"{self.shift:.{digits}f} ± {half:.{digits}f} {self.unit}"
+
+    @property
+    def sentence(self) -> str:
+        """It in words, with half the 95 % interval."""
+        return f"{self.what} moved by {self.size}"
 
     def to_json(self) -> dict[str, object]:
         """Return it as plain values, the unit in the name of the shift."""
@@ -135,7 +140,7 @@ def _of_frame(
                 motion.view(2, 3) @ problem.setup.anchors.bases[space.frames.index(name), :3, :3]
             ).flatten()
     return [
-        Moved(group.what, float(vector.norm()) * factor, _along(vector, block) * factor, unit)
+        Moved(group.what, float(vector.norm()) * factor, deviation_along(vector, block) * factor, unit)
         for vector, block, (unit, factor) in (
             (motion[:3], covariance[:3, :3], UNITS["m"]),
             (motion[3:], covariance[3:, 3:], UNITS["rad"]),
@@ -143,7 +148,7 @@ def _of_frame(
     ]
 
 
-def _along(vector: Float64[Tensor, " 3"], covariance: Float64[Tensor, "3 3"]) -> float:
+def deviation_along(vector: Float64[Tensor, " 3"], covariance: Float64[Tensor, "3 3"]) -> float:
     """Standard deviation along a vector, or at most where it has no length."""
     length = float(vector.norm())
     if length > 0.0:

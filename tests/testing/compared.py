@@ -1,0 +1,43 @@
+"""Models of one simulated arm that were made of different rows, for tests."""
+
+import functools
+import math
+
+import torch
+from testing.aged import NAME, rows_later
+from testing.hybrid import hybrid_of
+from testing.models import no_type_checker
+
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.geometric_model import model_of_hybrid
+
+COLLISION = (0.0, 0.0, math.radians(0.1), 0.0, 0.0, 0.0)
+"""[rad] By how much the zeros of the joints have moved: joint 3 by 0.1 deg."""
+CARRIED = (0.3, -0.2, 0.1, 0.4, 0.02, -0.03)
+"""Motion of an instrument that was carried elsewhere."""
+
+
+@functools.cache
+def model_of(
+    seed: int, moved: tuple[float, ...] = (0.0,) * 6, base: tuple[float, ...] = (0.0,) * 6
+) -> CalibratedModel:
+    """A hybrid calibration of 80 rows; for the arguments see `testing.aged.rows_later`."""
+    nominal = hybrid_of(NAME).true.nominal
+    rows = rows_later(80, seed, moved, base)
+    calibrator = HybridCalibrator(
+        GeometricCalibrator(nominal), features=("gravity", "series"), harmonics=(4, 8), products=False
+    )
+    with no_type_checker():
+        return model_of_hybrid(f"rows_{seed}", nominal, calibrator.fit(rows), rows)
+
+
+def after_collision() -> CalibratedModel:
+    """The arm with joint 3 moved by 0.1 deg, as an instrument measured it that stands elsewhere."""
+    return model_of(60, COLLISION, CARRIED)
+
+
+def joints_of(model: CalibratedModel, count: int) -> torch.Tensor:
+    """Some joint values [rad or m] that a model keeps."""
+    return model.starts[:count]
