@@ -25,6 +25,7 @@ _NAMES = {
     "robot.description": "Robot",
     "sensors.registry": "Measurements register_sensor",
     "workflow.calibrate": "Calibration CalibrationSettings calibrate",
+    "workflow.compare": "ComparedModels ComparisonSettings compare",
     "workflow.distill": "Distillation DistillationSettings distill",
     "workflow.evaluate": "EvaluationSettings Limits evaluate",
     "workflow.import_rows": "ImportSettings import_rows",

@@ -19,6 +19,9 @@ from pisigma.sensors.registry import register_sensor as register_sensor
 from pisigma.workflow.calibrate import Calibration as Calibration
 from pisigma.workflow.calibrate import CalibrationSettings as CalibrationSettings
 from pisigma.workflow.calibrate import calibrate as calibrate
+from pisigma.workflow.compare import ComparedModels as ComparedModels
+from pisigma.workflow.compare import ComparisonSettings as ComparisonSettings
+from pisigma.workflow.compare import compare as compare
 from pisigma.workflow.distill import Distillation as Distillation
 from pisigma.workflow.distill import DistillationSettings as DistillationSettings
 from pisigma.workflow.distill import distill as distill

@@ -15,6 +15,7 @@ from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
 from pisigma.cli.ik.command import ik
 from pisigma.cli.import_ import import_
+from pisigma.cli.lifetime.compare import compare
 from pisigma.cli.lifetime.monitor import monitor
 from pisigma.cli.lifetime.recalibrate import recalibrate
 from pisigma.cli.measure.command import measure
@@ -43,6 +44,7 @@ for command in (
     calibrate,
     recalibrate,
     monitor,
+    compare,
     train,
     evaluate,
     report,

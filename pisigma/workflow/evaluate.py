@@ -213,13 +213,13 @@ def evaluate(
         PoseError: the joint values do not fit a robot.
     """
     settings, begin = settings or EvaluationSettings(), time.perf_counter()
-    sources = _labelled([models] if isinstance(models, str | os.PathLike | CalibratedModel) else list(models))
-    loaded = _load(sources)
+    sources = labelled([models] if isinstance(models, str | os.PathLike | CalibratedModel) else list(models))
+    loaded = load_models(sources)
     everything = data
     if not isinstance(everything, Measurements):
         everything = Measurements.read_csv(everything, next(iter(loaded.values())).robot)
     rows = test_rows(everything)
-    compared = _with_references(list(sources), loaded, rows.rotation is not None)
+    compared = with_references(list(sources), loaded, rows.rotation is not None)
     comparison = compare_models(compared, rows, settings.bootstrap, settings.fit_frame)
     hashes = everything.content_hash(), rows.content_hash()
     evaluated = {
@@ -267,7 +267,7 @@ def _text(source: ModelSource) -> str:
     return source.name if isinstance(source, CalibratedModel) else os.fspath(source)
 
 
-def _labelled(sources: Sequence[ModelSource]) -> dict[str, ModelSource]:
+def labelled(sources: Sequence[ModelSource]) -> dict[str, ModelSource]:
     """Name models for tables: by the folder's last name, or by all that was given where two have the same.
 
     Raises:
@@ -283,7 +283,7 @@ def _labelled(sources: Sequence[ModelSource]) -> dict[str, ModelSource]:
     return dict(zip(labels, sources, strict=True))
 
 
-def _load(sources: Mapping[str, ModelSource]) -> dict[str, CalibratedModel]:
+def load_models(sources: Mapping[str, ModelSource]) -> dict[str, CalibratedModel]:
     """Load all models but the references."""
     loaded = {
         label: source if isinstance(source, CalibratedModel) else load_model(source)
@@ -298,7 +298,7 @@ def _load(sources: Mapping[str, ModelSource]) -> dict[str, CalibratedModel]:
     return loaded
 
 
-def _with_references(
+def with_references(
     labels: Sequence[str], loaded: Mapping[str, CalibratedModel], turned: bool
 ) -> dict[str, CalibratedModel]:
     """Add the references to the models, in the order in which they were given; nominal before a single one."""

@@ -1,1 +1,1 @@
-"""Commands for a model over the years: recalibrate and monitor."""
+"""Commands for a model over the years: recalibrate, monitor and compare."""

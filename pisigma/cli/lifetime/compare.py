@@ -1,0 +1,93 @@
+"""`pisigma compare`: in what two models of one robot differ, and what that means for the tool."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from pisigma.cli.arguments import AsJson, complete_model
+from pisigma.cli.output import print_json, print_lines, print_table, progress_of, screen_width
+
+if TYPE_CHECKING:
+    from pisigma.workflow.compare import ComparedModels
+
+First = Annotated[
+    str,
+    typer.Argument(
+        metavar="A", help="Model folder, or 'nominal' or 'geometric'.", autocompletion=complete_model
+    ),
+]
+Second = Annotated[
+    str,
+    typer.Argument(metavar="B", help="What it is compared with, likewise.", autocompletion=complete_model),
+]
+Rows = Annotated[Path | None, typer.Option(help="Measurements (CSV) that both models predict.")]
+Program = Annotated[
+    Path | None,
+    typer.Option(
+        help="Joint values or poses (CSV) of a program that was taught with A: what it misses under B."
+    ),
+]
+FixedFrames = Annotated[
+    bool,
+    typer.Option(
+        "--fixed-frames",
+        help="Both models were measured in the same frame with the same tool. [default: base and tool are fitted]",
+    ),
+]
+Level = Annotated[
+    float, typer.Option(help="Probability that any parameter at all is called different by chance.")
+]
+Page = Annotated[Path | None, typer.Option(help="HTML page to write, with a map of the workspace.")]
+
+
+def compare(
+    first: First,
+    second: Second,
+    rows: Rows = None,
+    program: Program = None,
+    fixed_frames: FixedFrames = False,
+    level: Level = 0.01,
+    page: Page = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say in what two models of one robot differ: parameters, positions of the tool, rows and programs.
+
+    The significance of differences is from the posteriors of both models.
+    """
+    from pisigma.workflow import compare as workflow
+
+    inputs = [one for one in (Path(first), Path(second), rows, program) if one is not None]
+    if page is not None:
+        workflow.check_page(page, inputs)
+    settings = workflow.ComparisonSettings("fixed" if fixed_frames else "fitted", level)
+    with progress_of("compare") as progress:
+        progress("both models")
+        compared = workflow.compare(first, second, rows, program, settings)
+        if page is not None:
+            compared.save_page(page)
+    if as_json:
+        print_json(compared.to_json())
+    else:
+        _print(compared, page)
+
+
+def _print(compared: "ComparedModels", page: Path | None) -> None:
+    """Print what differs, the parameters side by side, and distances of the tool."""
+    from pisigma.reporting.comparison_tables import comparison_tables
+    from pisigma.reporting.difference_tables import difference_table
+    from pisigma.reporting.tables import pose_rows
+
+    first, second = compared.models
+    print_lines(compared.sentences)
+    print_table(
+        f"parameters of {first} (A) and {second} (B)", *difference_table(compared.parameters, ("A", "B"))
+    )
+    distances = {what: one.errors.figures for what, one in compared.displacements.items()}
+    print_table("distances of the tool", *pose_rows(distances))
+    if compared.rows is not None:
+        for title, table in comparison_tables(compared.rows, "the rows", screen_width()):
+            print_table(title, *table)
+    print_lines(f"Warning: {one}" for one in compared.warnings)
+    if page is not None:
+        print_lines([f"Page written to {page}."])

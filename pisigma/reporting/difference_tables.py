@@ -1,0 +1,28 @@
+"""Differences of two models as tables."""
+
+from pisigma.comparison.parameter_differences import ParameterDifference, ParameterDifferences
+from pisigma.recalibration.moved import NORMAL_95
+from pisigma.reporting.tables import Table
+
+NO_VALUE = "-"
+
+
+def difference_table(differences: ParameterDifferences, names: tuple[str, str]) -> Table:
+    """One row per parameter of the arm that is not the same in both models: values, shift with 95 %, and p.
+
+    Args:
+        differences: of two models.
+        names: of the models.
+    """
+    columns = ("parameter", "unit", *names, "shift alone", "± 95 %", "p")
+    shown = [one for one in differences.parameters if one.difference or any(one.deviations)]
+    return Table(columns, tuple(_row(one) for one in shown))
+
+
+def _row(one: ParameterDifference) -> tuple[str, ...]:
+    """A parameter; what has no test has no shift."""
+    values = (f"{value:.4f}" for value in (one.first, one.second))
+    if one.shift is None or one.deviation is None or one.p is None:
+        return (one.name, one.unit, *values, NO_VALUE, NO_VALUE, NO_VALUE)
+    p = "<0.0001" if one.p < 1e-4 else f"{one.p:.2g}"
+    return (one.name, one.unit, *values, f"{one.shift:.4f}", f"{NORMAL_95 * one.deviation:.4f}", p)

@@ -1,0 +1,349 @@
+"""Compare two models of one robot: parameters, positions of the tool, rows that they predict, and programs."""
+
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, get_args
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.comparison.displacement import Displacement
+from pisigma.comparison.model_pair import FrameChoice, ModelPair
+from pisigma.comparison.parameter_differences import (
+    LEVEL,
+    ParameterDifference,
+    ParameterDifferences,
+    parameter_differences,
+)
+from pisigma.errors import IdentificationError, nearest_choice
+from pisigma.files.model_files import model_hash
+from pisigma.files.output_file import check_output, write_whole
+from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.judging.bootstrap import Bootstrap
+from pisigma.judging.model_comparison import Difference, ModelComparison, compare_models
+from pisigma.measurement.csv.poses import read_poses
+from pisigma.measurement.csv.reading import read_joints
+from pisigma.measurement.csv.table import read_table
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.workflow.evaluate import (
+    REFERENCES,
+    ModelSource,
+    labelled,
+    load_models,
+    test_rows,
+    with_references,
+)
+
+
+@dataclass(frozen=True)
+class ComparisonSettings:
+    """How two models are compared.
+
+    Attributes:
+        frames: "fitted" where base or tool may stand elsewhere for the second model: they are fitted so that the arms
+            agree best, and compared apart. "fixed" where both models were measured in the same frame with the same
+            tool.
+        level: probability that any parameter at all is called different by chance.
+        bootstrap: how confidence intervals of errors on rows are computed.
+
+    Raises:
+        IdentificationError: the level is no probability, or the frames are treated otherwise.
+    """
+
+    frames: FrameChoice = "fitted"
+    level: float = LEVEL
+    bootstrap: Bootstrap = field(default_factory=Bootstrap)
+
+    def __post_init__(self) -> None:
+        """Refuse what is no choice, and a level that no test has."""
+        if self.frames not in get_args(FrameChoice):
+            raise IdentificationError(
+                f"frames: '{self.frames}' is no choice; {nearest_choice(self.frames, get_args(FrameChoice))}"
+            )
+        if not 0.0 < self.level < 1.0:
+            raise IdentificationError(
+                f"level: a probability between 0 and 1 was wanted, got {self.level:g}; 0.01 is usual."
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class TaughtProgram:
+    """What a program that was taught with the first model misses under the second.
+
+    Attributes:
+        source: the file.
+        line: of every pose of the displacement in the file.
+        displacement: of its poses.
+    """
+
+    source: str
+    line: tuple[int, ...]
+    displacement: Displacement
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedModels:
+    """Two models of one robot beside each other.
+
+    Attributes:
+        models: by the names that tables use, the first model and the second.
+        settings: how they were compared.
+        parameters: side by side, and which of them differ.
+        workspace: distances between both models' poses over the workspace.
+        rows: errors of both models on the same rows; None where none were given.
+        program: what a program misses; None where none was given.
+        warnings: what to heed, a sentence each.
+        seconds: that it took [s].
+    """
+
+    models: dict[str, CalibratedModel]
+    settings: ComparisonSettings
+    parameters: ParameterDifferences
+    workspace: Displacement
+    rows: ModelComparison | None
+    program: TaughtProgram | None
+    warnings: tuple[str, ...]
+    seconds: float
+
+    @property
+    def better(self) -> str | None:
+        """Name of the model that predicts the rows better, by more than chance; None where neither does, or no rows."""
+        difference = self._difference
+        interval = None if difference is None else difference.intervals["rms"]
+        if interval is None or interval[0] <= 0.0 <= interval[1]:
+            return None
+        first, second = self.models
+        return second if interval[1] < 0.0 else first
+
+    @property
+    def displacements(self) -> dict[str, Displacement]:
+        """Distances of the tool by where they are: over the workspace, and along the program where there is one."""
+        program = self.program
+        along = {} if program is None else {f"along {program.source}": program.displacement}
+        return {"over the workspace": self.workspace, **along}
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What the comparison says."""
+        return (
+            *_parameters_in_words(self.parameters, *self.models),
+            *self._displacements_in_words(),
+            *self._rows_in_words(),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return everything as plain values, in mm and deg: the result of `pisigma compare --json`."""
+        differences, (first, _) = self.parameters, self.models.values()
+        return {
+            "models": [{"name": name, "kind": model.kind} for name, model in self.models.items()],
+            "robot": first.robot.name,
+            "frames": self.settings.frames,
+            "level": differences.level,
+            "differs": [one.to_json() for one in differences.differing],
+            "parameters": [_parameter_json(one) for one in differences.parameters],
+            "frames_moved": [one.to_json() for one in differences.frames],
+            "remainder": None if differences.remainder is None else vars(differences.remainder),
+            "workspace": _displacement_json(self.workspace, first),
+            "rows": None if self.rows is None else {**self.rows.to_json(), "better": self.better},
+            "program": None
+            if self.program is None
+            else {
+                "file": self.program.source,
+                "largest_in_line": self.program.line[self.program.displacement.largest],
+                **_displacement_json(self.program.displacement, first),
+            },
+            "says": list(self.sentences),
+            "warnings": list(self.warnings),
+            "seconds": round(self.seconds, 3),
+        }
+
+    def save_page(self, page: str | os.PathLike[str]) -> None:
+        """Write the comparison as one HTML page.
+
+        Raises:
+            OutputError: the page is no .html file or cannot be written.
+        """
+        from pisigma.reporting.page.comparison import comparison_page  # matplotlib takes a second
+
+        check_page(page)
+        says = self.sentences, self.warnings
+        text = comparison_page(self.models, self.parameters, self.displacements, self.rows, says)
+        write_whole(Path(page), text)
+
+    @property
+    def _difference(self) -> Difference | None:
+        return None if self.rows is None else self.rows.models[1].position.difference
+
+    def _displacements_in_words(self) -> tuple[str, ...]:
+        """Say by how much tools differ over the workspace and along a program."""
+        first, second = self.models
+        figures = self.workspace.errors.figures.by_name
+        where = " with base and tool fitted" if self.settings.frames == "fitted" else ""
+        lines = [
+            f"Over the workspace {second} has the tool {figures['rms_mm']:.3f} mm (RMS) from where {first} has it"
+            f"{where}, at most {figures['max_mm']:.3f} mm."
+        ]
+        if self.program is not None:
+            missed, line = self.program.displacement, self.program.line
+            figures = missed.errors.figures.by_name
+            lines.append(
+                f"{self.program.source}, taught with {first}, misses by {figures['rms_mm']:.3f} mm (RMS) under "
+                f"{second}, at most by {figures['max_mm']:.3f} mm in line {line[missed.largest]}."
+            )
+        return tuple(lines)
+
+    def _rows_in_words(self) -> tuple[str, ...]:
+        """Say which model predicts the rows better."""
+        difference = self._difference
+        if difference is None or self.rows is None:
+            return ()
+        errors = " and ".join(
+            f"{one.position.statistics['rms']:.3f} mm under {one.name}" for one in self.rows.models
+        )
+        which = (
+            f"{self.better} predicts them better" if self.better else "neither predicts them clearly better"
+        )
+        return (
+            f"The RMS error of {self.rows.rows} rows is {errors}: {which} (Wilcoxon's p {difference.test.p:.2g}).",
+        )
+
+
+def compare(
+    first: ModelSource,
+    second: ModelSource,
+    rows: str | os.PathLike[str] | Measurements | None = None,
+    program: str | os.PathLike[str] | None = None,
+    settings: ComparisonSettings = ComparisonSettings(),
+) -> ComparedModels:
+    """Say in what two models of one robot differ, and what that means for the tool.
+
+    Args:
+        first: a model or its folder, or "nominal" (the robot as drawn) or "geometric" (what a hybrid builds upon) of
+            the other.
+        second: what it is compared with, likewise.
+        rows: measurements, or their file, that both models predict; where rows are marked, those of the set "test".
+        program: a file of joint values, or of poses in the base frame, that was taught with the first model.
+        settings: see `ComparisonSettings`.
+
+    Raises:
+        ModelError: a folder cannot be used, or the models are of different robots.
+        MeasurementError: rows or program cannot be used.
+        PoseError: the joint values do not fit the robot.
+    """
+    begin = time.perf_counter()
+    if (
+        isinstance(first, CalibratedModel)
+        and isinstance(second, CalibratedModel)
+        and first.name == second.name
+    ):
+        second = replace(second, name=f"{second.name}-2")
+    sources = labelled([first, second])
+    models = with_references(list(sources), load_models(sources), turned=True)
+    one, other = models.values()
+    pair = ModelPair.of(one, other, settings.frames)
+    compared = None
+    if rows is not None:
+        data = rows if isinstance(rows, Measurements) else Measurements.read_csv(rows, pair.first.robot)
+        compared = compare_models(models, test_rows(data), settings.bootstrap, settings.frames == "fitted")
+    return ComparedModels(
+        models=models,
+        settings=settings,
+        parameters=parameter_differences(pair, settings.level),
+        workspace=Displacement.at(pair, pair.workspace, "the workspace"),
+        rows=compared,
+        program=None if program is None else _taught_program(pair, Path(program)),
+        warnings=_warnings(pair, list(sources.values())),
+        seconds=time.perf_counter() - begin,
+    )
+
+
+def check_page(page: str | os.PathLike[str], inputs: Sequence[str | os.PathLike[str]] = ()) -> None:
+    """Make sure that a page may be written; see `pisigma.files.output_file.check_output`."""
+    check_output(Path(page), (".html", ".htm"), "a page", [Path(one) for one in inputs])
+
+
+def _taught_program(pair: ModelPair, path: Path) -> TaughtProgram:
+    """Read joint values, or the first model's joint values of poses, and compare the models there."""
+    q, lines = _program_joints(pair.first, path)
+    kept = torch.isfinite(pair.displacement(q.nan_to_num())).all(1) & torch.isfinite(q).all(1)
+    line = tuple(number for number, good in zip(lines, kept.tolist(), strict=True) if good)
+    return TaughtProgram(path.name, line, Displacement.at(pair, q, str(path)))
+
+
+def _program_joints(model: CalibratedModel, path: Path) -> tuple[Float64[Tensor, "poses dof"], Sequence[int]]:
+    """Joint values of a program, NaN where the model does not reach a pose, and their lines."""
+    table = read_table(path)
+    if any(name.startswith("q1_") for name in table.header):
+        return read_joints(path, model.robot), table.lines
+    chunk = read_poses(path)
+    return CorrectedIK(model)(chunk.T, throw=False).q, chunk.line
+
+
+def _parameters_in_words(differences: ParameterDifferences, first: str, second: str) -> tuple[str, ...]:
+    """Say which parameters differ, and whether more does."""
+    if differences.remainder is None:
+        return (
+            "A model holds no posterior of its parameters, so that their differences cannot be compared with chance; "
+            "make it with `pisigma calibrate`, which keeps one.",
+        )
+    level = f"at a level of {differences.level:.2g} for all parameters together"
+    lines = [f"No parameter of {second} differs from {first} beyond its uncertainty, {level}."]
+    if differences.differing:
+        shifts = "; ".join(f"{one.what} by {one.size}" for one in differences.differing)
+        lines = [
+            f"{second} differs from {first} in {shifts}. No other parameter differs beyond its uncertainty, {level}."
+        ]
+    if differences.remainder.significant:
+        lines.append(
+            "The joint corrections, or several parameters together, differ beyond their uncertainty too."
+        )
+    pairs = zip(differences.frames[::2], differences.frames[1::2], strict=True)
+    clauses = [f"the {length.what} {length.size} and {angle.size} away" for length, angle in pairs]
+    return (*lines, *((f"{second} has {' and '.join(clauses)} from {first}'s.",) if clauses else ()))
+
+
+def _parameter_json(one: ParameterDifference) -> dict[str, Any]:
+    """A parameter with the unit in the names of its figures."""
+    figures = {
+        "first": one.first,
+        "second": one.second,
+        "difference": one.difference,
+        "first_deviation": one.deviations[0],
+        "second_deviation": one.deviations[1],
+        "shift": one.shift,
+        "shift_deviation": one.deviation,
+    }
+    with_unit = {f"{name}_{one.unit}": value for name, value in figures.items()}
+    return {"name": one.name, **with_unit, "p": one.p, "alike": list(one.alike)}
+
+
+def _displacement_json(displacement: Displacement, model: CalibratedModel) -> dict[str, Any]:
+    """Figures, with the joint values of the largest distance in deg or mm."""
+    joints = displacement.joints(model.robot.revolute)[displacement.largest]
+    return {**displacement.to_json(), "largest_at_joints": joints.tolist()}
+
+
+def _warnings(pair: ModelPair, sources: Sequence[ModelSource]) -> tuple[str, ...]:
+    """What to heed, a sentence each."""
+    warnings = []
+    models = (pair.first, pair.second)
+    for child, parent, source in zip(models, models[::-1], reversed(sources), strict=True):
+        if isinstance(source, CalibratedModel) or source in REFERENCES:
+            continue
+        if (child.metrics.get("parent") or {}).get("sha256") == model_hash(source):
+            warnings.append(
+                f"{child.name} was made from {parent.name}, so that what is unknown is partly the same in both: "
+                "differences are surer than stated."
+            )
+    data = [model.provenance.data_sha256 for model in models]
+    if data[0] and data[0] == data[1]:
+        warnings.append(
+            "Both models were made of the same rows, so that their errors are partly the same: differences are surer "
+            "than stated."
+        )
+    return tuple(warnings)

@@ -1,0 +1,57 @@
+"""`pisigma compare`."""
+
+import json
+
+import pytest
+from testing.aged import rows_later
+from testing.compared import COLLISION, model_of
+
+from pisigma.model.folder.model_folder import save_model
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """A folder with the models before and after a collision, new rows and poses of a program."""
+    folder = tmp_path_factory.mktemp("compare")
+    for name, model in (("before", model_of(50)), ("after", model_of(61, COLLISION))):
+        (folder / name).mkdir()
+        save_model(model, folder / name)
+    rows_later(20, 70).write_csv(folder / "rows.csv", model_of(50).robot)
+    poses = "x_mm,y_mm,z_mm,roll_deg,pitch_deg,yaw_deg\n400,100,400,0,180,0\n9999,0,0,0,0,0\n450,120,400,10,180,0\n"
+    (folder / "poses.csv").write_text(poses)
+    return folder
+
+
+def test_differences_are_printed_and_shown_on_a_page(run, folder):
+    page = folder / "page.html"
+    done = run(
+        *("compare", folder / "before", folder / "after", "--rows", folder / "rows.csv"),
+        *("--program", folder / "poses.csv", "--page", page),
+    )
+    assert done.exit_code == 0, done.output
+    assert "after differs from before in joint 3 by 0." in done.stdout
+    assert "before predicts them better" in " ".join(done.stdout.split())
+    assert all(len(line) <= 80 for line in done.stdout.splitlines())
+    text = page.read_text(encoding="utf-8")
+    assert "joint 3 by 0." in text
+    assert "along poses.csv" in text
+    assert 'src="http' not in text
+
+
+def test_a_model_is_compared_with_the_robot_as_drawn(run, folder):
+    done = run("compare", folder / "before", "nominal", "--program", folder / "poses.csv", "--json")
+    assert done.exit_code == 0, done.output
+    report = json.loads(done.stdout)
+    assert [one["name"] for one in report["models"]] == ["before", "nominal"]
+    assert (report["program"]["poses"], report["program"]["poses_not_predicted"]) == (2, 1)
+    assert report["differs"]
+
+
+def test_inputs_at_fault_are_refused(run, folder):
+    assert run("compare", folder / "before", folder / "before").exit_code == 2
+    done = run("compare", folder / "before", folder / "after", "--page", folder / "page.pdf")
+    assert done.exit_code == 2
+    assert ".html" in done.stderr
+    done = run("compare", folder / "before", folder / "after", "--level", "2")
+    assert done.exit_code == 2
+    assert "between 0 and 1" in done.stderr

@@ -1,0 +1,64 @@
+"""`pisigma.compare`: two models in, differences, distances and a verdict on rows out."""
+
+from dataclasses import replace
+
+import pytest
+from testing.aged import rows_later
+from testing.closeness import assert_close
+from testing.compared import COLLISION, joints_of, model_of
+from testing.models import no_type_checker
+
+from pisigma.errors import IdentificationError
+from pisigma.measurement.dataset import Measurements
+from pisigma.workflow.compare import ComparisonSettings, compare
+
+
+@pytest.fixture(scope="module")
+def compared(tmp_path_factory):
+    """Models before and after a collision, with rows from after it and a program."""
+    program = tmp_path_factory.mktemp("compare") / "program.csv"
+    model = model_of(50)
+    Measurements(q=joints_of(model, 5), position=model.forward(joints_of(model, 5))[:, :3, 3]).write_csv(
+        program, model.robot
+    )
+    return compare(model, model_of(61, COLLISION), rows_later(20, 70, COLLISION), program)
+
+
+def test_the_model_of_the_robot_as_it_is_predicts_its_rows_better(compared):
+    assert compared.better == "rows_61"
+    assert any("rows_61 predicts them better" in line for line in compared.sentences)
+
+
+def test_a_program_misses_about_what_the_joint_moved_by(compared):
+    report = compared.to_json()
+    assert report["program"]["poses"] == 5
+    assert 0.1 < report["program"]["rms_mm"] < 3.0  # 0.1 deg at less than 1 m, base and tool fitted
+    assert report["workspace"]["rms_mm"] == pytest.approx(report["program"]["rms_mm"], rel=0.8)
+    assert report["program"]["largest_in_line"] in range(2, 7)
+
+
+def test_the_report_is_whole(compared):
+    report = compared.to_json()
+    assert [one["what"] for one in report["differs"]] == ["joint 3"]
+    theta = next(one for one in report["parameters"] if one["name"] == "theta_3")
+    assert_close(theta["shift_deg"], 0.1, atol=0.005)
+    assert theta["p"] < 1e-6
+    assert report["says"][0].startswith("rows_61 differs from rows_50 in joint 3 by ")
+    assert report["rows"]["better"] == "rows_61"
+
+
+def test_models_of_the_same_name_and_rows_are_told_apart_and_warned_of():
+    model = model_of(50)
+    result = compare(model, replace(model))
+    assert list(result.models) == ["rows_50", "rows_50-2"]
+    assert result.parameters.differing == ()
+    assert_close(result.to_json()["workspace"]["max_mm"], 0.0, atol=1e-6)
+    assert any("same rows" in line for line in result.warnings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "hint"), [({"level": 0.0}, "between 0 and 1"), ({"frames": "fixd"}, "did you mean 'fixed'")]
+)
+def test_settings_that_make_no_sense_are_refused(settings, hint):
+    with no_type_checker(), pytest.raises(IdentificationError, match=hint):
+        ComparisonSettings(**settings)
