@@ -27,7 +27,9 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.recalibration.adaptation import adapt
+from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot import Robot
+from pisigma.workflow.plan import plan
 from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate
 
 DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
@@ -35,6 +37,7 @@ SIMULATED = Path(os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))
 SERIES = {"B": "ur10/series_b.csv", "C": "ur10/series_c_train.csv"}
 DRAWS = 10
 ASKED = {10: 0.42, 20: 0.28, 30: 0.225, 50: 0.165}
+ASKED_OF_PLAN = {10: 0.38, 20: 0.24, 30: 0.19}
 GATE_ROWS = (5, 7, 10, 15, 20, 30, 50, 70, 100)
 COLLISION_SEEDS = range(10)
 
@@ -83,6 +86,24 @@ def accuracy() -> None:
                 f"B to C, moved {moved or 'not stated'}, {count} rows: {mean:.3f} (asked {asked}): {shown}",
                 flush=True,
             )
+
+
+def planned() -> None:
+    """The same with rows that `pisigma plan` chooses with the model of series B, from all of series C."""
+    rows, every = series("C"), np.arange(series("C").rows)
+    with tempfile.TemporaryDirectory() as folder:
+        candidates = Path(folder) / "candidates.csv"
+        rows.write_csv(candidates, Robot.load("ur10"))
+        for count, asked in ASKED_OF_PLAN.items():
+            settings = PlanSettings(count, check=0, candidates_from=str(candidates))
+            chosen = plan(model_of("B"), settings).stored.candidate.numpy() - 1
+            few, others = (
+                rows.select(torch.from_numpy(one)) for one in (chosen, np.setdiff1d(every, chosen))
+            )
+            for moved in (None, ("base", "tool")):
+                result = recalibrate(model_of("B"), few, RecalibrationSettings(moved))
+                error, shown = error_of(result.model, others), moved or "not stated"
+                print(f"B to C, moved {shown}, {count} planned rows: {error:.3f} (asked {asked})", flush=True)
 
 
 def candidates_of(result: Recalibration, few: Measurements, others: Measurements) -> dict[str, float]:
@@ -188,7 +209,14 @@ def seconds() -> None:
         print(f"10 rows, moved {moved or 'not stated'}: {time.perf_counter() - started:.2f} s", flush=True)
 
 
-PARTS = {"accuracy": accuracy, "gate": gate, "collision": collision, "chain": chain, "seconds": seconds}
+PARTS = {
+    "accuracy": accuracy,
+    "planned": planned,
+    "gate": gate,
+    "collision": collision,
+    "chain": chain,
+    "seconds": seconds,
+}
 
 
 def main() -> None:
