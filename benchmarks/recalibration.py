@@ -26,8 +26,8 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.row_poses import poses_of_rows
-from pisigma.recalibration.adaptation import adapt
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.recalibration.adaptation import adapt
 from pisigma.robot import Robot
 from pisigma.workflow.plan import plan
 from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate
