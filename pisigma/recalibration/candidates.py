@@ -30,6 +30,8 @@ NAMES: dict[Kept, str] = {
 FOLDS = 5
 ABOUT_AS_GOOD = 1.05
 """The recalibrated model is kept where left-out errors of others are smaller by no more than this factor."""
+FAR_BETTER = 2.0
+"""A candidate whose root mean square is smaller by this factor is better, however its rows are distributed."""
 STRAY = 5.0
 """Rows that every candidate misses by so many times the usual error say nothing of the candidates."""
 
@@ -124,15 +126,18 @@ def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> Gate:
 
 
 def _clearly_better(errors: Float64[Tensor, " rows"], than: Float64[Tensor, " rows"]) -> bool:
-    """Whether the RMS of errors is smaller by more than 5 %, and rows are smaller by more than chance.
+    """Whether the RMS of errors is smaller by more than 5 %, and by far or rows are smaller by more than chance.
 
     Paired t-tests, 2.5 % each: of the squares, and of the logarithms where a few large squares hide what most rows say.
+    Squares of errors by metres have so heavy tails that neither shows what their size alone does.
     """
     count = len(errors)
     if not bool(torch.isfinite(than).all()):
         return True
     if count < 2 or ABOUT_AS_GOOD**2 * float(errors.square().sum()) >= float(than.square().sum()):
         return False
+    if FAR_BETTER**2 * float(errors.square().sum()) <= float(than.square().sum()):
+        return True
     quantile = 1.96 + 3 / (count - 1)  # of Student's distribution, to 3 % from two degrees of freedom on
     gains = than.square() - errors.square(), (than / errors).clamp(1e-9, 1e9).log()
     return any(float(gain.mean()) > quantile * float(gain.std()) / math.sqrt(count) for gain in gains)

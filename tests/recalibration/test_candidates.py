@@ -35,6 +35,12 @@ def test_a_row_that_is_off_by_far_does_not_save_a_candidate_that_is_worse_everyw
     assert decided(recalibrated=hopeless, old=[31.0] * 10, scratch=[0.9, 1.1] * 5).kept == "scratch"
 
 
+def test_a_candidate_that_is_far_better_is_kept_however_its_rows_are_distributed():
+    by_metres = [40.0, 1e-3, 0.3, 4.0, 6.0, 9.0]
+    by_luck = [2e-3, 0.2, 3e-3, 0.5, 4e-4, 0.3]
+    assert decided(recalibrated=by_metres, old=by_metres, scratch=by_luck).kept == "scratch"
+
+
 def test_a_candidate_that_cannot_be_fitted_is_not_kept():
     judged = decided(recalibrated=[2.0, 2.1] * 5, old=[1.0, 1.1] * 5, scratch=[math.inf, 0.9] * 5)
     assert (judged.kept, judged.rms["scratch"]) == ("old", None)
