@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Float64
@@ -19,6 +19,7 @@ from pisigma.measurement.groups import held_out_groups
 from pisigma.recalibration.drift import Drift, DriftGroup, DriftSearch, LinearValues
 from pisigma.recalibration.posterior_update import PosteriorUpdate
 from pisigma.recalibration.recalibration_problem import RecalibrationProblem
+from pisigma.recalibration.wrong_rows import Explained, with_wrong_rows
 from pisigma.sensors.registry import measured_errors
 
 MOST_ROUNDS = 5
@@ -74,6 +75,7 @@ class Adaptation:
         effective: how many directions the new rows determine.
         rounds: linearisations made.
         search: the evidence at the solution, for what moved.
+        values: all that count at the solution.
     """
 
     problem: RecalibrationProblem
@@ -83,7 +85,17 @@ class Adaptation:
     effective: float
     rounds: int
     search: DriftSearch
+    values: LinearValues
     update: PosteriorUpdate = field(repr=False)
+
+    @property
+    def wrong_rows(self) -> list[int]:
+        """Rows of the measurements that do not count: so far off that the loss drops them, or wrong by evidence."""
+        configuration = self.problem.configuration
+        wrong = ~torch.isin(configuration, self.values.configuration)
+        wrong |= torch.isin(configuration, torch.tensor([*self.values.wrong]))
+        rows: list[int] = self.problem.setup.rows[wrong].tolist()
+        return rows
 
     @cached_property
     def root(self) -> Float64[Tensor, "unknowns directions"]:
@@ -117,17 +129,19 @@ def adapt(
     usual = noise_of_sensors(problem, usual_noise)
     group = held_out_groups(problem.setup.measurements)
     x, effective = mean, 0.0
+    wrong: Mapping[int, float] = {}
     drift = start or Drift(problem.groups, usual)
     drift = replace(drift, groups=_with_sizes(problem.groups, drift.groups))
     rounds = 0
     while rounds < MOST_ROUNDS:
         rounds += 1
         rows = linearised(design, x, effective, group)
-        values = linear_values(problem, rows)
-        search = _search(problem, values, drift, usual)
-        drift = search.estimated()
+        values = replace(linear_values(problem, rows), wrong=wrong)
+        search = with_wrong_rows(values, partial(_searched, problem, drift, usual)).what
+        drift, wrong = search.drift, search.values.wrong
+        values = replace(values, wrong=wrong)
         update = PosteriorUpdate(problem.root, values, drift)
-        step = values.X @ (mean + update.shift - x) / drift.noise[values.sensor]
+        step = values.X @ (mean + update.shift - x) / values.deviation(drift.noise)
         x, effective = mean + update.shift, update.effective
         if float(step.square().mean().sqrt()) < SETTLED:
             break
@@ -139,6 +153,7 @@ def adapt(
         effective=effective,
         rounds=rounds,
         search=search,
+        values=values,
         update=update,
     )
 
@@ -158,13 +173,14 @@ def noise_of_sensors(
 
 def linear_values(problem: RecalibrationProblem, rows: Rows) -> LinearValues:
     """Put the values of all sensors together, their residuals those of the model."""
-    X, y, sensor = [], [], []
+    X, y, sensor, configuration = [], [], [], []
     for number, one in enumerate(rows.values):
         columns = (problem.design.columns(one, slice(None)) * one.root[:, None, None]).flatten(0, 1)
         X.append(columns)
         y.append((one.residual * one.root[:, None]).flatten() - columns @ problem.mean)
         sensor.append(torch.full((len(columns),), number))
-    return LinearValues(torch.cat(X), torch.cat(y), torch.cat(sensor), rows.sensors)
+        configuration.append(problem.configuration[one.row].repeat_interleave(one.components))
+    return LinearValues(torch.cat(X), torch.cat(y), torch.cat(sensor), torch.cat(configuration), rows.sensors)
 
 
 def _with_sizes(groups: tuple[DriftGroup, ...], like: tuple[DriftGroup, ...]) -> tuple[DriftGroup, ...]:
@@ -173,11 +189,12 @@ def _with_sizes(groups: tuple[DriftGroup, ...], like: tuple[DriftGroup, ...]) ->
     return tuple(one if one.stands else replace(one, size=sizes.get(one.what, 0.0)) for one in groups)
 
 
-def _search(
-    problem: RecalibrationProblem, values: LinearValues, drift: Drift, usual: Float64[Tensor, " sensors"]
-) -> DriftSearch:
-    """The search for the sizes of the drift, on some of the values where there are many."""
-    chosen = values
-    if len(values.y) > MOST_VALUES:
-        chosen = values.select(chosen_rows(len(values.y), MOST_VALUES).sort().values)
-    return DriftSearch(chosen, chosen.X @ problem.root, drift.groups, drift.noise, usual)
+def _searched(
+    problem: RecalibrationProblem, drift: Drift, usual: Float64[Tensor, " sensors"], chosen: LinearValues
+) -> Explained[DriftSearch]:
+    """The sizes of the drift by evidence, on some of the values where there are many."""
+    if len(chosen.y) > MOST_VALUES:
+        chosen = chosen.select(chosen_rows(len(chosen.y), MOST_VALUES).sort().values)
+    search = DriftSearch(chosen, chosen.X @ problem.root, drift.groups, drift.noise, usual)
+    search.estimate()
+    return Explained(search, chosen, search.log_evidence, search.covariance, search.deviation)

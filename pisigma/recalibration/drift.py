@@ -1,11 +1,11 @@
 """How much every group of unknowns has drifted since a calibration, by the evidence of new rows."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.hybrid.evidence import SensorCount
@@ -14,6 +14,8 @@ SIZES = torch.logspace(-6, -0.5, 56, dtype=torch.float64)
 """Sizes that are tried: 1 µm to 0.3 m, 0.0001 to 18 deg; of corrections, shares of ten times their usual size."""
 WORTH = 4.0
 """[nats] By so much a drift has to raise the log evidence: prior odds of about 1 to 50 for a group of the arm."""
+WORTH_OF_WRONG = math.log(100)
+"""[nats] The same of a wrong configuration of any number of them: prior odds of 1 to 100 that one is."""
 SWEEPS = 3
 NOISE_FACTORS = torch.linspace(-1.0, 1.6, 14, dtype=torch.float64).exp()
 """Factors on the noise of the calibration that are tried."""
@@ -55,17 +57,41 @@ class LinearValues:
         X: weighted derivatives.
         y: weighted residuals of the model.
         sensor: number of every value's sensor.
+        configuration: number of the joint values at which every value was measured.
         counts: of the sensors.
+        wrong: configurations that were measured wrongly, each with the factor on its noise.
     """
 
     X: Float64[Tensor, "values unknowns"]
     y: Float64[Tensor, " values"]
     sensor: Int64[Tensor, " values"]
+    configuration: Int64[Tensor, " values"]
     counts: tuple[SensorCount, ...]
+    wrong: Mapping[int, float] = field(default_factory=dict)
 
     def select(self, values: Tensor) -> "LinearValues":
         """Select some of the values."""
-        return replace(self, X=self.X[values], y=self.y[values], sensor=self.sensor[values])
+        names = ("X", "y", "sensor", "configuration")
+        return replace(self, **{name: getattr(self, name)[values] for name in names})
+
+    def deviation(self, noise: Float64[Tensor, " sensors"]) -> Float64[Tensor, " values"]:
+        """Standard deviation of the noise of every value, by those of the sensors."""
+        deviation = noise[self.sensor]
+        for number, factor in self.wrong.items():
+            wrong = (self.configuration == number) & ~self.exact
+            deviation = torch.where(wrong, math.hypot(1.0, factor) * deviation, deviation)
+        return deviation
+
+    @property
+    def exact(self) -> Bool[Tensor, " values"]:
+        """Whether every value is exactly as stated, rather than measured."""
+        return torch.tensor([one.exact for one in self.counts])[self.sensor]
+
+    @property
+    def worth(self) -> float:
+        """[nats] By so much the wrong configurations together have to raise the log evidence."""
+        count = len(torch.unique(self.configuration))
+        return len(self.wrong) * (WORTH_OF_WRONG + math.log(max(count, 1)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +101,7 @@ class Drift:
     Attributes:
         groups: with their sizes.
         noise: per sensor [m or rad], or a factor where the rows state it.
-        log_evidence: of the new rows, with the prior odds of the drifts.
+        log_evidence: of the new rows, with the prior odds of the drifts and of wrong configurations.
     """
 
     groups: tuple[DriftGroup, ...]
@@ -111,26 +137,40 @@ class DriftSearch:
             noise: to start from.
             usual_noise: that of the calibration.
         """
-        self._values, self._K = values, A @ A.t()
+        self.values, self._K = values, A @ A.t()
         self._groups, self._noise, self._usual = list(groups), noise.clone(), usual_noise
         self._Z = [fewest_columns(values.X[:, one.index] * one.scale) for one in groups]
-        self._V = self._K + self._variances().diag()
+        self.covariance = self._K + self.deviation.square().diag()
         for one, Z in zip(self._groups, self._Z, strict=True):
-            self._V += one.size**2 * Z @ Z.t()
+            self.covariance += one.size**2 * Z @ Z.t()
 
-    def estimated(self, sweeps: int = SWEEPS) -> Drift:
+    def estimate(self, sweeps: int = SWEEPS) -> None:
         """Estimate sizes and noise, group after group and sensor after sensor."""
         for _ in range(sweeps):
             before = [one.size for one in self._groups]
             for number, group in enumerate(self._groups):
                 if not group.stands:
                     self._resize(number, self._best_size(number))
-            for sensor, count in enumerate(self._values.counts):
+            for sensor, count in enumerate(self.values.counts):
                 if not count.exact and count.values:
                     self._renew_noise(sensor, 1.0 if count.stated else 0.0)
             if before == [one.size for one in self._groups]:
                 break
-        return Drift(tuple(self._groups), self._noise, self._log_evidence(self._V))
+
+    @property
+    def drift(self) -> Drift:
+        """Sizes and noise as they are now."""
+        return Drift(tuple(self._groups), self._noise, self.log_evidence)
+
+    @property
+    def log_evidence(self) -> float:
+        """See `Drift`."""
+        return self._log_evidence(self.covariance)
+
+    @property
+    def deviation(self) -> Float64[Tensor, " values"]:
+        """Of every value's noise."""
+        return self.values.deviation(self._noise)
 
     def shift(
         self, number: int, held: bool = True
@@ -163,37 +203,38 @@ class DriftSearch:
 
     def _beside(self, number: int, reduced: bool = True) -> tuple[Tensor, Tensor, Tensor]:
         """A group's columns, and values and columns in the metric of everything else."""
-        group, Z, y = self._groups[number], self._Z[number], self._values.y
-        V = self._V - group.size**2 * Z @ Z.t()
+        group, Z, y = self._groups[number], self._Z[number], self.values.y
+        V = self.covariance - group.size**2 * Z @ Z.t()
         if not reduced:
-            Z = self._values.X[:, group.index] * group.scale
+            Z = self.values.X[:, group.index] * group.scale
         both = torch.linalg.solve_triangular(covariance_factor(V), torch.cat([y[:, None], Z], 1), upper=False)
         return Z, both[:, 0], both[:, 1:]
 
     def _resize(self, number: int, size: float) -> None:
         group, Z = self._groups[number], self._Z[number]
-        self._V += (size**2 - group.size**2) * Z @ Z.t()
+        self.covariance += (size**2 - group.size**2) * Z @ Z.t()
         self._groups[number] = replace(group, size=size)
 
     def _renew_noise(self, sensor: int, least: float) -> None:
         """Take the factor on the usual noise that has the highest evidence, with a log-normal prior."""
-        chosen, now = (self._values.sensor == sensor).double(), float(self._noise[sensor])
+        variance, now = (
+            self.values.deviation(torch.ones_like(self._noise)).square(),
+            float(self._noise[sensor]),
+        )
+        variance = variance * (self.values.sensor == sensor)
         tried = []
         for factor in NOISE_FACTORS.tolist():
             sigma = max(factor * float(self._usual[sensor]), least)
-            V = self._V + (chosen * (sigma**2 - now**2)).diag()
+            V = self.covariance + (variance * (sigma**2 - now**2)).diag()
             tried.append((self._log_evidence(V) - 0.5 * (math.log(factor) / NOISE_SPREAD) ** 2, sigma))
         sigma = max(tried)[1]
-        self._V += (chosen * (sigma**2 - now**2)).diag()
+        self.covariance += (variance * (sigma**2 - now**2)).diag()
         self._noise[sensor] = sigma
-
-    def _variances(self) -> Float64[Tensor, " values"]:
-        return self._noise.square()[self._values.sensor]
 
     def _log_evidence(self, V: Tensor) -> float:
         factor = covariance_factor(V)
-        a = torch.linalg.solve_triangular(factor, self._values.y[:, None], upper=False)
-        odds = sum(one.worth for one in self._groups if one.size > 0 and not one.stands)
+        a = torch.linalg.solve_triangular(factor, self.values.y[:, None], upper=False)
+        odds = self.values.worth + sum(one.worth for one in self._groups if one.size > 0 and not one.stands)
         return -0.5 * float(a.square().sum()) - float(factor.diagonal().log().sum()) - odds
 
 

@@ -37,7 +37,7 @@ class PosteriorUpdate:
         index = torch.cat([group.index for group in drifted] or [torch.zeros(0, dtype=torch.int64)])
         deviation = torch.cat([group.deviation for group in drifted] or [values.y[:0]])
         self._index, self._deviation = index, deviation
-        noise = drift.noise[values.sensor]
+        noise = values.deviation(drift.noise)
         A = torch.cat([values.X @ root, values.X[:, index] * deviation], 1) / noise[:, None]
         y = values.y / noise
         self._few = 2 * len(y) <= A.shape[1]

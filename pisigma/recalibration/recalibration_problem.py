@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence, Set
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.hybrid.design import Design
@@ -20,6 +21,7 @@ from pisigma.identification.problem.setup import (
     usable_rows,
 )
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import Frames
 from pisigma.recalibration.drift import DriftGroup
@@ -62,6 +64,11 @@ class RecalibrationProblem:
     change: Float64[Tensor, "parameters parameters"]
     groups: tuple[DriftGroup, ...]
     standing: Float64[Tensor, "unknowns _directions"]
+
+    @cached_property
+    def configuration(self) -> Int64[Tensor, " rows"]:
+        """Number of every row's joint values; the two rows of a pair have one."""
+        return groups_to_keep_whole(self.setup.measurements)
 
     def without_arm(self) -> "RecalibrationProblem":
         """The same where the arm is exactly as it was: only what stands elsewhere is unknown."""

@@ -4,14 +4,17 @@ import datetime
 import math
 import os
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+import torch
 
 from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.files.model_files import model_hash
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.result import HybridResult
+from pisigma.judging.calibration_validation import errors_under
 from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.distillation_summary import ParentFigures
 from pisigma.judging.progress import Progress, stage
@@ -22,13 +25,18 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.recalibration.adaptation import Adaptation, adapt
-from pisigma.recalibration.candidates import Gate, gate
+from pisigma.recalibration.candidates import FAR_BETTER, Gate, gate
 from pisigma.recalibration.elsewhere import owners_elsewhere
 from pisigma.recalibration.model_posterior import ModelPosterior
 from pisigma.recalibration.moved import Moved, moved_by, what_moved
 from pisigma.recalibration.recalibrated_model import KIND, recalibrated_model
 from pisigma.recalibration.recalibration_problem import Owner, recalibration_problem
-from pisigma.recalibration.summary import LeftOutFigures, MovedFigures, RecalibrationSummary
+from pisigma.recalibration.summary import (
+    LeftOutFigures,
+    MovedFigures,
+    RecalibrationSummary,
+    WrongRowFigures,
+)
 from pisigma.reporting.recalibration_card import write_recalibration_card
 from pisigma.robot.description import Robot
 from pisigma.workflow.result import AbstractModelResult
@@ -37,7 +45,7 @@ FEW_ROWS = 5
 """Different poses below which nothing can be said of left-out rows."""
 IMPLAUSIBLE = 0.01
 """Share of the reach that errors of left-out rows have where the rows are not of this robot."""
-
+UNBELIEVABLE = "What has moved cannot be said: the recalibrated model does not predict left-out rows."
 SUSPICIOUS = 5.0
 """Left-out errors that are so many times the noise of the calibration are warned of."""
 
@@ -124,8 +132,14 @@ def recalibrate(
     rows = posterior.renamed(measurements.split_sets()[0])
     progress("what has moved")
     elsewhere = _elsewhere(parent, posterior, rows, settings)
-    problem = recalibration_problem(parent, posterior, rows, elsewhere)
-    adaptation = adapt(problem, posterior.noise)
+    adaptation = adapt(recalibration_problem(parent, posterior, rows, elsewhere), posterior.noise)
+    outliers: tuple[WrongRowFigures, ...] = ()
+    if wrong := adaptation.wrong_rows:
+        every = rows
+        rows = every.select(torch.tensor([row for row in range(every.rows) if row not in wrong]))
+        adaptation = adapt(recalibration_problem(parent, posterior, rows, elsewhere), posterior.noise)
+        outliers = _outliers(adaptation, every, wrong)
+    problem = adaptation.problem
     calibrator = HybridCalibrator(drawn)
     judged = gate(parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation"))
     if judged.kept == "scratch":
@@ -135,15 +149,41 @@ def recalibrate(
     else:
         chosen = adapt(problem.without_arm(), adaptation.noise) if judged.kept == "old" else adaptation
         kept = recalibrated_model(parent, chosen, rows)
-    moved = moved_by(adaptation)
+    moved = moved_by(adaptation) if _believable(judged, drawn) else None
     summary = _summary(parent, rows, adaptation, judged, moved).having(
         parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=sha256),
+        outliers=outliers,
         elsewhere=tuple(" ".join(owner).strip() for owner in sorted(elsewhere)),
     )
     kept = replace(kept, metrics=summary.to_json())
     return Recalibration(
-        kept, parent, adaptation, judged, moved, summary, seconds=time.perf_counter() - started
+        kept, parent, adaptation, judged, moved or (), summary, seconds=time.perf_counter() - started
     )
+
+
+def _outliers(
+    adaptation: Adaptation, rows: Measurements, wrong: Sequence[int]
+) -> tuple[WrongRowFigures, ...]:
+    """The rows that were left out, and how far they are off what the others say."""
+    errors = errors_under(adaptation, rows)
+    sizes = {"residual_mm": (errors.position, 1e3), "residual_deg": (errors.rotation, math.degrees(1.0))}
+    outliers = []
+    for row in wrong:
+        off = {
+            name: float(those[row]) * factor
+            for name, (those, factor) in sizes.items()
+            if those is not None and math.isfinite(those[row])
+        }
+        outliers.append(WrongRowFigures(row=row, place=rows.place(row), **off))
+    return tuple(outliers)
+
+
+def _believable(judged: Gate, robot: Robot) -> bool:
+    """Whether the recalibrated model predicts left-out rows so well that what it says of the arm may be true."""
+    error, kept = judged.rms["recalibrated"], judged.rms[judged.kept]
+    if error is None or kept is None:
+        return not judged.rows
+    return error <= min(IMPLAUSIBLE * robot.reach, FAR_BETTER * kept)
 
 
 def _summary(
@@ -151,9 +191,9 @@ def _summary(
     rows: Measurements,
     adaptation: Adaptation,
     judged: Gate,
-    moved: tuple[Moved, ...],
+    moved: tuple[Moved, ...] | None,
 ) -> RecalibrationSummary:
-    """All figures."""
+    """All figures; `moved` is None where nothing can be said of it."""
     return RecalibrationSummary(
         command=f"pisigma.recalibrate({parent.name!r}, {Path(rows.source).name!r})",
         diagnostics=_diagnostics(adaptation.problem.design.problem.space.robot, judged, rows),
@@ -167,8 +207,8 @@ def _summary(
             name: LeftOutFigures(rms_mm=None if rms is None else rms * 1e3)
             for name, rms in judged.rms.items()
         },
-        changed=what_moved(moved),
-        moved=tuple(MovedFigures.model_validate(one.to_json()) for one in moved),
+        changed=UNBELIEVABLE if moved is None else what_moved(moved),
+        moved=tuple(MovedFigures.model_validate(one.to_json()) for one in moved or ()),
         elsewhere=(),
         effective_parameters=adaptation.effective,
         noise=adaptation.noise,

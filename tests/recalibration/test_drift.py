@@ -8,7 +8,7 @@ import torch
 from testing.closeness import assert_close
 
 from pisigma.hybrid.evidence import SensorCount
-from pisigma.recalibration.drift import SIZES, WORTH, DriftGroup, DriftSearch, LinearValues
+from pisigma.recalibration.drift import SIZES, WORTH, Drift, DriftGroup, DriftSearch, LinearValues
 
 NOISE, MOVED = 1e-4, 4e-3
 
@@ -24,14 +24,19 @@ def search(moved: float, seed: int = 0, stated: bool = False) -> DriftSearch:
     groups = [DriftGroup("lengths", torch.arange(3), torch.ones(3).double())]
     groups += [DriftGroup(f"joint {k}", torch.tensor([2 + k]), torch.ones(1).double()) for k in (1, 2, 3, 4)]
     values = LinearValues(
-        X, y, torch.zeros(50, dtype=torch.int64), (SensorCount(50.0, stated, exact=stated),)
+        *(X, y, torch.zeros(50, dtype=torch.int64), torch.arange(50)), (SensorCount(50.0, stated, stated),)
     )
     noise = torch.tensor([NOISE]).double()
     return DriftSearch(values, X @ root, groups, noise, noise)
 
 
+def estimated(looked_at: DriftSearch) -> Drift:
+    looked_at.estimate()
+    return looked_at.drift
+
+
 def dense_evidence(looked_at: DriftSearch, sizes: list[float]) -> float:
-    values = looked_at._values
+    values = looked_at.values
     V = looked_at._K + NOISE**2 * torch.eye(50).double()
     for group, size in zip(looked_at._groups, sizes, strict=True):
         Z = values.X[:, group.index] * group.scale
@@ -40,7 +45,7 @@ def dense_evidence(looked_at: DriftSearch, sizes: list[float]) -> float:
 
 
 def test_only_what_moved_has_a_size():
-    drift = search(MOVED).estimated()
+    drift = estimated(search(MOVED))
     sizes = {group.what: group.size for group in drift.groups}
     assert [what for what, size in sizes.items() if size] == ["joint 2"]
     assert_close(math.log10(sizes["joint 2"]), math.log10(MOVED), atol=0.3)
@@ -49,12 +54,12 @@ def test_only_what_moved_has_a_size():
 
 @pytest.mark.parametrize("seed", range(8))
 def test_nothing_has_a_size_where_nothing_moved(seed):
-    assert not any(group.size for group in search(0.0, seed).estimated().groups)
+    assert not any(group.size for group in estimated(search(0.0, seed)).groups)
 
 
 def test_a_size_has_the_highest_evidence():
     looked_at = search(MOVED, stated=True)
-    drift = looked_at.estimated()
+    drift = estimated(looked_at)
     sizes = [group.size for group in drift.groups]
     best = dense_evidence(looked_at, sizes)
     number = sizes.index(max(sizes))
@@ -65,13 +70,13 @@ def test_a_size_has_the_highest_evidence():
 
 def test_a_shift_is_that_of_least_squares():
     looked_at = search(MOVED, stated=True)
-    number = [group.size > 0 for group in looked_at.estimated().groups].index(True)
+    number = [group.size > 0 for group in estimated(looked_at).groups].index(True)
     shift, covariance = looked_at.shift(number, held=False)
-    x = looked_at._values.X[:, 4]
+    x = looked_at.values.X[:, 4]
     V = looked_at._K + NOISE**2 * torch.eye(50).double()
     weight = torch.linalg.solve(V, x)
     assert_close(covariance[0, 0], 1 / (x @ weight), rtol=1e-9)
-    assert_close(shift[0], (weight @ looked_at._values.y) / (x @ weight), rtol=1e-9)
+    assert_close(shift[0], (weight @ looked_at.values.y) / (x @ weight), rtol=1e-9)
     held, narrower = looked_at.shift(number)
     assert abs(float(held)) < abs(float(shift))
     assert float(narrower) < float(covariance)
@@ -79,5 +84,5 @@ def test_a_shift_is_that_of_least_squares():
 
 def test_more_noise_than_before_is_noticed():
     looked_at = search(0.0)
-    looked_at._values.y.add_(3 * NOISE * torch.from_numpy(np.random.default_rng(5).normal(size=50)))
-    assert float(looked_at.estimated().noise[0]) > 2 * NOISE
+    looked_at.values.y.add_(3 * NOISE * torch.from_numpy(np.random.default_rng(5).normal(size=50)))
+    assert float(estimated(looked_at).noise[0]) > 2 * NOISE

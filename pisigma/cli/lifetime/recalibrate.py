@@ -72,7 +72,7 @@ def _print(recalibration: "Recalibration", folder: Path | None, as_json: bool) -
         print_json({"model": folder and str(folder), **recalibration.to_json()})
         return
     summary = recalibration.summary
-    print_lines([summary.changed, summary.verdict])
+    print_lines([*(one.sentence for one in summary.outliers), summary.changed, summary.verdict])
     print_table(f"errors of {summary.left_out} left-out rows", *candidate_table(summary))
     print_lines(f"Implausible: {one.sentence}" for one in summary.diagnostics)
     print_lines(f"Warning: {sentence}" for sentence in summary.warnings)
