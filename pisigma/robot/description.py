@@ -3,12 +3,13 @@
 import os
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 from jaxtyping import Float64
 
 from pisigma.errors import PoseError, RobotError, nearest_choice
+from pisigma.robot.coupling import Coupling
 from pisigma.robot.robot_file import read_robot
 from pisigma.robot.row import LARGEST, MOST_ROWS, JointType, Row
 
@@ -30,6 +31,9 @@ class Robot:
         dh: `(rows, 5)`: theta [rad], d [m], a [m], alpha [rad], beta [rad].
         base: x, y, z [m], roll, pitch, yaw [rad] of `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
         tool: the same for the tool behind the last row.
+        coupling: how the joints of the rows follow the controller's values; None where these are the same. Joint values
+            are DH values everywhere but in files, in answers of `CorrectedIK` and where a name or docstring says that
+            they are the controller's.
     """
 
     name: str
@@ -39,6 +43,7 @@ class Robot:
     dh: Float64[np.ndarray, " rows 5"]
     base: Float64[np.ndarray, " 6"] = field(default_factory=lambda: np.zeros(6))
     tool: Float64[np.ndarray, " 6"] = field(default_factory=lambda: np.zeros(6))
+    coupling: Coupling | None = None
 
     def __post_init__(self) -> None:
         """Check that the parts fit together and make the arrays read-only."""
@@ -109,8 +114,26 @@ class Robot:
         return tuple(i for i, row in enumerate(self.rows) if row.type != "fixed")
 
     @property
+    def axes(self) -> tuple[Row, ...]:
+        """What the controller commands, in order; the joints where they are not coupled."""
+        return self.joints if self.coupling is None else self.coupling.axes
+
+    @property
+    def axis_limits(self) -> Float64[np.ndarray, "axes 2"]:
+        """Lower and upper limit of every axis [rad or m]: what the controller allows."""
+        return np.array([[axis.lower, axis.upper] for axis in self.axes])
+
+    def to_dh(self, q: Any) -> Any:
+        """Give the joint values `(*batch, dof)` at the controller's values `(*batch, axes)`, both [rad or m]."""
+        return q if self.coupling is None else self.coupling.to_dh(q)
+
+    def to_controller(self, q: Any) -> Any:
+        """Give the controller's values `(*batch, axes)` at joint values `(*batch, dof)`, both [rad or m]."""
+        return q if self.coupling is None else self.coupling.to_controller(q)
+
+    @property
     def limits(self) -> Float64[np.ndarray, " dof 2"]:
-        """Lower and upper limit of every joint [rad or m], as the controller counts."""
+        """Lower and upper limit of every joint [rad or m]; of a coupled one the widest that the axes allow."""
         return np.array([[joint.lower, joint.upper] for joint in self.joints])
 
     @property
@@ -162,7 +185,7 @@ class Robot:
         return serial_chain(self)
 
     def check_joint_count(self, count: int) -> None:
-        """Refuse joint values whose last axis does not fit the robot.
+        """Refuse joint values whose last axis does not fit the joints.
 
         Raises:
             PoseError: `count` is not the number of joints.

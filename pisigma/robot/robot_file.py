@@ -10,10 +10,12 @@ from jaxtyping import Float64
 from pydantic import Field, model_validator
 
 from pisigma.errors import RobotError, UnknownRobotError, nearest_choice
-from pisigma.robot.row import LARGEST, MOST_ROWS, Drawing, JointType, Row
+from pisigma.robot.coupling_section import CoupledJointSection, coupled
+from pisigma.robot.drawing import Drawing
+from pisigma.robot.modified_dh import from_modified
+from pisigma.robot.row import MOST_ROWS, Bounded, JointType, Row
 from pisigma.yaml_file import Section, parse_yaml, read_yaml
 
-Bounded = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
 Limits = Annotated[tuple[Bounded, Bounded], Field(description="lower and upper")]
 
 
@@ -89,14 +91,22 @@ class FrameSection(Section):
 
 
 class RobotDocument(Section):
-    """The whole file."""
+    """The whole file.
+
+    Attributes:
+        convention: "standard", where a row is `RotZ(theta) · Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; or "modified",
+            where it is `RotX(alpha) · Trans(a, 0, 0) · RotZ(theta) · Trans(0, 0, d)` (Craig 1986).
+        coupling: joints that do not simply follow the controller's value of the same name.
+    """
 
     name: str = Field(min_length=1)
     maker: str
     source: str
+    convention: Literal["standard", "modified"] = "standard"
     rows: tuple[RowSection, ...] = Field(min_length=1, max_length=MOST_ROWS)
     base: FrameSection = FrameSection()
     tool: FrameSection = FrameSection()
+    coupling: tuple[CoupledJointSection, ...] = ()
 
     @model_validator(mode="after")
     def _rows_fit_together(self) -> "RobotDocument":
@@ -105,19 +115,20 @@ class RobotDocument(Section):
             raise ValueError(f"the row name '{twice[0]}' stands twice in rows; names must differ")
         if all(row.type == "fixed" for row in self.rows):
             raise ValueError("no row moves; add a revolute or prismatic one")
+        self.drawing()
         return self
 
     def drawing(self) -> Drawing:
-        """The robot in SI units."""
-        return Drawing(
-            name=self.name,
-            maker=self.maker,
-            source=self.source,
-            rows=tuple(row.to_row() for row in self.rows),
-            dh=np.array([row.to_si() for row in self.rows]),
-            base=self.base.to_si(),
-            tool=self.tool.to_si(),
-        )
+        """The robot in SI units.
+
+        Raises:
+            RobotError: the coupling does not fit the rows, or a row of the modified convention has a beta.
+        """
+        rows, coupling = coupled([row.to_row() for row in self.rows], self.coupling)
+        dh, base = np.array([row.to_si() for row in self.rows]), self.base.to_si()
+        if self.convention == "modified":
+            dh, base = from_modified(dh, base)
+        return Drawing(self.name, self.maker, self.source, rows, dh, base, self.tool.to_si(), coupling)
 
 
 def catalogue() -> tuple[str, ...]:

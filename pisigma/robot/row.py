@@ -2,10 +2,11 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64
+from pydantic import Field
 
 JointType = Literal["revolute", "prismatic", "fixed"]
 
@@ -17,6 +18,9 @@ FRAME_COLUMNS = ("x", "y", "z", "roll", "pitch", "yaw")
 
 LARGEST = 1e9
 """[mm, deg, or as a file states it] No robot, pose or measurement has a larger value."""
+
+Bounded = Annotated[float, Field(ge=-LARGEST, le=LARGEST)]
+"""A number of a robot file."""
 
 MOST_ROWS = 1000
 """Of a robot."""
@@ -71,24 +75,6 @@ class Row:
         """A joint value [rad or m] in the unit of files."""
         return float(value * 1e3 if self.type == "prismatic" else np.rad2deg(value))
 
-
-class Drawing(NamedTuple):
-    """What a file says of a robot, not yet checked as a whole; see `Robot`, which has the same attributes.
-
-    Attributes:
-        name: short name, as in the catalogue.
-        maker: who builds it.
-        source: where the figures come from.
-        rows: joints and fixed rows, from the base to the tool.
-        dh: `(rows, 5)`, columns as `DH_COLUMNS`.
-        base: as `FRAME_COLUMNS`.
-        tool: as `FRAME_COLUMNS`.
-    """
-
-    name: str
-    maker: str
-    source: str
-    rows: tuple[Row, ...]
-    dh: Float64[np.ndarray, " rows 5"]
-    base: Float64[np.ndarray, " 6"]
-    tool: Float64[np.ndarray, " 6"]
+    def from_file_unit(self, value: float) -> float:
+        """A joint value in the unit of files as [rad or m]."""
+        return float(value / 1e3 if self.type == "prismatic" else np.deg2rad(value))

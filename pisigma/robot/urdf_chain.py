@@ -4,7 +4,7 @@ import math
 import os
 import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -23,7 +23,7 @@ MOST_ELEMENTS = 10_000
 """Links and joints of a file; a whole cell has some hundreds."""
 
 _KEPT = {"origin": ("xyz", "rpy"), "axis": ("xyz",), "parent": ("link",), "child": ("link",)}
-_KEPT |= {"limit": ("lower", "upper"), "mimic": ("joint",)}
+_KEPT |= {"limit": ("lower", "upper"), "mimic": ("joint", "multiplier", "offset")}
 _VECTORS = {("origin", "xyz"), ("origin", "rpy"), ("axis", "xyz")}
 
 
@@ -165,7 +165,7 @@ def _copy_joint(element: Any, copied: Any, source: str) -> None:
 def _check_value(element: Any, tag: str, key: str, place: str) -> None:
     """Refuse what is no number, or not three of them where a vector is wanted."""
     text = element.get(key)
-    if tag not in ("origin", "axis", "limit"):
+    if tag not in ("origin", "axis", "limit", "mimic") or key == "joint":
         return
     count = 3 if (tag, key) in _VECTORS else 1
     try:
@@ -205,8 +205,10 @@ class ChainJoint:
         type: how it moves.
         origin: its frame at rest in the frame behind the joint before (in the base link of the first).
         axis: unit vector in its own frame that it turns about or slides along.
-        lower: smallest joint value [rad or m]; -inf of a continuous joint.
+        lower: smallest joint value [rad or m]; -inf of a continuous joint, and of one that mimics another.
         upper: largest joint value [rad or m].
+        mimic: the joint that it mimics, by how many [rad or m] it moves per [rad or m] of that one, and where it stands
+            at 0 of that one; None where it is commanded.
     """
 
     name: str
@@ -215,6 +217,7 @@ class ChainJoint:
     axis: Float64[np.ndarray, " 3"]
     lower: float
     upper: float
+    mimic: tuple[str, float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -248,7 +251,7 @@ def read_chain(path: str | os.PathLike[str], base: str | None = None, tip: str |
 
     Raises:
         RobotError: the file cannot be used, there is no such link or no way between them, or a joint of the
-            chain mimics another, floats, is planar, or lacks its axis or limits.
+            chain mimics one outside of it, floats, is planar, or lacks its axis or limits.
     """
     urdf, place = read_urdf(path)
     links = list(urdf.link_map)
@@ -258,11 +261,12 @@ def read_chain(path: str | os.PathLike[str], base: str | None = None, tip: str |
             raise RobotError(f"{path}: there is no {option} link '{link}'; {nearest_choice(link, links)}")
     base = base or _root(urdf, str(path))
     tip = tip or _only_tip(urdf, base, str(path))
-    origin, joints = np.eye(4), []
-    for joint in _way(urdf, base, tip, str(path)):
+    origin, joints, way = np.eye(4), [], _way(urdf, base, tip, str(path))
+    commanded = {joint.name for joint in way if joint.type != "fixed" and joint.mimic is None}
+    for joint in way:
         origin = origin @ origin_of(joint)
         if joint.type != "fixed":
-            joints.append(_moving(joint, origin, place(joint.name)))
+            joints.append(_moving(joint, origin, place(joint.name), commanded))
             origin = np.eye(4)
     if not joints:
         raise RobotError(
@@ -338,12 +342,12 @@ def origin_of(joint: Any) -> Frame:
     return frame_of([float(value) for value in (*xyz, *rpy[::-1])])
 
 
-def _moving(joint: Any, origin: Frame, place: str) -> ChainJoint:
+def _moving(joint: Any, origin: Frame, place: str, commanded: Collection[str]) -> ChainJoint:
     what = f"{place}: joint '{joint.name}'"
-    if joint.mimic is not None:
+    if joint.mimic is not None and joint.mimic.joint not in commanded:
         raise RobotError(
-            f"{what} mimics '{joint.mimic.joint}', and a chain of independent joints was wanted; choose base "
-            "and tip so that it is not between them, or make it a joint of its own."
+            f"{what} mimics '{joint.mimic.joint}', which is no commanded joint of the chain; choose base and tip so "
+            "that both are between them, or none, or make it a joint of its own."
         )
     if joint.type in ("floating", "planar"):
         raise RobotError(
@@ -355,9 +359,12 @@ def _moving(joint: Any, origin: Frame, place: str) -> ChainJoint:
     length = float(np.linalg.norm(axis))
     if abs(length - 1) > UNIT:
         raise RobotError(f"{what} has an axis of length {length:g}; a unit vector such as 0 0 1 was wanted.")
-    lower, upper = _limits(joint, what)
     kind: Literal["revolute", "prismatic"] = "prismatic" if joint.type == "prismatic" else "revolute"
-    return ChainJoint(joint.name, kind, origin, axis / length, lower, upper)
+    if joint.mimic is None:
+        return ChainJoint(joint.name, kind, origin, axis / length, *_limits(joint, what))
+    multiplier, offset = joint.mimic.multiplier, joint.mimic.offset or 0.0
+    mimic = joint.mimic.joint, 1.0 if multiplier is None else float(multiplier), float(offset)
+    return ChainJoint(joint.name, kind, origin, axis / length, -math.inf, math.inf, mimic)
 
 
 def _limits(joint: Any, what: str) -> tuple[float, float]:

@@ -13,7 +13,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.robot.row import Drawing, Row
+from pisigma.robot.coupling_section import CoupledJointSection, coupled
+from pisigma.robot.drawing import Drawing
+from pisigma.robot.row import Row
 from pisigma.robot.urdf_chain import Chain, ChainJoint
 from pisigma.robot.urdf_frames import (
     ROUNDING,
@@ -69,19 +71,37 @@ def rows_of_chain(chain: Chain, nearly_parallel: float = NEARLY_PARALLEL) -> Cha
         frames.append(inverse(T_row_next) @ row_frame(*parameters))
     T_row_tip = inverse(frames[-1]) @ chain.end
     dh.append(_last_row(T_row_tip))
+    rows = [
+        Row(j.name, j.type, _direction(j), j.lower, j.upper, _drawn_at(frame))
+        for j, frame in zip(joints, frames, strict=True)
+    ]
+    coupled_rows, coupling = coupled(rows, _mimics(joints, rows))
     drawing = Drawing(
         name=chain.name,
         maker="not stated",
         source=f"URDF file {Path(chain.source).name}, from link '{chain.base}' to link '{chain.tip}'",
-        rows=tuple(
-            Row(j.name, j.type, _direction(j), j.lower, j.upper, _drawn_at(frame))
-            for j, frame in zip(joints, frames, strict=True)
-        ),
+        rows=coupled_rows,
         dh=np.array(dh),
         base=xyzrpy_of(frame),
         tool=xyzrpy_of(inverse(row_frame(*dh[-1])) @ T_row_tip),
+        coupling=coupling,
     )
     return ChainRows(drawing, tuple(frames))
+
+
+def _mimics(joints: tuple[ChainJoint, ...], rows: list[Row]) -> list[CoupledJointSection]:
+    """What joints that mimic others are coupled by, as a robot file would state it."""
+    by_name = {row.name: row for row in rows}
+    sections = []
+    for joint, row in zip(joints, rows, strict=True):
+        if joint.mimic is not None:
+            name, multiplier, offset = joint.mimic
+            other = by_name[name]
+            if other.type != row.type:
+                multiplier *= row.in_file_unit(1.0) * other.from_file_unit(1.0)
+            stated = {f"offset_{row.file_unit}": row.in_file_unit(offset)}
+            sections.append(CoupledJointSection(joint=row.name, factors={name: multiplier}, **stated))
+    return sections
 
 
 def _drawn_at(frame: Frame) -> tuple[float, float, float]:

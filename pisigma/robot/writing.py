@@ -2,14 +2,18 @@
 
 import os
 from collections.abc import Collection
+from dataclasses import replace
 from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
+from jaxtyping import Float64
 
 from pisigma.errors import OutputError, RobotError
+from pisigma.robot.coupling_section import coupling_document
 from pisigma.robot.description import Robot
-from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, Drawing, Row, in_file_units
+from pisigma.robot.drawing import Drawing
+from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, Row, in_file_units
 from pisigma.robot.urdf_chain import Chain, origin_of, parse_xml, read_chain, read_urdf
 from pisigma.robot.urdf_frames import Frame, frame_of, inverse, row_frame, shift, turn, xyzrpy_of
 from pisigma.robot.urdf_rows import ChainRows, rows_of_chain
@@ -32,7 +36,10 @@ def robot_document(robot: Robot) -> dict[str, object]:
         RobotError: a row has one limit only, which a file cannot hold.
     """
     rows = []
-    for row, parameters in zip(robot.rows, robot.dh, strict=True):
+    axes = {axis.name: axis for axis in robot.axes}
+    for joint, parameters in zip(robot.rows, robot.dh, strict=True):
+        # Files hold the limits of the controller's values, which a passive joint has none of.
+        row = axes.get(joint.name, replace(joint, lower=-np.inf, upper=np.inf))
         entry: dict[str, object] = {"name": row.name, "type": row.type, "direction": row.direction}
         entry |= {"drawn_at_mm": [value * 1e3 for value in row.drawn_at]} if any(row.drawn_at) else {}
         rows.append(entry | _limits_entry(row) | in_file_units(DH_COLUMNS, parameters))
@@ -43,6 +50,8 @@ def robot_document(robot: Robot) -> dict[str, object]:
         "rows": rows,
     }
     document |= {part: in_file_units(FRAME_COLUMNS, getattr(robot, part)) for part in ("base", "tool")}
+    if robot.coupling is not None:
+        document["coupling"] = coupling_document(robot.coupling, robot.joints)
     return document
 
 
@@ -66,14 +75,15 @@ def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
     axis, or the other way round where its direction is -1; `Trans(a, 0, 0) · RotX(alpha) · RotY(beta)` leads
     on to the next. No common normal is needed, so parallel axes stay where they are. Base and tool are fixed
     joints, links are named `link_1` and so on, joints like the rows. `effort` and `velocity`, which the
-    format asks for, are written as 0: not known.
+    format asks for, are written as 0: not known. A coupled joint is followed by joints about or along the same axis,
+    one for each axis of the controller that moves it too, which mimic that axis.
 
     Args:
         robot: the robot.
         comments: sentences to write at the top.
 
     Raises:
-        OutputError: a joint has limits that the format cannot say.
+        OutputError: a joint has limits, or a linkage drives it, so that the format cannot say it.
     """
     root = ElementTree.Element("robot", name=robot.name)
     for sentence in comments:
@@ -82,24 +92,74 @@ def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
     link = "link_0"
     ElementTree.SubElement(root, "link", name=BASE_LINK)
     _joint(root, unused_name("base_joint", names), "fixed", (BASE_LINK, link), frame_of(robot.base))
-    behind = np.eye(4)
-    for number, (row, (theta, d, a, alpha, beta)) in enumerate(
-        zip(robot.rows, robot.dh.tolist(), strict=True), 1
-    ):
-        following = f"link_{number}"
-        origin = behind @ turn(2, theta) @ shift(0.0, 0.0, d)
-        element = _joint(root, row.name, _type(row, robot.name), (link, following), origin)
-        if row.type != "fixed":
-            ElementTree.SubElement(element, "axis", xyz=f"0 0 {row.direction}")
-        if np.isfinite(row.upper):
-            ElementTree.SubElement(
-                element, "limit", lower=repr(row.lower), upper=repr(row.upper), effort="0", velocity="0"
-            )
-        link, behind = following, row_frame(0.0, 0.0, a, alpha, beta)
+    behind, number = np.eye(4), 0
+    for row, (theta, d, a, alpha, beta) in zip(robot.rows, _at_rest(robot).tolist(), strict=True):
+        behind = behind @ turn(2, theta) @ shift(0.0, 0.0, d)
+        for moving, mimic in _movers(robot, row):
+            number += 1
+            links = link, f"link_{number}"
+            element = _joint(root, moving.name, _type(moving, robot.name), links, behind)
+            _add_motion(element, moving, mimic)
+            link, behind = links[1], np.eye(4)
+        behind = row_frame(0.0, 0.0, a, alpha, beta)
     tool = behind @ frame_of(robot.tool)
     _joint(root, unused_name("tool_joint", names), "fixed", (link, TOOL_LINK), tool)
     ElementTree.indent(root)
     return f'<?xml version="1.0"?>\n{ElementTree.tostring(root, encoding="unicode")}\n'
+
+
+_Mimic = tuple[str, float]
+"""The joint that another one mimics, and by how many [rad or m] it moves per [rad or m] of that one."""
+
+
+def _at_rest(robot: Robot) -> Float64[np.ndarray, "rows 5"]:
+    """The rows of a robot where all of the controller's values are 0.
+
+    Raises:
+        OutputError: a linkage drives a joint, so that it does not follow in proportion.
+    """
+    if robot.coupling is None:
+        return robot.dh
+    if robot.coupling.four_bars:
+        driven = robot.joints[robot.coupling.four_bars[0][0]].name
+        raise OutputError(
+            f"robot '{robot.name}': a four-bar linkage drives the joint '{driven}', which URDF cannot say; write a "
+            "robot file (--format dh with .yaml) instead."
+        )
+    dh = robot.dh.copy()
+    for joint, row, offset in zip(robot.joints, robot.joint_rows, robot.coupling.offset, strict=True):
+        dh[row, 0 if joint.type == "revolute" else 1] += joint.direction * offset
+    return dh
+
+
+def _movers(robot: Robot, row: Row) -> list[tuple[Row, _Mimic | None]]:
+    """The joints about one axis that move what stands behind a row: what is commanded first, then those that mimic."""
+    if robot.coupling is None or row.type == "fixed":
+        return [(row, None)]
+    factors = robot.coupling.matrix[[joint.name for joint in robot.joints].index(row.name)].tolist()
+    result: list[tuple[Row, _Mimic | None]] = []
+    for axis, factor in zip(robot.axes, factors, strict=True):
+        if axis.name == row.name:
+            result.insert(0, (axis, None))
+            factor -= 1.0
+        if factor:
+            lower, upper = sorted((factor * axis.lower, factor * axis.upper))
+            follower = replace(row, name=f"{row.name}_by_{axis.name}", lower=lower, upper=upper)
+            result.append((follower, (axis.name, factor)))
+    mover, mimic = result[0]
+    return [(replace(mover, name=row.name), mimic), *result[1:]]
+
+
+def _add_motion(element: ElementTree.Element, row: Row, mimic: _Mimic | None) -> None:
+    """Say how a joint moves."""
+    if row.type != "fixed":
+        ElementTree.SubElement(element, "axis", xyz=f"0 0 {row.direction}")
+    if np.isfinite(row.upper):
+        ElementTree.SubElement(
+            element, "limit", lower=repr(row.lower), upper=repr(row.upper), effort="0", velocity="0"
+        )
+    if mimic is not None:
+        ElementTree.SubElement(element, "mimic", joint=mimic[0], multiplier=repr(mimic[1]))
 
 
 def _joint(

@@ -8,10 +8,13 @@ import sys
 import numpy as np
 import pytest
 from testing.closeness import assert_close
+from testing.coupled import PALLETISER, coupled_robot
 
-from pisigma.errors import RobotError, UnknownRobotError
+import pisigma
+from pisigma.errors import OutputError, RobotError, UnknownRobotError
 from pisigma.robot import Robot
 from pisigma.robot.urdf_chain import read_chain
+from pisigma.robot.writing import robot_to_urdf
 
 TEXT = """\
 <?xml version="1.0" encoding="utf-8"?>
@@ -114,7 +117,10 @@ def test_effort_and_velocity_may_be_missing(arm):
         ({"base": "tool0", "tip": "base"}, "the link 'base' does not hang on 'tool0'"),
         ({"base": "flange", "tip": "tool0"}, "no joint moves between the links 'flange' and 'tool0'"),
         ({"base": "tool0", "tip": "tool0"}, "no joint moves between the links 'tool0' and 'tool0'"),
-        ({"tip": "finger"}, "line 34: joint 'grip' mimics 'slide'"),
+        (
+            {"base": "tool0", "tip": "finger"},
+            "line 34: joint 'grip' mimics 'slide', which is no commanded joint",
+        ),
     ],
 )
 def test_links_that_make_no_chain(arm, links, complaint):
@@ -281,3 +287,23 @@ def test_a_file_of_more_links_than_any_cell_has_is_refused_at_once(tmp_path):
     )
     with pytest.raises(RobotError, match="holds more than 10,000 links and joints; fewer were wanted"):
         Robot.load(path)
+
+
+def test_a_joint_that_mimics_another_is_coupled_to_it(arm):
+    text = TEXT.replace('multiplier="2"', 'multiplier="2" offset="0.01"')
+    robot = Robot.load(arm(text), tip="finger")
+    assert [axis.name for axis in robot.axes] == ["shoulder", "elbow", "slide"]
+    q = np.array([[0.3, -0.4, 0.2]])
+    assert_close(robot.to_dh(q), [[0.3, -0.4, 0.2, 0.41]], atol=1e-15)
+    assert_close(robot.to_controller(robot.to_dh(q)), q, atol=1e-15)
+
+
+def test_coupled_joints_are_written_as_joints_that_mimic(arm):
+    robot = coupled_robot()
+    again = Robot.load(arm(robot_to_urdf(robot)))
+    assert [axis.name for axis in again.axes] == [axis.name for axis in robot.axes]
+    assert_close(again.axis_limits, robot.axis_limits, atol=1e-15)
+    q = np.random.default_rng(0).uniform(-1, 1, (5, 6))
+    assert_close(pisigma.forward_kinematics(again, q), pisigma.forward_kinematics(robot, q), atol=1e-12)
+    with pytest.raises(OutputError, match="four-bar linkage drives the joint 'theta_3'"):
+        robot_to_urdf(coupled_robot(PALLETISER))

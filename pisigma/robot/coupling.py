@@ -1,0 +1,225 @@
+"""How the joints of the DH rows follow what a controller counts: the only file that maps one to the other.
+
+    q_dh = f(C · q_controller + b)
+
+C and b are written in the robot's file. f is the identity, except for joints that a four-bar linkage drives.
+Files, answers of the inverse kinematics and programs hold the controller's values; everything else holds DH values.
+"""
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+
+from pisigma.errors import RobotError
+from pisigma.robot.row import Row
+
+SLACK = 1e-9
+"""[rad or m] How far a joint value may lie beyond a limit by rounding."""
+
+
+@dataclass(frozen=True)
+class FourBar:
+    """A linkage of a ground, a crank, a coupler and a rocker, whose rocker is the joint.
+
+    The pivot of the crank is the origin and that of the rocker lies at (ground, 0). The crank end P at the angle ψ and
+    the rocker end Q at the angle φ are one coupler length apart (Freudenstein 1955), assembled without crossing. With
+    equal opposite sides it is a parallelogram, φ = ψ.
+
+    Attributes:
+        ground: distance of the pivots [m].
+        crank: length of the driven bar [m].
+        coupler: length of the bar between crank and rocker [m].
+        rocker: length of the bar that turns with the joint [m].
+        zero: angle ψ of the crank where `C · q_controller + b` is 0 [rad].
+    """
+
+    ground: float
+    crank: float
+    coupler: float
+    rocker: float
+    zero: float
+
+    def follow(self, x: Any) -> Any:
+        """Joint value [rad] at a crank turned by x [rad], 0 where the parallelogram's would be 0."""
+        return self._other_end(x, self.crank, self.rocker, 1.0)
+
+    def drive(self, u: Any) -> Any:
+        """Turn of the crank [rad] at a joint value u [rad]; the inverse of `follow`."""
+        return self._other_end(u, self.rocker, self.crank, -1.0)
+
+    def _other_end(self, turn: Any, length: float, other: float, side: float) -> Any:
+        """Turn of the bar at the other pivot, which is `side · ground` along x."""
+        xp, angle = _functions(turn), turn + self.zero
+        x, y = length * xp.cos(angle) - side * self.ground, length * xp.sin(angle)
+        square = x * x + y * y
+        cosine = (other**2 + square - self.coupler**2) / (2 * other * square**0.5)
+        opened = xp.sign(y) * xp.arccos(cosine)
+        change = xp.arctan2(y, x) - side * opened - angle
+        return turn + change - 2 * math.pi * xp.round(change / (2 * math.pi))
+
+
+@dataclass(frozen=True, eq=False)
+class Coupling:
+    """What the controller commands, and how the joints of the DH rows follow.
+
+    Attributes:
+        axes: what the controller commands, with the limits of its values.
+        matrix: `(dof, axes)`: C, [rad or m] of a joint per [rad or m] of an axis.
+        offset: `(dof,)`: b [rad or m].
+        four_bars: per joint that a linkage drives, its number and the linkage.
+    """
+
+    axes: tuple[Row, ...]
+    matrix: Float64[np.ndarray, "dof axes"]
+    offset: Float64[np.ndarray, " dof"]
+    four_bars: tuple[tuple[int, FourBar], ...] = ()
+
+    def __post_init__(self) -> None:
+        """Check that every axis can be told from the joints."""
+        if np.linalg.matrix_rank(self.matrix) < len(self.axes):
+            names = ", ".join(axis.name for axis in self.axes)
+            raise RobotError(
+                f"coupling: different values of the axes {names} give the same pose, since their factors depend on "
+                "each other; correct the factors."
+            )
+
+    @property
+    def passive(self) -> bool:
+        """Whether there are joints that follow the others and that no axis of the controller moves alone."""
+        return len(self.matrix) > len(self.axes)
+
+    @property
+    def limits(self) -> Float64[np.ndarray, "axes 2"]:
+        """Lower and upper limit of every axis [rad or m]."""
+        return np.array([[axis.lower, axis.upper] for axis in self.axes])
+
+    def to_dh(self, q: Any) -> Any:
+        """DH values `(*batch, dof)` at the controller's values `(*batch, axes)`, both [rad or m]; arrays or tensors."""
+        return self._by_four_bars(_times(q, self.matrix) + _like(q, self.offset), FourBar.follow)
+
+    def to_controller(self, q: Any) -> Any:
+        """The controller's values `(*batch, axes)` at DH values `(*batch, dof)`; the inverse of `to_dh`.
+
+        Where there are passive joints it is the least-squares solution.
+        """
+        driven = self._by_four_bars(q, FourBar.drive) - _like(q, self.offset)
+        return _times(driven, np.linalg.pinv(self.matrix))
+
+    def slope(self, q: Any) -> Any:
+        """Derivative of `to_dh` by the controller's values, `(*batch, dof, axes)`."""
+        slope = np.broadcast_to(self.matrix, (*np.shape(q)[:-1], *self.matrix.shape)).copy()
+        step = 1e-6
+        for joint, bar in self.four_bars:
+            x = np.asarray(q) @ self.matrix[joint] + self.offset[joint]
+            slope[..., joint, :] *= ((bar.follow(x + step) - bar.follow(x - step)) / (2 * step))[..., None]
+        return slope
+
+    def approach_to_dh(self, approach: Any) -> Any:
+        """From which side the joints come, +1 or -1, where the sides of all axes that move them agree, else 0."""
+        return _sides(approach, np.sign(self.matrix))
+
+    def approach_to_controller(self, approach: Any) -> Any:
+        """From which side the axes come, where those of the joints say it; else 0."""
+        return _sides(approach, np.sign(np.round(np.linalg.pinv(self.matrix), 12)))
+
+    def is_inside(self, q: Float[np.ndarray, "*batch dof"]) -> Bool[np.ndarray, "*batch"]:
+        """Whether the controller's values at DH values are within its limits; NaN is not."""
+        values, (lower, upper) = self.to_controller(q), self.limits.T
+        return np.asarray(((values >= lower - SLACK) & (values <= upper + SLACK)).all(-1))
+
+    def turned_inside(
+        self, q: Float64[np.ndarray, "rows dof"], near: Float64[np.ndarray, "#rows dof"] | None = None
+    ) -> tuple[Float64[np.ndarray, "rows dof"], Bool[np.ndarray, " rows"]]:
+        """Turn joints by full turns so that the controller's values come into its limits, and near to others.
+
+        Args:
+            q: DH values [rad or m].
+            near: DH values to come near to, as far as the limits allow; None turns as little as possible.
+
+        Returns:
+            The DH values, and whether the controller's are within its limits; others are left as they came.
+        """
+        turns = 2 * math.pi * self._turns()
+        every = q[:, None] + turns
+        least = np.abs(turns).sum(-1)[None] if near is None else np.abs(every - near[:, None]).sum(-1)
+        inside = self.is_inside(every)
+        best = np.where(inside, least, math.inf).argmin(1)
+        reached: np.ndarray = inside[np.arange(len(q)), best]
+        return np.where(reached[:, None], every[np.arange(len(q)), best], q), reached
+
+    def _turns(self) -> Float64[np.ndarray, "turns dof"]:
+        """Full turns by -1, 0 or 1 of all joints that are coupled and turn; the others have limits of their own."""
+        shared = (self.matrix != 0).sum(0) > 1
+        coupled = ((self.matrix != 0).sum(1) > 1) | (self.matrix[:, shared] != 0).any(1)
+        choices = [(-1, 0, 1) if both else (0,) for both in np.logical_and(coupled, self.turning).tolist()]
+        return np.array(list(itertools.product(*choices)), dtype=np.float64)
+
+    @property
+    def turning(self) -> tuple[bool, ...]:
+        """For every joint, whether it turns: as the axes do that move it."""
+        return tuple(self.axes[int(np.abs(row).argmax())].type == "revolute" for row in self.matrix)
+
+    def _by_four_bars(self, values: Any, change: Any) -> Any:
+        """The values, those of joints with a linkage changed by it."""
+        if not self.four_bars:
+            return values
+        bars = dict(self.four_bars)
+        columns = [
+            change(bars[j], values[..., j]) if j in bars else values[..., j] for j in range(values.shape[-1])
+        ]
+        return _functions(values).stack(columns, -1)
+
+
+def hull(coupling: Coupling) -> Float64[np.ndarray, "dof 2"]:
+    """Smallest and largest DH value of every joint [rad or m] within the controller's limits."""
+    ends = coupling.matrix[..., None] * np.where(np.isfinite(coupling.limits), coupling.limits, 0.0)
+    unbounded = ((coupling.matrix != 0) & ~np.isfinite(coupling.limits).all(1)).any(1)
+    lower, upper = ends.min(-1).sum(1) + coupling.offset, ends.max(-1).sum(1) + coupling.offset
+    for joint, bar in coupling.four_bars:
+        with np.errstate(invalid="ignore"):  # complained of below
+            lower[joint], upper[joint] = bar.follow(lower[joint]), bar.follow(upper[joint])
+        if not np.isfinite([lower[joint], upper[joint]]).all() or unbounded[joint]:
+            raise RobotError(
+                f"coupling: the four-bar linkage of joint {joint + 1} does not close at all values within the limits "
+                "of the axes that move it; state these limits, or correct its lengths."
+            )
+    return np.stack([np.where(unbounded, -np.inf, lower), np.where(unbounded, np.inf, upper)], 1)
+
+
+def _functions(values: Any) -> Any:
+    """The module whose functions take the values."""
+    if not hasattr(values, "new_tensor"):
+        return np
+    import torch
+
+    return torch
+
+
+def _like(values: Any, constants: np.ndarray) -> Any:
+    """Constants as values are: an array, or a tensor of their type on their device."""
+    return values.new_tensor(constants) if hasattr(values, "new_tensor") else constants
+
+
+def _times(values: Any, matrix: np.ndarray) -> Any:
+    """`matrix · values` along the last axis; what stands alone stays exactly what it is, NaN included."""
+    columns: Sequence[Any] = [
+        sum(
+            (values[..., j] if factor == 1 else factor * values[..., j])
+            for j, factor in enumerate(row.tolist())
+            if factor
+        )
+        for row in matrix
+    ]
+    return _functions(values).stack(columns, -1)
+
+
+def _sides(approach: Any, signs: np.ndarray) -> Any:
+    """Sides +1 or -1 of what moves by a sum of others, where all of these come from sides that agree, else 0."""
+    count = _like(approach, np.abs(signs).sum(1))
+    total = _times(approach, signs)
+    return (abs(total) == count) * total / count.clip(1)

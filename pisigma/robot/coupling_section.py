@@ -1,0 +1,136 @@
+"""Coupled joints as robot files state them, in millimetres and degrees."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from pydantic import Field
+
+from pisigma.errors import RobotError, nearest_choice
+from pisigma.robot.coupling import Coupling, FourBar, hull
+from pisigma.robot.row import LARGEST, Bounded, Row
+from pisigma.yaml_file import Section
+
+
+class FourBarSection(Section):
+    """The lengths of a linkage, and the angle of its crank where factors and offset give 0; see `FourBar`."""
+
+    ground_mm: float = Field(gt=0, le=LARGEST)
+    crank_mm: float = Field(gt=0, le=LARGEST)
+    coupler_mm: float = Field(gt=0, le=LARGEST)
+    rocker_mm: float = Field(gt=0, le=LARGEST)
+    zero_deg: Bounded
+
+    def to_si(self) -> FourBar:
+        """The linkage in SI units."""
+        lengths = (self.ground_mm, self.crank_mm, self.coupler_mm, self.rocker_mm)
+        ground, crank, coupler, rocker = (length / 1e3 for length in lengths)
+        return FourBar(ground, crank, coupler, rocker, float(np.deg2rad(self.zero_deg)))
+
+
+class CoupledJointSection(Section):
+    """How one joint follows the controller's values: `q_dh = f(sum of factor · q_controller + offset)`.
+
+    Attributes:
+        joint: name of its row.
+        factors: by name of a row, how far the joint moves for 1 deg (1 mm) of the controller's value of that name, in
+            the joint's own deg (mm); 0 for those that are not named, the joint's own included.
+        offset_deg: of a joint that turns.
+        offset_mm: of a joint that slides.
+        four_bar: the linkage that drives it, if one does.
+    """
+
+    joint: str
+    factors: dict[str, Bounded] = Field(min_length=1)
+    offset_deg: Bounded = 0.0
+    offset_mm: Bounded = 0.0
+    four_bar: FourBarSection | None = None
+
+
+def coupled(
+    rows: Sequence[Row], sections: Sequence[CoupledJointSection]
+) -> tuple[tuple[Row, ...], Coupling | None]:
+    """Give the rows with the limits of their DH values, and how these follow the controller's.
+
+    A joint that no section names is what the controller counts. One that a section names, but of which no section has
+    a factor, is passive: the controller has no value for it.
+
+    Args:
+        rows: of the robot, with the limits of the controller's values.
+        sections: as in the file.
+
+    Raises:
+        RobotError: a name, unit or factor does not fit; the message says which.
+    """
+    if not sections:
+        return tuple(rows), None
+    joints = [row for row in rows if row.type != "fixed"]
+    names, by_name = [joint.name for joint in joints], {section.joint: section for section in sections}
+    used = {name for section in sections for name, factor in section.factors.items() if factor}
+    for name in (*(section.joint for section in sections), *used):
+        if name not in names:
+            raise RobotError(f"coupling: there is no joint '{name}'; {nearest_choice(name, names)}")
+    if len(by_name) < len(sections):
+        raise RobotError("coupling: a joint has two entries; join them, one per joint.")
+    axes = [joint for joint in joints if joint.name in used or joint.name not in by_name]
+    matrix, offset = np.zeros((len(joints), len(axes))), np.zeros(len(joints))
+    four_bars: list[tuple[int, FourBar]] = []
+    for index, joint in enumerate(joints):
+        section = by_name.get(joint.name, CoupledJointSection(joint=joint.name, factors={joint.name: 1.0}))
+        matrix[index] = [
+            section.factors.get(axis.name, 0.0) * axis.in_file_unit(1.0) / joint.in_file_unit(1.0)
+            if axis.type != joint.type
+            else section.factors.get(axis.name, 0.0)
+            for axis in axes
+        ]
+        offset[index] = _offset(joint, section)
+        if joint not in axes and np.isfinite([joint.lower, joint.upper]).any():
+            raise RobotError(
+                f"coupling: the joint '{joint.name}' is passive, so the controller has no limits for it; remove them."
+            )
+        if section.four_bar is not None:
+            four_bars.append((index, section.four_bar.to_si()))
+    coupling = Coupling(tuple(axes), matrix, offset, tuple(four_bars))
+    limits = iter(hull(coupling).tolist())
+    return tuple(row if row.type == "fixed" else _within(row, *next(limits)) for row in rows), coupling
+
+
+def _within(row: Row, lower: float, upper: float) -> Row:
+    return replace(row, lower=lower, upper=upper)
+
+
+def _offset(joint: Row, section: CoupledJointSection) -> float:
+    """The offset of a joint [rad or m]."""
+    sliding = joint.type == "prismatic"
+    if section.offset_deg if sliding else section.offset_mm or (sliding and section.four_bar):
+        raise RobotError(
+            f"coupling: the joint '{joint.name}' is {joint.type}; state offset_{joint.file_unit} and nothing that "
+            "belongs to the other kind."
+        )
+    return section.offset_mm / 1e3 if sliding else float(np.deg2rad(section.offset_deg))
+
+
+def coupling_document(coupling: Coupling, joints: Sequence[Row]) -> list[dict[str, object]]:
+    """The sections that `coupled` makes a coupling of, as plain values."""
+    result: list[dict[str, object]] = []
+    bars = dict(coupling.four_bars)
+    for index, (joint, factors) in enumerate(zip(joints, coupling.matrix.tolist(), strict=True)):
+        stated = {
+            axis.name: factor
+            * (joint.in_file_unit(1.0) / axis.in_file_unit(1.0) if axis.type != joint.type else 1.0)
+            for axis, factor in zip(coupling.axes, factors, strict=True)
+            if factor
+        }
+        offset = float(coupling.offset[index])
+        if stated == {joint.name: 1.0} and not offset and index not in bars:
+            continue
+        entry: dict[str, object] = {"joint": joint.name, "factors": stated}
+        entry |= {f"offset_{joint.file_unit}": joint.in_file_unit(offset)} if offset else {}
+        if index in bars:
+            bar = bars[index]
+            lengths = ("ground", "crank", "coupler", "rocker")
+            entry["four_bar"] = {f"{name}_mm": getattr(bar, name) * 1e3 for name in lengths} | {
+                "zero_deg": float(np.rad2deg(bar.zero))
+            }
+        result.append(entry)
+    return result
