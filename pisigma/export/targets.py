@@ -16,15 +16,11 @@ from pisigma.export.programs.targets import Targets, targets_of
 from pisigma.export.programs.text import millimetres_and_euler
 from pisigma.inverse.corrected_ik import load
 from pisigma.measurement.csv.poses import read_poses
+from pisigma.planning.plan_file import joint_columns
 from pisigma.robot.row import FRAME_COLUMNS, in_file_units
 
 KINDS = ("joints", "cartesian")
 POSE_COLUMNS = tuple(in_file_units(FRAME_COLUMNS, np.zeros(6)))
-
-
-def joint_columns(targets: Targets) -> list[str]:
-    """The names of the columns of joint values."""
-    return [f"q{i}_{'deg' if turns else 'mm'}" for i, turns in enumerate(targets.robot.revolute, 1)]
 
 
 def sentences(targets: Targets) -> tuple[str, ...]:
@@ -55,8 +51,8 @@ def targets_csv(targets: Targets) -> str:
     """
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("line", "status", "branch", *joint_columns(targets), *POSE_COLUMNS, "sigma_mm"))
-    turns = torch.tensor(targets.robot.revolute)
+    writer.writerow(("line", "status", "branch", *joint_columns(targets.robot), *POSE_COLUMNS, "sigma_mm"))
+    turns = torch.tensor([axis.type == "revolute" for axis in targets.robot.axes])
     q = torch.where(turns, torch.rad2deg(targets.q), targets.q * 1e3)
     pose = millimetres_and_euler(targets.T)
     # The angles of a matrix of NaN are finite where the functions are made safe, so the gaps come from q.

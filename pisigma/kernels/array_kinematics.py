@@ -6,6 +6,7 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 from weakref import WeakKeyDictionary
 
@@ -38,6 +39,8 @@ def forward_kinematics(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
     Raises:
         PoseError: q has another number of columns than the robot has joints.
     """
+    if robot.coupling is not None:
+        q = robot.to_dh(q if is_tensor(q) else np.asarray(q, dtype=np.float64))
     chain = _chain(robot, q)
     if chain is not None:
         return chain.move(q, False)[0]
@@ -62,6 +65,12 @@ def joint_jacobian(robot: "pisigma.robot.description.Robot", q: Any) -> Any:
     Raises:
         PoseError: q has another number of columns than the robot has joints.
     """
+    if robot.coupling is not None:
+        values = robot.to_dh(q) if is_tensor(q) else robot.to_dh(np.asarray(q, dtype=np.float64))
+        slope = robot.coupling.slope(q)
+        return joint_jacobian(replace(robot, coupling=None), values) @ (
+            q.new_tensor(slope) if is_tensor(q) else slope
+        )
     chain = _chain(robot, q)
     if chain is not None:
         return chain.move(q, True)[1]

@@ -23,8 +23,8 @@ def wrap_into_limits(
     """Move revolute joints that are outside their limits by full turns where that brings them inside.
 
     Args:
-        robot: the robot, for the limits.
-        q: joint values [rad or m], as the controller counts; NaN stays NaN.
+        robot: the robot, for the limits; where joints are coupled, those of the controller's values.
+        q: joint values [rad or m]; NaN stays NaN.
 
     Returns:
         The joint values, and whether all joints of a pose are inside (False where one is NaN). A value that
@@ -38,4 +38,12 @@ def wrap_into_limits(
     down = torch.where(q > upper, torch.ceil((q - upper) / (2 * torch.pi)), 0.0)
     moved = q + (up - down) * turn
     inside = (moved >= lower) & (moved <= upper)
-    return torch.where(inside, moved, q), inside.all(-1)
+    moved, every = torch.where(inside, moved, q), inside.all(-1)
+    if robot.coupling is None:
+        return moved, every
+    turned, allowed = robot.coupling.turned_inside(
+        moved.detach().double().cpu().numpy().reshape(-1, robot.dof)
+    )
+    return torch.from_numpy(turned).to(q).reshape(q.shape), every & torch.from_numpy(allowed).to(
+        every
+    ).reshape(every.shape)

@@ -4,7 +4,7 @@ import hashlib
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -252,7 +252,8 @@ class Measurements:
 
         Args:
             path: the file.
-            robot: checks number, units and limits of the joints; None checks none of them.
+            robot: checks number, units and limits of the joints and, where these are coupled, turns the controller's
+                values in the file into theirs; None takes the values as they stand.
             on_bad_row: "error", or "leave_out" to go on without it and to report it in `left_out`.
 
         Raises:
@@ -270,7 +271,8 @@ class Measurements:
 
         Args:
             path: the file; written whole or not at all.
-            robot: says which joints turn (degrees) and which slide (millimetres).
+            robot: says which joints turn (degrees) and which slide (millimetres); of coupled joints the controller's
+                values are written.
             revolute: the same per joint, without a robot; with neither, all joints turn.
 
         Raises:
@@ -281,12 +283,19 @@ class Measurements:
         origin = "'revolute'" if robot is None else f"robot '{robot.name}'"
         turning = (True,) * self.dof if revolute is None else tuple(revolute)
         turning = turning if robot is None else robot.revolute
+        written = self.as_fields()
         if len(turning) != self.dof:
             raise MeasurementError(
                 f"{self.source}: has {self.dof} joints, but {origin} has {len(turning)}; give the robot that was "
                 "measured."
             )
-        write_fields(self.as_fields(), path, turning)
+        if robot is not None and robot.coupling is not None:
+            values = {"q": robot.to_controller(self.q)}
+            if self.approach is not None:
+                values["approach"] = robot.coupling.approach_to_controller(self.approach)
+            written = replace(written, numbers={**written.numbers, **values})
+            turning = tuple(axis.type == "revolute" for axis in robot.axes)
+        write_fields(written, path, turning)
 
 
 def join(data: Sequence[Measurements]) -> Measurements:

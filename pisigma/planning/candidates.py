@@ -79,8 +79,8 @@ def draw_candidates(arm: ArmInCell, count: int, seed: int, workspace: Workspace 
     q = limits.new_zeros((0, arm.robot.dof))
     faults = _faults(arm, q, workspace)
     while len(q) < MOST_DRAWS * count and int(faults.allowed.sum()) < count:
-        draws = torch.rand(count, arm.robot.dof, generator=generator, dtype=torch.float64)
-        drawn = limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws
+        draws = torch.rand(count, len(limits), generator=generator, dtype=torch.float64)
+        drawn = arm.robot.to_dh(limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws)
         q = torch.cat([q, drawn])
         faults = replace(faults, failed=torch.cat([faults.failed, _faults(arm, drawn, workspace).failed]))
     enough = (
@@ -151,10 +151,10 @@ def _allowed(q: Float64[Tensor, "poses dof"], faults: Faults) -> Candidates:
     return Candidates(q[faults.allowed], faults.allowed.nonzero()[:, 0] + 1, len(q), faults.counts())
 
 
-def _drawn_range(arm: ArmInCell) -> Float64[Tensor, "dof 2"]:
-    """Lowest and highest joint values that are drawn [rad or m]."""
+def _drawn_range(arm: ArmInCell) -> Float64[Tensor, "axes 2"]:
+    """Lowest and highest of the controller's values that are drawn [rad or m]."""
     limits = arm.limits.clone()
-    for index, (joint, (lower, upper)) in enumerate(zip(arm.robot.joints, arm.limits.tolist(), strict=True)):
+    for index, (joint, (lower, upper)) in enumerate(zip(arm.robot.axes, arm.limits.tolist(), strict=True)):
         if joint.type == "revolute" and upper - lower > 2 * np.pi:
             middle = (lower + upper) / 2 if np.isfinite([lower, upper]).all() else 0.0
             limits[index] = torch.tensor([max(lower, middle - np.pi), min(upper, middle + np.pi)])

@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float64, Int64
 from pydantic import Field
@@ -23,7 +22,8 @@ from pisigma.planning.cell.cell import Cell
 from pisigma.planning.knowledge import Instrument
 from pisigma.planning.plan_settings import FILES, PlanSettings
 from pisigma.robot.description import Robot
-from pisigma.robot.robot_file import Bounded, RobotDocument
+from pisigma.robot.robot_file import RobotDocument
+from pisigma.robot.row import Bounded
 from pisigma.robot.writing import robot_document
 from pisigma.yaml_file import Section, read_yaml, yaml_text
 
@@ -108,13 +108,11 @@ class StoredPlan:
         write_whole(yaml_of(path), yaml_text(self._document(path)))
 
     def _in_file_units(self, q: Float64[Tensor, "poses dof"]) -> list[list[float]]:
-        """Joint values in deg or mm, with the digits that controllers take."""
+        """The controller's values in deg or mm, with the digits that controllers take."""
+        robot = self.arm.robot
         return [
-            [
-                round(joint.in_file_unit(value), 6)
-                for joint, value in zip(self.arm.robot.joints, row, strict=True)
-            ]
-            for row in q.tolist()
+            [round(axis.in_file_unit(value), 6) for axis, value in zip(robot.axes, row, strict=True)]
+            for row in robot.to_controller(q).tolist()
         ]
 
     def _document(self, path: Path) -> dict[str, Any]:
@@ -133,8 +131,8 @@ class StoredPlan:
 
 
 def joint_columns(robot: Robot) -> list[str]:
-    """Columns of the joint values in files, such as q1_deg."""
-    return [f"q{number}_{joint.file_unit}" for number, joint in enumerate(robot.joints, start=1)]
+    """Columns of the controller's values in files, such as q1_deg."""
+    return [f"q{number}_{axis.file_unit}" for number, axis in enumerate(robot.axes, start=1)]
 
 
 def yaml_of(path: Path) -> Path:
@@ -162,9 +160,8 @@ def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
     poses = file.parent / document.poses
     table, q = read_table(poses), read_joints(poses, arm.robot)
     order = _numbers(table, "order")
-    scale = torch.tensor(
-        [np.pi / 180 if turns else 1e-3 for turns in arm.robot.revolute], dtype=torch.float64
-    )
+    axes = arm.robot.axes
+    scale = torch.tensor([axis.from_file_unit(1.0) for axis in axes], dtype=torch.float64)
     return StoredPlan(
         arm,
         document.settings.with_files_from(file.parent),
@@ -173,10 +170,13 @@ def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
         torch.tensor([name == "test" for name in _cells(table, "set")]),
         torch.tensor(_numbers(table, "candidate")),
         tuple(
-            torch.tensor(
-                [point.joints for point in document.way_points if point.before == number], dtype=torch.float64
-            ).reshape(-1, arm.robot.dof)
-            * scale
+            arm.robot.to_dh(
+                torch.tensor(
+                    [point.joints for point in document.way_points if point.before == number],
+                    dtype=torch.float64,
+                ).reshape(-1, len(axes))
+                * scale
+            )
             for number in order
         ),
     )

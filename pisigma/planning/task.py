@@ -68,5 +68,5 @@ def read_task(path: str | os.PathLike[str], model: CalibratedModel) -> Float64[T
     for line, status in zip(poses.line, map(Status, solution.status.tolist()), strict=True):
         if status not in REACHED:
             raise PlanningError(f"{path}, line {line}: {status.name.lower()}. {status.sentence}")
-    q: Tensor = torch.as_tensor(solution.q)
+    q: Tensor = model.robot.to_dh(torch.as_tensor(solution.q))
     return q

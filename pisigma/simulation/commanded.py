@@ -11,7 +11,7 @@ from pisigma.kinematics.joint_limits import wrap_into_limits, wrapped_difference
 from pisigma.kinematics.numeric import solve_numeric
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
-from pisigma.simulation.errors.source import joint_values
+from pisigma.simulation.errors.source import stated_joints
 from pisigma.simulation.poses import JointsRandom, WhereToMeasure
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.yaml_file import Section
@@ -93,10 +93,12 @@ class BranchSection(Section):
         return _nearest(solutions, robot, near, reached).nan_to_num(), reached.any(-1)
 
     def _near(self, robot: Robot) -> Float64[Tensor, " dof"]:
-        """The joint values to be near to [rad or m]."""
+        """The joint values to be near to [rad or m], which are stated as the controller counts."""
         fields = ("near_deg", "near_mm")
-        stated = torch.from_numpy(joint_values(robot, self.near_deg or {}, self.near_mm, fields, "branch"))
-        return torch.where(torch.tensor(robot.revolute), torch.deg2rad(stated), stated / 1e3)
+        stated = stated_joints(robot, self.near_deg or {}, self.near_mm, fields, "branch", axes=True)
+        values = [axis.from_file_unit(stated.get(index, 0.0)) for index, axis in enumerate(robot.axes)]
+        near: Tensor = robot.to_dh(torch.tensor(values, dtype=torch.float64))
+        return near
 
     def _solutions(
         self, solver: AbstractClosedForm | None, robot: Robot, T: Float64[Tensor, "poses 4 4"]

@@ -94,7 +94,7 @@ class JointsRandom(Section):
     range_mm: dict[str, Range] = Field(default_factory=dict)
 
     def joints(self, robot: Robot) -> Float64[Tensor, "count dof"]:
-        """Joint values to command [rad or m], as the controller counts; the same at every call.
+        """Joint values to command [rad or m], drawn as the controller counts; the same at every call.
 
         Raises:
             RecipeError: an unknown joint, a range in the wrong unit or outside the limits, or no limits at
@@ -102,18 +102,21 @@ class JointsRandom(Section):
         """
         bounds = torch.from_numpy(self._bounds(robot))
         generator = torch.Generator().manual_seed(self.seed)
-        draws = torch.rand(self.count, robot.dof, generator=generator, dtype=torch.float64)
-        return bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) * draws
+        draws = torch.rand(self.count, len(bounds), generator=generator, dtype=torch.float64)
+        q: Tensor = robot.to_dh(bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) * draws)
+        return q
 
-    def _bounds(self, robot: Robot) -> Float64[np.ndarray, "dof 2"]:
+    def _bounds(self, robot: Robot) -> Float64[np.ndarray, "axes 2"]:
+        limits = robot.axis_limits
         with np.errstate(invalid="ignore"):  # joints without limits are complained of below
-            middle, half = robot.limits.mean(1, keepdims=True), np.diff(robot.limits) / 2
+            middle, half = limits.mean(1, keepdims=True), np.diff(limits) / 2
             bounds: np.ndarray = middle + self.share * half * np.array([-1.0, 1.0])
         fields = ("range_deg", "range_mm")
-        ranges = stated_joints(robot, self.range_deg, self.range_mm, fields, "joints_random")
+        ranges = stated_joints(robot, self.range_deg, self.range_mm, fields, "joints_random", axes=True)
         for index, stated in ranges.items():
-            bounds[index] = np.deg2rad(stated) if robot.revolute[index] else np.array(stated) / 1e3
-        for joint, (lower, upper) in zip(robot.joints, bounds, strict=True):
+            turns = robot.axes[index].type == "revolute"
+            bounds[index] = np.deg2rad(stated) if turns else np.array(stated) / 1e3
+        for joint, (lower, upper) in zip(robot.axes, bounds, strict=True):
             if not np.isfinite([lower, upper]).all():
                 raise RecipeError(
                     f"joints_random: joint '{joint.name}' of robot '{robot.name}' has no limits; "

@@ -244,11 +244,11 @@ def check_program(path: Path, robot: Robot, cartesian: bool, config: str | None)
     """
     language = LANGUAGES[path.suffix.lower()]
     language.program_name(path)
-    if robot.dof != 6 or not all(robot.revolute):
-        turning = sum(robot.revolute)
+    turning = sum(axis.type == "revolute" for axis in robot.axes)
+    if len(robot.axes) != 6 or turning != 6:
         raise OutputError(
             f"{path}: {language.name} programs are written for robots with six joints that turn; robot "
-            f"'{robot.name}' has {turning} that turn and {robot.dof - turning} that slide. Take a .csv file."
+            f"'{robot.name}' has {turning} that turn and {len(robot.axes) - turning} that slide. Take a .csv file."
         )
     needed = language.configuration if cartesian else None
     if needed is None:

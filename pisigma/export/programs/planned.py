@@ -35,6 +35,11 @@ def planned_program(plan: StoredPlan, path: Path) -> str:
     title = f"{len(plan.q)} planned poses of robot {robot.name}, by pisigma {__version__}."
     heading = [title, TEST, COUNTING.format(robot=robot.name)]
     program = Program(
-        language.program_name(path), robot, heading, torch.stack(q), tuple(labels), tuple(waits)
+        language.program_name(path),
+        robot,
+        heading,
+        robot.to_controller(torch.stack(q)),
+        tuple(labels),
+        tuple(waits),
     )
     return language.write(program)

@@ -128,7 +128,7 @@ def targets_of(solution: Solution, source: str, line: tuple[int, ...], accuracy:
         status=status,
         branch=tuple(solution.branches[index] for index in solution.branch.tolist()),
         q=q,
-        T=forward_kinematics(model.robot, q).where(has_target[:, None, None], torch.nan),
+        T=forward_kinematics(model.robot, model.robot.to_dh(q)).where(has_target[:, None, None], torch.nan),
         deviation=deviation.double().where(has_target, torch.nan),
         remarks=(*condition_remarks(model), *frame_remarks(model)),
     )

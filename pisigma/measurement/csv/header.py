@@ -163,12 +163,12 @@ def _check_one_unit(place: str, columns: list[Column]) -> None:
 
 def _check_robot(place: str, joints: list[Column], robot: Robot) -> None:
     """The joint columns fit the robot's joints."""
-    if len(joints) != robot.dof:
+    if len(joints) != len(robot.axes):
         raise MeasurementError(
             f"{place}, column '{joints[-1].name}': the file ends with joint {len(joints)}, but robot '{robot.name}' "
-            f"has {robot.dof} joints; choose the robot that was measured or correct the columns."
+            f"has {len(robot.axes)} joints; choose the robot that was measured or correct the columns."
         )
-    for column, joint in zip(joints, robot.joints, strict=True):
+    for column, joint in zip(joints, robot.axes, strict=True):
         units = REVOLUTE_UNITS if joint.type == "revolute" else PRISMATIC_UNITS
         if column.unit not in units:
             choices = " or ".join(f"{column.quantity}_{unit}" for unit in units)

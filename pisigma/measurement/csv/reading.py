@@ -48,7 +48,8 @@ def read_fields(
 
     Args:
         path: the file.
-        robot: checks number, units and limits of the joints; None checks none of them.
+        robot: checks number, units and limits of the joints and, where these are coupled, turns the controller's values
+            into theirs; None takes the values as they stand.
         on_bad_row: "error" to raise at the first row that cannot be used, "leave_out" to go on without such
             rows and to list them in `left_out`.
 
@@ -104,6 +105,10 @@ def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFi
         for name, values in sound.numbers.items()
         if name == "q" or not bool(values.isnan().all())
     }
+    if robot is not None and robot.coupling is not None:
+        numbers["q"] = robot.to_dh(numbers["q"])
+        if "approach" in numbers:
+            numbers["approach"] = robot.coupling.approach_to_dh(numbers["approach"])
     left_out = tuple(LeftOut(table.lines[row], faults.reasons[row]) for row in sorted(faults.reasons))
     return replace(sound, numbers=numbers, left_out=left_out)
 
@@ -157,35 +162,39 @@ def _fields(table: Table, layout: Layout, rows: CheckedRows) -> MeasuredFields:
 def read_joints(path: str | os.PathLike[str], robot: Robot) -> Float64[Tensor, "rows dof"]:
     """Read the columns `q1_deg` or `q1_rad` and so on (prismatic: `q3_mm` or `q3_m`); other columns are not looked at.
 
+    They hold the controller's values; what is given back are the joint values of the rows.
+
     Files of measurements have these columns, and those that `pisigma ik` writes.
 
     Raises:
         MeasurementError: the file or a joint's cell cannot be used; the message names file, line and column.
     """
     table = read_table(path)
-    columns = [_joint_column(table, number, robot) for number in range(robot.dof)]
-    more = [name for name in table.header if (column := find_column(name)) and column.joint == robot.dof + 1]
+    axes = len(robot.axes)
+    columns = [_joint_column(table, number, robot) for number in range(axes)]
+    more = [name for name in table.header if (column := find_column(name)) and column.joint == axes + 1]
     if more:
         raise MeasurementError(
-            f"{table.source}, line {table.header_line}, column '{more[0]}': robot '{robot.name}' has {robot.dof} "
+            f"{table.source}, line {table.header_line}, column '{more[0]}': robot '{robot.name}' has {axes} "
             "joints only; give joint values of this robot."
         )
-    values = np.empty((len(table.lines), robot.dof))
+    values = np.empty((len(table.lines), axes))
     for number, column in enumerate(columns):
         place = table.header.index(column.name)
         values[:, number] = to_si(_numbers(table, place), column.unit)
-    return torch.from_numpy(values)
+    return torch.from_numpy(robot.to_dh(values))
 
 
 def _joint_column(table: Table, number: int, robot: Robot) -> Column:
     """The column of a joint."""
-    units = REVOLUTE_UNITS if robot.revolute[number] else PRISMATIC_UNITS
+    axis = robot.axes[number]
+    units = REVOLUTE_UNITS if axis.type == "revolute" else PRISMATIC_UNITS
     wanted = [f"q{number + 1}_{unit}" for unit in units]
     there = [name for name in table.header if name in wanted]
     if len(there) != 1:
         what = "is no column" if not there else "are two columns"
         raise MeasurementError(
-            f"{table.source}, line {table.header_line}: there {what} for joint '{robot.joints[number].name}' of "
+            f"{table.source}, line {table.header_line}: there {what} for joint '{axis.name}' of "
             f"robot '{robot.name}'; give one, {' or '.join(wanted)}."
         )
     column = find_column(there[0])

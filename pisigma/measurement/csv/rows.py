@@ -125,7 +125,7 @@ def _check_joints(values: _Values, layout: Layout, robot: Robot | None, faults: 
         empty = f"column '{column.name}': the cell is empty; every row needs all joints"
         faults.add((row, empty) for row in rows_where(np.isnan(q)))
         if robot is not None:
-            _check_limits(q, column, robot.joints[number], robot.name, faults)
+            _check_limits(q, column, robot.axes[number], robot.name, faults)
 
 
 def _check_limits(

@@ -61,7 +61,7 @@ class ArmInCell:
         pairs: of pieces of links that may touch each other.
         beside: pieces that must not stand in the tracker's beam: none of the link with the reflector, and none that
             is so near to the reflector that it touches every beam.
-        limits: of the joints, with their margins [rad or m].
+        limits: of the controller's values, with their margins [rad or m].
     """
 
     drawn: Robot
@@ -70,7 +70,7 @@ class ArmInCell:
     capsules: Capsules
     pairs: Int64[Tensor, "pairs 2"]
     beside: Int64[Tensor, " pieces"]
-    limits: Float64[Tensor, "dof 2"]
+    limits: Float64[Tensor, "axes 2"]
 
     @staticmethod
     def of(robot: Robot, cell: Cell | None = None) -> "ArmInCell":
@@ -122,7 +122,8 @@ class ArmInCell:
 
     def _faults(self, q: Float64[Tensor, "poses dof"]) -> dict[str, Bool[Tensor, " poses"]]:
         segments = self.capsules.segments(q)
-        outside = (q < self.limits[:, 0] - LIMIT_TOLERANCE) | (q > self.limits[:, 1] + LIMIT_TOLERANCE)
+        values, (lower, upper) = self.robot.to_controller(q), self.limits.t()
+        outside = (values < lower - LIMIT_TOLERANCE) | (values > upper + LIMIT_TOLERANCE)
         faults = {"a joint is outside its limits or their margin": outside.any(-1)}
         faults |= {reason: gap < 0 for reason, gap in self._gaps(segments).items()}
         if self.cell.tracker is not None:

@@ -12,7 +12,8 @@ from torch import Tensor
 from pisigma.errors import PlanningError, RecipeError, nearest_choice
 from pisigma.planning.cell.capsules import TOOL_RADIUS, Capsules
 from pisigma.robot.description import Robot
-from pisigma.robot.robot_file import Bounded, FrameSection, Limits
+from pisigma.robot.robot_file import FrameSection, Limits
+from pisigma.robot.row import Bounded
 from pisigma.se3 import rotation_from_rpy, transform_from_xyzrpy, xyzrpy_from_transform
 from pisigma.simulation.errors.source import stated_joints
 from pisigma.yaml_file import Section, line_of, read_yaml
@@ -37,17 +38,17 @@ class JointSection(Section):
     limits_deg: dict[str, Limits] = Field(default_factory=dict)
     limits_mm: dict[str, Limits] = Field(default_factory=dict)
 
-    def limits(self, robot: Robot) -> Float64[Tensor, "dof 2"]:
-        """Lowest and highest joint values that are allowed [rad or m]; infinite where there is no limit.
+    def limits(self, robot: Robot) -> Float64[Tensor, "axes 2"]:
+        """Lowest and highest of the controller's values that are allowed [rad or m]; infinite where there is no limit.
 
         Raises:
             RecipeError: a name is no joint, or one of the other kind.
             PlanningError: nothing is left of a joint's range.
         """
         fields = ("limits_deg", "limits_mm")
-        stated = stated_joints(robot, self.limits_deg, self.limits_mm, fields, "joints")
-        limits = robot.limits.copy()
-        for index, joint in enumerate(robot.joints):
+        stated = stated_joints(robot, self.limits_deg, self.limits_mm, fields, "joints", axes=True)
+        limits = robot.axis_limits
+        for index, joint in enumerate(robot.axes):
             to_si = (
                 np.deg2rad
                 if joint.type == "revolute"

@@ -136,6 +136,7 @@ def stated_joints(
     for_prismatic: Mapping[str, Value],
     fields: tuple[str, str],
     place: str,
+    axes: bool = False,
 ) -> dict[int, Value]:
     """What the two mappings of a recipe state, by index of the joint.
 
@@ -145,16 +146,18 @@ def stated_joints(
         for_prismatic: values of prismatic joints, by name.
         fields: how the recipe calls the two mappings, revolute first.
         place: where in the recipe, for complaints.
+        axes: whether the values are of what the controller commands, `robot.axes`, and not of the joints.
 
     Raises:
         RecipeError: an unknown joint, or one in the mapping of the other type.
     """
     values: dict[int, Value] = {}
+    joints = robot.axes if axes else robot.joints
     kinds = ((for_revolute, *fields, "revolute"), (for_prismatic, *fields[::-1], "prismatic"))
     for mapping, field, other, kind in kinds:
         for name, value in mapping.items():
-            index = joint_index(robot, name, place)
-            actual = robot.joints[index].type
+            index = _index(robot, [joint.name for joint in joints], name, "joint", place)
+            actual = joints[index].type
             if actual != kind:
                 raise RecipeError(
                     f"{place}: joint '{name}' is {actual}, so state it in {other}, not in {field}."
