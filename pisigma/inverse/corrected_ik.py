@@ -18,6 +18,7 @@ if TYPE_CHECKING:  # names in full, which type checkers at run time find without
     import pytorch_kinematics
 
     import pisigma.inverse.compiled_ik
+    import pisigma.inverse.controller_values
     import pisigma.inverse.path
     import pisigma.inverse.reference
     import pisigma.inverse.solution
@@ -41,7 +42,11 @@ class CorrectedIK:
         revolute: `(dof,)`: which joints turn.
         closed_form: whether the nominal robot has a closed-form inverse, so that all branches are known.
         warnings: sentences on conditions of `under` that lie beyond those of the calibration.
+        controller: of coupled joints, what turns the controller's values, which are taken and given, into those of the
+            joints; else None.
     """
+
+    controller: "pisigma.inverse.controller_values.ControllerValues | None"
 
     def __init__(self, model: "pisigma.model.calibrated_model.CalibratedModel") -> None:
         """Prepare a model for calls.
@@ -61,6 +66,15 @@ class CorrectedIK:
         self.warnings = condition_warnings(model)
         self.model, self.reference = model, route
         self._read: Callable[[], pisigma.model.calibrated_model.CalibratedModel] = lambda: model
+        self.controller = None
+        if model.robot.coupling is not None:
+            from pisigma.inverse.controller_values import ControllerValues
+
+            axes = model.robot.axes
+            of_joints = replace(model, robot=replace(model.robot, coupling=None))
+            self.controller = ControllerValues(CorrectedIK(of_joints), model.robot.coupling)
+            self.joints, self.limits = tuple(axis.name for axis in axes), model.robot.axis_limits
+            self.revolute = np.array([axis.type == "revolute" for axis in axes])
 
     @classmethod
     def _of_kernels(
@@ -74,7 +88,7 @@ class CorrectedIK:
         ik.name, ik.branches, ik.joints = kernels.name, kernels.branches, kernels.joints
         ik.order = tuple(int(index) for index in form.order)
         ik.limits, ik.revolute = arms.limits, np.asarray(arms.revolute, dtype=bool)
-        ik.warnings = ()
+        ik.warnings, ik.controller = (), None
         ik.closed_form = bool(kernels.description.forms.closed_forms)
         ik._read, ik.compiled = read, kernels
         return ik
@@ -140,6 +154,8 @@ class CorrectedIK:
         if near is not None:
             near = self.postures.checked(near, throw)
         approach = checked_approach(approach)
+        if self.controller is not None:
+            return self.controller.solve(T_base_tool, near, self, branch, throw=throw, approach=approach)
         kernels = self.compiled
         if isinstance(T_base_tool, np.ndarray) and T_base_tool.shape == (4, 4) and kernels is not None:
             return kernels.solve(T_base_tool, near, branch, throw, approach, self)  # the way of control loops
@@ -159,8 +175,10 @@ class CorrectedIK:
 
     def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> "pisigma.inverse.solution.Solution":
         """Solutions on every branch, as `(*batch, branches)`; one for a robot without closed-form inverse."""
-        T, single = pose_array(T_base_tool)
         approach = checked_approach(approach)
+        if self.controller is not None:
+            return self.controller.all_branches(T_base_tool, self, approach=approach)
+        T, single = pose_array(T_base_tool)
         if self.compiled is None:
             return self._like(T_base_tool, self.reference.all_branches(T, approach=approach, single=single))
         every = self.compiled.all_branches(T, approach=approach, single=single, owner=self)
@@ -197,6 +215,8 @@ class CorrectedIK:
                 where torch evaluates the arm.
         """
         approach = checked_approach(approach)
+        if self.controller is not None:
+            return self.controller.forward(q, approach)
         kernels = self._kernels_of(q)
         if kernels is None and approach is not None:
             raise PoseError("approach is read with arrays of models that have kernels; give q as an array.")
@@ -212,6 +232,8 @@ class CorrectedIK:
         The slope of the correction, some 1e-3, is left out. For the arguments see `forward`; a network that corrects
         nominal joint values is left out too.
         """
+        if self.controller is not None:
+            return self.controller.jacobian(q)
         kernels = self._kernels_of(q, forward=False)
         if kernels is None:
             return by_torch(self.model.jacobian, q)
@@ -243,6 +265,8 @@ class CorrectedIK:
         """
         from pisigma.model.accuracy import position_accuracy
 
+        if self.controller is not None:
+            return self.controller.accuracy(q)
         return by_torch(partial(position_accuracy, self.model), q)
 
     def to_pytorch_kinematics(self) -> "pytorch_kinematics.SerialChain":

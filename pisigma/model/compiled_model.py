@@ -53,8 +53,14 @@ def describe(model: CalibratedModel) -> tuple[arrays.Description, tuple[str, ...
 
     Raises:
         ModelError: the model has a network and an identified geometry, its learned correction uses features without
-            compiled form, or it has neither a closed-form inverse nor joint values to start from.
+            compiled form, it has neither a closed-form inverse nor joint values to start from, or its joints are
+            coupled: kernels take DH values, which nobody should command.
     """
+    if model.robot.coupling is not None:
+        raise ModelError(
+            f"model '{model.name}': its joints are coupled, which compiled models do not know; use pisigma.load, which "
+            "turns the controller's values into those of the joints."
+        )
     if model.network is not None and model.calibrated is not None:
         raise ModelError(
             f"model '{model.name}': it has an identified geometry and a network that corrects nominal joint values, "
