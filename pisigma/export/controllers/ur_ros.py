@@ -14,7 +14,7 @@ from pisigma.export.controllers.universal_robots import JOINTS, check_robot, wit
 from pisigma.export.dh_table import head
 from pisigma.robot.chains import joint_origins, robot_of_origins
 from pisigma.robot.description import Robot
-from pisigma.robot.robot_file import Bounded
+from pisigma.robot.row import Bounded
 from pisigma.robot.urdf_frames import Frame, frame_of, xyzrpy_of
 from pisigma.yaml_file import Section, parse_yaml, yaml_text
 
