@@ -56,7 +56,7 @@ class BinaryFrames(AbstractProtocol):
         """
         count = len(received)
         if not MAGIC.startswith(received[:4]):
-            raise BrokenStreamError(_refusal(0, Refusal.BROKEN_FRAME))
+            raise BrokenStreamError(self.broken())
         if count < HEAD.size:
             return 0
         _, length, name, _, flags = HEAD.unpack_from(received)
@@ -78,6 +78,10 @@ class BinaryFrames(AbstractProtocol):
         if model.quick:
             return self._solve(model, message, name, begun)
         return lambda: self._solve(model, message, name, begun)
+
+    def broken(self) -> bytes:
+        """Say that what came is no frame."""
+        return _refusal(0, Refusal.BROKEN_FRAME)
 
     def token_of(self, message: bytes) -> bytes | None:
         """What stands behind the head of a frame with the flag `TOKEN`."""

@@ -69,8 +69,7 @@ class JsonLines(AbstractProtocol):
         """
         length = received.find(b"\n") + 1
         if length > LONGEST_LINE or (not length and len(received) > LONGEST_LINE):
-            words = f"the line is longer than {LONGEST_LINE} bytes; send a path in pieces."
-            raise BrokenStreamError(_line({"id": None, "error": words}))
+            raise BrokenStreamError(self.broken())
         return length
 
     def answer(self, message: bytes) -> Reply:
@@ -86,6 +85,11 @@ class JsonLines(AbstractProtocol):
             return lambda: self._carry_out(request, job, begun)
         return self._carry_out(request, job, begun)
 
+    def broken(self) -> bytes:
+        """Say that what came is no line."""
+        words = f"this is no line, or one that is longer than {LONGEST_LINE} bytes; send a path in pieces."
+        return _line({"id": None, "error": words})
+
     def token_of(self, message: bytes) -> bytes | None:
         """The token of `{"token": "..."}`."""
         try:
@@ -99,7 +103,8 @@ class JsonLines(AbstractProtocol):
         """Say whether the token was the right one."""
         if admitted:
             return _line({"status": "admitted"})
-        return _line({"id": None, "error": 'the first line has to be {"token": "..."} with the right token.'})
+        words = 'the token is missing or wrong; send {"token": "..."} as the first line, by ZeroMQ in every message.'
+        return _line({"id": None, "error": words})
 
     def _job(self, request: dict[str, Any]) -> tuple[Callable[[], tuple[str, dict[str, Any]]], bool]:
         """What gives the status and the values of an answer, and whether that takes its time.

@@ -36,6 +36,10 @@ class AbstractProtocol(ABC):
         """Answer one whole message; whatever it holds, nothing is raised."""
 
     @abstractmethod
+    def broken(self) -> bytes:
+        """Say that what came is no message."""
+
+    @abstractmethod
     def token_of(self, message: bytes) -> bytes | None:
         """The token that a first message holds; None where it holds none."""
 

@@ -19,6 +19,7 @@ from pisigma.serve.json_lines import JsonLines
 from pisigma.serve.metrics import Metrics
 from pisigma.serve.models import ServedModels
 from pisigma.serve.protocol import AbstractProtocol
+from pisigma.serve.zeromq import ZeroMq
 
 MOST_CONNECTIONS = 512
 PATIENCE = 10.0
@@ -35,6 +36,7 @@ class ServeSettings:
         host: address of this machine; at 127.0.0.1 only programs of this machine reach it.
         json_port: for lines of JSON; 0 for a free one.
         binary_port: for binary frames; 0 for a free one.
+        zmq_port: for ZeroMQ; 0 for a free one, None for none.
         token: that every client has to send first; wanted where the host is not of the loopback.
         patience: see `PATIENCE`.
     """
@@ -42,6 +44,7 @@ class ServeSettings:
     host: str = "127.0.0.1"
     json_port: int = 0
     binary_port: int = 0
+    zmq_port: int | None = None
     token: str | None = None
     patience: float = PATIENCE
 
@@ -52,6 +55,7 @@ class Server:
     Attributes:
         json_port: where lines of JSON are answered.
         binary_port: where binary frames are answered.
+        zmq: the answers over ZeroMQ, if they are wanted.
         metrics: what was answered.
     """
 
@@ -60,6 +64,7 @@ class Server:
 
         Raises:
             OutputError: the host is no address of this machine, a port is taken, or a token is wanted and missing.
+            ImportError: pyzmq is wanted and not installed.
         """
         check_host(settings)
         self.metrics = Metrics()
@@ -71,7 +76,8 @@ class Server:
         try:
             self.json_port = self._listen(settings.json_port, JsonLines(models, self.metrics))
             self.binary_port = self._listen(settings.binary_port, BinaryFrames(models, self.metrics))
-        except OutputError:
+            self.zmq = None if settings.zmq_port is None else self._zmq(settings.zmq_port)
+        except (OutputError, ImportError):
             self._listen_no_more()
             self._selector.close()
             raise
@@ -81,6 +87,12 @@ class Server:
         self._wake.setblocking(False)
         self._selector.register(self._woken, selectors.EVENT_READ, self._take_ready)
         self._slow = ThreadPoolExecutor(1, "slow answers")
+
+    @property
+    def ports(self) -> dict[str, int]:
+        """Where the server listens, by protocol."""
+        ports = {"json_port": self.json_port, "binary_port": self.binary_port}
+        return ports if self.zmq is None else ports | {"zmq_port": self.zmq.port}
 
     def run(self) -> None:
         """Answer until `stop`, then finish what was begun."""
@@ -111,6 +123,9 @@ class Server:
                 report(problem)
 
         self._slow.submit(load)
+
+    def _zmq(self, port: int) -> ZeroMq:
+        return ZeroMq(self._models, self.metrics, self._settings.host, port, self._token)
 
     def _listen(self, port: int, protocol: AbstractProtocol) -> int:
         """Have a protocol answered at a port; gives the port."""
@@ -187,6 +202,8 @@ class Server:
     def _finish(self) -> None:
         """Answer what has come in whole, then close everything."""
         self._listen_no_more()
+        if self.zmq is not None:
+            self.zmq.close()
         for connection in self._connections:
             connection.end()
         until = time.monotonic() + LAST

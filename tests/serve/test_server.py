@@ -47,7 +47,7 @@ def test_nothing_is_answered_before_the_token(kiro4):
             assert client.solve([1.0] * 16)[0] == 6
         for token in (None, "Secret", ""):
             with (
-                pytest.raises(RuntimeError, match="the first line has to be"),
+                pytest.raises(RuntimeError, match="the token is missing or wrong"),
                 json_client(server, token=token) as client,
             ):
                 client.ask(pose=POSE)

@@ -23,6 +23,12 @@ Port = Annotated[
     int, typer.Option("--port", min=0, max=65535, help="Port for lines of JSON; 0 for a free one.")
 ]
 BinaryPort = Annotated[int, typer.Option(min=0, max=65535, help="Port for binary frames; 0 for a free one.")]
+ZmqPort = Annotated[
+    int | None,
+    typer.Option(
+        min=0, max=65535, help="Port for ZeroMQ too; 0 for a free one. Needs the extra serve. [default: none]"
+    ),
+]
 TokenFile = Annotated[
     Path | None, typer.Option(help="File with the token that every client has to send first.")
 ]
@@ -34,6 +40,7 @@ def serve(
     host: Host = "127.0.0.1",
     port: Port = 0,
     binary_port: BinaryPort = 0,
+    zmq_port: ZmqPort = None,
     token_file: TokenFile = None,
 ) -> None:
     """Answer requests for corrected joint values, paths and poses, until SIGTERM or Ctrl-C.
@@ -47,12 +54,12 @@ def serve(
     token = (
         None if token_file is None else read_input(token_file, OutputError).decode(errors="replace").strip()
     )
-    server = Server(_load(model, models), ServeSettings(host, port, binary_port, token))
+    server = Server(_load(model, models), ServeSettings(host, port, binary_port, zmq_port, token))
     for name in (signal.SIGTERM, signal.SIGINT):
         signal.signal(name, lambda *_: server.stop())
     if hasattr(signal, "SIGHUP"):
         signal.signal(signal.SIGHUP, lambda *_: server.reload(lambda line: print_line(line, to_stderr=True)))
-    print_json({"json_port": server.json_port, "binary_port": server.binary_port})
+    print_json(server.ports)
     server.run()
 
 
