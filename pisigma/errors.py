@@ -86,6 +86,10 @@ class PlanningError(PisigmaError, ValueError):
     """A cell, a plan or the settings of one cannot be used."""
 
 
+class FleetError(PisigmaError, ValueError):
+    """A fleet cannot be read or its settings cannot be used."""
+
+
 class OutputError(PisigmaError, ValueError):
     """An output cannot be written where it was asked for."""
 
@@ -102,7 +106,15 @@ class MissingExtraError(PisigmaError, ImportError):
     """A package that comes with an extra of pisigma is not installed."""
 
 
-EXTRAS = {"lightning": "train", "onnx": "onnx", "numba": "compile", "viser": "view", "pyzmq": "serve"}
+EXTRAS = {
+    "lightning": "train",
+    "onnx": "onnx",
+    "numba": "compile",
+    "viser": "view",
+    "pyarrow": "fleet",
+    "ray": "ray",
+    "pyzmq": "serve",
+}
 """By the package that is imported on use, the extra that it comes with."""
 
 

@@ -51,6 +51,7 @@ LAYERS = (
     "comparison",
     "verification",
     "measuring",
+    "fleet",
     "recipes",
     "reporting",
     "workflow",

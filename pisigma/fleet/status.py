@@ -1,0 +1,115 @@
+"""How a fleet stands: which robots err most, which drift, which were not measured for long, which were refused."""
+
+import datetime
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pisigma.fleet.record import RobotRecord, SessionRecord
+
+
+@dataclass(frozen=True)
+class RobotStatus:
+    """How a robot stands.
+
+    Attributes:
+        robot: its id.
+        last: its last session that was not refused; None where all were.
+        refused: its session that was refused; None where none was.
+        days: since its last session [days]; None where that has no date.
+        overdue: whether that is too long.
+    """
+
+    robot: str
+    last: SessionRecord | None
+    refused: SessionRecord | None
+    days: int | None
+    overdue: bool
+
+    @property
+    def drifting(self) -> bool:
+        """Whether something has moved, or recalibrating pays."""
+        return self.last is not None and (self.last.recalibrate or self.last.verdict in ("moved", "unclear"))
+
+    @property
+    def state(self) -> str:
+        """The first that holds of: refused, drifting, overdue, fine."""
+        if self.refused is not None:
+            return "refused"
+        return "drifting" if self.drifting else "overdue" if self.overdue else "fine"
+
+
+@dataclass(frozen=True)
+class FleetStatus:
+    """How a fleet stands.
+
+    Attributes:
+        robots: by their ids.
+        today: day that it is seen from.
+        overdue_days: days without a session after which a robot is overdue.
+    """
+
+    robots: tuple[RobotStatus, ...]
+    today: datetime.date
+    overdue_days: int
+
+    @staticmethod
+    def of(records: Sequence[RobotRecord], today: datetime.date, overdue_days: int) -> "FleetStatus":
+        """See a fleet from a day.
+
+        Args:
+            records: of its robots.
+            today: the day.
+            overdue_days: days without a session after which a robot is overdue.
+        """
+        robots = (_status(one, today, overdue_days) for one in records)
+        return FleetStatus(tuple(sorted(robots, key=lambda one: one.robot)), today, overdue_days)
+
+    @property
+    def worst_first(self) -> tuple[RobotStatus, ...]:
+        """The robots with an error, the largest first."""
+        judged = [one for one in self.robots if one.last is not None and one.last.rms_mm is not None]
+        return tuple(sorted(judged, key=lambda one: -_rms(one)))
+
+    @property
+    def action(self) -> bool:
+        """Whether a robot was refused or drifts."""
+        return any(one.state in ("refused", "drifting") for one in self.robots)
+
+    def in_state(self, state: str) -> tuple[RobotStatus, ...]:
+        """The robots of a state."""
+        return tuple(one for one in self.robots if one.state == state)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all figures as plain values."""
+        return {
+            "robots": len(self.robots),
+            "today": self.today.isoformat(),
+            "worst": [{"robot": one.robot, "rms_mm": _rms(one)} for one in self.worst_first],
+            "drifting": [one.robot for one in self.robots if one.drifting],
+            "overdue": [{"robot": one.robot, "days": one.days} for one in self.robots if one.overdue],
+            "refused": [
+                {"robot": one.robot, "reason": one.refused.sentence}
+                for one in self.robots
+                if one.refused is not None
+            ],
+        }
+
+
+def _rms(one: RobotStatus) -> float:
+    assert one.last is not None
+    return one.last.rms_mm or 0.0
+
+
+def _status(record: RobotRecord, today: datetime.date, overdue_days: int) -> RobotStatus:
+    """How one robot stands."""
+    done = [one for one in record.sessions if not one.refused]
+    last = done[-1] if done else None
+    days = None if last is None or not last.date else (today - datetime.date.fromisoformat(last.date)).days
+    return RobotStatus(
+        robot=record.robot,
+        last=last,
+        refused=next((one for one in record.sessions if one.refused), None),
+        days=days,
+        overdue=days is not None and days > overdue_days,
+    )

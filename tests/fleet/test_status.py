@@ -1,0 +1,61 @@
+"""How a fleet stands."""
+
+import datetime
+
+from pisigma.fleet.record import RobotRecord, SessionRecord
+from pisigma.fleet.status import FleetStatus
+from pisigma.reporting.fleet_tables import robot_table, state_table
+
+TODAY = datetime.date(2026, 11, 22)
+
+
+def session(date, verdict, rms=None, recalibrate=False):
+    return SessionRecord(
+        session=date, date=date, file="x.csv", rows=10, verdict=verdict, sentence=f"It is {verdict}.", rms_mm=rms,
+        recalibrate=recalibrate,
+    )  # fmt: skip
+
+
+STATUS = FleetStatus.of(
+    [
+        RobotRecord(
+            "moved", "", (session("2026-01-01", "calibrated", 0.1), session("2026-11-01", "moved", 0.9))
+        ),
+        RobotRecord("fine", "", (session("2026-11-01", "calibrated", 0.05),)),
+        RobotRecord("old", "", (session("2025-11-01", "calibrated", 0.2),)),
+        RobotRecord("bad", "", (session("2026-01-01", "refused"),)),
+        RobotRecord("pays", "", (session("2026-11-01", "unchanged", 0.3, True),)),
+    ],
+    TODAY,
+    180,
+)
+
+
+def test_every_robot_has_its_state():
+    states = {one.robot: one.state for one in STATUS.robots}
+    assert states == {
+        "bad": "refused",
+        "fine": "fine",
+        "moved": "drifting",
+        "old": "overdue",
+        "pays": "drifting",
+    }
+    assert STATUS.action
+
+
+def test_the_worst_come_first():
+    assert [one.robot for one in STATUS.worst_first] == ["moved", "pays", "old", "fine"]
+
+
+def test_json_names_what_is_to_be_done():
+    figures = STATUS.to_json()
+    assert figures["drifting"] == ["moved", "pays"]
+    assert figures["overdue"] == [{"robot": "old", "days": 386}]
+    assert figures["refused"] == [{"robot": "bad", "reason": "It is refused."}]
+
+
+def test_tables_have_all_robots():
+    assert dict(state_table(STATUS).rows) == {"refused": "1", "drifting": "2", "overdue": "1", "fine": "1"}
+    rows = {row[0]: row[1:] for row in robot_table(STATUS.robots).rows}
+    assert rows["moved"] == ("2026-11-01", "10", "moved", "0.900", "21", "drifting")
+    assert rows["bad"] == ("2026-01-01", "", "", "", "", "refused")
