@@ -28,6 +28,8 @@ _NAMES = {
     "workflow.compare": "ComparedModels ComparisonSettings compare",
     "workflow.distill": "Distillation DistillationSettings distill",
     "workflow.evaluate": "EvaluationSettings Limits evaluate",
+    "workflow.fleet": "FleetRun run_fleet",
+    "workflow.fleet_robot": "FleetSettings",
     "workflow.import_rows": "ImportSettings import_rows",
     "workflow.monitor": "Monitoring MonitorSettings monitor",
     "workflow.plan": "Plan plan",

@@ -13,6 +13,7 @@ from pisigma.cli.distill import distill
 from pisigma.cli.endings import end_with, tell_problems
 from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
+from pisigma.cli.fleet.commands import fleet
 from pisigma.cli.ik.command import ik
 from pisigma.cli.import_ import import_
 from pisigma.cli.lifetime.compare import compare
@@ -56,6 +57,7 @@ for command in (
     upgrade,
 ):
     app.command(command.__name__.rstrip("_"))(tell_problems(command))
+app.add_typer(fleet)
 
 
 def _show_version(wanted: bool) -> None:

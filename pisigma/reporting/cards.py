@@ -34,6 +34,7 @@ def write_calibration_card(
     summary: CalibrationSummary,
     texts: CardTexts,
     folder: Path,
+    pictures: bool = True,
 ) -> None:
     """Write the card, its CSV files and its figures into a model folder.
 
@@ -45,11 +46,31 @@ def write_calibration_card(
         summary: all figures of the calibration.
         texts: description, and what was not validated.
         folder: where to write.
+        pictures: whether figures are drawn.
     """
     tables.write_parameters(summary.parameters, folder / model_files.PARAMETERS_CSV)
     geometric = geometric_result(result)
     correlations = (geometric.pairwise.lengths, geometric.pairwise.angles)
     tables.write_correlations(correlations, folder / model_files.CORRELATION_CSV)
+    if pictures:
+        _draw_calibration(result, rows, validation, summary, folder)
+    drawn = {entry.name for entry in folder.glob("*.png")}
+    write_card(
+        folder, "calibration_card.md.j2", model=model, result=geometric, summary=summary, texts=texts, drawn=drawn,
+        files=model_files, say=tables,
+    )  # fmt: skip
+
+
+def _draw_calibration(
+    result: Result,
+    rows: Measurements,
+    validation: CalibrationValidation | None,
+    summary: CalibrationSummary,
+    folder: Path,
+) -> None:
+    """Draw the figures of `write_calibration_card`."""
+    geometric = geometric_result(result)
+    correlations = (geometric.pairwise.lengths, geometric.pairwise.angles)
     figures.draw_correlations(correlations, folder / model_files.CORRELATION_PNG)
     figures.draw_residuals(
         geometric.residuals,
@@ -66,11 +87,6 @@ def write_calibration_card(
         figures.draw_corrections(result.learned.correction, rows, folder / model_files.CORRECTIONS_PNG)
     if summary.learning_curve is not None:
         figures.draw_learning_curve(summary.learning_curve, folder / model_files.CURVE_PNG)
-    drawn = {entry.name for entry in folder.glob("*.png")}
-    write_card(
-        folder, "calibration_card.md.j2", model=model, result=geometric, summary=summary, texts=texts, drawn=drawn,
-        files=model_files, say=tables,
-    )  # fmt: skip
 
 
 def write_training_card(

@@ -178,6 +178,7 @@ class Calibration(AbstractModelResult):
         texts: description, and what was not validated.
         settings: what it was calibrated with; None for a recipe.
         seconds: time it took [s].
+        figures: whether the card has pictures.
     """
 
     model: CalibratedModel
@@ -190,6 +191,7 @@ class Calibration(AbstractModelResult):
     texts: CardTexts
     settings: CalibrationSettings | None = None
     seconds: float = 0.0
+    figures: bool = True
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -198,7 +200,9 @@ class Calibration(AbstractModelResult):
 
     def _describe(self, model: CalibratedModel, summary: CalibrationSummary, folder: Path) -> None:
         judged = self.validation or self.test
-        write_calibration_card(model, self.result, self.rows, judged, summary, self.texts, folder)
+        write_calibration_card(
+            model, self.result, self.rows, judged, summary, self.texts, folder, self.figures
+        )
         if self.held_out is not None:
             text = self.held_out.to_csv(model.robot)
             (folder / HELD_OUT_CSV).write_text(text, encoding="utf-8", newline="\n")

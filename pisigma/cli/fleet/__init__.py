@@ -1,0 +1,1 @@
+"""`pisigma fleet`: many robots with one command."""

@@ -1,0 +1,157 @@
+"""`pisigma fleet run` and `pisigma fleet status`: many robots with one command."""
+
+import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from pisigma.cli.arguments import AsJson
+from pisigma.cli.endings import NOT_ACCEPTED, tell_problems
+from pisigma.cli.output import print_json, print_lines, print_table, progress_of
+from pisigma.errors import FleetError
+
+if TYPE_CHECKING:
+    from pisigma.fleet.status import FleetStatus
+    from pisigma.workflow.fleet import FleetRun
+
+SHOWN = 10
+"""Robots that a table for people has at most."""
+
+Source = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FLEET",
+        help="Manifest (CSV) with the columns id, robot and data, or a folder with one folder per robot.",
+    ),
+]
+Out = Annotated[Path, typer.Option(help="Folder of the fleet; one that is there already is gone on with.")]
+RobotName = Annotated[
+    str | None, typer.Option(metavar="ROBOT", help="Catalogue name or robot file of robots that state none.")
+]
+Task = Annotated[
+    str,
+    typer.Option(
+        help="calibrate: every session; recalibrate: the first is calibrated, the later ones bring its model up to "
+        "date; monitor: they are compared with it."
+    ),
+]
+Validate = Annotated[
+    bool,
+    typer.Option("--validate", help="Cross-validate every calibration and draw the figures of its card."),
+]
+Model = Annotated[str, typer.Option(help="hybrid or geometric.")]
+EngineName = Annotated[str, typer.Option(help="processes: of this machine; or ray.")]
+Jobs = Annotated[int | None, typer.Option(help="Processes that work side by side. [default: one per core]")]
+Address = Annotated[str | None, typer.Option(help="Of a Ray cluster. [default: Ray on this machine]")]
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `pisigma fleet run` wrote.")]
+Page = Annotated[Path | None, typer.Option(help="HTML page to write, with filters by state and name.")]
+OverdueDays = Annotated[
+    int, typer.Option(min=0, help="Days without a session after which a robot is overdue.")
+]
+Today = Annotated[str | None, typer.Option(metavar="DAY", help="Day to count from, such as 2026-11-22.")]
+
+fleet = typer.Typer(name="fleet", help="Calibrate, recalibrate or monitor many robots.", no_args_is_help=True)
+
+
+@fleet.command()
+@tell_problems
+def run(
+    source: Source,
+    out: Out,
+    robot: RobotName = None,
+    task: Task = "calibrate",
+    validate: Validate = False,
+    model: Model = "hybrid",
+    engine: EngineName = "processes",
+    jobs: Jobs = None,
+    address: Address = None,
+    as_json: AsJson = False,
+) -> None:
+    """Work out all robots of a fleet: a model folder each, and one table of all results.
+
+    A call that was ended goes on where it was. A robot whose files are bad is named and does not stop the others; exit
+    status 3 then.
+    """
+    from pisigma.workflow.calibrate import CalibrationSettings
+    from pisigma.workflow.fleet import run_fleet
+    from pisigma.workflow.fleet_robot import FleetSettings
+
+    stated: dict[str, Any] = {"task": task, "engine": engine}
+    kind: Any = model
+    calibration = CalibrationSettings(model=kind)
+    settings = FleetSettings(validate=validate, calibration=calibration, jobs=jobs, address=address, **stated)
+    with progress_of("fleet") as progress:
+        result = run_fleet(source, out, settings, robot, progress)
+    if as_json:
+        print_json(result.to_json())
+    else:
+        _print_run(result)
+    if result.refused:
+        raise typer.Exit(NOT_ACCEPTED)
+
+
+@fleet.command()
+@tell_problems
+def status(
+    folder: Folder,
+    page: Page = None,
+    overdue_days: OverdueDays = 180,
+    today: Today = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say how a fleet stands: the worst robots, those that drift, that were not measured for long, or were refused.
+
+    Exit status 3 where a robot drifts or was refused.
+    """
+    from pisigma.files.output_file import check_output, write_whole
+    from pisigma.fleet.record import read_records
+    from pisigma.fleet.status import FleetStatus
+
+    if page is not None:
+        check_output(page, (".html", ".htm"), "a page", (folder / "records",))
+    seen = FleetStatus.of(read_records(folder), _day(today), overdue_days)
+    if page is not None:
+        from pisigma.reporting.page.fleet import fleet_page
+
+        write_whole(page, fleet_page(seen, folder.resolve().name))
+    if as_json:
+        print_json(seen.to_json())
+    else:
+        _print_status(seen, page)
+    if seen.action:
+        raise typer.Exit(NOT_ACCEPTED)
+
+
+def _day(stated: str | None) -> datetime.date:
+    """A stated day, or today."""
+    try:
+        return datetime.date.today() if stated is None else datetime.date.fromisoformat(stated)
+    except ValueError:
+        raise FleetError(f"today: a day such as 2026-11-22 was wanted, got '{stated}'.") from None
+
+
+def _print_run(result: "FleetRun") -> None:
+    """Print how many robots are done, and why others are not."""
+    again = f", {result.resumed} of them by an earlier call" if result.resumed else ""
+    print_lines([f"{result.done} of {len(result.records)} robots are done{again}; {result.seconds:.1f} s."])
+    print_lines((f"Refused: {robot}, {reason}" for robot, reason in result.refused), indent="  ")
+    print_lines(
+        [f"Results written to {result.results}; `pisigma fleet status {result.results.parent}` sums them up."]
+    )
+
+
+def _print_status(seen: "FleetStatus", page: Path | None) -> None:
+    """Print how many robots are in each state, the worst, and what is to be done."""
+    from pisigma.reporting.fleet_tables import robot_table, state_table
+
+    print_table(f"{len(seen.robots)} robots, seen on {seen.today}", *state_table(seen))
+    print_table("largest errors", *robot_table(seen.worst_first[:SHOWN]))
+    for state, title in (("drifting", "Drifting"), ("overdue", "Overdue"), ("refused", "Refused")):
+        for one in seen.in_state(state):
+            said = one.refused or one.last
+            assert said is not None
+            words = f"{one.days} days since its last session." if state == "overdue" else said.sentence
+            print_lines([f"{title}: {one.robot}, {said.session}: {words}"], indent="  ")
+    if page is not None:
+        print_lines([f"Page written to {page}."])

@@ -1,0 +1,201 @@
+"""Calibrate, recalibrate or monitor many robots: typed settings in, records, model folders and one table out."""
+
+import functools
+import hashlib
+import json
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+from pisigma.errors import OutputError
+from pisigma.files.conflicts import check_apart
+from pisigma.files.model_files import is_model, model_hash
+from pisigma.files.output_file import write_whole
+from pisigma.fleet.engine import AbstractEngine
+from pisigma.fleet.members import Member, read_fleet
+from pisigma.fleet.processes import ProcessEngine
+from pisigma.fleet.record import MARK, RobotRecord, read_record, read_records, record_path
+from pisigma.fleet.results_table import RESULTS, write_results
+from pisigma.judging.progress import Progress
+from pisigma.workflow.calibrate import CalibrationSettings
+from pisigma.workflow.fleet_robot import FleetSettings, work_out
+
+ROBOTS_A_CHUNK = 4
+"""Calibrations that a worker gets at once: some seconds of work."""
+
+
+@dataclass(frozen=True)
+class FleetRun:
+    """What came of a call.
+
+    Attributes:
+        records: of the robots of this call, by their ids.
+        refused: ids and reasons of those whose results are missing.
+        resumed: how many an earlier call had worked out already.
+        results: the table of all robots in the folder.
+        seconds: time it took [s].
+    """
+
+    records: tuple[RobotRecord, ...]
+    refused: tuple[tuple[str, str], ...]
+    resumed: int
+    results: Path
+    seconds: float
+
+    @property
+    def done(self) -> int:
+        """How many robots have results for all of their sessions."""
+        return len(self.records) - len(self.refused)
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all figures as plain values."""
+        return {
+            "robots": len(self.records),
+            "done": self.done,
+            "resumed": self.resumed,
+            "refused": [{"robot": robot, "reason": reason} for robot, reason in self.refused],
+            "seconds": round(self.seconds, 3),
+            "results": str(self.results),
+        }
+
+
+def run_fleet(
+    source: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    settings: FleetSettings | None = None,
+    robot: str | None = None,
+    progress: Progress = lambda what: None,
+) -> FleetRun:
+    """Work out all robots of a fleet; what an earlier call into the same folder came to is kept.
+
+    A robot whose files are bad is reported and does not stop the others. Every robot has a record of its own, written
+    whole when the robot is done; a robot is worked out again where its files or the settings have changed, its model is
+    gone, or it was refused for want of space.
+
+    Args:
+        source: manifest (CSV) or folder; see `pisigma.fleet.members.read_fleet`.
+        out: folder to write: `results.parquet`, `records/ID.json` and `models/ID/SESSION`.
+        settings: what is done, and where; None for the usual.
+        robot: as drawn, of those robots that state none.
+        progress: called with what is being done.
+
+    Raises:
+        FleetError: the fleet or a robot's options cannot be used.
+        MeasurementError: the manifest is no CSV file.
+        OutputError: the folder is not that of a fleet, or cannot be written to.
+        ImportError: the extra of the engine or of the table is not installed.
+    """
+    import_module("pyarrow")  # before the work, not after it
+    started, settings = time.perf_counter(), settings or FleetSettings()
+    members = read_fleet(source, robot)
+    plans = {member.id: settings.of(member) for member in members}
+    folder = Path(out)
+    _prepare(folder, Path(source), members)
+    keys = {member.id: _key(member, settings, plans[member.id]) for member in members}
+    records = {
+        member.id: record
+        for member in members
+        if (record := _finished(folder, member, keys[member.id])) is not None
+    }
+    resumed, waiting = len(records), [member for member in members if member.id not in records]
+    lost: dict[str, str] = {}
+    work = functools.partial(work_out, settings=settings, out=folder.absolute(), keys=keys, plans=plans)
+    with _engine(settings, len(waiting)) as engine:
+        for member, record in engine.results(work, waiting, ROBOTS_A_CHUNK) if waiting else ():
+            if record is None:
+                lost[member.id] = (
+                    "the process that worked on it ended twice; look at memory and at its files."
+                )
+                record = RobotRecord(member.id, keys[member.id], ())
+            records[member.id] = record
+            progress(f"{len(records)} of {len(members)} robots")
+    of_call = tuple(records[member.id] for member in members)
+    reasons = {record.robot: lost.get(record.robot) or record.reason for record in of_call}
+    write_results(folder / RESULTS, read_records(folder))
+    return FleetRun(
+        records=of_call,
+        refused=tuple((name, reason) for name, reason in reasons.items() if reason),
+        resumed=resumed,
+        results=folder / RESULTS,
+        seconds=time.perf_counter() - started,
+    )
+
+
+@contextmanager
+def _engine(settings: FleetSettings, items: int) -> Iterator[AbstractEngine]:
+    """The engine that the settings choose."""
+    jobs = settings.jobs or os.cpu_count() or 1
+    if settings.engine == "processes" or not items:
+        yield ProcessEngine(max(1, min(jobs, items)))
+        return
+    from pisigma.fleet.ray_cluster import RayEngine
+
+    engine = RayEngine(settings.jobs, settings.address)
+    try:
+        yield engine
+    finally:
+        engine.close()
+
+
+def _prepare(folder: Path, source: Path, members: tuple[Member, ...]) -> None:
+    """Make the folder of a fleet, or make sure that it is one.
+
+    Raises:
+        OutputError: it is something else, holds an input, lies in one, or cannot be written to.
+    """
+    inputs = [source, *(one.data for member in members for one in member.sessions)]
+    inputs += [member.model for member in members if member.model is not None]
+    mark = folder / MARK
+    try:
+        check_apart(folder, inputs)
+        if folder.exists() and not folder.is_dir():
+            raise OutputError(f"{folder}: is no folder; choose another --out.")
+        if folder.is_dir() and any(folder.iterdir()) and not mark.is_file():
+            raise OutputError(
+                f"{folder}: holds files that are not those of a fleet; choose another --out, or an empty folder."
+            )
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as problem:
+        raise OutputError(
+            f"{folder}: cannot be written ({problem.strerror}); choose another --out."
+        ) from None
+    if not mark.is_file():
+        write_whole(mark, json.dumps({"format": 1, "made_by": "pisigma fleet run"}) + "\n")
+
+
+def _finished(out: Path, member: Member, key: str) -> RobotRecord | None:
+    """What an earlier call came to, where it was made of the same and its models are there."""
+    record = read_record(record_path(out, member.id))
+    if record is None or record.key != key:
+        return None
+    return record if all(not one.model or is_model(out / one.model) for one in record.sessions) else None
+
+
+def _key(member: Member, settings: FleetSettings, plan: CalibrationSettings) -> str:
+    """SHA-256 of all that a robot is worked out from: files, settings and the version of pisigma."""
+    from pisigma import __version__
+
+    drawn, model = Path(member.robot), member.model
+    stated = {
+        "version": __version__,
+        "task": settings.task,
+        "validate": settings.validate,
+        "plan": repr(plan),
+        "robot": _hash_of(drawn) if drawn.is_file() else member.robot,
+        "model": None if model is None else model_hash(model) if is_model(model) else str(model),
+        "sessions": [(one.name, one.date, one.data.name, _hash_of(one.data)) for one in member.sessions],
+    }
+    return hashlib.sha256(json.dumps(stated, sort_keys=True).encode()).hexdigest()
+
+
+def _hash_of(path: Path) -> str:
+    """SHA-256 of a file; what is wrong with it where it cannot be read, which the work on the robot then reports."""
+    try:
+        return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else "no file"
+    except OSError as problem:
+        return str(problem.strerror)

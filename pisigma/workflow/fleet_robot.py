@@ -1,0 +1,226 @@
+"""What is done with one robot of a fleet: settings, its sessions one after the other, and its record."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal, get_args
+
+from pydantic import TypeAdapter, ValidationError
+
+from pisigma.errors import FleetError, OutputError, PisigmaError, nearest_choice
+from pisigma.fleet.members import Member, SessionFile
+from pisigma.fleet.record import REFUSED, ParameterValue, RobotRecord, SessionRecord, write_record
+from pisigma.judging.validation_figures import AbstractValidationFigures
+from pisigma.workflow.calibrate import Calibration, CalibrationSettings, calibrate
+from pisigma.workflow.monitor import MonitorSettings, monitor
+from pisigma.workflow.recalibrate import Recalibration, recalibrate
+
+Task = Literal["calibrate", "recalibrate", "monitor"]
+EngineName = Literal["processes", "ray"]
+OPTIONS = ("model", "free", "split", "robust", "prior_length", "prior_angle", "train_rows", "seed")
+"""Settings of a calibration that a manifest may state for one robot."""
+
+
+@dataclass(frozen=True)
+class FleetSettings:
+    """What is done with every robot, and where.
+
+    Attributes:
+        task: "calibrate": every session by itself; "recalibrate": the first session is calibrated, and every later one
+            brings the model of the one before up to date; "monitor": the first is calibrated, and the later ones are
+            compared with its model. A robot with a model of its own begins with that.
+        validate: cross-validate the calibrations and draw the figures of their cards.
+        calibration: of every robot, but for what its own options say; its folds count only with `validate`.
+        engine: "processes" on this machine, or "ray".
+        jobs: processes that work side by side; None for one per core.
+        address: of a Ray cluster; None for Ray on this machine.
+
+    Raises:
+        FleetError: something is no choice, or there are no jobs.
+    """
+
+    task: Task = "calibrate"
+    validate: bool = False
+    calibration: CalibrationSettings = field(default_factory=CalibrationSettings)
+    engine: EngineName = "processes"
+    jobs: int | None = None
+    address: str | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse what is no choice."""
+        for name, choices in (("task", get_args(Task)), ("engine", get_args(EngineName))):
+            if (value := getattr(self, name)) not in choices:
+                raise FleetError(f"{name} '{value}' is unknown; {nearest_choice(value, choices)}")
+        if self.jobs is not None and self.jobs < 1:
+            raise FleetError(f"jobs: 1 or more were wanted, got {self.jobs}.")
+        if self.address is not None and self.engine != "ray":
+            raise FleetError(
+                f"address {self.address}: only the engine ray has one; choose it, or leave it out."
+            )
+
+    def of(self, member: Member) -> CalibrationSettings:
+        """Settings of the calibration of one robot.
+
+        Raises:
+            FleetError: an option of the robot is unknown or has no such value.
+            PisigmaError: the settings make no sense together.
+        """
+        for name, _ in member.options:
+            if name not in OPTIONS:
+                raise FleetError(
+                    f"robot '{member.id}': option '{name}' is unknown; {nearest_choice(name, OPTIONS)}"
+                )
+        stated = {name: getattr(self.calibration, name) for name in self.calibration.__dataclass_fields__}
+        stated |= {name: _free(value) if name == "free" else value for name, value in member.options}
+        stated |= {} if self.validate else {"folds": 0, "hold_out": None, "repeats": None}
+        try:
+            return TypeAdapter(CalibrationSettings).validate_python(stated)
+        except ValidationError as problem:
+            where = problem.errors()[0]
+            name = ".".join(map(str, where["loc"]))
+            raise FleetError(
+                f"robot '{member.id}': option '{name}': {where['msg']}, got '{where['input']}'."
+            ) from None
+
+
+def work_out(
+    member: Member,
+    settings: FleetSettings,
+    out: Path,
+    keys: Mapping[str, str],
+    plans: Mapping[str, CalibrationSettings],
+) -> RobotRecord:
+    """Work out one robot, and write its models and its record.
+
+    Args:
+        member: the robot.
+        settings: what is done.
+        out: folder of the fleet.
+        keys: of all robots, by id.
+        plans: settings of their calibrations.
+    """
+    sessions: list[SessionRecord] = []
+    try:
+        for record in _worked_out(member, settings, plans[member.id], out):
+            sessions.append(record)
+        result = RobotRecord(member.id, keys[member.id], tuple(sessions))
+        write_record(out, result)
+    except Exception as problem:  # what ends one robot does not end the others; a later call tries it again
+        known = isinstance(problem, PisigmaError | OSError | MemoryError)
+        what = (
+            str(problem)
+            if known
+            else f"a defect of pisigma ({type(problem).__name__}: {problem}); please report it."
+        )
+        at = member.sessions[min(len(sessions), len(member.sessions) - 1)]
+        return RobotRecord(member.id, keys[member.id], (*sessions, _refusal(at, what)))
+    return result
+
+
+def _worked_out(
+    member: Member, settings: FleetSettings, plan: CalibrationSettings, out: Path
+) -> Iterator[SessionRecord]:
+    """The records of the sessions of a robot, one after the other, up to one that is refused.
+
+    Raises:
+        OutputError: a model cannot be written.
+    """
+    parent = member.model
+    for number, session in enumerate(member.sessions):
+        folder = out / "models" / member.id / session.name
+        try:
+            if parent is None or settings.task == "calibrate":
+                calibration = replace(calibrate(member.robot, session.data, plan), figures=settings.validate)
+                record = _calibrated(calibration, session)
+                result: Calibration | Recalibration = calibration
+            elif settings.task == "recalibrate":
+                recalibration = recalibrate(parent, session.data)
+                record = _recalibrated(recalibration, session)
+                result = recalibration
+            else:
+                yield from _monitored(parent, member.sessions[number:])
+                return
+        except OutputError:
+            raise
+        except PisigmaError as problem:
+            yield _refusal(session, str(problem))
+            return
+        if not result.trusted:
+            reasons = (one.sentence for one in result.diagnostics if one.severity == "implausible")
+            yield replace(record, verdict=REFUSED, sentence=" ".join(reasons), parameters=())
+            return
+        result.save(folder, command=f"pisigma fleet run --task {settings.task}", overwrite=True)
+        yield replace(record, model=folder.relative_to(out).as_posix())
+        parent = folder
+
+
+def _calibrated(calibration: Calibration, session: SessionFile) -> SessionRecord:
+    """What came of a calibration."""
+    summary = calibration.summary
+    kind = "hybrid" if summary.hybrid is not None else "geometric"
+    return SessionRecord(
+        session=session.name,
+        date=session.date,
+        file=session.data.name,
+        rows=calibration.rows.rows,
+        verdict="calibrated",
+        sentence=f"A {kind} calibration of {calibration.rows.rows} rows.",
+        rms_mm=_best_rms(summary.calibrated),
+        held_out_rms_mm=_best_rms(summary.judged),
+        parameters=tuple(
+            ParameterValue(one.name, one.unit, one.estimated, one.change, one.standard_error)
+            for one in summary.parameters
+            if one.standard_error is not None
+        ),
+        warnings=calibration.warnings,
+    )
+
+
+def _best_rms(figures: AbstractValidationFigures | None) -> float | None:
+    """RMS error of the last of the calibrations that are compared [mm]."""
+    return None if figures is None else list(figures.models.values())[-1].rms_mm
+
+
+def _recalibrated(recalibration: Recalibration, session: SessionFile) -> SessionRecord:
+    """What came of a recalibration."""
+    summary = recalibration.summary
+    return SessionRecord(
+        session=session.name,
+        date=session.date,
+        file=session.data.name,
+        rows=summary.rows,
+        verdict=summary.kept,
+        sentence=f"{summary.changed} {summary.verdict}",
+        rms_mm=summary.cross_validation[summary.kept].rms_mm,
+        warnings=recalibration.warnings,
+    )
+
+
+def _monitored(model: Path, sessions: tuple[SessionFile, ...]) -> Iterator[SessionRecord]:
+    """What the sessions say of the robot of a model, as one chart of all of them."""
+    files = [one.data for one in sessions]
+    dates = tuple(one.date for one in sessions) if all(one.date for one in sessions) else ()
+    monitoring = monitor(model, files, MonitorSettings(dates=dates, history=False))
+    for session, judged in zip(sessions, monitoring.sessions, strict=True):
+        yield SessionRecord(
+            session=session.name,
+            date=judged.date,
+            file=judged.file,
+            rows=judged.session.rows,
+            verdict=judged.session.verdict,
+            sentence=judged.session.sentence,
+            rms_mm=judged.session.rms * 1e3,
+            recalibrate=judged.session.recalibrate,
+            warnings=tuple(judged.session.unobservable),
+        )
+
+
+def _refusal(session: SessionFile, sentence: str) -> SessionRecord:
+    return SessionRecord(session.name, session.date, session.data.name, 0, REFUSED, sentence)
+
+
+def _free(value: str) -> str | tuple[str, ...]:
+    """Free parameters: a choice, or names with commas or blanks between them."""
+    if value in ("identifiable", "joint_offsets"):
+        return value
+    return tuple(value.replace(",", " ").split())

@@ -1,0 +1,143 @@
+"""Many robots at once: what is written, what is gone on with, and what is refused."""
+
+import math
+import resource
+
+import pytest
+from testing.aged import model_before, rows_later
+
+from pisigma.errors import FleetError, OutputError
+from pisigma.fleet.processes import ProcessEngine
+from pisigma.fleet.record import read_records
+from pisigma.model.folder.model_folder import load_model, save_model
+from pisigma.workflow import fleet as workflow
+from pisigma.workflow.fleet import run_fleet
+from pisigma.workflow.fleet_robot import FleetSettings
+
+parquet = pytest.importorskip("pyarrow.parquet", reason="Parquet comes with the extra fleet")
+
+
+class InThisProcess(ProcessEngine):
+    """Works in this process: the engines themselves have their own tests."""
+
+    def _chunks(self, work, chunks):
+        for chunk in chunks:
+            yield chunk, [work(item) for item in chunk]
+
+
+@pytest.fixture(autouse=True)
+def in_this_process(monkeypatch):
+    monkeypatch.setattr(workflow, "ProcessEngine", InThisProcess)
+
+
+@pytest.fixture
+def plant(tmp_path):
+    """Three robots, of which the file of one is bad."""
+    for number in range(2):
+        rows_later(30, number).write_csv(tmp_path / f"{number}.csv", model_before().robot)
+    (tmp_path / "bad.csv").write_text("q1_deg\nx\n", encoding="utf-8")
+    lines = (
+        "id,robot,data,date,options",
+        "r0,rb5,0.csv,2026-10-01,",
+        "r1,rb5,1.csv,2026-10-01,free=joint_offsets",
+    )
+    (tmp_path / "fleet.csv").write_text(
+        "\n".join((*lines, "r2,rb5,bad.csv,2026-10-01,", "")), encoding="utf-8"
+    )
+    return tmp_path
+
+
+SETTINGS = FleetSettings(calibration=workflow.CalibrationSettings(model="geometric"), jobs=1)
+
+
+def test_a_bad_file_is_named_and_stops_no_other(plant):
+    run = run_fleet(plant / "fleet.csv", plant / "out", SETTINGS)
+    assert (len(run.records), run.done, run.resumed) == (3, 2, 0)
+    ((robot, reason),) = run.refused
+    assert robot == "r2"
+    assert "bad.csv" in reason
+    assert load_model(plant / "out" / "models" / "r0" / "2026-10-01").robot.name == "rb5"
+    table = parquet.read_table(run.results).to_pylist()
+    assert [(row["robot"], row["verdict"]) for row in table] == [
+        ("r0", "calibrated"),
+        ("r1", "calibrated"),
+        ("r2", "refused"),
+    ]
+    assert len(table[0]["parameters"]) > len(table[1]["parameters"]) > 0
+    assert 0 < table[0]["rms_mm"] < 1
+
+
+def test_a_later_call_goes_on(plant):
+    run_fleet(plant / "fleet.csv", plant / "out", SETTINGS)
+    content = (plant / "out" / "results.parquet").read_bytes()
+    (plant / "out" / "records" / "r1.json").unlink()
+    (plant / "out" / "records" / "r0.json").write_text("{", encoding="utf-8")  # as a bad disk leaves it
+    run = run_fleet(plant / "fleet.csv", plant / "out", SETTINGS)
+    assert run.resumed == 1
+    assert (plant / "out" / "results.parquet").read_bytes() == content
+    rows_later(31, 5).write_csv(plant / "bad.csv", model_before().robot)
+    run = run_fleet(plant / "fleet.csv", plant / "out", SETTINGS)
+    assert (run.resumed, run.done, run.refused) == (2, 3, ())
+
+
+def test_sessions_recalibrate_or_are_monitored(plant):
+    save_folder = plant / "first"
+    save_folder.mkdir()
+    save_model(model_before(), save_folder)
+    for month, moved in ((11, 0.0), (12, math.radians(0.25))):
+        shift = (0.0, 0.0, moved, 0.0, 0.0, 0.0)
+        rows_later(12, month, shift).write_csv(plant / f"2026-{month}-01.csv", model_before().robot)
+    rows = "".join(f"a,rb5,2026-{month}-01.csv,first\n" for month in (11, 12))
+    (plant / "aged.csv").write_text(f"id,robot,data,model\n{rows}", encoding="utf-8")
+    monitored = run_fleet(plant / "aged.csv", plant / "watched", FleetSettings(task="monitor", jobs=1))
+    (robot,) = monitored.records
+    assert [one.verdict for one in robot.sessions] == ["unchanged", "moved"]
+    assert robot.sessions[1].recalibrate
+    assert "joint 3" in robot.sessions[1].sentence
+    renewed = run_fleet(plant / "aged.csv", plant / "renewed", FleetSettings(task="recalibrate", jobs=1))
+    (robot,) = renewed.records
+    assert [one.model for one in robot.sessions] == ["models/a/2026-11-01", "models/a/2026-12-01"]
+    assert robot.sessions[1].verdict == "recalibrated"
+    assert "Joint 3 moved" in robot.sessions[1].sentence
+    last = load_model(plant / "renewed" / robot.sessions[1].model)
+    assert last.metrics["parent"]["name"] == "2026-11-01"
+
+
+def test_outputs_that_are_not_a_fleets_are_refused(plant):
+    (plant / "mine").mkdir()
+    (plant / "mine" / "notes.txt").write_text("mine", encoding="utf-8")
+    for out, complaint in (("mine", "not those of a fleet"), (".", "holds"), ("fleet.csv", "input")):
+        with pytest.raises(OutputError, match=complaint):
+            run_fleet(plant / "fleet.csv", plant / out, SETTINGS)
+    assert (plant / "mine" / "notes.txt").read_text(encoding="utf-8") == "mine"
+    with pytest.raises(FleetError, match="is not the folder of a fleet"):
+        read_records(plant)
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ("folds=3", "option 'folds' is unknown"),
+        ("model=neural", "option 'model'"),
+        ("prior_length=long", "option 'prior_length'"),
+    ],
+)
+def test_options_of_one_robot_are_checked_before_the_work(plant, options, complaint):
+    path = plant / "options.csv"
+    path.write_text(f"id,robot,data,options\nr0,rb5,0.csv,{options}\n", encoding="utf-8")
+    with pytest.raises(FleetError, match=complaint):
+        run_fleet(path, plant / "out", SETTINGS)
+    assert not (plant / "out").exists()
+
+
+def test_a_full_disk_loses_nothing_and_a_later_call_goes_on(plant):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, hard))
+    try:
+        full = run_fleet(plant / "fleet.csv", plant / "out", SETTINGS)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    reasons = dict(full.refused)
+    assert "File too large" in reasons["r0"]
+    assert not list((plant / "out" / "models").rglob("model.yaml"))
+    assert run_fleet(plant / "fleet.csv", plant / "out", SETTINGS).done == 2
