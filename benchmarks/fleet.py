@@ -1,0 +1,122 @@
+"""Time and memory of a fleet of simulated robots, with processes and with Ray, and what kills leave of it.
+
+Run `OMP_NUM_THREADS=1 python benchmarks/fleet.py [PART ...]` with the simulator of arms (`sim.py`) in
+`PISIGMA_SIMULATED`. Every robot is a kr10 with errors of its own, measured in 100 poses.
+"""
+
+import argparse
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+
+SIMULATED = Path(os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))
+
+
+def write_fleet(folder: Path, robots: int) -> None:
+    """Measure the robots; the manifest is `fleet.csv`."""
+    sys.path.insert(0, str(SIMULATED))
+    import sim  # type: ignore[import-not-found]
+
+    os.chdir(folder)
+    sim.write_urdf("kr10")
+    lines = ["id,robot,data,date"]
+    for number in range(robots):
+        true, rng = sim.True_("kr10", seed=number), np.random.default_rng(number)
+        q = true.sample(100, 1000 + number)
+        position, _ = true.measure(q, noise=3e-5, rng=rng, rep=2e-5)
+        header = ",".join([*(f"q{k + 1}_rad" for k in range(q.shape[1])), "x_mm", "y_mm", "z_mm"])
+        rows = np.column_stack([q, position * 1e3])
+        np.savetxt(f"r{number:04d}.csv", rows, "%.9f", ",", header=header, comments="")
+        lines.append(f"r{number:04d},kr10.urdf,r{number:04d}.csv,2026-10-01")
+    Path("fleet.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def command(out: str, *options: str) -> list[str]:
+    """The command line of a run."""
+    return [sys.executable, "-m", "pisigma", "fleet", "run", "fleet.csv", "--out", out, "--json", *options]
+
+
+def timed(out: str, *options: str) -> tuple[float, float]:
+    """Seconds of a run, and the most memory of the processes below this one [GB]."""
+    started = time.monotonic()
+    process = subprocess.Popen(command(out, *options), stdout=subprocess.PIPE, text=True)
+    most = 0.0
+    while process.poll() is None:
+        most = max(most, memory_below(process.pid))
+        time.sleep(0.2)
+    assert process.stdout is not None
+    report = json.loads(process.stdout.read())
+    assert report["done"] == report["robots"], report["refused"]
+    return time.monotonic() - started, most
+
+
+def memory_below(pid: int) -> float:
+    """Resident memory of a process and of those it started, shared pages counted once [GB]."""
+    total, waiting = 0.0, [pid]
+    while waiting:
+        one = waiting.pop()
+        try:
+            sums = Path(f"/proc/{one}/smaps_rollup").read_text(encoding="utf-8")
+            children = Path(f"/proc/{one}/task/{one}/children").read_text(encoding="utf-8")
+        except OSError:  # it has ended
+            continue
+        total += sum(int(line.split()[1]) for line in sums.splitlines() if line.startswith("Pss:")) / 1e6
+        waiting += map(int, children.split())
+    return total
+
+
+def engines(robots: int) -> None:
+    """Two processes beside two workers of Ray."""
+    seconds, most = timed("processes", "--jobs", "2")
+    print(f"{robots} robots, 2 processes: {seconds:.1f} s, {most:.2f} GB", flush=True)
+    on_ray, most = timed("ray", "--jobs", "2", "--engine", "ray")
+    print(
+        f"{robots} robots, Ray with 2 workers: {on_ray:.1f} s ({on_ray / seconds:.2f} times), {most:.2f} GB"
+    )
+    same = Path("processes/results.parquet").read_bytes() == Path("ray/results.parquet").read_bytes()
+    print(f"results are {'the same to the bit' if same else 'different'}", flush=True)
+
+
+def kills(robots: int, count: int) -> None:
+    """End runs at random moments; what the last comes to is what one run comes to."""
+    seconds, _ = timed("whole", "--jobs", "2")
+    rng, killed = np.random.default_rng(0), 0
+    for _ in range(count):
+        process = subprocess.Popen(command("killed", "--jobs", "2"), stdout=subprocess.DEVNULL)
+        time.sleep(float(rng.uniform(0.1, 0.6)) * min(seconds, 20.0))
+        process.kill()
+        killed += process.wait() == -signal.SIGKILL
+    timed("killed", "--jobs", "2")
+    same = Path("whole/results.parquet").read_bytes() == Path("killed/results.parquet").read_bytes()
+    left = [path.name for path in Path("killed").rglob(".*") if path.is_file()]
+    print(
+        f"{robots} robots, killed {killed} times: {'the same to the bit' if same else 'different'}, {left} left"
+    )
+
+
+def main() -> None:
+    """Run the parts that are asked for."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("parts", nargs="*", help="engines, kills; both by default")
+    parser.add_argument("--robots", type=int, default=200)
+    parser.add_argument("--kills", type=int, default=20)
+    wanted = parser.parse_args()
+    parts = wanted.parts or ["engines", "kills"]
+    with TemporaryDirectory() as folder:
+        write_fleet(Path(folder), wanted.robots)
+        if "engines" in parts:
+            engines(wanted.robots)
+        if "kills" in parts:
+            kills(wanted.robots, wanted.kills)
+        os.chdir("/")
+
+
+if __name__ == "__main__":
+    main()
