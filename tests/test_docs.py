@@ -66,7 +66,10 @@ COMMANDS = get_command(app).commands  # type: ignore[attr-defined]
 @pytest.mark.parametrize(("page", "words"), _command_lines(), ids=lambda value: str(value)[:60])
 def test_a_command_line_is_understood(page: str, words: tuple[str, ...]) -> None:
     assert words[0] in COMMANDS, f"{page}: there is no command {words[0]}"
-    context = COMMANDS[words[0]].make_context(words[0], list(words[1:]))
+    command, *arguments = COMMANDS[words[0]], *words[1:]
+    while isinstance(getattr(command, "commands", None), dict):  # a group such as `pisigma fleet`
+        command, *arguments = command.commands[arguments[0]], *arguments[1:]
+    context = command.make_context(words[0], arguments)
     assert context.params
 
 
