@@ -36,7 +36,9 @@ def test_training_readme_names_every_recipe(repository):
 
 def test_the_commands_of_the_readme_exist(repository):
     text = (repository / "README.md").read_text(encoding="utf-8")
-    known = {command.name for command in app.registered_commands}
+    known = {command.name for command in app.registered_commands} | {
+        one.typer_instance.info.name for one in app.registered_groups
+    }
     used = set(re.findall(r"^\| `pisigma (\w+)", text, flags=re.MULTILINE))
     assert used == known
 
