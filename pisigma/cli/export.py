@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder, PayloadKg, TemperatureC, complete_export
-from pisigma.cli.endings import fail
+from pisigma.cli.endings import NOT_ACCEPTED, fail
 from pisigma.cli.output import print_json, print_line
 from pisigma.export.registry import BUILT_IN
 
@@ -57,6 +57,25 @@ Config = Annotated[
     str | None,
     typer.Option(help="With .ls and --targets cartesian: the arm's configuration, such as 'N U T, 0, 0, 0'."),
 ]
+Program = Annotated[
+    Path | None,
+    typer.Option(
+        help="With targets: existing program (.script, .src, .mod, .ls) whose pose targets are rewritten into --out; "
+        "all else stays."
+    ),
+]
+Frames = Annotated[
+    Path | None,
+    typer.Option(
+        help="With --program: YAML file of the frames and tools that it names without stating them."
+    ),
+]
+ToleranceMm = Annotated[
+    float | None,
+    typer.Option(
+        help="With --program: how far the tool may leave a straight line between way points [mm]. [default: 0.1]"
+    ),
+]
 CountsPerTurn = Annotated[
     str | None,
     typer.Option(
@@ -79,6 +98,9 @@ def export(
     targets: TargetKind = None,
     branch: Branch = None,
     config: Config = None,
+    program: Program = None,
+    frames: Frames = None,
+    tolerance_mm: ToleranceMm = None,
     counts_per_turn: CountsPerTurn = None,
     present_counts: PresentCounts = None,
     payload_kg: PayloadKg = None,
@@ -88,7 +110,8 @@ def export(
     """Write a model for other programs, whole or not at all.
 
     Exit status 2 when a pose of --poses has no target, being unreachable, singular or outside the joint limits: its
-    values are empty in a .csv file, and no program is written. Every program is slow and has to be tested.
+    values are empty in a .csv file, and no program is written. Every program is slow and has to be tested. With
+    --program, poses that cannot be reached keep their line, and the exit status is 3.
     """
     from pisigma.export.export_format import ExportRequest
     from pisigma.export.registry import export_format, export_model
@@ -102,6 +125,9 @@ def export(
         targets=targets,
         branch=branch,
         config=config,
+        program=program,
+        frames=frames,
+        tolerance_mm=tolerance_mm,
         counts_per_turn=counts_per_turn,
         present_counts=present_counts,
         payload_kg=payload_kg,
@@ -119,9 +145,11 @@ def _print(exported: "Exported", form: str, out: Path, contents: str, as_json: b
         remarks = [*exported.remarks, *exported.doubts]
         print_json({"file": str(out), "format": form, **exported.facts, "remarks": remarks})
     else:
-        for sentence in exported.remarks:
-            print_line(sentence)
+        for line in (*exported.shown.splitlines(), *exported.remarks):
+            print_line(line)
         what = exported.summary or contents[0].upper() + contents[1:]
         print_line(f"{what} written to {out}{exported.details}.")
     if exported.failure:
         fail(exported.failure)
+    if exported.shortfall:
+        fail(exported.shortfall, NOT_ACCEPTED)

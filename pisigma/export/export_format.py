@@ -22,6 +22,9 @@ class ExportRequest:
         targets: with targets, "joints" or "cartesian".
         branch: with targets, the branch to take instead of the trained one.
         config: with FANUC's Cartesian targets, the arm's configuration.
+        program: with targets, an existing program whose targets are rewritten.
+        frames: with `program`, the file of frames and tools that it does not state.
+        tolerance_mm: with `program`, how far the tool may leave a straight line between way points [mm].
         counts_per_turn: with counts, encoder counts a turn of every joint, with commas between.
         present_counts: with counts, those that the controller has now.
         payload_kg: what the robot carries [kg].
@@ -36,6 +39,9 @@ class ExportRequest:
     targets: str | None = None
     branch: str | None = None
     config: str | None = None
+    program: Path | None = None
+    frames: Path | None = None
+    tolerance_mm: float | None = None
     counts_per_turn: str | None = None
     present_counts: str | None = None
     payload_kg: float | None = None
@@ -77,6 +83,9 @@ OPTIONS = (
     "targets",
     "branch",
     "config",
+    "program",
+    "frames",
+    "tolerance_mm",
     "counts_per_turn",
     "present_counts",
     "payload_kg",
@@ -97,6 +106,8 @@ class Exported:
         summary: what was written, as a sentence that ends before the file's name; "" for the format's contents.
         details: what the sentence says behind the file's name.
         failure: why the input is at fault though the file was written; None where all is well.
+        shortfall: which limit is missed though the file was written; None where none is.
+        shown: what is printed before all else, such as a diff.
     """
 
     content: str | bytes | Mapping[str, bytes]
@@ -106,6 +117,8 @@ class Exported:
     summary: str = ""
     details: str = ""
     failure: str | None = None
+    shortfall: str | None = None
+    shown: str = ""
 
 
 @dataclass(frozen=True)

@@ -89,7 +89,7 @@ def export_model(name: str, request: ExportRequest) -> Exported:
                 f"--{option.replace('_', '-')} goes with --format {takers}, not with {name}; leave it out."
             )
     form.check(request)
-    inputs = (request.model, request.like, request.poses)
+    inputs = (request.model, request.like, request.poses, request.program, request.frames)
     if form.suffixes:
         check_output(request.out, form.suffixes, form.contents, inputs)
     else:

@@ -14,6 +14,7 @@ from pisigma.export.export_format import Exported, ExportFormat, ExportRequest
 from pisigma.export.programs.languages import LANGUAGES, cautions, check_program, program_text
 from pisigma.export.programs.targets import Targets, targets_of
 from pisigma.export.programs.text import millimetres_and_euler
+from pisigma.export.rewriting.export import check_rewriting, rewrite_program
 from pisigma.inverse.corrected_ik import load
 from pisigma.measurement.csv.poses import read_poses
 from pisigma.planning.plan_file import joint_columns
@@ -65,8 +66,14 @@ def targets_csv(targets: Targets) -> str:
 
 
 def _check(request: ExportRequest) -> None:
-    if request.poses is None:
-        raise OutputError("--format targets needs the poses to make them for; give them with --poses.")
+    if (request.poses is None) == (request.program is None):
+        raise OutputError(
+            "--format targets needs the poses to make them for; give them with --poses, or a --program that has them."
+        )
+    if request.program is not None:
+        check_rewriting(request)
+    elif request.frames is not None or request.tolerance_mm is not None:
+        raise OutputError("--frames and --tolerance-mm go with --program; leave them out.")
 
 
 def _check_options(request: ExportRequest) -> None:
@@ -82,6 +89,8 @@ def _check_options(request: ExportRequest) -> None:
 
 def _write(request: ExportRequest) -> Exported:
     """Make the targets, and say what about them is in doubt."""
+    if request.program is not None:
+        return rewrite_program(request)
     _check_options(request)
     assert request.poses is not None  # checked before
     table, cartesian = request.as_csv, request.targets == "cartesian"
@@ -119,6 +128,18 @@ FORMAT = ExportFormat(
     "a table or program of targets",
     (".csv", *LANGUAGES),
     _write,
-    frozenset(("poses", "targets", "branch", "config", "payload_kg", "temperature_c")),
+    frozenset(
+        (
+            "poses",
+            "program",
+            "frames",
+            "tolerance_mm",
+            "targets",
+            "branch",
+            "config",
+            "payload_kg",
+            "temperature_c",
+        )
+    ),
     _check,
 )

@@ -279,3 +279,29 @@ def test_a_sliding_joint_has_no_program(refuses, models, poses, tmp_path):
 def test_the_command_tells_its_formats(run):
     text = run("export", "--help").stdout
     assert all(word in text for word in ("targets", "--poses", "--config", "URScript", "FANUC", "cartesian"))
+
+
+def test_a_program_is_rewritten(run, refuses, models, tmp_path):
+    values = xyzrpy_from_transform(
+        forward_kinematics(Robot.load("ur10"), joints_around("ur10", 1, seed=6, spread=0.1))
+    )
+    letters = [f"{letter} {value}" for letter, value in zip("XYZABC", torch.cat(
+        [values[0, :3] * 1e3, torch.rad2deg(values[0, 3:])]).tolist(), strict=True)]  # fmt: skip
+    move = f"LIN {{{', '.join(letters)}}}"
+    program, out = tmp_path / "cell.src", tmp_path / "new.src"
+    program.write_text(
+        f"DEF cell()\n$BASE = $NULLFRAME\n$TOOL = $NULLFRAME\n{move}\nLIN {{X 9000, Y 0, Z 0, A 0, B 0, C 0}}\n"
+    )
+    command = ("export", models / "ur10", "--format", "targets", "--program", program, "--out", out)
+    result = run(*command)
+    assert result.exit_code == 3
+    assert f"-{move}\n+LIN {{X " in result.stdout
+    assert "cell.src, line 5: unreachable, so the line is as it was." in result.stderr
+    assert "line 4: where the straight move begins is not stated" in result.stderr
+    stated = json.loads(run(*command, "--json").stdout)
+    assert (stated["statuses"], stated["way_points"]) == ({"reached": 1, "unreachable": 1}, 0)
+    assert stated["diff"].splitlines()[0] == f"--- {program}"
+    assert "is an input of this command" in refuses(*command[:-1], program)
+    assert "--program goes with --format targets, not with dh" in refuses(
+        "export", models / "ur10", "--format", "dh", "--program", program, "--out", tmp_path / "dh.csv"
+    )

@@ -1,0 +1,142 @@
+"""Poses of KRL programs: `{X .., Y .., Z .., A .., B .., C ..}` in millimetres and degrees."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import torch
+
+from pisigma.export.programs.text import labelled, millimetres_and_euler
+from pisigma.export.rewriting.frame_file import FrameFile
+from pisigma.export.rewriting.scan import (
+    IDENTITY,
+    NUMBER,
+    Edit,
+    Frame,
+    Pose,
+    Scan,
+    ScannedProgram,
+    masked,
+    numbers_in,
+)
+from pisigma.se3 import transform_from_xyzrpy
+
+_HIDDEN = re.compile(r';[^\n]*|"[^"\n]*"')
+_SIX = r"\s*,\s*".join(rf"{letter}\s*{NUMBER}" for letter in "XYZABC")
+_AGGREGATE = re.compile(rf"\{{\s*(?:(?:FRAME|E?\d?POS)\s*:\s*)?({_SIX})\s*(?:,[^{{}}]*)?\}}", re.IGNORECASE)
+_ASSIGNMENT = re.compile(
+    r"(?im)^[ \t]*(?:DECL\s+|GLOBAL\s+)*(?:(?:E6|E3)?POS\s+|FRAME\s+)?(\w+)\s*=\s*(?=\{)"
+)
+_STATEMENT = re.compile(
+    r"^[ \t]*(?:"
+    r"(?P<flow>(?:GLOBAL\s+)?DEF|END|IF|ELSE|ENDIF|FOR|ENDFOR|WHILE|ENDWHILE|LOOP|ENDLOOP|REPEAT|UNTIL|SWITCH|CASE|DEFAULT|"
+    r"ENDSWITCH|GOTO|INTERRUPT|RETURN|\w+:)(?=\W|$)"
+    r"|\$(?P<system>BASE|TOOL)\s*=\s*(?P<value>[^\n]*?)[ \t\r]*$"
+    r"|BAS\s*\(\s*#(?P<bas>BASE|TOOL)\s*,\s*(?P<number>\d+)\s*\)"
+    r"|S?(?P<move>PTP|LIN|CIRC)(?P<relative>_REL)?\s+(?P<target>[^\n]*?)[ \t\r]*$)",
+    re.MULTILINE | re.IGNORECASE,
+)
+_OPENS = re.compile(r"(?:GLOBAL\s+)?DEF|IF|FOR|WHILE|LOOP|REPEAT|SWITCH", re.IGNORECASE)
+_CLOSES = re.compile(r"END\w*|UNTIL", re.IGNORECASE)
+
+
+def scan_krl(text: str, stated: FrameFile) -> ScannedProgram:
+    """Read a program; poses are of `$TOOL` in `$BASE`, whose values or numbers the program has to say before them.
+
+    Args:
+        text: of the program.
+        stated: frames that the program names but does not state, such as `BASE_DATA[1]` and `TOOL_DATA[2]`.
+    """
+    return _Reader(Scan(text), masked(text, _HIDDEN), stated).read()
+
+
+@dataclass
+class _Reader:
+    """Walks through the statements of a program."""
+
+    scan: Scan
+    text: str
+    stated: FrameFile
+    state: dict[str, Frame | str] = field(default_factory=dict)
+    poses: dict[str, Pose] = field(default_factory=dict)
+    uses: dict[str, int] = field(default_factory=dict)
+
+    def read(self) -> ScannedProgram:
+        self.state = {name: f"${name} is not stated before the move" for name in ("BASE", "TOOL")}
+        for found in _ASSIGNMENT.finditer(self.text):
+            literal, name = _AGGREGATE.match(self.text, found.end()), found[1].upper()
+            others = re.findall(rf"(?im)^[^\n=]*\b{name}\b(?:\.\w+)?\s*=(?!=)", self.text)
+            if literal and len(others) == 1:
+                self.poses[name] = _pose(literal)
+        depth = 0
+        for found in _STATEMENT.finditer(self.text):
+            if word := found["flow"]:
+                self.scan.interrupt()
+                depth += bool(_OPENS.fullmatch(word)) - bool(_CLOSES.fullmatch(word))
+            elif found["move"]:
+                self._move(found)
+            else:
+                self._set_frame(found, computed=depth > 1)
+        for name, pose in self.poses.items():
+            if len(re.findall(rf"(?i)\b{name}\b", self.text)) - 1 > self.uses.get(name, 0):
+                self.scan.blur(pose)
+        return self.scan.program()
+
+    def _set_frame(self, found: re.Match[str], computed: bool) -> None:
+        name = (found["system"] or found["bas"]).upper()
+        look_up = self.stated.frame if name == "BASE" else self.stated.tool
+        value = f"{name}_DATA[{found['number']}]" if found["bas"] else found["value"]
+        if computed:
+            self.state[name] = f"${name} depends on which way the program takes"
+        elif literal := _AGGREGATE.fullmatch(value):
+            self.state[name] = _pose(literal).T
+        else:
+            self.state[name] = IDENTITY if value.upper() == "$NULLFRAME" else look_up(value)
+
+    def _move(self, found: re.Match[str]) -> None:
+        start, kind = found.start("target"), found["move"].upper()
+        for count in range(2 if kind == "CIRC" else 1):
+            literal = _AGGREGATE.match(self.text, start)
+            name = re.compile(r"\w+(?![\w.:\[])").match(self.text, start)
+            if re.compile(r"\{\s*(?:(?:AXIS|E6AXIS)\s*:|A1\b)", re.IGNORECASE).match(self.text, start):
+                self.scan.joints(found.start())
+                return
+            pose: Pose | str = "the target is computed or not stated in this file"
+            operand = (start, start)
+            if not found["relative"] and literal:
+                pose, operand = _pose(literal), literal.span()
+            elif not found["relative"] and name and name[0].upper() in self.poses:
+                pose, operand = self.poses[name[0].upper()], name.span()
+                self.uses[name[0].upper()] = self.uses.get(name[0].upper(), 0) + 1
+            cut = (
+                partial(self._way_points, found, operand, pose)
+                if kind == "LIN" and isinstance(pose, Pose)
+                else None
+            )
+            self.scan.move(found.start(), pose, self.state["BASE"], self.state["TOOL"], cut)
+            comma = self.text.find(",", operand[1])
+            start = comma + 1 + len(self.text[comma + 1 :]) - len(self.text[comma + 1 :].lstrip(" \t"))
+            if count == 0 and (comma < 0 or comma > found.end()):
+                return
+
+    def _way_points(
+        self, move: re.Match[str], operand: tuple[int, int], pose: Pose, poses: Sequence[Frame]
+    ) -> list[Edit]:
+        """Straight moves to all way points, which are passed by distance."""
+        start = self.scan.line_start(move.start())
+        end = "\r\n" if "\r\n" in self.scan.text else "\n"
+        word = self.text[start : operand[0]]
+        smooth = "" if "SLIN" in word.upper() else " C_DIS"
+        lines = (f"{word}{{{_six(T)}}}{smooth}{end}" for T in poses)
+        return [Edit((start, start), "".join(lines))]
+
+
+def _pose(literal: re.Match[str]) -> Pose:
+    values = torch.tensor(numbers_in(re.sub(r"[A-Ca-cX-Zx-z]", " ", literal[1])), dtype=torch.float64)
+    xyzrpy = torch.cat([values[:3] / 1e3, torch.deg2rad(values[3:])])
+    return Pose(literal.span(1), transform_from_xyzrpy(xyzrpy), _six)
+
+
+def _six(T: Frame) -> str:
+    return labelled(millimetres_and_euler(T).tolist(), "XYZABC")

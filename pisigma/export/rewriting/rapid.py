@@ -1,0 +1,175 @@
+"""Poses of RAPID modules: robtargets in millimetres and quaternions (w, x, y, z)."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import torch
+
+from pisigma.export.programs.text import millimetres, numbers, quaternion
+from pisigma.export.rewriting.frame_file import FrameFile
+from pisigma.export.rewriting.scan import (
+    IDENTITY,
+    NUMBER,
+    Edit,
+    Frame,
+    Pose,
+    Scan,
+    ScannedProgram,
+    arguments,
+    masked,
+    numbers_in,
+)
+from pisigma.se3 import rotation_from_quaternion, transform
+
+_HIDDEN = re.compile(r'![^\n]*|"[^"\n]*"')
+
+
+def _list(count: int) -> str:
+    return rf"\[\s*{NUMBER}(?:\s*,\s*{NUMBER}){{{count - 1}}}\s*\]"
+
+
+_PLACE = rf"{_list(3)}\s*,\s*{_list(4)}"
+_TARGET = re.compile(rf"\[\s*({_PLACE})\s*,\s*{_list(4)}\s*,\s*{_list(6)}\s*\]")
+_TOOL = re.compile(rf"\[\s*TRUE\s*,\s*\[\s*({_PLACE})\s*\]", re.IGNORECASE)
+_WOBJ = re.compile(
+    rf"\[\s*FALSE\s*,\s*TRUE\s*,\s*(?:\"\")?\s*,\s*\[\s*({_PLACE})\s*\]\s*,\s*\[\s*({_PLACE})\s*\]",
+    re.IGNORECASE,
+)
+_DATA = re.compile(
+    r"(?im)^[ \t]*(?:LOCAL\s+|TASK\s+)?(?:CONST|PERS|VAR)\s+(robtarget|tooldata|wobjdata)\s+(\w+)\s*:=\s*"
+)
+_FLOW = (
+    "PROC|ENDPROC|FUNC|ENDFUNC|TRAP|ENDTRAP|IF|ELSEIF|ELSE|ENDIF|FOR|ENDFOR|WHILE|ENDWHILE|TEST|CASE|DEFAULT|ENDTEST|"
+    "GOTO|RETURN|ERROR"
+)
+_STATEMENT = re.compile(
+    rf"(?P<flow>^[ \t]*(?:LOCAL\s+)?(?:{_FLOW}|\w+:(?!=))(?=\W|$))"
+    r"|\b(?P<move>MoveAbsJ|Move[JLC](?:DO|AO|GO|Sync)?|Trigg[JLC]|Search[LC])\b",
+    re.MULTILINE | re.IGNORECASE,
+)
+
+
+def scan_rapid(text: str, stated: FrameFile) -> ScannedProgram:
+    """Read a module; tool and work object are those of each move.
+
+    Args:
+        text: of the module.
+        stated: tools and work objects that are declared in other modules.
+    """
+    return _Reader(Scan(text), masked(text, _HIDDEN), stated).read()
+
+
+@dataclass
+class _Reader:
+    """Walks through the statements of a module."""
+
+    scan: Scan
+    text: str
+    stated: FrameFile
+    data: dict[str, Pose | Frame] = field(default_factory=dict)
+    uses: dict[str, int] = field(default_factory=dict)
+
+    def read(self) -> ScannedProgram:
+        self.data = {"TOOL0": IDENTITY, "WOBJ0": IDENTITY}
+        for found in _DATA.finditer(self.text):
+            kind, name = found[1].lower(), found[2].upper()
+            form = {"robtarget": _TARGET, "tooldata": _TOOL, "wobjdata": _WOBJ}[kind]
+            literal = form.match(self.scan.text, found.end())  # where strings are not hidden
+            if literal and len(re.findall(rf"(?i)\b{name}(?:\.[\w.]+)?\s*:=", self.text)) == 1:
+                self.data[name] = _pose(literal) if kind == "robtarget" else _product(literal)
+        for found in _STATEMENT.finditer(self.text):
+            if found["flow"]:
+                self.scan.interrupt()
+            elif found["move"].upper() == "MOVEABSJ":
+                self.scan.joints(found.start())
+            else:
+                self._move(found)
+        for name, pose in self.data.items():
+            if isinstance(pose, Pose):
+                used = len(re.findall(rf"(?i)\b{name}\b", self.text)) - 1
+                if used > self.uses.get(name, 0):
+                    self.scan.blur(pose)
+        return self.scan.program()
+
+    def _move(self, found: re.Match[str]) -> None:
+        spans = [
+            span for span in arguments(self.text, found.end()) if not self.text[slice(*span)].startswith("\\")
+        ]
+        kind = re.match(r"Move([JLC])", found["move"], re.IGNORECASE)
+        count = 2 if kind and kind[1].upper() == "C" else 1
+        if kind is None or len(spans) < count + 3:
+            self.scan.move(found.start(), "the move is of a kind that is not understood", IDENTITY, IDENTITY)
+            return
+        frame, tool = self._frames(self.text[slice(*spans[count + 2])])
+        timed = re.search(r"(?i)\\T\s*:=", self.text[slice(*spans[count])])
+        for span in spans[:count]:
+            pose = self._target(re.split(r"\s*\\", self.text[slice(*span)])[0], span)
+            cut = None
+            if kind[1].upper() == "L" and isinstance(pose, Pose):
+                if timed:
+                    self.scan.leave(found.start(), "the move has a time, so no way points are put in")
+                else:
+                    cut = partial(self._way_points, found, spans, pose)
+            self.scan.move(found.start(), pose, frame, tool, cut)
+
+    def _target(self, expression: str, span: tuple[int, int]) -> Pose | str:
+        if literal := _TARGET.match(self.text, span[0]):
+            return _pose(literal)
+        pose = self.data.get(expression.upper())
+        if not isinstance(pose, Pose):
+            return "the target is computed or not stated in this file"
+        self.uses[expression.upper()] = self.uses.get(expression.upper(), 0) + 1
+        return pose
+
+    def _frames(self, expression: str) -> tuple[Frame | str, Frame | str]:
+        """Work object and tool of a move, from its last argument."""
+        words = re.split(r"\s*\\\s*", expression)
+        wobj = next(
+            (word.split(":=")[1].strip() for word in words if re.match(r"(?i)WObj\s*:=", word)), "wobj0"
+        )
+        frame, tool = self.data.get(wobj.upper()), self.data.get(words[0].upper())
+        return (
+            frame if isinstance(frame, torch.Tensor) else self.stated.frame(wobj),
+            tool if isinstance(tool, torch.Tensor) else self.stated.tool(words[0]),
+        )
+
+    def _way_points(
+        self, move: re.Match[str], spans: Sequence[tuple[int, int]], pose: Pose, poses: Sequence[Frame]
+    ) -> list[Edit]:
+        """The move again before itself, once a way point, past which the tool flies."""
+        start = self.scan.line_start(move.start())
+        text, (begin, end) = self.scan.text, pose.span
+        literal = _TARGET.search(text, text.rfind("[", 0, begin))
+        assert literal is not None
+        rest = text[end : literal.end()]
+        speed, last = text[slice(*spans[1])], text[slice(*spans[3])]
+        line_end = "\r\n" if "\r\n" in text else "\n"
+        indent = re.match(r"[ \t]*", text[start:])
+        lines = (
+            f"{indent[0] if indent else ''}MoveL [{pose.write(T)}{rest}, {speed}, z1, {last};{line_end}"
+            for T in poses
+        )
+        return [Edit((start, start), "".join(lines))]
+
+
+def _frame(text: str) -> Frame:
+    values = torch.tensor(numbers_in(text), dtype=torch.float64)
+    return transform(rotation_from_quaternion(values[[4, 5, 6, 3]]), values[:3] / 1e3)
+
+
+def _pose(literal: re.Match[str]) -> Pose:
+    return Pose(literal.span(1), _frame(literal[1]), _written)
+
+
+def _product(literal: re.Match[str]) -> Frame:
+    """The frames of tooldata or wobjdata, one in the other."""
+    T = IDENTITY
+    for place in literal.groups():
+        T = T @ _frame(place)
+    return T
+
+
+def _written(T: Frame) -> str:
+    return f"[{numbers(millimetres(T))}], [{numbers(quaternion(T), 9)}]"

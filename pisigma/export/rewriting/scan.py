@@ -1,0 +1,227 @@
+"""What is understood of a program: poses in its text, the frame and tool they are of, and the moves to them."""
+
+import bisect
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+Frame = Float64[Tensor, "4 4"]
+
+NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+IDENTITY = torch.eye(4, dtype=torch.float64)
+
+
+@dataclass(frozen=True, eq=False)
+class Pose:
+    """A pose that stands in a text.
+
+    Attributes:
+        span: where its numbers stand.
+        T: the pose, of the tool in the frame [m].
+        write: gives the text of another pose in the same form.
+    """
+
+    span: tuple[int, int]
+    T: Frame
+    write: Callable[[Frame], str]
+
+
+@dataclass(frozen=True)
+class Edit:
+    """Text to put in place of a stretch of a program; an empty stretch is a place to insert at."""
+
+    span: tuple[int, int]
+    text: str
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """A pose that the robot is sent to.
+
+    Attributes:
+        line: of the pose.
+        pose: the pose.
+        T_root_frame: the frame it is given in, seen from the origin of the robot description.
+        T_flange_tool: the tool, seen from the last row of the robot description.
+    """
+
+    line: int
+    pose: Pose
+    T_root_frame: Frame
+    T_flange_tool: Frame
+
+
+@dataclass(frozen=True, eq=False)
+class LinearMove:
+    """A straight move to a target.
+
+    Attributes:
+        line: of the move.
+        start: the target before; None where the program does not say where the move begins.
+        end: where it leads.
+        way_points: gives the edits that make it go by poses of the end's tool in the end's frame.
+    """
+
+    line: int
+    start: Target | None
+    end: Target
+    way_points: Callable[[Sequence[Frame]], list[Edit]]
+
+
+@dataclass(frozen=True, eq=False)
+class ScannedProgram:
+    """A program as far as it is understood.
+
+    Attributes:
+        text: of the program.
+        targets: those whose frame and tool are known, in the order of the text.
+        moves: the straight ones among the moves to them.
+        left: line and reason of whatever is left alone.
+        joint_lines: lines of moves to joint values, which stay.
+        finish: what is done to the text after the edits, such as numbering its lines.
+    """
+
+    text: str
+    targets: tuple[Target, ...]
+    moves: tuple[LinearMove, ...]
+    left: tuple[tuple[int, str], ...]
+    joint_lines: tuple[int, ...]
+    finish: Callable[[str], str] = lambda text: text
+
+
+class Scan:
+    """Collects what a reader of a language understands, move after move in the order of the text."""
+
+    def __init__(self, text: str) -> None:
+        """Begin with the text of a program."""
+        self.text = text
+        self._breaks = [found.start() for found in re.finditer("\n", text)]
+        self._targets: dict[tuple[int, int], Target] = {}
+        self._unclear: set[tuple[int, int]] = set()
+        self._moves: list[LinearMove] = []
+        self._left: dict[int, str] = {}
+        self._joint_lines: list[int] = []
+        self._previous: Target | None = None
+
+    def line(self, position: int) -> int:
+        """The line of a place in the text, from 1."""
+        return bisect.bisect_left(self._breaks, position) + 1
+
+    def line_start(self, position: int) -> int:
+        """Where the line of a place begins."""
+        return self.text.rfind("\n", 0, position) + 1
+
+    def leave(self, position: int, reason: str) -> None:
+        """Name what is left alone; the first reason of a line counts."""
+        self._left.setdefault(self.line(position), reason)
+
+    def interrupt(self) -> None:
+        """What follows may be reached from elsewhere: the next straight move begins nobody knows where."""
+        self._previous = None
+
+    def joints(self, position: int) -> None:
+        """A move to joint values, which stays."""
+        self._joint_lines.append(self.line(position))
+        self._previous = None
+
+    def blur(self, pose: Pose) -> None:
+        """A pose is used in ways that are not understood, so it stays."""
+        self._unclear.add(pose.span)
+
+    def move(
+        self,
+        position: int,
+        pose: Pose | str,
+        frame: Frame | str,
+        tool: Frame | str,
+        way_points: Callable[[Sequence[Frame]], list[Edit]] | None = None,
+    ) -> None:
+        """A move to a pose.
+
+        Args:
+            position: where the move stands.
+            pose: the pose, or why it is not understood; likewise `frame` and `tool`.
+            frame: that the pose is given in, seen from the origin of the robot description.
+            tool: that is brought there, seen from the last row of the robot description.
+            way_points: of a straight move, see `LinearMove`.
+        """
+        self._previous, before = None, self._previous
+        for part in (pose, frame, tool):
+            if isinstance(part, str):
+                self.leave(position, part)
+                if isinstance(pose, Pose):
+                    self.blur(pose)
+                return
+        assert isinstance(pose, Pose)
+        assert isinstance(frame, Tensor)
+        assert isinstance(tool, Tensor)
+        target = Target(self.line(pose.span[0]), pose, frame, tool)
+        same = self._targets.setdefault(pose.span, target)
+        if not (torch.equal(same.T_root_frame, frame) and torch.equal(same.T_flange_tool, tool)):
+            self.leave(position, "the pose is used with several frames or tools")
+            self.blur(pose)
+            return
+        if way_points is not None:
+            self._moves.append(LinearMove(self.line(position), before, target, way_points))
+        self._previous = target
+
+    def program(self, finish: Callable[[str], str] = lambda text: text) -> ScannedProgram:
+        """What was collected, without poses that are used in ways that are not understood."""
+        for span, target in self._targets.items():
+            if span in self._unclear:
+                self._left.setdefault(target.line, "the pose is also used in a way that is not understood")
+        kept = {span: target for span, target in self._targets.items() if span not in self._unclear}
+        moves = [
+            LinearMove(
+                move.line,
+                move.start if move.start and move.start.pose.span in kept else None,
+                move.end,
+                move.way_points,
+            )
+            for move in self._moves
+            if move.end.pose.span in kept
+        ]
+        targets = tuple(kept[span] for span in sorted(kept))
+        left = tuple(sorted(self._left.items()))
+        return ScannedProgram(self.text, targets, tuple(moves), left, tuple(self._joint_lines), finish)
+
+
+def masked(text: str, hidden: re.Pattern[str]) -> str:
+    """The text with blanks in place of comments and strings, so that every place stays where it is."""
+    return hidden.sub(lambda found: re.sub(r"[^\n]", " ", found[0]), text)
+
+
+def arguments(text: str, start: int) -> Iterator[tuple[int, int]]:
+    """Spans of what stands between commas at one level of brackets, from `start` to the bracket that ends it.
+
+    Args:
+        text: masked.
+        start: behind the opening bracket, or where a list without brackets begins.
+    """
+    depth, begin = 0, start
+    for position in range(start, len(text)):
+        letter = text[position]
+        if letter in "([{":
+            depth += 1
+        elif letter in ")]}" or (letter == ";" and depth == 0):
+            depth -= 1
+            if depth < 0 or letter == ";":
+                yield _stripped(text, begin, position)
+                return
+        elif letter == "," and depth == 0:
+            yield _stripped(text, begin, position)
+            begin = position + 1
+
+
+def _stripped(text: str, start: int, end: int) -> tuple[int, int]:
+    inside = text[start:end]
+    return start + len(inside) - len(inside.lstrip()), end - len(inside) + len(inside.rstrip())
+
+
+def numbers_in(text: str) -> list[float]:
+    """All numbers of a stretch of text."""
+    return [float(number) for number in re.findall(NUMBER, text)]

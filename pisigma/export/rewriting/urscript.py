@@ -1,0 +1,146 @@
+"""Poses of URScript programs: `p[x, y, z, rx, ry, rz]` in metres and rotation vectors."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import partial
+
+import torch
+
+from pisigma.export.programs.text import metres_and_rotation_vector, number, numbers
+from pisigma.export.rewriting.frame_file import FrameFile
+from pisigma.export.rewriting.scan import (
+    IDENTITY,
+    NUMBER,
+    Edit,
+    Frame,
+    Pose,
+    Scan,
+    ScannedProgram,
+    arguments,
+    masked,
+    numbers_in,
+)
+from pisigma.se3 import rotation_from_vector, transform
+
+_HIDDEN = re.compile(r'#[^\n]*|"[^"\n]*"')
+_LITERAL = re.compile(rf"p\[\s*{NUMBER}(?:\s*,\s*{NUMBER}){{5}}\s*\]")
+_ASSIGNMENT = re.compile(r"(?m)^[ \t]*(?:global\s+|local\s+)?(\w+)\s*=(?!=)\s*")
+_STATEMENT = re.compile(
+    r"(?P<flow>^[ \t]*(?:def|thread|while|if|elif|else|for|end|return|break|continue|halt)\b)"
+    r"|(?P<call>\b(?P<name>move[jlpc]|servo[jc]|set_tcp)\s*\()",
+    re.MULTILINE,
+)
+BLEND = 1e-3
+"""[m] Radius at way points, smaller where the way is short."""
+
+
+def scan_urscript(text: str, stated: FrameFile) -> ScannedProgram:
+    """Read a program; poses count from the base, or from the frame of a `pose_trans`.
+
+    Args:
+        text: of the program.
+        stated: frames that the program does not state; its tool `tcp` holds until a `set_tcp` of numbers.
+    """
+    return _Reader(Scan(text), masked(text, _HIDDEN), stated).read()
+
+
+@dataclass
+class _Reader:
+    """Walks through the statements of a program."""
+
+    scan: Scan
+    text: str
+    stated: FrameFile
+    tool: Frame | str = ""
+    poses: dict[str, Pose] = field(default_factory=dict)
+    uses: dict[str, int] = field(default_factory=dict)
+
+    def read(self) -> ScannedProgram:
+        self.tool, depth = self.stated.tool("tcp"), 0
+        for found in _ASSIGNMENT.finditer(self.text):
+            literal = _LITERAL.match(self.text, found.end())
+            once = len(re.findall(rf"(?m)^[ \t]*(?:global\s+|local\s+)?{found[1]}\s*=(?!=)", self.text)) == 1
+            if literal and once:
+                self.poses[found[1]] = _pose(self.text, literal.span())
+        for found in _STATEMENT.finditer(self.text):
+            if found["flow"]:
+                self.scan.interrupt()
+                opens = found["flow"].strip() in ("def", "thread", "while", "if", "for")
+                depth += 1 if opens else -1 if found["flow"].strip() == "end" else 0
+            elif found["name"] == "set_tcp":
+                literal = _LITERAL.match(self.text, found.end())
+                self.tool = (
+                    _pose(self.text, literal.span()).T if literal and depth < 2 else "the tool is computed"
+                )
+            else:
+                self._move(found)
+        for name, pose in self.poses.items():
+            used = len(re.findall(rf"\b{name}\b", self.text)) - 1
+            if used > self.uses.get(name, 0):
+                self.scan.blur(pose)
+        return self.scan.program()
+
+    def _move(self, call: re.Match[str]) -> None:
+        spans = list(arguments(self.text, call.end()))
+        for span in spans[: 2 if call["name"] in ("movec", "servoc") else 1]:
+            if self.text[span[0]] == "[":
+                self.scan.joints(call.start())
+                continue
+            pose, frame, operand = self._target(span)
+            cut = None
+            if call["name"] == "movel" and isinstance(pose, Pose):
+                if any(re.match(r"t\s*=", self.text[slice(*other)]) for other in spans):
+                    self.scan.leave(call.start(), "the move has a time, so no way points are put in")
+                else:
+                    cut = partial(self._way_points, call, spans, operand, pose)
+            self.scan.move(call.start(), pose, frame, self.tool, cut)
+
+    def _target(self, span: tuple[int, int]) -> tuple[Pose | str, Frame | str, tuple[int, int]]:
+        """The pose that an argument is, the frame it is given in, and where it stands."""
+        expression = self.text[slice(*span)]
+        if function := re.match(r"(get_inverse_kin|pose_trans)\s*\(", expression):
+            inner = list(arguments(self.text, span[0] + function.end()))
+            if function[1] == "get_inverse_kin":
+                return self._target(inner[0])
+            frame = self._constant(inner[0])
+            pose, _, operand = self._target(inner[1])
+            return pose, frame.T if frame else "the frame is computed", operand
+        pose = self._constant(span) or "the target is computed"
+        if expression in self.poses:
+            self.uses[expression] = self.uses.get(expression, 0) + 1
+        return pose, IDENTITY, span
+
+    def _constant(self, span: tuple[int, int]) -> Pose | None:
+        expression = self.text[slice(*span)]
+        return _pose(self.text, span) if _LITERAL.fullmatch(expression) else self.poses.get(expression)
+
+    def _way_points(
+        self,
+        call: re.Match[str],
+        spans: Sequence[tuple[int, int]],
+        operand: tuple[int, int],
+        pose: Pose,
+        poses: Sequence[Frame],
+    ) -> list[Edit]:
+        """The move again before itself, once a way point, with a small blend radius."""
+        start, (before, after) = self.scan.line_start(call.start()), operand
+        ends = torch.stack([*poses, pose.T])[:, :3, 3]
+        nearest = float((ends[1:] - ends[:-1]).norm(dim=-1).min())
+        radius = f"r={number(min(BLEND, nearest / 4), 6)}"
+        rest = [self.text[slice(*span)] for span in spans[1:]]
+        named = [index for index, argument in enumerate(rest) if re.match(r"r\s*=", argument)]
+        rest = [radius if index in named else argument for index, argument in enumerate(rest)]
+        rest += [] if named else [radius]
+        head, tail = self.text[start:before], self.text[after : spans[0][1]]
+        lines = (f"{head}{', '.join([pose.write(T) + tail, *rest])})\n" for T in poses)
+        return [Edit((start, start), "".join(lines))]
+
+
+def _pose(text: str, span: tuple[int, int]) -> Pose:
+    values = torch.tensor(numbers_in(text[slice(*span)]), dtype=torch.float64)
+    return Pose(span, transform(rotation_from_vector(values[3:]), values[:3]), _written)
+
+
+def _written(T: Frame) -> str:
+    return f"p[{numbers(metres_and_rotation_vector(T), 9)}]"

@@ -1,0 +1,371 @@
+"""Programs whose targets are rewritten: the real tool comes where the program says, along straight lines too."""
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from testing.closeness import assert_close
+from testing.identified import geometric_model, off_by
+from testing.models import joints_around
+
+from pisigma.errors import OutputError
+from pisigma.export.export_format import Exported, ExportRequest
+from pisigma.export.programs.text import (
+    labelled,
+    metres_and_rotation_vector,
+    millimetres,
+    millimetres_and_euler,
+    numbers,
+    quaternion,
+)
+from pisigma.export.registry import export_model
+from pisigma.export.rewriting.export import SCANNERS
+from pisigma.export.rewriting.frame_file import FrameFile
+from pisigma.export.rewriting.scan import Frame, ScannedProgram
+from pisigma.kinematics.closed_form import closed_form_solver
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.model.folder.model_folder import load_model, save_model
+from pisigma.robot import Robot
+from pisigma.se3 import invert, transform_from_xyzrpy
+
+FRAME = transform_from_xyzrpy(torch.tensor([0.4, -0.3, 0.1, 0.5, -0.2, 0.1], dtype=torch.float64))
+TOOL = transform_from_xyzrpy(torch.tensor([0.02, -0.01, 0.15, 0.3, 0.1, -0.4], dtype=torch.float64))
+TOLERANCE_MM = 0.02
+
+
+@dataclass(frozen=True)
+class Language:
+    """How a program of two straight moves, one by joints, one that is computed and one to a far pose is written."""
+
+    suffix: str
+    pose: Callable[[Frame], str]
+    text: str
+    kept: tuple[str, ...]
+    """What has to stand in the new program too."""
+
+
+def six(T: Frame) -> str:
+    return labelled(millimetres_and_euler(T).tolist(), "XYZABC")
+
+
+def place_of(T: Frame) -> str:
+    return f"{numbers(millimetres(T))}], [{numbers(quaternion(T), 9)}"
+
+
+def position(number: int) -> Callable[[Frame], str]:
+    def written(T: Frame) -> str:
+        x, y, z, r, p, w = (f"{value:.6f}" for value in millimetres_and_euler(T).tolist())
+        return (
+            f"P[{number}]{{\n   GP1:\n\tUF : 1, UT : 2,\t\tCONFIG : 'N U T, 0, 0, 0',\n"
+            f"\tX = {x}  mm,\tY = {y}  mm,\tZ = {z}  mm,\n\tW = {w} deg,\tP = {p} deg,\tR = {r} deg\n}};"
+        )
+
+    return written
+
+
+LANGUAGES = [
+    Language(
+        ".script",
+        lambda T: f"p[{numbers(metres_and_rotation_vector(T), 9)}]",
+        """def cell():
+  # movel(p[1, 2, 3, 4, 5, 6]) "is a remark"
+  set_tcp({tool})
+  bench = {frame}
+  over = {P1}
+  movej([0.1, -1.0, 1.2, -0.4, -1.2, 0.3], a=1.2)
+  movej(get_inverse_kin(pose_trans(bench, {P0}), [0, 0, 0, 0, 0, 0]), a=1.4, v=0.5)
+  movel(pose_trans(bench, over), a=1.2, v=0.25, r=0.01)  # over the bench
+  set_digital_out(1, True)
+  movel(pose_trans(bench, {P2}), a=1.2, v=0.2)
+  movel(pose_trans(bench, {far}))
+  movel(pose_add(get_actual_tcp_pose(), p[0, 0, 0.1, 0, 0, 0]))
+end
+""",
+        (
+            "  movel(pose_trans(bench, over), a=1.2, v=0.25, r=0.01)  # over the bench",
+            "set_digital_out(1, True)",
+        ),
+    ),
+    Language(
+        ".src",
+        lambda T: "{X 1, Y 2}"[:0] + f"{{{six(T)}}}",
+        """&ACCESS RVP
+DEF cell()
+; LIN {{X 1,Y 2,Z 3,A 4,B 5,C 6}}
+$TOOL = {tool}
+$BASE = {frame}
+OVER = {P1}
+PTP {{A1 0, A2 -90, A3 90, A4 0, A5 0, A6 0}}
+PTP {{FRAME: {p0}}}
+LIN OVER C_DIS ; over the bench
+$OUT[1] = TRUE
+LIN {{POS: {p2}, S 2, T 35}}
+LIN {far}
+LIN_REL {{Z 10}}
+END
+""",
+        ("LIN OVER C_DIS ; over the bench", "$OUT[1] = TRUE", ", S 2, T 35}"),
+    ),
+    Language(
+        ".mod",
+        lambda T: f"[[{place_of(T)}], [0, -1, 0, 1], [9E9, 9E9, 9E9, 9E9, 9E9, 9E9]]",
+        """MODULE cell
+  PERS tooldata torch := [TRUE, [[{tool}]], [1, [0, 0, 0], [1, 0, 0, 0], 0, 0, 0]];
+  TASK PERS wobjdata bench := [FALSE, TRUE, "", [[{frame}]], [[0, 0, 0], [1, 0, 0, 0]]];
+  CONST robtarget over := {P1};
+  PROC run()
+    MoveAbsJ [[0, 0, 0, 0, 0, 0], [9E9, 9E9, 9E9, 9E9, 9E9, 9E9]], v500, fine, torch;
+    MoveJ {P0}, v1000, z10, torch \\WObj:=bench;
+    MoveL over, v200, z5, torch \\WObj:=bench;  ! over the bench
+    SetDO do1, 1;
+    MoveL {P2}, v100, fine, torch
+      \\WObj:=bench;
+    MoveL {far}, v100, fine, torch \\WObj:=bench;
+    MoveL Offs(home, 0, 0, 10), v100, fine, torch \\WObj:=bench_2;
+  ENDPROC
+ENDMODULE
+""",
+        ("MoveL over, v200, z5, torch \\WObj:=bench;  ! over the bench", "SetDO do1, 1;", "[0, -1, 0, 1]"),
+    ),
+    Language(
+        ".ls",
+        lambda T: "",
+        """/PROG  CELL
+/ATTR
+LINE_COUNT = 9;
+/MN
+   1:  !L P[1] a remark ;
+   2:J P[1] 20% FINE ;
+   3:L P[2] 250mm/sec CNT50 ACC80 ;
+   4:  DO[1]=ON ;
+   5:L P[3] 100mm/sec FINE ;
+   6:L P[4] 100mm/sec FINE ;
+   7:L PR[1] 100mm/sec FINE ;
+   8:J P[5] 20% FINE ;
+   9:L P[3] 100mm/sec FINE Offset,PR[2] ;
+/POS
+{P0}
+{P1}
+{P2}
+{far}
+P[5]{{
+   GP1:
+	UF : 0, UT : 2,
+	J1=     0.000 deg,	J2=     0.000 deg,	J3=     0.000 deg,
+	J4=     0.000 deg,	J5=     0.000 deg,	J6=     0.000 deg
+}};
+/END
+""",
+        ("L P[2] 250mm/sec CNT50 ACC80 ;", "DO[1]=ON ;", "!L P[1] a remark ;"),
+    ),
+]
+FANUC_FRAMES = """frames: {{"UFRAME 1": {{{frame}}}}}
+tools: {{"UTOOL 2": {{{tool}}}}}
+"""
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory) -> Path:
+    """A geometric model of a UR10 with a base and a tool of its own."""
+    nominal = Robot.load("ur10").with_geometry(base=np.full(6, 0.3), tool=np.full(6, 0.1))
+    model = geometric_model("ur10")
+    folder = tmp_path_factory.mktemp("models") / "arm"
+    folder.mkdir()
+    save_model(replace(model, robot=nominal, calibrated=off_by(nominal)), folder)
+    return folder
+
+
+def wanted_poses(robot: Robot) -> torch.Tensor:
+    """Three poses of the tool in the frame, within the domain, and one that is too far."""
+    bare = robot.with_geometry(base=np.zeros(6), tool=np.zeros(6))
+    T = invert(FRAME) @ forward_kinematics(bare, joints_around("ur10", 3, seed=2, spread=0.2)) @ TOOL
+    far = T[:1].clone()
+    far[:, :3, 3] += 9.0
+    return torch.cat([T, far])
+
+
+def program(language: Language, arm: Path, tmp_path: Path) -> ExportRequest:
+    """The program and what it does not state, as files, and the request to rewrite it."""
+    T = wanted_poses(load_model(arm).robot)
+    written = {
+        f"P{i}": (position(i + 1) if language.suffix == ".ls" else language.pose)(T[i]) for i in range(3)
+    }
+    far = (position(4) if language.suffix == ".ls" else language.pose)(T[3])
+    place = place_of if language.suffix == ".mod" else language.pose
+    text = language.text.format(
+        **written, far=far, tool=place(TOOL), frame=place(FRAME), p0=six(T[0]), p2=six(T[2])
+    )
+    path = tmp_path / f"cell{language.suffix}"
+    path.write_text(text, newline="")
+    columns = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
+    stated = {
+        name: ", ".join(
+            f"{c}: {v!r}" for c, v in zip(columns, millimetres_and_euler(frame).tolist(), strict=True)
+        )
+        for name, frame in (("frame", FRAME), ("tool", TOOL))
+    }
+    (tmp_path / "frames.yaml").write_text(FANUC_FRAMES.format(**stated))
+    frames = tmp_path / "frames.yaml" if language.suffix == ".ls" else None
+    out = tmp_path / f"new{language.suffix}"
+    return ExportRequest(arm, out, program=path, frames=frames, tolerance_mm=TOLERANCE_MM)
+
+
+def scanned(path: Path, frames: Path | None) -> ScannedProgram:
+    return SCANNERS[path.suffix](path.read_text(), FrameFile.read(frames))
+
+
+def really(arm: Path, commanded: torch.Tensor, wanted: torch.Tensor) -> torch.Tensor:
+    """Where the real tool comes when a controller that computes with the robot as drawn is sent to poses."""
+    model = load_model(arm)
+    base, tool = (
+        transform_from_xyzrpy(torch.from_numpy(f.copy())) for f in (model.robot.base, model.robot.tool)
+    )
+    before, after = base @ FRAME, invert(TOOL) @ tool
+    q = closed_form_solver(model.robot).solve(before @ commanded @ after).q
+    T = invert(before) @ model.forward(q.flatten(0, 1)).unflatten(0, q.shape[:2]) @ invert(after)
+    off = (T - wanted[:, None]).flatten(2).norm(dim=-1).nan_to_num(torch.inf)
+    return T[range(len(T)), off.argmin(-1)]
+
+
+@pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
+def test_the_real_tool_comes_where_the_program_says(language, arm, tmp_path):
+    request = program(language, arm, tmp_path)
+    exported = export_model("targets", request)
+    wanted = wanted_poses(load_model(arm).robot)
+    before, after = scanned(request.program, request.frames), scanned(request.out, request.frames)
+    names = [round(float(t.pose.T[0, 3]), 6) for t in before.targets]
+    kept = 2 if language.suffix == ".ls" else 3  # P[3] is used with an offset too
+    assert len(before.targets) == kept + 1
+    assert exported.facts["statuses"] == {"reached": kept, "unreachable": 1}
+    order = [min(range(4), key=lambda i: abs(float(wanted[i, 0, 3]) - x)) for x in names]
+    assert sorted(order) == [0, 1, *([2] if kept == 3 else []), 3]
+    commanded = {}
+    for target in after.targets:
+        nearest = min(range(4), key=lambda i: float((wanted[i] - target.pose.T)[:3, 3].norm()))
+        if float((wanted[nearest] - target.pose.T)[:3, 3].norm()) < 4e-3:
+            commanded[nearest] = target.pose.T
+    for index in set(order) - {3}:
+        assert float((commanded[index] - wanted[index])[:3, 3].norm()) > 1e-4
+        real = really(arm, commanded[index][None], wanted[index][None])
+        assert_close(real[0, :3, 3], wanted[index, :3, 3], atol=1e-8)
+        assert_close(real[0, :3, :3], wanted[index, :3, :3], atol=1e-7)
+    assert_close(commanded[3], wanted[3], atol=1e-8)  # it keeps its line
+    line = next(
+        i for i, text in enumerate(request.program.read_text().splitlines(), 1) if "9" in text and i > 5
+    )
+    assert line
+    assert str(exported.shortfall).startswith(f"{request.program}, line ")
+    assert "unreachable, so the line is as it was" in str(exported.shortfall)
+
+
+@pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
+def test_straight_moves_stay_straight(language, arm, tmp_path):
+    """Between way points a controller moves on the line between commanded poses; so does the real tool, nearly."""
+    request = program(language, arm, tmp_path)
+    exported = export_model("targets", request)
+    after = scanned(request.out, request.frames)
+    moves = [move for move in after.moves if move.start is not None]
+    wanted = wanted_poses(load_model(arm).robot)
+    assert exported.facts["way_points"] >= 1
+    ends = [float((move.end.pose.T - wanted[1])[:3, 3].norm()) < 4e-3 for move in moves]
+    moves = moves[: ends.index(True) + 1]
+    assert len(moves) > 1
+    share = torch.linspace(0, 1, 9, dtype=torch.float64)[:, None, None]
+    worst, line = 0.0, wanted[1, :3, 3] - wanted[0, :3, 3]
+    for move in moves:
+        T = move.start.pose.T + share * (move.end.pose.T - move.start.pose.T)
+        u, _, v = torch.linalg.svd(T[:, :3, :3])
+        T[:, :3, :3] = u @ v
+        real = really(arm, T, T)[:, :3, 3] - wanted[0, :3, 3]
+        off = real - (real @ line / (line @ line))[:, None] * line
+        worst = max(worst, float(off.norm(dim=-1).max()) * 1e3)
+    assert worst < 1.5 * TOLERANCE_MM
+
+
+@pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
+def test_all_else_stays_and_is_named(language, arm, tmp_path):
+    request = program(language, arm, tmp_path)
+    exported = export_model("targets", request)
+    text, old = request.out.read_text(), request.program.read_text()
+    assert all(piece in text for piece in language.kept)
+    removed = [
+        line[1:] for line in exported.facts["diff"].splitlines() if line.startswith("-") and line[:3] != "---"
+    ]
+    unnumbered = [re.sub(r"^:", "", line) for line in removed]
+    assert all(any(line.endswith(rest) for line in old.splitlines()) for rest in unnumbered)
+    reasons = {entry["line"]: entry["reason"] for entry in exported.facts["left_alone"]}
+    computed = next(
+        i for i, line in enumerate(old.splitlines(), 1) if re.search(r"pose_add|LIN_REL|Offs\(|PR\[1\]", line)
+    )
+    assert re.search("computed|register|bench_2", reasons[computed])
+    assert exported.facts["joint_lines"]
+    assert exported.facts["largest_shift_mm"] > 0.1
+    assert any("TEST IT AT LOW SPEED" in sentence for sentence in exported.doubts)
+    if language.suffix == ".ls":
+        lines = re.findall(r"(?m)^ *(\d+):", text)
+        assert lines == [str(i) for i in range(1, len(lines) + 1)]
+        assert f"LINE_COUNT = {len(lines)};" in text
+        assert reasons[13] == "Offset moves the target"
+
+
+@pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
+def test_frames_that_are_not_stated_leave_their_targets(language, arm, tmp_path):
+    request = program(language, arm, tmp_path)
+    pattern = r"(?m)^.*(set_tcp|\$BASE|tooldata).*\n"
+    request.program.write_text(re.sub(pattern, "", request.program.read_text(), count=1), newline="")
+    with pytest.raises(OutputError, match=r"holds no pose that can be rewritten \(line \d+: .* not stated"):
+        export_model("targets", replace(request, frames=None))
+    assert not request.out.exists()
+
+
+def test_a_pose_within_a_branch_of_the_program_begins_nowhere(arm, tmp_path):
+    request = program(LANGUAGES[0], arm, tmp_path)
+    text = request.program.read_text().replace("  set_digital_out(1, True)\n", "  if x > 1:\n  end\n")
+    request.program.write_text(text)
+    exported = export_model("targets", request)
+    reasons = [entry["reason"] for entry in exported.facts["left_alone"]]
+    assert sum("begins is not stated" in reason for reason in reasons) == 1
+
+
+def test_a_pose_of_several_tools_stays(arm, tmp_path):
+    request = program(LANGUAGES[0], arm, tmp_path)
+    other = "end\n".join(request.program.read_text().rsplit("end\n", 1)).replace(
+        "  movel(pose_add",
+        "  set_tcp(p[0, 0, 0, 0, 0, 0])\n  movel(pose_trans(bench, over))\n  movel(pose_add",
+    )
+    request.program.write_text(other)
+    exported = export_model("targets", request)
+    assert any("several frames or tools" in entry["reason"] for entry in exported.facts["left_alone"])
+    assert exported.facts["targets"] == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        ({"program": Path("cell.txt")}, "a program ends in .script, .src, .mod, .ls"),
+        ({"out": Path("new.src")}, "--out ends as the program does"),
+        ({"targets": "joints"}, "--targets goes with --poses"),
+        ({"tolerance_mm": 0.0}, "--tolerance-mm 0: a length above 0 was wanted"),
+        ({"poses": Path("poses.csv")}, "needs the poses to make them for"),
+        ({"program": None}, "needs the poses to make them for"),
+        ({"program": None, "poses": Path("x.csv")}, "--frames and --tolerance-mm go with --program"),
+        ({"program": Path("none.script")}, "none.script: cannot be read"),
+    ],
+)
+def test_what_is_refused(options, complaint, arm, tmp_path):
+    request = replace(program(LANGUAGES[0], arm, tmp_path), **options)
+    with pytest.raises(OutputError, match=complaint):
+        export_model("targets", request)
+
+
+def test_the_facts_are_plain(arm, tmp_path):
+    exported = export_model("targets", program(LANGUAGES[0], arm, tmp_path))
+    assert isinstance(exported, Exported)
+    assert json.loads(json.dumps(dict(exported.facts)))["unreached"] == [
+        {"line": 11, "status": "unreachable"}
+    ]
