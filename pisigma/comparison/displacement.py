@@ -3,14 +3,14 @@
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.comparison.model_pair import ModelPair, frames_of
 from pisigma.errors import ModelError
 from pisigma.judging.pose_statistics import PoseErrors
+from pisigma.robot.description import Robot
 from pisigma.se3 import invert
 
 
@@ -19,57 +19,66 @@ class Displacement:
     """Distances between the poses that two models predict for the same joint values.
 
     Attributes:
+        source: what the poses are.
         q: joint values [rad or m], of poses that both models predict.
+        number: of every pose among all of the source, from 1.
         place: position of the tool in the robot's base under the first model [m].
         errors: length [m] and angle [rad] from the first model's pose to the second's.
-        not_predicted: how many poses were left out because a model predicts nothing there.
+        not_predicted: how many poses are left out because a model predicts nothing there.
     """
 
+    source: str
     q: Float64[Tensor, "poses dof"]
+    number: Int64[Tensor, " poses"]
     place: Float64[Tensor, "poses 3"]
     errors: PoseErrors
     not_predicted: int
 
     @staticmethod
-    def at(pair: ModelPair, q: Float64[Tensor, "poses dof"], what: str) -> "Displacement":
+    def at(pair: ModelPair, q: Float64[Tensor, "poses dof"], source: str) -> "Displacement":
         """Compare a pair at joint values.
 
         Args:
             pair: the models.
-            q: joint values [rad or m]; those that are not finite count as not predicted.
-            what: the joint values are, for messages.
+            q: joint values [rad or m].
+            source: what they are, such as a file.
 
         Raises:
             ModelError: there is no pose that both models predict.
         """
-        usable = torch.isfinite(q).all(1)
-        by = pair.displacement(torch.where(usable[:, None], q, 0.0))
-        there = usable & torch.isfinite(by).all(1)
+        by = pair.displacement(q)
+        there = torch.isfinite(by).all(1)
         if not bool(there.any()):
             raise ModelError(
-                f"{pair.first.name} and {pair.second.name} predict no pose of {what}; give poses that the robot "
+                f"{pair.first.name} and {pair.second.name} predict no pose of {source}; give poses that the robot "
                 "reaches."
             )
         base = frames_of(pair.first, pair.owner[0])[0]
         place = (invert(base) @ pair.poses(q[there])[0])[:, :3, 3]
         errors = PoseErrors(by[there, :3].norm(dim=-1), by[there, 3:].norm(dim=-1))
-        return Displacement(q[there], place, errors, int((~there).sum()))
+        number = there.nonzero()[:, 0]
+        return Displacement(source, q[there], number + 1, place, errors, len(q) - len(number))
 
     @property
     def largest(self) -> int:
         """Number of the pose with the largest distance."""
         return int(self.errors.position.argmax())
 
-    def to_json(self) -> dict[str, Any]:
-        """Return the figures as plain values: statistics in mm and deg, and where the largest distance is."""
+    def to_json(self, robot: Robot) -> dict[str, Any]:
+        """Return the figures as plain values: statistics in mm and deg, and where the largest distance is.
+
+        Args:
+            robot: says what the controller's joint values are.
+        """
+        values = robot.to_controller(self.q[self.largest].numpy()).tolist()
         return {
+            "source": self.source,
             "poses": len(self.q),
             "poses_not_predicted": self.not_predicted,
             **self.errors.figures.by_name,
+            "largest_at_pose": int(self.number[self.largest]),
             "largest_at_mm": (self.place[self.largest] * 1e3).tolist(),
+            "largest_at_joints": [
+                axis.in_file_unit(value) for axis, value in zip(robot.axes, values, strict=True)
+            ],
         }
-
-    def joints(self, revolute: tuple[bool, ...]) -> Float64[np.ndarray, "poses dof"]:
-        """Joint values in deg or mm."""
-        joints: np.ndarray = self.q.numpy() * np.where(revolute, np.rad2deg(1.0), 1e3)
-        return joints

@@ -185,6 +185,8 @@ def _difference(one: Robot, other: Robot) -> str:
         return f"their rows are {', '.join(types[0])} and {', '.join(types[1])}"
     if tuple(one.directions) != tuple(other.directions):
         return "a joint turns the other way"
+    if not _coupled_alike(one, other):
+        return "their controllers couple the joints differently"
     scale = np.array([1.0, one.reach, one.reach, 1.0, 1.0])
     by = one.dh - other.dh
     by[:, [0, 3, 4]] = 2 * np.sin(by[:, [0, 3, 4]] / 2)  # angles are the same after a full turn
@@ -196,3 +198,11 @@ def _difference(one: Robot, other: Robot) -> str:
     unit, factor = ("mm", 1e3) if name in ("d", "a") else ("deg", float(np.rad2deg(1.0)))
     values = [f"{robot.dh[row, column] * factor:.6g}" for robot in (one, other)]
     return f"{name} of row '{one.rows[row].name}' is drawn as {values[0]} and as {values[1]} {unit}"
+
+
+def _coupled_alike(one: Robot, other: Robot) -> bool:
+    """Whether the controllers' values mean the same joint values."""
+    if len(one.axes) != len(other.axes):
+        return False
+    values = np.eye(len(one.axes))
+    return bool(np.allclose(one.to_dh(values), other.to_dh(values), equal_nan=True))

@@ -42,6 +42,11 @@ def check_output(
         raise _not_writable(path, problem) from None
 
 
+def check_page(page: Path, inputs: Iterable[Input] = ()) -> None:
+    """Make sure that an HTML page may be written; see `check_output`."""
+    check_output(page, (".html", ".htm"), "a page", inputs)
+
+
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write the content beside `path` and move it there in one step; what was there is replaced.
 

@@ -7,10 +7,6 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
-import torch
-from jaxtyping import Float64
-from torch import Tensor
-
 from pisigma.comparison.displacement import Displacement
 from pisigma.comparison.model_pair import FrameChoice, ModelPair
 from pisigma.comparison.parameter_differences import (
@@ -21,15 +17,12 @@ from pisigma.comparison.parameter_differences import (
 )
 from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.files.model_files import model_hash
-from pisigma.files.output_file import check_output, write_whole
-from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.files.output_file import check_page, write_whole
 from pisigma.judging.bootstrap import Bootstrap
 from pisigma.judging.model_comparison import Difference, ModelComparison, compare_models
-from pisigma.measurement.csv.poses import read_poses
-from pisigma.measurement.csv.reading import read_joints
-from pisigma.measurement.csv.table import read_table
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.planning.task import read_task
 from pisigma.workflow.evaluate import (
     REFERENCES,
     ModelSource,
@@ -72,21 +65,6 @@ class ComparisonSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class TaughtProgram:
-    """What a program that was taught with the first model misses under the second.
-
-    Attributes:
-        source: the file.
-        line: of every pose of the displacement in the file.
-        displacement: of its poses.
-    """
-
-    source: str
-    line: tuple[int, ...]
-    displacement: Displacement
-
-
-@dataclass(frozen=True, eq=False)
 class ComparedModels:
     """Two models of one robot beside each other.
 
@@ -94,9 +72,10 @@ class ComparedModels:
         models: by the names that tables use, the first model and the second.
         settings: how they were compared.
         parameters: side by side, and which of them differ.
-        workspace: distances between both models' poses over the workspace.
+        workspace: distances between both models' poses there.
         rows: errors of both models on the same rows; None where none were given.
-        program: what a program misses; None where none was given.
+        program: the same along a program that was taught with the first: what it misses under the second; None where
+            none was given.
         warnings: what to heed, a sentence each.
         seconds: that it took [s].
     """
@@ -106,7 +85,7 @@ class ComparedModels:
     parameters: ParameterDifferences
     workspace: Displacement
     rows: ModelComparison | None
-    program: TaughtProgram | None
+    program: Displacement | None
     warnings: tuple[str, ...]
     seconds: float
 
@@ -123,9 +102,8 @@ class ComparedModels:
     @property
     def displacements(self) -> dict[str, Displacement]:
         """Distances of the tool by where they are: over the workspace, and along the program where there is one."""
-        program = self.program
-        along = {} if program is None else {f"along {program.source}": program.displacement}
-        return {"over the workspace": self.workspace, **along}
+        along = {} if self.program is None else {f"along {self.program.source}": self.program}
+        return {f"over {self.workspace.source}": self.workspace, **along}
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -148,15 +126,9 @@ class ComparedModels:
             "parameters": [_parameter_json(one) for one in differences.parameters],
             "frames_moved": [one.to_json() for one in differences.frames],
             "remainder": None if differences.remainder is None else vars(differences.remainder),
-            "workspace": _displacement_json(self.workspace, first),
+            "workspace": self.workspace.to_json(first.robot),
             "rows": None if self.rows is None else {**self.rows.to_json(), "better": self.better},
-            "program": None
-            if self.program is None
-            else {
-                "file": self.program.source,
-                "largest_in_line": self.program.line[self.program.displacement.largest],
-                **_displacement_json(self.program.displacement, first),
-            },
+            "program": None if self.program is None else self.program.to_json(first.robot),
             "says": list(self.sentences),
             "warnings": list(self.warnings),
             "seconds": round(self.seconds, 3),
@@ -170,7 +142,7 @@ class ComparedModels:
         """
         from pisigma.reporting.page.comparison import comparison_page  # matplotlib takes a second
 
-        check_page(page)
+        check_page(Path(page))
         says = self.sentences, self.warnings
         text = comparison_page(self.models, self.parameters, self.displacements, self.rows, says)
         write_whole(Path(page), text)
@@ -189,11 +161,10 @@ class ComparedModels:
             f"{where}, at most {figures['max_mm']:.3f} mm."
         ]
         if self.program is not None:
-            missed, line = self.program.displacement, self.program.line
-            figures = missed.errors.figures.by_name
+            figures, largest = self.program.errors.figures.by_name, self.program.largest
             lines.append(
                 f"{self.program.source}, taught with {first}, misses by {figures['rms_mm']:.3f} mm (RMS) under "
-                f"{second}, at most by {figures['max_mm']:.3f} mm in line {line[missed.largest]}."
+                f"{second}, at most by {figures['max_mm']:.3f} mm at its pose {int(self.program.number[largest])}."
             )
         return tuple(lines)
 
@@ -233,6 +204,7 @@ def compare(
     Raises:
         ModelError: a folder cannot be used, or the models are of different robots.
         MeasurementError: rows or program cannot be used.
+        PlanningError: the first model does not reach a pose of the program.
         PoseError: the joint values do not fit the robot.
     """
     begin = time.perf_counter()
@@ -256,32 +228,12 @@ def compare(
         parameters=parameter_differences(pair, settings.level),
         workspace=Displacement.at(pair, pair.workspace, "the workspace"),
         rows=compared,
-        program=None if program is None else _taught_program(pair, Path(program)),
+        program=None
+        if program is None
+        else Displacement.at(pair, read_task(program, pair.first), Path(program).name),
         warnings=_warnings(pair, list(sources.values())),
         seconds=time.perf_counter() - begin,
     )
-
-
-def check_page(page: str | os.PathLike[str], inputs: Sequence[str | os.PathLike[str]] = ()) -> None:
-    """Make sure that a page may be written; see `pisigma.files.output_file.check_output`."""
-    check_output(Path(page), (".html", ".htm"), "a page", [Path(one) for one in inputs])
-
-
-def _taught_program(pair: ModelPair, path: Path) -> TaughtProgram:
-    """Read joint values, or the first model's joint values of poses, and compare the models there."""
-    q, lines = _program_joints(pair.first, path)
-    kept = torch.isfinite(pair.displacement(q.nan_to_num())).all(1) & torch.isfinite(q).all(1)
-    line = tuple(number for number, good in zip(lines, kept.tolist(), strict=True) if good)
-    return TaughtProgram(path.name, line, Displacement.at(pair, q, str(path)))
-
-
-def _program_joints(model: CalibratedModel, path: Path) -> tuple[Float64[Tensor, "poses dof"], Sequence[int]]:
-    """Joint values of a program, NaN where the model does not reach a pose, and their lines."""
-    table = read_table(path)
-    if any(name.startswith("q1_") for name in table.header):
-        return read_joints(path, model.robot), table.lines
-    chunk = read_poses(path)
-    return CorrectedIK(model)(chunk.T, throw=False).q, chunk.line
 
 
 def _parameters_in_words(differences: ParameterDifferences, first: str, second: str) -> tuple[str, ...]:
@@ -300,7 +252,7 @@ def _parameters_in_words(differences: ParameterDifferences, first: str, second: 
         ]
     if differences.remainder.significant:
         lines.append(
-            "The joint corrections, or several parameters together, differ beyond their uncertainty too."
+            "What is left of the differences is more than chance: the joint corrections differ, or several parameters."
         )
     pairs = zip(differences.frames[::2], differences.frames[1::2], strict=True)
     clauses = [f"the {length.what} {length.size} and {angle.size} away" for length, angle in pairs]
@@ -320,12 +272,6 @@ def _parameter_json(one: ParameterDifference) -> dict[str, Any]:
     }
     with_unit = {f"{name}_{one.unit}": value for name, value in figures.items()}
     return {"name": one.name, **with_unit, "p": one.p, "alike": list(one.alike)}
-
-
-def _displacement_json(displacement: Displacement, model: CalibratedModel) -> dict[str, Any]:
-    """Figures, with the joint values of the largest distance in deg or mm."""
-    joints = displacement.joints(model.robot.revolute)[displacement.largest]
-    return {**displacement.to_json(), "largest_at_joints": joints.tolist()}
 
 
 def _warnings(pair: ModelPair, sources: Sequence[ModelSource]) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ import torch
 
 from pisigma.errors import IdentificationError, MeasurementError
 from pisigma.files.model_files import model_hash
-from pisigma.files.output_file import check_output, write_whole
+from pisigma.files.output_file import check_page, write_whole
 from pisigma.judging.progress import Progress
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.rules import is_date
@@ -152,14 +152,9 @@ class Monitoring:
         """
         from pisigma.reporting.page.monitoring import monitoring_page  # matplotlib takes a second
 
-        check_page(page)
+        check_page(Path(page))
         lines = (self.sentences, self.warnings)
         write_whole(Path(page), monitoring_page(self.model, self.records, self.charts, *lines))
-
-
-def check_page(page: str | os.PathLike[str], inputs: Sequence[str | os.PathLike[str]] = ()) -> None:
-    """Make sure that a page may be written; see `pisigma.files.output_file.check_output`."""
-    check_output(Path(page), (".html", ".htm"), "a page", [Path(one) for one in inputs])
 
 
 def monitor(

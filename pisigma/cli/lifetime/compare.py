@@ -55,11 +55,12 @@ def compare(
 
     The significance of differences is from the posteriors of both models.
     """
+    from pisigma.files.output_file import check_page
     from pisigma.workflow import compare as workflow
 
     inputs = [one for one in (Path(first), Path(second), rows, program) if one is not None]
     if page is not None:
-        workflow.check_page(page, inputs)
+        check_page(page, inputs)
     settings = workflow.ComparisonSettings("fixed" if fixed_frames else "fitted", level)
     with progress_of("compare") as progress:
         progress("both models")

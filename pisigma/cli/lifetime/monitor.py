@@ -48,10 +48,11 @@ def monitor(
     The sessions are kept in MODEL.history.sqlite beside the model folder, so that each month's call adds one. Exit
     status 3 where something is to be done: recalibrating pays, a chart is outside its limits, or the error is.
     """
+    from pisigma.files.output_file import check_page
     from pisigma.workflow import monitor as workflow
 
     if page is not None:
-        workflow.check_page(page, (model, *sessions))
+        check_page(page, (model, *sessions))
     days = tuple(day.strip() for day in dates.split(",")) if dates else ()
     settings = workflow.MonitorSettings(days, stated_to_move(moved), limit_mm, not no_history)
     with progress_of("monitor") as progress:

@@ -11,7 +11,7 @@ from pisigma.judging.model_comparison import ModelComparison
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.comparison_tables import comparison_tables
 from pisigma.reporting.difference_tables import difference_table
-from pisigma.reporting.page.error_map import ErrorMap, Layer
+from pisigma.reporting.page.error_map import Layer
 from pisigma.reporting.page.figures import Drawing, draw_map
 from pisigma.reporting.page.page import image, resource
 from pisigma.reporting.rendering import render
@@ -47,7 +47,7 @@ def comparison_page(
         parameters=difference_table(parameters, (first, second)),
         differs=bool(parameters.differing),
         level=f"{parameters.level:.2g}",
-        maps=[draw_displacement(models[first], what, one) for what, one in displacements.items()],
+        maps=[draw_displacement(what, one) for what, one in displacements.items()],
         displacements=pose_rows({what: one.errors.figures for what, one in displacements.items()}),
         rows=() if rows is None else comparison_tables(rows, "the rows", WIDE),
         sentences=sentences,
@@ -57,29 +57,17 @@ def comparison_page(
     )
 
 
-def draw_displacement(model: CalibratedModel, what: str, displacement: Displacement) -> Drawing:
-    """Draw distances over the workspace from above and from the side.
+def draw_displacement(what: str, displacement: Displacement) -> Drawing:
+    """Draw distances between both models' poses from above and from the side.
 
     Args:
-        model: the first one.
         what: the poses are.
         displacement: at the poses.
     """
-    errors, count = displacement.errors, len(displacement.q)
+    errors = displacement.errors
     layers = [Layer("distance", "distance", "mm", errors.position.numpy() * 1e3, "")]
     if errors.rotation is not None:
         layers.append(Layer("turn", "turn", "deg", np.rad2deg(errors.rotation.numpy()), ""))
-    drawing = draw_map(
-        ErrorMap(
-            place=displacement.place.numpy() * 1e3,
-            layers=tuple(layers),
-            row=np.zeros(count, dtype=np.int64),
-            q=displacement.joints(model.robot.revolute),
-            frame=("",) * count,
-            target=("",) * count,
-            inside=np.ones(count, dtype=bool),
-            says="",
-        )
-    )
-    alt = f"Distance and turn between the poses of both models, {what}, from above and from the side."
-    return Drawing(f"displacement_{what}", what[:1].upper() + what[1:], alt, drawing.figure)
+    seen = f"Distance and turn between the poses of both models, {what},"
+    title = f"{what[:1].upper()}{what[1:]}"
+    return draw_map(f"displacement_{what}", title, seen, displacement.place.numpy() * 1e3, layers)

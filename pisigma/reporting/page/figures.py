@@ -12,6 +12,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from jaxtyping import Float64
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.backends.backend_svg import FigureCanvasSVG
@@ -26,7 +27,7 @@ from pisigma.reporting.calibration_figures import STYLES, show_correlations
 from pisigma.reporting.page.content import ReportContent
 from pisigma.reporting.page.corrections import CorrectionCurve, Correlations
 from pisigma.reporting.page.dependence import Dependence, binned
-from pisigma.reporting.page.error_map import ErrorMap
+from pisigma.reporting.page.error_map import Layer
 
 SIZE = (5.2, 3.1)
 """Of a panel [inch]."""
@@ -167,7 +168,9 @@ def draw_figures(content: ReportContent) -> ReportFigures:
     """Draw what a report shows."""
     points = (content.summary.learning_curve if content.summary else None) or ()
     return ReportFigures(
-        map=draw_map(content.map),
+        map=draw_map(
+            "error_map", "map", "Errors over the workspace", content.map.place, content.map.layers[:3]
+        ),
         dependences=tuple(map(draw_dependence, content.dependences)),
         correlations=draw_correlations(content.parameters.correlations),
         corrections=tuple(map(draw_correction, content.curves)),
@@ -247,9 +250,18 @@ def draw_learning_curve(points: Sequence[LearningPoint]) -> Drawing:
     return Drawing("learning_curve", "learning curve", alt, figure)
 
 
-def draw_map(error_map: ErrorMap) -> Drawing:
-    """Draw the map from above and from the side, for paper and for pages without scripts."""
-    layers = error_map.layers[:3]
+def draw_map(
+    key: str, title: str, what: str, place: Float64[np.ndarray, "points 3"], layers: Sequence[Layer]
+) -> Drawing:
+    """Draw quantities at points of space from above and from the side, for paper and for pages without scripts.
+
+    Args:
+        key: of the drawing.
+        title: of the drawing.
+        what: is to be seen.
+        place: of every point [mm].
+        layers: the quantities, side by side.
+    """
     with drawing_style():
         figure = Figure(figsize=(3.9 * len(layers), 5.8), layout="constrained")
         grid = figure.subplots(2, len(layers), squeeze=False)
@@ -257,11 +269,11 @@ def draw_map(error_map: ErrorMap) -> Drawing:
             finite = np.isfinite(layer.values)
             order = np.argsort(layer.values[finite], kind="stable")
             order = np.concatenate([order[:-MOST_MAP_DOTS:4], order[-MOST_MAP_DOTS:]])[-2 * MOST_MAP_DOTS :]
-            values, place = layer.values[finite][order], error_map.place[finite][order]
+            values, at = layer.values[finite][order], place[finite][order]
             top = max(float(values.max(initial=0.0)), 1e-12)
             for axes, (a, b) in zip(grid[:, column], ((0, 1), (0, 2)), strict=True):
                 dots = axes.scatter(
-                    place[:, a], place[:, b], c=values, s=2 + 16 * values / top, cmap="cividis", vmin=0.0, vmax=top,
+                    at[:, a], at[:, b], c=values, s=2 + 16 * values / top, cmap="cividis", vmin=0.0, vmax=top,
                     linewidths=0, rasterized=len(values) > MANY_DOTS,
                 )  # fmt: skip
                 axes.set_aspect("equal", "datalim")
@@ -269,7 +281,7 @@ def draw_map(error_map: ErrorMap) -> Drawing:
             grid[0, column].set_title(f"{layer.label}, largest {top:.3g} {layer.unit}")
             bar = figure.colorbar(dots, ax=list(grid[:, column]), orientation="horizontal", format="%.2g")
             bar.set_label(layer.unit)
-    return Drawing("error_map", "map", "Errors over the workspace from above and from the side.", figure)
+    return Drawing(key, title, f"{what} from above and from the side.", figure)
 
 
 def panel() -> tuple[Figure, Axes]:
