@@ -1,7 +1,8 @@
 """What moved before a session, by the evidence of its rows: one hypothesis for everything that can move by itself."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 
 import torch
@@ -58,7 +59,7 @@ class Explanation:
         candidates: where something moved and it is not clear what, all hypotheses, the most probable first; else none.
         unchanged: probability that nothing moved.
         noise_factor: most probable factor on the usual noise.
-        log_evidence: of the rows, over all hypotheses beside the motions.
+        log_evidence: of the rows, over all hypotheses beside the motions, and less what wrong rows are worth.
     """
 
     motions: tuple[Motion, ...]
@@ -92,16 +93,23 @@ class SessionEvidence:
             values: its rows.
             usual_noise: that of the calibration, per sensor.
         """
-        self._values = values
+        self.values, self._usual_noise = values, usual_noise
         self.known = values.X @ problem.root
         standing = [values.X[:, one.index] * one.deviation for one in problem.groups if one.stands]
         self._K = self.known @ self.known.t()
         for B in standing:
             self._K += B @ B.t()
-        self._sigma = usual_noise[values.sensor]
-        self._scaled = ~torch.tensor([one.exact for one in values.counts])[values.sensor]
+        self._sigma = values.deviation(usual_noise)
+        self._scaled = ~values.exact
         self._groups = hypotheses(problem)
         self._Z = [fewest_columns(values.X[:, one.index] * one.scale) for one in self._groups]
+
+    def with_wrong(self, wrong: Mapping[int, float]) -> "SessionEvidence":
+        """Give the evidence of the same rows with other wrong configurations, see `LinearValues`."""
+        other = copy(self)
+        other.values = replace(self.values, wrong=wrong)
+        other._sigma = other.values.deviation(self._usual_noise)
+        return other
 
     def explain(self) -> Explanation:
         """Compare all hypotheses, and again beside what has moved clearly, until nothing more has."""
@@ -130,7 +138,7 @@ class SessionEvidence:
             The shifts [m or rad] and their covariance.
         """
         gain, covariance = self._gain(groups, noise_factor)
-        return gain @ self._values.y, covariance
+        return gain @ self.values.y, covariance
 
     def influence(
         self, groups: Sequence[DriftGroup], noise_factor: float
@@ -145,10 +153,20 @@ class SessionEvidence:
         own = self._K - self.known @ self.known.t() + self._noise(noise_factor).square().diag()
         return gain @ self.known, gain @ own @ gain.t()
 
+    def covariance(
+        self, groups: Sequence[DriftGroup], noise_factor: float
+    ) -> Float64[Tensor, "values values"]:
+        """Give the covariance of the values where some groups have moved by about their sizes."""
+        V = self._K + self._noise(noise_factor).square().diag()
+        for one in groups:
+            B = self.values.X[:, one.index] * one.deviation
+            V = V + B @ B.t()
+        return V
+
     def error_score(self) -> float:
         """Root mean square of all values over their standard deviations where nothing moved; about 1 is usual."""
         factor = covariance_factor(self._K + self._noise(1.0).square().diag())
-        a = torch.linalg.solve_triangular(factor, self._values.y[:, None], upper=False)
+        a = torch.linalg.solve_triangular(factor, self.values.y[:, None], upper=False)
         return float(a.square().mean().sqrt())
 
     def _compare(self, motions: Sequence[Motion]) -> Explanation:
@@ -159,7 +177,7 @@ class SessionEvidence:
             K = K + one.size**2 * Z @ Z.t()
         evidence = torch.empty(len(NOISE_FACTORS), dtype=torch.float64)
         raised = torch.empty(len(NOISE_FACTORS), len(self._groups), len(TRIED), dtype=torch.float64)
-        columns = torch.cat([self._values.y[:, None], *self._Z], 1)
+        columns = torch.cat([self.values.y[:, None], *self._Z], 1)
         for row, noise_factor in enumerate(NOISE_FACTORS.tolist()):
             factor = covariance_factor(K + self._noise(noise_factor).square().diag())
             whitened = torch.linalg.solve_triangular(factor, columns, upper=False)
@@ -181,7 +199,9 @@ class SessionEvidence:
             candidates=tuple(sorted(compared, key=lambda one: -one.probability)),
             unchanged=unchanged,
             noise_factor=float(NOISE_FACTORS[likely.argmax()]),
-            log_evidence=float(nothing + log_odds.logsumexp(0)) - sum(one.group.worth for one in motions),
+            log_evidence=float(nothing + log_odds.logsumexp(0))
+            - sum(one.group.worth for one in motions)
+            - self.values.worth,
         )
 
     def _raised(self, a: Tensor, W: Tensor) -> Float64[Tensor, "groups sizes"]:
@@ -205,13 +225,13 @@ class SessionEvidence:
     def _gain(self, groups: Sequence[DriftGroup], noise_factor: float) -> tuple[Tensor, Tensor]:
         """What an estimate of the unknowns of groups is by the values, and its covariance."""
         V = self._K + self._noise(noise_factor).square().diag()
-        for B in (self._values.X[:, one.index] * one.deviation for one in groups if one.stands):
+        for B in (self.values.X[:, one.index] * one.deviation for one in groups if one.stands):
             V = V - B @ B.t()
         factor = covariance_factor(V)
         index, deviation = (
             torch.cat([getattr(one, name) for one in groups]) for name in ("index", "deviation")
         )
-        W = torch.linalg.solve_triangular(factor, self._values.X[:, index] * deviation, upper=False)
+        W = torch.linalg.solve_triangular(factor, self.values.X[:, index] * deviation, upper=False)
         normal = W.t() @ W
         normal.diagonal().add_(1.0)
         covariance = torch.linalg.inv(normal) * deviation * deviation[:, None]

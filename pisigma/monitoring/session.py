@@ -1,7 +1,7 @@
 """One session of measurements against a model: unchanged, or what moved, and whether recalibrating pays."""
 
 import math
-from collections.abc import Set
+from collections.abc import Mapping, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -24,6 +24,7 @@ from pisigma.recalibration.model_posterior import ModelPosterior
 from pisigma.recalibration.moved import Moved, moved_of_group
 from pisigma.recalibration.posterior_update import PosteriorUpdate
 from pisigma.recalibration.recalibration_problem import Owner, RecalibrationProblem, recalibration_problem
+from pisigma.recalibration.wrong_rows import Explained, with_wrong_rows
 
 Verdict = Literal["unchanged", "moved", "unclear"]
 ANYWHERE = 0.02
@@ -86,6 +87,7 @@ class Session:
         values: number of measured values.
         standing: names of bases and tools that stand elsewhere than when the model was made.
         observable: per joint, whether the rows say anything of its zero.
+        outliers: places of rows that do not count, because they do not go with the others whatever has moved.
     """
 
     rows: int
@@ -99,6 +101,7 @@ class Session:
     values: int
     standing: tuple[str, ...]
     observable: tuple[bool, ...]
+    outliers: tuple[str, ...] = ()
 
     @property
     def verdict(self) -> Verdict:
@@ -167,7 +170,7 @@ def judge_session(
     probabilities = dict.fromkeys(stated or (), 1.0)
     if stated is None and solved.frame_moved:
         solved, probabilities = _elsewhere(model, posterior, rows, solved)
-    return _judged(solved, solved.problem.setup.measurements, probabilities), _zeros(solved)
+    return _judged(solved, probabilities), _zeros(solved)
 
 
 def _elsewhere(
@@ -234,24 +237,44 @@ def _solve(
     noise = noise_of_sensors(problem, posterior.noise)
     group = held_out_groups(problem.setup.measurements)
     x = problem.mean
+    wrong: Mapping[int, float] = {}
     for _ in range(MOST_ROUNDS):
         values = linear_values(problem, linearised(problem.design, x, 0.0, group))
-        evidence = SessionEvidence(problem, values, noise)
-        solved = _Solved(problem, values, noise, evidence, evidence.explain())
+        solved = _explained(problem, noise, replace(values, wrong=wrong))
+        values, wrong = solved.values, solved.values.wrong
         there = solved.unknowns(tuple(_sized(one) for one in solved.suspected))
-        step = values.X @ (there - x) / noise[values.sensor]
+        step = values.X @ (there - x) / values.deviation(noise)
         x = there
         if float(step.square().mean().sqrt()) < SETTLED or (solved.frame_moved and not elsewhere):
             break
     return solved
 
 
+def _explained(
+    problem: RecalibrationProblem, noise: Float64[Tensor, " sensors"], values: LinearValues
+) -> _Solved:
+    """The most probable explanation of a session's values, wrong rows among them."""
+    every = SessionEvidence(problem, values, noise)
+
+    def explain(wrong: Mapping[int, float]) -> Explained[_Solved]:
+        evidence = every.with_wrong(wrong)
+        there, explanation = evidence.values, evidence.explain()
+        solved = _Solved(problem, there, noise, evidence, explanation)
+        factor = explanation.noise_factor
+        V = evidence.covariance([_sized(one) for one in solved.suspected], factor)
+        return Explained(solved, there, explanation.log_evidence, V, factor * there.deviation(noise))
+
+    return with_wrong_rows(explain(values.wrong), explain).what
+
+
 def _sized(motion: Motion) -> DriftGroup:
     return replace(motion.group, size=motion.size)
 
 
-def _judged(solved: _Solved, rows: Measurements, elsewhere: dict[Owner, float]) -> Session:
+def _judged(solved: _Solved, elsewhere: dict[Owner, float]) -> Session:
     """Work out what there is to say."""
+    every, wrong = solved.problem.setup.measurements, solved.problem.wrong_rows(solved.values)
+    rows = every.select((~wrong).nonzero()[:, 0])
     explanation, evidence = solved.explanation, solved.evidence
     motions = tuple(_sized(one) for one in solved.suspected)
     of_arm = tuple(group for group in motions if not is_frame(group.what))
@@ -262,7 +285,7 @@ def _judged(solved: _Solved, rows: Measurements, elsewhere: dict[Owner, float]) 
     determined = sum(len(group.index) for group in of_arm if group.what != CORRECTION)
     optimism = math.sqrt(count / max(count - determined, 1))  # the rows themselves determined what moved
     return Session(
-        rows=rows.rows,
+        rows=every.rows,
         unchanged=explanation.unchanged,
         moved=_moved(solved, elsewhere),
         candidates=tuple((one.group.what, one.probability) for one in explanation.candidates),
@@ -277,6 +300,7 @@ def _judged(solved: _Solved, rows: Measurements, elsewhere: dict[Owner, float]) 
             < UNOBSERVABLE * float(group.scale)
             for group in _joints(solved)
         ),
+        outliers=tuple(every.place(row) for row in wrong.nonzero()[:, 0].tolist()),
     )
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import cached_property
 
 import torch
 from jaxtyping import Float64
@@ -91,10 +91,7 @@ class Adaptation:
     @property
     def wrong_rows(self) -> list[int]:
         """Rows of the measurements that do not count: so far off that the loss drops them, or wrong by evidence."""
-        configuration = self.problem.configuration
-        wrong = ~torch.isin(configuration, self.values.configuration)
-        wrong |= torch.isin(configuration, torch.tensor([*self.values.wrong]))
-        rows: list[int] = self.problem.setup.rows[wrong].tolist()
+        rows: list[int] = self.problem.setup.rows[self.problem.wrong_rows(self.values)].tolist()
         return rows
 
     @cached_property
@@ -137,7 +134,7 @@ def adapt(
         rounds += 1
         rows = linearised(design, x, effective, group)
         values = replace(linear_values(problem, rows), wrong=wrong)
-        search = with_wrong_rows(values, partial(_searched, problem, drift, usual)).what
+        search = _searched(problem, values, drift, usual)
         drift, wrong = search.drift, search.values.wrong
         values = replace(values, wrong=wrong)
         update = PosteriorUpdate(problem.root, values, drift)
@@ -190,11 +187,17 @@ def _with_sizes(groups: tuple[DriftGroup, ...], like: tuple[DriftGroup, ...]) ->
 
 
 def _searched(
-    problem: RecalibrationProblem, drift: Drift, usual: Float64[Tensor, " sensors"], chosen: LinearValues
-) -> Explained[DriftSearch]:
-    """The sizes of the drift by evidence, on some of the values where there are many."""
-    if len(chosen.y) > MOST_VALUES:
-        chosen = chosen.select(chosen_rows(len(chosen.y), MOST_VALUES).sort().values)
-    search = DriftSearch(chosen, chosen.X @ problem.root, drift.groups, drift.noise, usual)
-    search.estimate()
-    return Explained(search, chosen, search.log_evidence, search.covariance, search.deviation)
+    problem: RecalibrationProblem, values: LinearValues, drift: Drift, usual: Float64[Tensor, " sensors"]
+) -> DriftSearch:
+    """The sizes of the drift and the wrong rows by evidence, of some of the values where there are many."""
+    if len(values.y) > MOST_VALUES:
+        values = values.select(chosen_rows(len(values.y), MOST_VALUES).sort().values)
+    A = values.X @ problem.root
+
+    def explain(wrong: Mapping[int, float]) -> Explained[DriftSearch]:
+        there = replace(values, wrong=wrong)
+        search = DriftSearch(there, A, drift.groups, drift.noise, usual)
+        search.estimate()
+        return Explained(search, there, search.log_evidence, search.covariance, search.deviation)
+
+    return with_wrong_rows(explain(values.wrong), explain).what

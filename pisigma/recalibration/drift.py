@@ -242,8 +242,9 @@ def coordinates(
     W: Float64[Tensor, "values columns"], a: Float64[Tensor, " values"]
 ) -> tuple[Float64[Tensor, " k"], Float64[Tensor, " k"]]:
     """Eigenvalues of a group's covariance, and squared coordinates of the values, in the metric of everything else."""
-    U, S, _ = torch.linalg.svd(W, full_matrices=False)
-    return S.square(), (U.t() @ a).square()
+    eigenvalues, U = torch.linalg.eigh(W.t() @ W)  # several times as fast as the singular values of W
+    eigenvalues = eigenvalues.clamp(min=1e-15 * float(eigenvalues[-1]) + 1e-300)
+    return eigenvalues, (U.t() @ (W.t() @ a)).square() / eigenvalues
 
 
 def gains(

@@ -24,7 +24,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import Frames
-from pisigma.recalibration.drift import DriftGroup
+from pisigma.recalibration.drift import DriftGroup, LinearValues
 from pisigma.recalibration.model_posterior import ModelPosterior
 from pisigma.sensors.registry import unknown_groups
 from pisigma.sensors.sensor import UnknownGroup
@@ -69,6 +69,11 @@ class RecalibrationProblem:
     def configuration(self) -> Int64[Tensor, " rows"]:
         """Number of every row's joint values; the two rows of a pair have one."""
         return groups_to_keep_whole(self.setup.measurements)
+
+    def wrong_rows(self, values: LinearValues) -> Bool[Tensor, " rows"]:
+        """Which rows do not count: so far off that the loss drops them, or of configurations that are wrong."""
+        wrong = ~torch.isin(self.configuration, values.configuration)
+        return wrong | torch.isin(self.configuration, torch.tensor([*values.wrong]))
 
     def without_arm(self) -> "RecalibrationProblem":
         """The same where the arm is exactly as it was: only what stands elsewhere is unknown."""

@@ -1,7 +1,7 @@
 """Configurations that were measured wrongly, by the evidence of all other rows and beside whatever has drifted."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Generic, TypeVar
 
 import torch
@@ -42,24 +42,24 @@ class Explained(Generic[What]):
 
 
 def with_wrong_rows(
-    values: LinearValues, explain: Callable[[LinearValues], Explained[What]]
+    explained: Explained[What], explain: Callable[[Mapping[int, float]], Explained[What]]
 ) -> Explained[What]:
-    """Explain values, and take configurations for wrong as long as that raises the evidence by what it is worth.
+    """Take configurations for wrong as long as that raises the evidence by what it is worth.
 
     Beside a drift of many unknowns that was estimated from all rows, a wrong one looks usual. So those that stand out
     most get a noise of their own, one by one, and the drift is estimated anew for each; compare the externally
     studentised residuals of Cook and Weisberg 1982, Residuals and Influence in Regression, section 2.2.
 
     Args:
-        values: some of which may count less already.
-        explain: gives the best explanation of values.
+        explained: the values, some of which may count less already.
+        explain: gives the best explanation for other wrong configurations, see `LinearValues`.
 
     Returns:
         The best explanation.
     """
-    explained = explain(values)
-    while len(explained.values.wrong) + 1 <= LARGEST_SHARE * len(torch.unique(values.configuration)):
-        tried = [explain(replace(values, wrong=wrong)) for wrong in _suspects(explained)]
+    configurations = len(torch.unique(explained.values.configuration))
+    while len(explained.values.wrong) + 1 <= LARGEST_SHARE * configurations:
+        tried = [explain(wrong) for wrong in _suspects(explained)]
         best = max(tried, key=lambda one: one.log_evidence, default=explained)
         if best.log_evidence <= explained.log_evidence:
             break

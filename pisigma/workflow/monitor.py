@@ -191,6 +191,10 @@ def monitor(
         progress(f"{Path(day.source).name}, {date}")
         judged.append(_record(loaded, posterior, day, date, settings.moved))
         warnings += [f"{judged[-1].file}: {one}" for one in condition_warnings(loaded, day)]
+        warnings += [
+            f"{place} was left out: it does not go with the other rows of its session; measure it again."
+            for place in judged[-1].session.outliers
+        ]
         if day.rows < FEWEST_ROWS:
             warnings.append(
                 f"{judged[-1].file}: {day.rows} rows say little of what moved; measure {FEWEST_ROWS} poses or more."
@@ -268,6 +272,7 @@ def _session_json(record: Record) -> dict[str, Any]:
         "candidates": [{"what": what, "probability": share} for what, share in session.candidates],
         "unobservable": [f"joint {k}" for k, seen in enumerate(session.observable, 1) if not seen],
         "remarks": list(session.unobservable),
+        "outliers": list(session.outliers),
         "rms_mm": session.rms * 1e3,
         "expected_gain_mm": session.gain * 1e3,
         "recalibrate": session.recalibrate,

@@ -1,6 +1,7 @@
 """One session against a model: the joint that moved, an instrument elsewhere, and what cannot be observed."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -47,6 +48,17 @@ def test_recalibrating_pays_after_a_collision():
     assert session.rms_after < 0.2 * session.rms
     assert_close(session.gain, session.rms - session.rms_after, rtol=1e-12)
     assert not judged(rows_later(10, 3))[0].recalibrate
+
+
+@pytest.mark.parametrize("joint", [0, 3])
+def test_a_wrong_row_is_named_and_not_taken_for_a_motion(joint):
+    rows = rows_later(10, 3, moved_joint(joint, 0.25))
+    wrong = rows.position.clone()
+    wrong[4, 1] += 0.005
+    session, _ = judged(replace(rows, position=wrong))
+    assert session.outliers == (rows.place(4),)
+    assert [one.moved.what for one in session.moved] == (["joint 3"] if joint else [])
+    assert_close(session.rms, judged(rows.select(torch.tensor([0, 1, 2, 3, 5, 6, 7, 8, 9])))[0].rms, rtol=0.1)
 
 
 def test_two_joints_that_moved_are_both_named():

@@ -1,5 +1,7 @@
 """Configurations that were measured wrongly, beside a joint that has moved and unknowns that could explain anything."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -24,14 +26,15 @@ def explained(off: float, seed: int = 0) -> Explained[DriftSearch]:
     groups = [DriftGroup("joint 1", torch.tensor([0]), torch.ones(1).double())]
     groups += [DriftGroup("correction", torch.arange(1, count + 1), torch.ones(count).double())]
 
-    def explain(values: LinearValues) -> Explained[DriftSearch]:
-        search = DriftSearch(values, 1e-6 * X, groups, noise, noise)
-        search.estimate()
-        return Explained(search, values, search.log_evidence, search.covariance, search.deviation)
+    values = LinearValues(X, y, torch.zeros(count, dtype=torch.int64), configuration, counts)
 
-    return with_wrong_rows(
-        LinearValues(X, y, torch.zeros(count, dtype=torch.int64), configuration, counts), explain
-    )
+    def explain(wrong) -> Explained[DriftSearch]:
+        there = replace(values, wrong=wrong)
+        search = DriftSearch(there, 1e-6 * X, groups, noise, noise)
+        search.estimate()
+        return Explained(search, there, search.log_evidence, search.covariance, search.deviation)
+
+    return with_wrong_rows(explain({}), explain)
 
 
 @pytest.mark.parametrize("off", [0.005, 0.5])
