@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pisigma.errors import MeasurementError
 from pisigma.judging.bootstrap import STATISTICS, Bootstrap, Intervals, statistics
-from pisigma.judging.frame_fits import poses_in_fitted_frames
+from pisigma.judging.frames.frame_fits import poses_in_fitted_frames
 from pisigma.judging.pose_statistics import ErrorVectors, axis_statistics, error_statistics
 from pisigma.judging.rank_tests import SignedRank, signed_rank
 from pisigma.kinematics.forward import forward_kinematics

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.judging.frame_fits import MeasuredPoses, affine_error, best_base
+from pisigma.judging.frames.frame_fits import MeasuredPoses, affine_error, best_base
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel

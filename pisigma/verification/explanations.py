@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.judging.frame_fits import (
+from pisigma.judging.frames.frame_fits import (
     LEVER_SHARE,
     MeasuredPoses,
     affine_error,

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.judging.frame_fits import LEVER_SHARE, MeasuredPoses
+from pisigma.judging.frames.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.measurement.dataset import Measurements

@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.judging.frame_fits import (
+from pisigma.judging.frames.frame_fits import (
     MeasuredPoses,
     base_and_tool_step,
     best_base_and_tool,

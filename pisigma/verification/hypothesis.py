@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.judging.frame_fits import MeasuredPoses
+from pisigma.judging.frames.frame_fits import MeasuredPoses
 from pisigma.se3 import rotation_vector
 from pisigma.verification.cause import Cause
 

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.judging.frame_fits import MeasuredPoses
+from pisigma.judging.frames.frame_fits import MeasuredPoses
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.se3 import wrap_to_pi

@@ -10,7 +10,7 @@ from jaxtyping import Float64
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from pisigma.judging.frame_fits import MeasuredPoses
+from pisigma.judging.frames.frame_fits import MeasuredPoses
 from pisigma.measurement.csv.columns import RPY
 from pisigma.verification.cause import Cause
 

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.judging.frame_fits import LEVER_SHARE, MeasuredPoses, affine_error, best_base_and_tool
+from pisigma.judging.frames.frame_fits import LEVER_SHARE, MeasuredPoses, affine_error, best_base_and_tool
 from pisigma.measurement.dataset import Measurements
 from pisigma.verification.arm import PredictingArm
 from pisigma.verification.cause import Cause

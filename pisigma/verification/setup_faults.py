@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from pisigma.judging.calibration_summary import CalibrationSummary
-from pisigma.judging.frame_fits import LEVER_SHARE, MeasuredPoses
+from pisigma.judging.frames.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.judging.model_comparison import ModelFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel

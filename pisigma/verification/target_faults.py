@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.judging.frame_fits import MeasuredPoses, best_base_and_tool
+from pisigma.judging.frames.frame_fits import MeasuredPoses, best_base_and_tool
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import numbers_of_names

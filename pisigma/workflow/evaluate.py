@@ -12,7 +12,7 @@ import torch
 from pisigma.errors import MeasurementError, ModelError
 from pisigma.judging.bootstrap import Bootstrap
 from pisigma.judging.diagnostic import Diagnostic
-from pisigma.judging.frame_fits import FRAMES_FITTED
+from pisigma.judging.frames.frame_fits import FRAMES_FITTED
 from pisigma.judging.model_comparison import ModelComparison, ModelFigures, compare_models
 from pisigma.judging.reference_models import geometric_model, nominal_model
 from pisigma.measurement.dataset import Measurements

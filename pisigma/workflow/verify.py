@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from pisigma.judging.bootstrap import Bootstrap
-from pisigma.judging.frame_fits import FRAMES_FITTED
+from pisigma.judging.frames.frame_fits import FRAMES_FITTED
 from pisigma.judging.model_comparison import Difference, ModelComparison, compare_models
 from pisigma.judging.reference_models import geometric_model, nominal_model
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from testing.closeness import assert_close
 from testing.simulated_arm import simulate
 
-from pisigma.judging.frame_fits import MeasuredPoses, affine_error, best_base_and_tool
+from pisigma.judging.frames.frame_fits import MeasuredPoses, affine_error, best_base_and_tool
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.verification.faults_as_drawn import are_unrelated, find_faults_as_drawn, usual_error
 from pisigma.verification.pose_faults import other_conventions

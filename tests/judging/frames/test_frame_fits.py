@@ -9,7 +9,7 @@ from testing.closeness import assert_close
 from testing.models import no_type_checker
 
 from pisigma.errors import MeasurementError
-from pisigma.judging.frame_fits import (
+from pisigma.judging.frames.frame_fits import (
     MeasuredPoses,
     best_base,
     best_base_and_tool,

@@ -1,0 +1,1 @@
+"""Frames of measured rows: fitted to them in closed form, and errors under such frames."""
