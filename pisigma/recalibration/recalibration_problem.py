@@ -1,6 +1,6 @@
 """The problem of a recalibration: new rows, and the posterior of a model as the prior of all unknowns."""
 
-from collections.abc import Sequence, Set
+from collections.abc import Collection, Sequence, Set
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -39,6 +39,12 @@ LARGEST_CORRECTION = 10.0
 
 WORTH_OF_CORRECTION = 12.0
 """[nats] Its many weights explain what a model gets wrong of few rows by chance, so it has to show more clearly."""
+
+
+def owners_in(rows: Measurements, kinds: Collection[str]) -> frozenset[Owner]:
+    """List the owners among rows: their frames for the kind "base", and their targets for the kind "tool"."""
+    names = {"base": rows.frame, "tool": rows.target}
+    return frozenset((kind, name) for kind in kinds for name in names[kind])
 
 
 @dataclass(frozen=True, eq=False)

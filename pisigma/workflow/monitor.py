@@ -25,7 +25,7 @@ from pisigma.monitoring.history import Record, history_path, in_order, remember
 from pisigma.monitoring.session import judge_session
 from pisigma.monitoring.trends import Forecast, Trend, charts_of, forecast_of, trends_of
 from pisigma.recalibration.model_posterior import ModelPosterior
-from pisigma.recalibration.recalibration_problem import Owner
+from pisigma.recalibration.recalibration_problem import owners_in
 from pisigma.workflow.recalibrate import RecalibrationSettings
 
 FEWEST_ROWS = 5
@@ -251,10 +251,7 @@ def _record(
 ) -> Record:
     """Judge a session."""
     rows = posterior.renamed(rows)
-    names = {"base": set(rows.frame), "tool": set(rows.target)}
-    stated: frozenset[Owner] | None = None
-    if moved is not None:
-        stated = frozenset((kind, name) for kind in moved for name in names[kind])
+    stated = None if moved is None else owners_in(rows, moved)
     session, zeros = judge_session(model, posterior, rows, stated)
     temperature = None if rows.temperature is None else float(rows.temperature.nanmean())
     return Record(Path(rows.source).name, date, rows.content_hash(), temperature, session, zeros)

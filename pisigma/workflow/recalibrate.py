@@ -30,7 +30,7 @@ from pisigma.recalibration.elsewhere import owners_elsewhere
 from pisigma.recalibration.model_posterior import ModelPosterior
 from pisigma.recalibration.moved import Moved, moved_by, what_moved
 from pisigma.recalibration.recalibrated_model import KIND, recalibrated_model
-from pisigma.recalibration.recalibration_problem import Owner, recalibration_problem
+from pisigma.recalibration.recalibration_problem import Owner, owners_in, recalibration_problem
 from pisigma.recalibration.summary import (
     LeftOutFigures,
     MovedFigures,
@@ -222,8 +222,7 @@ def _elsewhere(
     """Bases and tools that stand elsewhere: all those of the rows that are stated to, or what the evidence says."""
     if settings.moved is None:
         return owners_elsewhere(model, posterior, rows, posterior.noise)
-    names = {"base": set(rows.frame), "tool": set(rows.target)}
-    return frozenset((kind, name) for kind in settings.moved for name in names[kind])
+    return owners_in(rows, settings.moved)
 
 
 def _diagnostics(robot: Robot, judged: Gate, rows: Measurements) -> tuple[Diagnostic, ...]:
