@@ -6,7 +6,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson
 from pisigma.cli.output import print_json, print_lines
-from pisigma.cli.verify import FitFrame, print_comparison
+from pisigma.cli.verify import FitFrame, FitTool, print_comparison
 from pisigma.errors import AcceptanceError
 
 if TYPE_CHECKING:
@@ -52,6 +52,7 @@ def evaluate(
     max_mm: Largest = None,
     max_mean_deg: MaxMeanDeg = None,
     fit_frame: FitFrame = False,
+    fit_tool: FitTool = False,
     resamples: Resamples = 2000,
     seed: Seed = 0,
     sha256: Hashes = None,
@@ -60,8 +61,8 @@ def evaluate(
     """Compare models on measurements, with confidence intervals, and accept them or not.
 
     Rows of the set "train" are left out where the file has a column "set". With a limit, every model folder has to
-    meet it, else the exit status is 3; so it is where errors of positions or orientations are too large to be those of
-    a calibrated robot, and the usual setup faults that explain them are named.
+    meet it, else the exit status is 3; so it is where the base or the tool has moved, and where errors of positions or
+    orientations are too large to be those of a calibrated robot: the usual setup faults that explain them are named.
     """
     from pisigma.files.model_files import check_model_hash
     from pisigma.judging.bootstrap import Bootstrap
@@ -78,7 +79,7 @@ def evaluate(
     for folder, wanted in zip(folders, sha256 or (), strict=False):
         check_model_hash(folder, wanted)
     limits = workflow.Limits(max_mean_mm, max_p95_mm, max_mm, max_mean_deg)
-    settings = workflow.EvaluationSettings(limits, fit_frame, Bootstrap(resamples, seed))
+    settings = workflow.EvaluationSettings(limits, fit_frame, fit_tool, Bootstrap(resamples, seed))
     evaluation = workflow.evaluate(paths[:-1], paths[-1], settings)
     if as_json:
         print_json(evaluation.to_json())

@@ -6,14 +6,24 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder
-from pisigma.cli.output import print_json, print_lines, print_table, progress_of, screen_width
+from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of, screen_width
 from pisigma.errors import AcceptanceError
 
 if TYPE_CHECKING:
     from pisigma.judging.model_comparison import ModelComparison
 
 FitFrame = Annotated[
-    bool, typer.Option("--fit-frame", help="The sensor was moved since: fit its frame to these rows.")
+    bool,
+    typer.Option(
+        "--fit-frame", help="The sensor was moved since: fit its frame to these rows, 6 poses or more."
+    ),
+]
+FitTool = Annotated[
+    bool,
+    typer.Option(
+        "--fit-tool",
+        help="Another reflector was mounted since: fit its place to these rows, 6 poses or more.",
+    ),
 ]
 Hash = Annotated[
     str | None,
@@ -31,14 +41,16 @@ def verify(
     model: ModelFolder,
     data: Data,
     fit_frame: FitFrame = False,
+    fit_tool: FitTool = False,
     sha256: Hash = None,
     as_json: AsJson = False,
 ) -> None:
     """Say whether new measurements are explained better by the corrected model than by the nominal robot.
 
-    Where errors are large, the usual setup faults that explain them are named: another frame or tool, units, order,
-    signs or zeros of the joints, a correction that was applied twice or not at all. Rows of the set "train" are
-    left out. Exit status 3 where the corrected model does not explain the measurements better.
+    Where a joint, a length, the base or the tool has moved since the model was made, it says by how much, and prints
+    the line that recalibrates. Where errors are large, the usual setup faults that explain them are named: units,
+    order, signs or zeros of the joints, a correction that was applied twice or not at all. Rows of the set "train" are
+    left out. Exit status 3 where the corrected model does not explain the measurements better, or the arm has moved.
     """
     from pisigma.files.model_files import check_model_hash
     from pisigma.workflow import verify as workflow
@@ -47,11 +59,13 @@ def verify(
         check_model_hash(model, sha256)
 
     with progress_of(f"verifying {model}"):
-        verification = workflow.verify(model, data, workflow.VerificationSettings(fit_frame))
+        verification = workflow.verify(model, data, workflow.VerificationSettings(fit_frame, fit_tool))
     if as_json:
         print_json(verification.to_json())
     else:
         print_lines([verification.sentence])
+        if verification.recalibration:
+            print_line(f"Run {verification.recalibration}")
         print_comparison(verification.comparison, verification.data)
         print_lines([*(fault.sentence for fault in verification.setup_faults), *verification.warnings])
     if not verification.accepted:

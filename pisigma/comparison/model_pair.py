@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import ModelError
-from pisigma.judging.frame_fits import LEVER_SHARE, MeasuredPoses, best_base_and_tool
+from pisigma.judging.frames.frame_fits import LEVER_SHARE, MeasuredPoses, best_base_and_tool
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import poses_of_rows

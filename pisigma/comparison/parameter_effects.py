@@ -10,7 +10,7 @@ from torch import Tensor
 
 from pisigma.comparison.model_pair import ModelPair, frames_of
 from pisigma.identification.problem.parameters import ParameterSpace, row_labels
-from pisigma.judging.frame_fits import LEVER_SHARE
+from pisigma.judging.frames.frame_fits import LEVER_SHARE
 from pisigma.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements

@@ -18,6 +18,7 @@ from pisigma.identification.result import CalibrationResult
 from pisigma.judging.summary import AbstractSummary
 from pisigma.judging.trained_calibrations import Result, geometric_result
 from pisigma.judging.validation_figures import LearningPoint, ValidationFigures
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.yaml_file import Section
 
 _UNITS = {"m": ("mm", 1e3), "rad": ("deg", math.degrees(1.0))}
@@ -335,3 +336,9 @@ def _learned(result: HybridResult, learned: LearnedPart) -> LearnedFigures:
 
 def _or_none(value: float) -> float | None:
     return value if math.isfinite(value) else None
+
+
+def has_orientation(model: CalibratedModel) -> bool:
+    """Say whether a model knows how its tools are turned; one that was calibrated without orientations does not."""
+    summary = CalibrationSummary.read(model)
+    return summary is None or any(noise.sensor == "rotation" for noise in summary.noise)

@@ -1,6 +1,6 @@
 """Any number of models on the same measured rows: their errors, confidence intervals and differences."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -11,14 +11,13 @@ from torch import Tensor
 
 from pisigma.errors import MeasurementError
 from pisigma.judging.bootstrap import STATISTICS, Bootstrap, Intervals, statistics
-from pisigma.judging.frames.frame_fits import poses_in_fitted_frames
-from pisigma.judging.pose_statistics import ErrorVectors, axis_statistics, error_statistics
+from pisigma.judging.frames.fitted_frames import FrameKind, errors_in_fitted_frames
+from pisigma.judging.pose_statistics import axis_statistics, error_statistics
 from pisigma.judging.rank_tests import SignedRank, signed_rank
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import poses_of_rows
 
 Interval = tuple[float, float]
 """Lower and upper end."""
@@ -161,7 +160,7 @@ def compare_models(
     models: Mapping[str, CalibratedModel],
     measurements: Measurements,
     bootstrap: Bootstrap | None = None,
-    fit_frame: bool = False,
+    fitted: Collection[FrameKind] = (),
 ) -> ModelComparison:
     """Judge models on measurements; rows for which one of them predicts nothing count for none.
 
@@ -169,19 +168,15 @@ def compare_models(
         models: by name, one or more.
         measurements: the rows, in the frames that the models were fitted in.
         bootstrap: how confidence intervals are computed. None: `Bootstrap()`.
-        fit_frame: fit the frames anew, for every model; see `poses_in_fitted_frames`.
+        fitted: frames or targets that are fitted to the rows, for every model; see `errors_in_fitted_frames`.
 
     Raises:
         MeasurementError: no positions were measured, or in a frame or of a target that a model does not know, or no
-            row is predicted by all models.
+            row is predicted by all models, or a frame or target that is fitted has too few rows.
         PoseError: the joint values do not fit a model's robot.
     """
     bootstrap = bootstrap or Bootstrap()
-    predict = poses_in_fitted_frames if fit_frame else poses_of_rows
-    vectors = {
-        name: ErrorVectors.between(measurements, predict(model, measurements))
-        for name, model in models.items()
-    }
+    vectors = {name: errors_in_fitted_frames(model, measurements, fitted) for name, model in models.items()}
     assert measurements.position is not None  # or there were no errors
     measured = torch.isfinite(measurements.position).all(-1)
     predicted = {name: torch.isfinite(errors.position).all(-1) for name, errors in vectors.items()}

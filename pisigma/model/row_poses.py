@@ -44,6 +44,12 @@ def nominal_poses_of_rows(model: CalibratedModel, measurements: Measurements) ->
     return _seen(T, model.robot, model.bases, model.tools, measurements)
 
 
+def bases_of_rows(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "#rows 4 4"]:
+    """Where the robot's base stands in the frame of every row; for errors see `poses_of_rows`."""
+    bases = _of_rows(model.bases, measurements.frame, "frame", measurements)
+    return transform_from_xyzrpy(torch.from_numpy(model.robot.base[None].copy())) if bases is None else bases
+
+
 def known_names(
     known: Frames, names: tuple[str, ...], what: str, measurements: Measurements
 ) -> tuple[str, ...]:

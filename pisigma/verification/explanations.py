@@ -19,7 +19,7 @@ from pisigma.judging.frames.frame_fits import (
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import nominal_poses_of_rows
+from pisigma.model.row_poses import bases_of_rows, nominal_poses_of_rows, poses_of_rows
 from pisigma.se3 import rotation_vector
 from pisigma.verification.arm import PredictingArm
 from pisigma.verification.cause import Cause, length_text
@@ -37,15 +37,18 @@ AS_GOOD = 1.5
 """A simpler explanation is believed where its errors are not larger than the best by this factor."""
 MOST_CONVENTIONS = 8
 """Conventions of orientations that are looked at again, at most."""
+SMALLEST_TURN = 0.01
+"""[deg] A base or a tool that has turned by less has not turned."""
 _MOVED = {
     "frame": (
-        "the measuring frame has moved",
-        "the sensor or what it measures from stands elsewhere than when the model was fitted (if it was moved, verify "
-        "with --fit-frame)",
+        "base",
+        "the robot or the sensor stands elsewhere than when the model was made; run again with --fit-frame, or "
+        "recalibrate with --moved base",
     ),
     "tool": (
-        "another tool or target is mounted",
-        "another point of the tool was measured than when the model was fitted",
+        "tool",
+        "another tool or target is mounted, or another point of it was measured; run again with --fit-tool, or "
+        "recalibrate with --moved tool",
     ),
 }
 
@@ -78,7 +81,7 @@ def hypotheses(arm: PredictingArm, some: Measurements, here: Hypothesis, most: f
     for measured, cause in units_and_frames(here.measured):
         yield from in_frames(arm, some, replace(here, measured=measured, causes=(cause,)), most)
     if arm.model is not None:
-        for T, clause, advice in _other_corrections(arm.model, some, here.T):
+        for T, clause, advice in _other_corrections(arm.model, some):
             cause = Cause("correction", clause, advice, 1.0)
             yield from in_frames(arm, some, here.with_cause(cause, T, fitted=0), most)
     if not here.error > SMALL_SHARE * arm.robot.reach:
@@ -111,10 +114,10 @@ def _likely_conventions(arm: PredictingArm, here: Hypothesis) -> Iterator[tuple[
 
 
 def _other_corrections(
-    model: CalibratedModel, some: Measurements, T: Float64[Tensor, "rows 4 4"]
+    model: CalibratedModel, some: Measurements
 ) -> Iterator[tuple[Float64[Tensor, "rows 4 4"], str, str]]:
     """Predict poses with the correction once more than logged, and once less (first order: its square is small)."""
-    T_nominal = nominal_poses_of_rows(model, some)
+    T, T_nominal = poses_of_rows(model, some), nominal_poses_of_rows(model, some)
     yield (
         T_nominal,
         "the rows fit the nominal robot at the joint values of the file",
@@ -150,11 +153,12 @@ def in_frames(
     per_tool = 6 if bool(here.measured.has_rotation.any()) else 3
     count, tools = int(frames.max()) + 1, int(targets.max()) + 1
     X, Y = _per_group(best_base, frames, here), _per_group(best_tool, targets, here)
-    yield here.with_cause(_moved("frame", X), X @ here.T, 6 * count)
+    bases = bases_of_rows(arm.model, some)
+    yield here.with_cause(_moved("frame", X, bases), X @ here.T, 6 * count)
     yield here.with_cause(_moved("tool", Y), here.T @ Y, per_tool * tools)
     if count == 1 and tools == 1 and bound <= most**2:
         base, tool = best_base_and_tool(here.T, here.measured)
-        moved = here.with_cause(_moved("frame", base[None]), base @ here.T, 6)
+        moved = here.with_cause(_moved("frame", base[None], bases), base @ here.T, 6)
         yield moved.with_cause(_moved("tool", tool[None]), base @ here.T @ tool, per_tool)
 
 
@@ -169,10 +173,19 @@ def _per_group(
     return X
 
 
-def _moved(kind: str, X: Float64[Tensor, "rows 4 4"]) -> Cause:
-    """Say that the "frame" or the "tool" has moved, and how far the farthest of some transforms shifts and turns."""
-    clause, advice = _MOVED[kind]
-    motion = f"shifted by {length_text(float(X[:, :3, 3].norm(dim=-1).max()))}"
+def _moved(
+    kind: str, X: Float64[Tensor, "#rows 4 4"], frames: Float64[Tensor, "#rows 4 4"] | None = None
+) -> Cause:
+    """Say that the "frame" or the "tool" has moved, and how far the farthest of some transforms takes its origin.
+
+    Args:
+        kind: which.
+        X: transforms of it.
+        frames: where it was, in the coordinates of the transforms; None at their origin.
+    """
+    what, advice = _MOVED[kind]
+    origin = torch.zeros(3, 1).to(X) if frames is None else frames[:, :3, 3:]
+    shift = (X[:, :3, :3] @ origin + X[:, :3, 3:] - origin).norm(dim=1).max()
     turn = float(torch.rad2deg(rotation_vector(X[:, :3, :3]).norm(dim=-1)).max())
-    motion += f", turned by {turn:.3g} deg" if turn > 1e-9 else ""
-    return Cause(kind, f"{clause} ({motion})", advice, 2.0)
+    motion = length_text(float(shift)) + (f" and {turn:.3g} deg" if turn > SMALLEST_TURN else "")
+    return Cause(kind, f"the {what} has moved by about {motion} against the model", advice, 2.0)

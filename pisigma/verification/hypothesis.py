@@ -1,5 +1,6 @@
 """A hypothesis of what is wrong with a setup, and the poses that it predicts."""
 
+from collections.abc import Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -54,6 +55,10 @@ class Hypothesis:
         position = float((self.measured.position - self.T[:, :3, 3]).square().sum(-1).mean().sqrt())
         R = (self.measured.rotation @ self.T[:, :3, :3].mT)[self.measured.has_rotation]
         return position, float(rotation_vector(R).square().sum(-1).mean().sqrt())
+
+    def without(self, kinds: Set[str]) -> "Hypothesis":
+        """Leave causes of some kinds unsaid."""
+        return replace(self, causes=tuple(cause for cause in self.causes if cause.kind not in kinds))
 
     def with_cause(self, cause: Cause, T: Float64[Tensor, "rows 4 4"], fitted: int) -> "Hypothesis":
         """Add a cause, under which the predicted poses are others."""

@@ -1,11 +1,13 @@
 """The usual setup faults behind large errors of a model, recognised by trying each on the data."""
 
+from collections.abc import Collection
 from dataclasses import replace
 
 import numpy as np
 import torch
 
-from pisigma.judging.calibration_summary import CalibrationSummary
+from pisigma.judging.calibration_summary import has_orientation
+from pisigma.judging.frames.fitted_frames import FrameKind, fit_frames, with_names_of
 from pisigma.judging.frames.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.judging.model_comparison import ModelFigures
 from pisigma.measurement.dataset import Measurements
@@ -25,10 +27,17 @@ from pisigma.verification.hypothesis import Hypothesis
 from pisigma.verification.joint_faults import NOTICED
 from pisigma.verification.setup_fault import SetupFault, fault_of
 
+CAUSES = {"base": "frame", "tool": "tool"}
+"""Kind of the cause that a base or a tool has moved."""
+
 
 @torch.no_grad()
 def find_setup_faults(
-    model: CalibratedModel, nominal: CalibratedModel, measurements: Measurements, fit_frame: bool = False
+    model: CalibratedModel,
+    nominal: CalibratedModel,
+    measurements: Measurements,
+    fitted: Collection[FrameKind] = (),
+    frames_only: bool = False,
 ) -> tuple[SetupFault, ...]:
     """Find what makes the errors of a model collapse to a quarter or less, the simplest first.
 
@@ -44,30 +53,39 @@ def find_setup_faults(
         model: the model.
         nominal: the nominal robot with the base and tool that suit it best; only shows what its errors fall to.
         measurements: rows with positions in frames and of targets that the model has; limits do not matter.
-        fit_frame: the frames are fitted anew, so that any frame will do, and that one has moved is no fault.
+        fitted: whether frames or targets are fitted anew: then any will do, and that one has moved is no fault.
+        frames_only: try only that frames or tools have moved.
 
     Returns:
         Nothing where errors are below 0.02 mm, or where nothing explains them.
     """
-    if not has_orientation(model):
-        measurements = replace(measurements, rotation=None, sigma_rotation=None)
-    if fit_frame:
-        measurements = replace(measurements, frame=(next(iter(model.bases), ""),) * measurements.rows)
-    some = measurements.select(spread(measured_rows(measurements), MOST_ROWS))
-    T = poses_of_rows(model, some)
+    judged = judged_values(model, measurements)
+    some = judged.select(spread(measured_rows(judged), MOST_ROWS))
+    known = with_names_of(model, some, fitted)
+    T = poses_of_rows(model, known)
     predicted = torch.isfinite(T).flatten(1).all(-1)
     if not bool(predicted.any()):
         return ()
-    some = some.select(predicted)
-    here = Hypothesis(some.q, T[predicted], MeasuredPoses.of(some, LEVER_SHARE * model.robot.reach))
+    some, known, T = some.select(predicted), known.select(predicted), T[predicted]
+    measured = MeasuredPoses.of(some, LEVER_SHARE * model.robot.reach)
+    here = Hypothesis(some.q, T, measured)
+    if fitted:
+        T, columns = fit_frames(T, measured, some, fitted)
+        here = replace(here, T=T, fitted=columns.shape[-1])
     if not here.error > NOTICED:
         return ()
     arm = PredictingArm(model.robot, model)
     most = largest_explained(here, model.robot.reach)
-    chosen = simplest(list(hypotheses(arm, some, here, most)), most)
-    faults = tuple(fault_of(here, other, _nominal_error(nominal, some, other)) for other in chosen)
-    faults = faults or find_faults_as_drawn(model.robot, measurements)
-    return tuple(fault for fault in faults if not (fit_frame and fault.kinds == ("frame",)))
+    tried = in_frames(arm, known, here, most) if frames_only else hypotheses(arm, known, here, most)
+    free = {CAUSES[kind] for kind in fitted}
+    faults = tuple(
+        fault_of(here, other.without(free), _nominal_error(nominal, known, other))
+        for other in simplest(list(tried), most)
+        if not {cause.kind for cause in other.causes} <= free
+    )
+    if not faults and not frames_only:
+        faults = find_faults_as_drawn(model.robot, with_names_of(model, judged, fitted))
+    return faults
 
 
 def _nominal_error(nominal: CalibratedModel, some: Measurements, other: Hypothesis) -> float:
@@ -79,6 +97,13 @@ def _nominal_error(nominal: CalibratedModel, some: Measurements, other: Hypothes
     tried = in_frames(PredictingArm(nominal.robot, nominal), some, Hypothesis(other.q, T, other.measured))
     wanted = kinds & {"frame", "tool"}
     return next(one.rms()[0] for one in tried if {cause.kind for cause in one.causes} == wanted)
+
+
+def judged_values(model: CalibratedModel, measurements: Measurements) -> Measurements:
+    """Leave orientations out that a model does not know."""
+    if has_orientation(model):
+        return measurements
+    return replace(measurements, rotation=None, sigma_rotation=None)
 
 
 def is_implausible(figures: ModelFigures, model: CalibratedModel) -> bool:
@@ -102,9 +127,3 @@ def unexplained(model: CalibratedModel) -> str:
         "correction applied twice or not at all) explains them; check whether this robot was measured, and whether the "
         "rows belong together."
     )
-
-
-def has_orientation(model: CalibratedModel) -> bool:
-    """Say whether a model knows how its tools are turned; one that was calibrated without orientations does not."""
-    summary = CalibrationSummary.read(model)
-    return summary is None or any(noise.sensor == "rotation" for noise in summary.noise)

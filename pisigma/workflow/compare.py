@@ -19,6 +19,7 @@ from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.judging.bootstrap import Bootstrap
+from pisigma.judging.frames.fitted_frames import fitted_kinds
 from pisigma.judging.model_comparison import Difference, ModelComparison, compare_models
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -221,7 +222,8 @@ def compare(
     compared = None
     if rows is not None:
         data = rows if isinstance(rows, Measurements) else Measurements.read_csv(rows, pair.first.robot)
-        compared = compare_models(models, test_rows(data), settings.bootstrap, settings.frames == "fitted")
+        fitted = fitted_kinds(fit_frame=settings.frames == "fitted", fit_tool=False)
+        compared = compare_models(models, test_rows(data), settings.bootstrap, fitted)
     return ComparedModels(
         models=models,
         settings=settings,

@@ -12,7 +12,7 @@ import torch
 from pisigma.errors import MeasurementError, ModelError
 from pisigma.judging.bootstrap import Bootstrap
 from pisigma.judging.diagnostic import Diagnostic
-from pisigma.judging.frames.frame_fits import FRAMES_FITTED
+from pisigma.judging.frames.fitted_frames import FrameKind, fitted_kinds, fitted_remark
 from pisigma.judging.model_comparison import ModelComparison, ModelFigures, compare_models
 from pisigma.judging.reference_models import geometric_model, nominal_model
 from pisigma.measurement.dataset import Measurements
@@ -99,13 +99,20 @@ class EvaluationSettings:
 
     Attributes:
         limits: that every model, but no reference, has to meet.
-        fit_frame: fit the frames of the rows anew, as after the sensor was moved.
+        fit_frame: fit the frames of the rows to them, as after the sensor was moved.
+        fit_tool: fit the targets of the rows to them, as after another reflector was mounted.
         bootstrap: how confidence intervals are computed.
     """
 
     limits: Limits = field(default_factory=Limits)
     fit_frame: bool = False
+    fit_tool: bool = False
     bootstrap: Bootstrap = field(default_factory=Bootstrap)
+
+    @property
+    def fitted(self) -> tuple[FrameKind, ...]:
+        """What is fitted to the rows."""
+        return fitted_kinds(self.fit_frame, self.fit_tool)
 
 
 @dataclass(frozen=True)
@@ -170,6 +177,7 @@ class Evaluation:
             "data": self.data,
             "rows": self.rows,
             "frame_fitted": self.settings.fit_frame,
+            "tool_fitted": self.settings.fit_tool,
             **comparison,
         }
         if stated := self.settings.limits.stated:
@@ -220,7 +228,7 @@ def evaluate(
         everything = Measurements.read_csv(everything, next(iter(loaded.values())).robot)
     rows = test_rows(everything)
     compared = with_references(list(sources), loaded, rows.rotation is not None)
-    comparison = compare_models(compared, rows, settings.bootstrap, settings.fit_frame)
+    comparison = compare_models(compared, rows, settings.bootstrap, settings.fitted)
     hashes = everything.content_hash(), rows.content_hash()
     evaluated = {
         label: EvaluatedModel(_text(sources[label]), model.kind, model.provenance.data_sha256 in hashes)
@@ -237,10 +245,11 @@ def evaluate(
         diagnostics=tuple(
             diagnostic
             for figures in judged
-            for diagnostic in _diagnostics(loaded[figures.name], figures, rows, settings.fit_frame)
+            for diagnostic in _diagnostics(loaded[figures.name], figures, rows, settings.fitted)
         ),
         warnings=(
-            *_warnings(comparison, evaluated, settings.fit_frame),
+            *fitted_remark(rows, settings.fitted),
+            *_warnings(comparison, evaluated),
             *(sentence for model in loaded.values() for sentence in condition_warnings(model, rows)),
         ),
         seconds=time.perf_counter() - begin,
@@ -314,21 +323,19 @@ def with_references(
 
 
 def _diagnostics(
-    model: CalibratedModel, figures: ModelFigures, rows: Measurements, fit_frame: bool
+    model: CalibratedModel, figures: ModelFigures, rows: Measurements, fitted: Sequence[FrameKind]
 ) -> Iterator[Diagnostic]:
-    """Say why the errors of a model are too large to be those of a calibrated robot, where they are."""
-    if is_implausible(figures, model):
-        nominal = nominal_model(model, rows.rotation is not None)
-        faults = find_setup_faults(model, nominal, rows, fit_frame)
+    """Say why errors are too large to be those of a calibrated robot, or those of a base or a tool that has moved."""
+    nominal, implausible = nominal_model(model, rows.rotation is not None), is_implausible(figures, model)
+    faults = find_setup_faults(model, nominal, rows, fitted, frames_only=not implausible)
+    if faults or implausible:
         sentence = either(faults).sentence if faults else unexplained(model)
         kind = "setup_fault" if faults else "implausible_errors"
         yield Diagnostic(kind=kind, severity="implausible", sentence=f"{figures.name}: {sentence}")
 
 
-def _warnings(
-    comparison: ModelComparison, evaluated: Mapping[str, EvaluatedModel], fit_frame: bool
-) -> list[str]:
-    warnings = [FRAMES_FITTED] if fit_frame else []
+def _warnings(comparison: ModelComparison, evaluated: Mapping[str, EvaluatedModel]) -> list[str]:
+    warnings = []
     if comparison.rows_without_position:
         warnings.append(f"{comparison.rows_without_position} rows hold no position and are not judged.")
     for model in comparison.models:

@@ -1,6 +1,7 @@
 """Verify whether new measurements are explained better by the corrected model than by the nominal robot."""
 
 import os
+import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 
 from pisigma.judging.bootstrap import Bootstrap
-from pisigma.judging.frames.frame_fits import FRAMES_FITTED
+from pisigma.judging.frames.fitted_frames import FrameKind, fitted_kinds, fitted_remark
 from pisigma.judging.model_comparison import Difference, ModelComparison, compare_models
 from pisigma.judging.reference_models import geometric_model, nominal_model
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
@@ -18,7 +19,9 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.stated_conditions import condition_warnings
+from pisigma.monitoring.session import Session
 from pisigma.verification.cause import length_text
+from pisigma.verification.motion import judged_motion, motion_sentence, motion_warnings
 from pisigma.verification.setup_fault import SetupFault
 from pisigma.verification.setup_faults import find_setup_faults, is_implausible, unexplained
 from pisigma.workflow.evaluate import test_rows
@@ -34,7 +37,10 @@ NOMINAL, GEOMETRIC, CORRECTED = "nominal", "geometric", "corrected"
 HALVED = 0.5
 """Where a setup fault is found, errors must at least be halved for the corrected model to count as better."""
 
-Verdict = Literal["better", "not_better", "undecided", "setup_fault", "implausible"]
+MOTIONS = {"joint_zero", "frame", "tool"}
+"""Setup faults of which the posterior of a model says more."""
+
+Verdict = Literal["better", "not_better", "undecided", "moved", "setup_fault", "implausible"]
 
 _BEGIN: dict[Verdict, str] = {
     "better": "The corrected model explains these measurements better than the nominal robot",
@@ -50,12 +56,19 @@ class VerificationSettings:
     """How a model is verified.
 
     Attributes:
-        fit_frame: fit the frames anew, as after the sensor was moved; then any frame will do.
+        fit_frame: fit the frames to the rows, as after the sensor was moved; then any frame will do.
+        fit_tool: fit the targets to the rows, as after another reflector was mounted; then any target will do.
         seed: of the resamples for confidence intervals.
     """
 
     fit_frame: bool = False
+    fit_tool: bool = False
     seed: int = 0
+
+    @property
+    def fitted(self) -> tuple[FrameKind, ...]:
+        """What is fitted to the rows."""
+        return fitted_kinds(self.fit_frame, self.fit_tool)
 
 
 @dataclass(frozen=True)
@@ -68,14 +81,17 @@ class Verification:
         rows: number of rows that were judged.
         settings: how.
         verdict: "better" where the corrected model explains the rows better than the nominal robot, which the
-            confidence interval of the mean difference has to show; "undecided" where it shows nothing; "setup_fault"
-            where a setup fault explains the errors, so that neither counts; "implausible" where they are too large
-            for a calibration and nothing explains them.
+            confidence interval of the mean difference has to show; "undecided" where it shows nothing; "moved" where
+            the posterior of the model says that the arm has moved and recalibrating pays; "setup_fault" where a setup
+            fault explains the errors, so that neither counts; "implausible" where they are too large for a calibration
+            and nothing explains them.
         sentence: the verdict with figures.
         ratio: mean position error of the corrected model over that of the nominal robot; NaN where that is 0.
         better_share: share of the configurations in which the corrected model is nearer.
         comparison: figures of "nominal", "geometric" (of a hybrid) and "corrected".
-        setup_faults: what explains large errors.
+        setup_faults: what explains large errors; nothing where `motion` explains them.
+        motion: what has moved since the model was made; None where the model or the rows do not say.
+        recalibration: the command that brings the model up to date; empty where that does not pay.
         warnings: what else should be known, each a sentence.
         seconds: that it took.
     """
@@ -90,6 +106,8 @@ class Verification:
     better_share: float
     comparison: ModelComparison
     setup_faults: tuple[SetupFault, ...]
+    motion: Session | None
+    recalibration: str
     warnings: tuple[str, ...]
     seconds: float
 
@@ -105,6 +123,7 @@ class Verification:
             "data": self.data,
             "rows": self.rows,
             "frame_fitted": self.settings.fit_frame,
+            "tool_fitted": self.settings.fit_tool,
             "explained_better": self.accepted,
             "verdict": self.verdict,
             "sentence": self.sentence,
@@ -112,6 +131,8 @@ class Verification:
             "better_share": self.better_share,
             **self.comparison.to_json(),
             "setup_faults": [fault.to_json() for fault in self.setup_faults],
+            "moved": [one.to_json() for one in self.motion.moved] if self.motion else [],
+            "recalibrate": self.recalibration or None,
             "warnings": list(self.warnings),
             "seconds": self.seconds,
         }
@@ -151,33 +172,73 @@ def verify(
     settings, begin = settings or VerificationSettings(), time.perf_counter()
     loaded = model if isinstance(model, CalibratedModel) else load_model(model)
     rows = data if isinstance(data, Measurements) else read_for_verification(data, loaded)
-    models = {NOMINAL: nominal_model(loaded, rows.rotation is not None)}
-    if loaded.hybrid is not None:
-        models[GEOMETRIC] = geometric_model(loaded)
-    models[CORRECTED] = loaded
+    models = _compared_models(loaded, rows.rotation is not None)
     resamples = int(np.clip(MOST_DRAWN // max(rows.rows, 1), *RESAMPLES))
-    comparison = compare_models(models, rows, Bootstrap(resamples, settings.seed), settings.fit_frame)
-    faults = find_setup_faults(loaded, models[NOMINAL], rows, settings.fit_frame)
-    nominal, corrected = comparison.models[0].position, comparison.models[-1].position
-    mean = nominal.statistics["mean"]
-    ratio = corrected.statistics["mean"] / mean if mean > 0 else float("nan")
-    difference = corrected.difference
+    comparison = compare_models(models, rows, Bootstrap(resamples, settings.seed), settings.fitted)
+    faults = find_setup_faults(loaded, models[NOMINAL], rows, settings.fitted)
+    motion = _motion(loaded, rows, settings.fitted, comparison, faults)
+    mean = comparison.models[0].position.statistics["mean"]
+    ratio = comparison.models[-1].position.statistics["mean"] / mean if mean > 0 else float("nan")
+    difference = comparison.models[-1].position.difference
     assert difference is not None  # it is not the first
-    verdict = _verdict(loaded, comparison, difference, ratio, faults)
+    if motion is not None and motion.moved and motion.recalibrate:
+        verdict: Verdict = "moved"
+        sentence, faults = motion_sentence(motion, comparison), ()
+    else:
+        verdict = _verdict(loaded, comparison, difference, ratio, faults)
+        sentence = _sentence(verdict, comparison, difference, ratio, faults)
+    name = loaded.name if isinstance(model, CalibratedModel) else os.fspath(model)
     return Verification(
-        model=loaded.name if isinstance(model, CalibratedModel) else os.fspath(model),
+        model=name,
         data=rows.source,
         rows=rows.rows,
         settings=settings,
         verdict=verdict,
-        sentence=_sentence(verdict, comparison, difference, ratio, faults),
+        sentence=sentence,
         ratio=ratio,
         better_share=difference.better_share,
         comparison=comparison,
         setup_faults=faults,
-        warnings=(*_warnings(loaded, rows, comparison, faults), *[FRAMES_FITTED] * settings.fit_frame),
+        motion=motion,
+        recalibration=_recalibration(name, rows.source, settings, motion),
+        warnings=(
+            *_warnings(loaded, rows, comparison, faults, motion),
+            *([] if motion is None or verdict == "moved" else motion_warnings(motion)),
+            *fitted_remark(rows, settings.fitted),
+        ),
         seconds=time.perf_counter() - begin,
     )
+
+
+def _compared_models(model: CalibratedModel, turned: bool) -> dict[str, CalibratedModel]:
+    """The nominal robot, the geometry of a hybrid, and the corrected model."""
+    models = {NOMINAL: nominal_model(model, turned)}
+    if model.hybrid is not None:
+        models[GEOMETRIC] = geometric_model(model)
+    return models | {CORRECTED: model}
+
+
+def _recalibration(name: str, data: str, settings: VerificationSettings, motion: Session | None) -> str:
+    """The command that brings a model up to date, where that pays."""
+    if motion is None or not motion.recalibrate:
+        return ""
+    stated = ["--moved", ",".join(settings.fitted)] if settings.fitted else []
+    return shlex.join(["pisigma", "recalibrate", name, data, *stated, "--out", "DIR"])
+
+
+def _motion(
+    model: CalibratedModel,
+    rows: Measurements,
+    fitted: Sequence[FrameKind],
+    comparison: ModelComparison,
+    faults: Sequence[SetupFault],
+) -> Session | None:
+    """Say what has moved, where no other setup fault and not the nominal robot explains the rows better."""
+    if any(not MOTIONS.issuperset(fault.kinds) for fault in faults):
+        return None
+    motion = judged_motion(model, rows, fitted)
+    nominal = comparison.models[0].position.statistics["rms"] * 1e-3
+    return motion if motion is not None and motion.rms_after < nominal else None
 
 
 def _verdict(
@@ -250,7 +311,11 @@ def _sentence(
 
 
 def _warnings(
-    model: CalibratedModel, rows: Measurements, comparison: ModelComparison, faults: Sequence[SetupFault]
+    model: CalibratedModel,
+    rows: Measurements,
+    comparison: ModelComparison,
+    faults: Sequence[SetupFault],
+    motion: Session | None,
 ) -> list[str]:
     warnings = []
     lower, upper = torch.from_numpy(model.robot.limits).unbind(1)
@@ -270,6 +335,6 @@ def _warnings(
             f"{corrected.rows_not_predicted} rows lie so far outside the domain that nothing is predicted; they do "
             "not count."
         )
-    if not faults and is_implausible(corrected, model):
+    if not faults and motion is None and is_implausible(corrected, model):
         warnings.append(unexplained(model))
     return warnings

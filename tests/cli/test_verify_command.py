@@ -76,10 +76,10 @@ def test_a_moved_sensor(run, models, files):
     assert "with --fit-frame" in " ".join(result.stdout.split())
     result = run("verify", models / "kiro3", files / "moved.csv", "--fit-frame")
     assert result.exit_code == 0
-    assert "The frames were fitted to these rows" in result.stdout
+    assert "These rows determine the frame (6 numbers) too" in " ".join(result.stdout.split())
     result = run("evaluate", models / "kiro3", files / "moved.csv", "--fit-frame", "--max-p95-mm", "0.001")
     assert result.exit_code == 0
-    assert "The frames were fitted to these rows" in result.stdout
+    assert "These rows determine the frame (6 numbers) too" in " ".join(result.stdout.split())
     result = run("evaluate", models / "kiro3", files / "moved.csv", "--max-p95-mm", "0.001")
     assert result.exit_code == 3
 

@@ -61,14 +61,18 @@ FAULTS = {
     "frame": (
         lambda rows, T: moved(rows, T, FRAME, EYE),
         ("frame",),
-        "the measuring frame has moved (shifted by 374 mm",
+        "the base has moved by about 680 mm and 36.6 deg against the model",
     ),
     "tool": (
         lambda rows, T: moved(rows, T, EYE, TOOL),
         ("tool",),
-        "another tool or target is mounted (shifted by 61.6 mm",
+        "the tool has moved by about 61.6 mm against the model",
     ),
-    "frame and tool": (lambda rows, T: moved(rows, T, FRAME, TOOL), ("frame", "tool"), "and another tool"),
+    "frame and tool": (
+        lambda rows, T: moved(rows, T, FRAME, TOOL),
+        ("frame", "tool"),
+        "and the tool has moved",
+    ),
     "mm named m": (
         lambda rows, T: replace(rows, position=rows.position * 1e3),
         ("position_unit",),
@@ -132,7 +136,7 @@ FAULTS = {
     "a sign, from elsewhere": (
         lambda rows, T: joints(moved(rows, T, FRAME, EYE), [1, 1, -1.0, 1, 1, 1]),
         ("joint_sign", "frame"),
-        "the sign of joint 3 is reversed and the measuring frame has moved",
+        "the sign of joint 3 is reversed and the base has moved",
     ),
 }
 """By name: how good measurements are spoilt, what is to be recognised, and words of the sentence."""

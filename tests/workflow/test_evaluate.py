@@ -3,12 +3,14 @@
 from dataclasses import replace
 
 import pytest
+import torch
 from testing.calibrated_ur5 import calibrated_ur5, measured
 
 import pisigma
 from pisigma.errors import MeasurementError
 from pisigma.judging.bootstrap import Bootstrap
 from pisigma.judging.model_comparison import ModelFigures, QuantityErrors
+from pisigma.se3 import transform_from_xyzrpy
 from pisigma.workflow.evaluate import EvaluationSettings, Limits
 
 
@@ -87,3 +89,22 @@ def test_models_and_rows_in_memory():
     assert printed["models"][1]["rms_mm"] == found.models[1].position.statistics["rms"]
     assert pisigma.evaluate(model, rows, EvaluationSettings(bootstrap=Bootstrap(20))).accepted
     assert pisigma.verify(model, rows).accepted
+
+
+@pytest.mark.usefixtures("without_type_checker")
+def test_a_base_or_a_tool_that_has_moved_is_named():
+    """Without a limit, and where errors are plausible; fitted, it is fine."""
+    model, q, T = calibrated_ur5(40)
+    X = transform_from_xyzrpy(torch.tensor([5e-3, 0.0, 0.0, 1e-3, 0.0, 0.0]).double())
+    for poses, what, fitted in (
+        (X @ T, "base", EvaluationSettings(fit_frame=True, bootstrap=Bootstrap(20))),
+        (T @ X, "tool", EvaluationSettings(fit_tool=True, bootstrap=Bootstrap(20))),
+    ):
+        found = pisigma.evaluate(
+            model, measured(q, poses, False), EvaluationSettings(bootstrap=Bootstrap(20))
+        )
+        assert not found.accepted
+        (diagnostic,) = found.diagnostics
+        assert f"ur5: The {what} has moved by about" in diagnostic.sentence
+        assert f"recalibrate with --moved {what}" in diagnostic.sentence
+        assert pisigma.evaluate(model, measured(q, poses, False), fitted).accepted

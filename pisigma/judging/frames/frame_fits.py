@@ -6,13 +6,8 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.errors import MeasurementError
 from pisigma.identification.initial_guess.base_and_tool_closed_form import nearest_rotation
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.groups import groups_to_keep_whole
-from pisigma.measurement.splits import k_folds
-from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.row_poses import poses_of_rows
 from pisigma.se3 import rotation_from_vector, rotation_vector, skew, transform
 
 LEVER_SHARE = 0.2
@@ -20,18 +15,11 @@ LEVER_SHARE = 0.2
 ALTERNATIONS = 10
 """Projections onto the rotations by which a guess of base and tool is polished."""
 STEPS = 20
+AFFINE_NUMBERS = 13
+"""Unknowns of every coordinate of an affine base and tool: so many positions or fewer do not determine them."""
 SETTLED = 1e-6
 """The search for base and tool ends when a step lowers the cost by less than this share."""
 FIRST_DAMPING = 1e-6
-FOLDS = 5
-"""Folds that fitted frames are cross-validated with."""
-FEWEST = 12
-"""Different joint vectors that a frame needs at least."""
-FRAMES_FITTED = (
-    "The frames were fitted to these rows for every model, each row's frame to other configurations, so an error of "
-    "the robot's base does not show."
-)
-"""What a user should know of errors in fitted frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,11 +163,16 @@ def moved_base_and_tool(
     step: Float64[Tensor, "*batch 12"],
 ) -> tuple[Float64[Tensor, "*batch 4 4"], Float64[Tensor, "*batch 4 4"]]:
     """Shift and turn base and tool by a step of `base_and_tool_step`."""
-    moved = [
-        transform(rotation_from_vector(part[..., 3:]) @ frame[..., :3, :3], frame[..., :3, 3] + part[..., :3])
-        for frame, part in ((base, step[..., :6]), (tool, step[..., 6:]))
-    ]
-    return moved[0], moved[1]
+    return moved_frame(base, step[..., :6]), moved_frame(tool, step[..., 6:])
+
+
+def moved_frame(
+    frame: Float64[Tensor, "*batch 4 4"], step: Float64[Tensor, "*batch 6"]
+) -> Float64[Tensor, "*batch 4 4"]:
+    """Shift [m] and turn [rad] a frame, about its origin."""
+    return transform(
+        rotation_from_vector(step[..., 3:]) @ frame[..., :3, :3], frame[..., :3, 3] + step[..., :3]
+    )
 
 
 def _rotation_products(
@@ -226,14 +219,37 @@ def _affine_base_and_tool(
         best = agreement.argmax(-1)[..., None, None, None]
         R_base = bases.take_along_dim(best, -3)[..., 0, :, :]
         R_tool = Z.take_along_dim(best, -3)[..., 0, :, :].mT
-    else:
+    elif T.shape[-3] > AFFINE_NUMBERS:
         R_base = nearest_rotation(_affine_solution(T, position)[1][..., 9:12, :].mT)
+    else:
+        R_base = best_base(T, measured)[..., :3, :3]
     eye = torch.eye(3).to(T).expand(R.shape)
     J = torch.cat([eye, R_base[..., None, :, :] @ R], -1).flatten(-3, -2)
     wanted = (position - p @ R_base.mT).flatten(-2)[..., None]
     ridge = 1e-9 * T.shape[-3] * torch.eye(6).to(T)
     shift = torch.linalg.solve(J.mT @ J + ridge, J.mT @ wanted)[..., 0]
     return transform(R_base, shift[..., :3]), transform(R_tool, shift[..., 3:])
+
+
+def frame_columns(
+    T: Float64[Tensor, "*batch rows 4 4"],
+    measured: MeasuredPoses,
+    base: Float64[Tensor, "*batch #rows 4 4"],
+    tool: Float64[Tensor, "*batch #rows 4 4"],
+) -> tuple[Float64[Tensor, "*batch rows 6 12"], Float64[Tensor, "*batch rows 6"]]:
+    """Derivatives of poses `base T tool` by shift [m] and turn [rad] of the base, then of the tool; and the errors.
+
+    The base turns about its origin, in the measuring frame. The six values of a row are those of its position [m] and,
+    times the lever, of its rotation vector; the latter are 0 where no rotation was measured.
+    """
+    R_base, R_flange = base[..., :3, :3], base[..., :3, :3] @ T[..., :3, :3]
+    arm = (R_base @ (T[..., :3, 3:] + T[..., :3, :3] @ tool[..., :3, 3:]))[..., 0]
+    eye, none = torch.eye(3).to(T).expand(R_flange.shape), torch.zeros_like(R_flange)
+    weight = measured.lever * measured.has_rotation.to(T)[..., None]
+    turn = rotation_vector(measured.rotation @ (R_flange @ tool[..., :3, :3]).mT)
+    J = torch.cat([eye, -skew(arm), R_flange, none], -1)
+    J = torch.cat([J, weight[..., None] * torch.cat([none, eye, none, R_flange], -1)], -2)
+    return J, torch.cat([measured.position - arm - base[..., :3, 3], weight * turn], -1)
 
 
 def base_and_tool_step(
@@ -255,15 +271,10 @@ def base_and_tool_step(
         free: shift [m] and turn [rad] of every row's pose by a value of its own, which is eliminated (variable
             projection, Golub and Pereyra 1973); None where there is none.
     """
-    R_base, R_flange = base[..., None, :3, :3], base[..., None, :3, :3] @ T[..., :3, :3]
-    arm = (R_base @ (T[..., :3, 3:] + T[..., :3, :3] @ tool[..., None, :3, 3:]))[..., 0]
-    eye, none = torch.eye(3).to(T).expand(R_flange.shape), torch.zeros_like(R_flange)
-    weight = measured.lever * measured.has_rotation.to(T)[..., None]
-    turn = rotation_vector(measured.rotation @ (R_flange @ tool[..., None, :3, :3]).mT)
-    J = torch.cat([eye, -skew(arm), R_flange, none], -1)
-    J = torch.cat([J, weight[..., None] * torch.cat([none, eye, none, R_flange], -1)], -2)
-    residual = torch.cat([measured.position - arm - base[..., None, :3, 3], weight * turn], -1)[..., None]
+    J, error = frame_columns(T, measured, base[..., None, :, :], tool[..., None, :, :])
+    residual = error[..., None]
     if free is not None:
+        weight = measured.lever * measured.has_rotation.to(T)[..., None]
         along = torch.cat([free[..., :3], weight * free[..., 3:]], -1)[..., None]
         along = along / along.norm(dim=-2, keepdim=True).clamp(min=1e-12)
         J, residual = J - along @ (along.mT @ J), residual - along @ (along.mT @ residual)
@@ -272,40 +283,3 @@ def base_and_tool_step(
     scale = normal.diagonal(dim1=-2, dim2=-1) * damping[..., None] + 1e-12 * T.shape[-3]
     step: Tensor = torch.linalg.solve(normal + torch.diag_embed(scale), J.mT @ residual)
     return step[..., 0]
-
-
-def poses_in_fitted_frames(model: CalibratedModel, measurements: Measurements) -> Float64[Tensor, "rows 4 4"]:
-    """Predict where the targets were, every frame of the file fitted anew, as after a tracker was moved.
-
-    The frame that a row is judged in is fitted to rows of other configurations, four fifths of them: a row has no part
-    in it. The fit is rigid and in closed form (see `best_base`).
-
-    Args:
-        model: of any kind; the frames that it holds do not matter.
-        measurements: rows with positions.
-
-    Raises:
-        MeasurementError: a frame has too few different joint vectors, no positions were measured, or the model lacks
-            a target.
-    """
-    if measurements.position is None:
-        raise MeasurementError(
-            f"{measurements.source}: no positions were measured, to which a frame could be fitted."
-        )
-    any_frame = next(iter(model.bases), "")
-    T = poses_of_rows(model, replace(measurements, frame=(any_frame,) * measurements.rows)).clone()
-    there = torch.isfinite(measurements.position).all(-1) & torch.isfinite(T).all(-1).all(-1)
-    for name in dict.fromkeys(measurements.frame):
-        rows = (there & torch.tensor([frame == name for frame in measurements.frame])).nonzero()[:, 0]
-        of_frame = measurements.select(rows)
-        count = len(set(groups_to_keep_whole(of_frame).tolist()))
-        if count < FEWEST:
-            what = f"frame '{name}'" if name else "the frame"
-            raise MeasurementError(
-                f"{measurements.source}: {what} holds {count} different joint vectors whose positions the model "
-                f"'{model.name}' predicts, and fitting it takes {FEWEST} or more; measure more poses."
-            )
-        predicted, measured = T[rows], MeasuredPoses.of(of_frame, LEVER_SHARE * model.robot.reach)
-        for others, judged in k_folds(of_frame, FOLDS, seed=0):
-            T[rows[judged]] = best_base(predicted[others], measured.select(others)) @ predicted[judged]
-    return T

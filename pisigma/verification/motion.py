@@ -1,0 +1,83 @@
+"""What has moved since a model was made, where the model holds a posterior that says how sure that is."""
+
+from collections.abc import Collection
+from contextlib import suppress
+from dataclasses import replace
+
+import torch
+
+from pisigma.errors import IdentificationError, ModelError
+from pisigma.judging.frames.fitted_frames import FrameKind
+from pisigma.judging.model_comparison import ModelComparison
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.monitoring.session import Session, is_frame, judge_session, shown_probability
+from pisigma.recalibration.model_posterior import ModelPosterior
+from pisigma.recalibration.recalibration_problem import owners_in
+from pisigma.verification.cause import joined, length_text
+from pisigma.verification.explanations import PLAUSIBLE_SHARE
+from pisigma.verification.faults_as_drawn import measured_rows, spread
+from pisigma.verification.setup_faults import judged_values
+
+MOST_ROWS = 60
+"""Rows that the question is decided on; its covariance is of all their values."""
+
+
+def judged_motion(
+    model: CalibratedModel, rows: Measurements, fitted: Collection[FrameKind] = ()
+) -> Session | None:
+    """Say which joint, length, base or tool has moved since a model was made; see `judge_session`.
+
+    Args:
+        model: the model.
+        rows: with positions, in frames and of targets that the model has or that are fitted.
+        fitted: what stands elsewhere for certain.
+
+    Returns:
+        What it says, without what is fitted; None where the model holds no posterior, where the rows do not determine
+        what is fitted, and where no motion explains the rows: errors of more than 1 % of the reach are left.
+    """
+    with suppress(IdentificationError, ModelError):
+        posterior = ModelPosterior.of(model)
+        some = judged_values(model, rows).select(spread(measured_rows(rows), MOST_ROWS))
+        some = posterior.renamed(replace(some, pair=None, distance=None))
+        with torch.no_grad():
+            session, _ = judge_session(model, posterior, some, owners_in(some, fitted) if fitted else None)
+        moved = tuple(one for one in session.moved if one.moved.what.split()[0] not in fitted)
+        if session.rms_after <= PLAUSIBLE_SHARE * model.robot.reach:
+            return replace(session, moved=moved)
+    return None
+
+
+def motion_sentence(motion: Session, comparison: ModelComparison) -> str:
+    """Say what of the arm has moved, how sure that is, and what recalibrating is expected to gain."""
+    means = (length_text(comparison.models[index].position.statistics["mean"] / 1e3) for index in (-1, 0))
+    errors = (length_text(rms) for rms in (motion.rms, motion.rms_after))
+    return (
+        f"{motion_text(motion)}, and the mean error is {next(means)} ({next(means)} under the nominal robot). "
+        f"Recalibrating is expected to lower the RMS error from {next(errors)} to {next(errors)}."
+    )
+
+
+def motion_warnings(motion: Session) -> tuple[str, ...]:
+    """Say what has moved so little that it changes no verdict, or that something has and it is not clear what."""
+    if motion.verdict == "unchanged":
+        return ()
+    return (
+        (f"{motion_text(motion)}.",)
+        if motion.moved
+        else (f"{motion.sentence[:1].upper()}{motion.sentence[1:]}",)
+    )
+
+
+def motion_text(motion: Session) -> str:
+    """Say what has moved, such as "Joint 3 has moved by 0.24 ± 0.01 deg (probability more than 99.9 %)"."""
+    amounts: dict[tuple[str, float], list[str]] = {}
+    for one in motion.moved:
+        amounts.setdefault((one.moved.what, one.probability), []).append(one.moved.size)
+    text = joined(
+        f"{'the ' if is_frame(what) else ''}{what} has {'changed' if '_' in what else 'moved'} by {joined(those)} "
+        f"(probability {shown_probability(probability)})"
+        for (what, probability), those in amounts.items()
+    )
+    return f"{text[:1].upper()}{text[1:]}"
