@@ -1,13 +1,15 @@
 """Corrected inverse kinematics of coupled joints: the controller's values in and out, DH values in between."""
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pisigma.inverse.joint_input import as_array, pose_array
+from pisigma.inverse.passive_joints import nearest_starts, solve, solve_from
 from pisigma.inverse.solution import Solution
-from pisigma.kernels.array_kinematics import is_tensor
+from pisigma.kernels.array_kinematics import forward_kinematics, is_tensor, joint_jacobian
 from pisigma.kinematics.status import Status
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
@@ -38,6 +40,8 @@ class ControllerValues:
             branch: name of the only branch that may be taken.
             options: of `CorrectedIK.__call__`.
         """
+        if self.coupling.passive:
+            return self._solve_passive(T, near, owner)
         if (sides := options.get("approach")) is not None:
             options["approach"] = self.coupling.approach_to_dh(np.asarray(sides, dtype=np.float64))
         beside = None if near is None else self.coupling.to_dh(np.asarray(near, dtype=np.float64))
@@ -51,6 +55,8 @@ class ControllerValues:
 
     def all_branches(self, T: Any, owner: Any, **options: Any) -> Solution:
         """See `CorrectedIK.all_branches`."""
+        if self.coupling.passive:
+            return self._solve_passive(T[..., None, :, :], None, owner)
         every = self.ik.all_branches(T, **options)
         q, _ = self._inside(np.asarray(as_array(every.q)), None)
         return self._answer(replace(every, q=every.q * 0 + _as(q, every.q)), owner)
@@ -70,6 +76,44 @@ class ControllerValues:
 
     def _to_dh(self, q: Any) -> Any:
         return self.coupling.to_dh(q if is_tensor(q) else np.asarray(q, dtype=np.float64))
+
+    def _solve_passive(self, T: Any, near: Any, owner: Any) -> Solution:
+        """Solve an arm with passive joints, from `near` or from the stored joint values whose poses are nearest."""
+        poses, axes = pose_array(T)[0], len(self.coupling.axes)
+        rows, batch = poses.reshape(-1, 4, 4), poses.shape[:-2]
+        if near is None:
+            stored = self.coupling.to_controller(self.ik.model.starts.double().cpu().numpy())
+            starts = nearest_starts(self._motion, rows, stored)
+        else:
+            starts = np.broadcast_to(near, (*batch, axes)).reshape(-1, 1, axes)
+        found = solve_from(
+            self._motion, rows, starts, lambda q: self.coupling.is_inside(self.coupling.to_dh(q))
+        )
+        nominal = solve(partial(self._motion, nominal=True), rows, found.q)
+        q, q_nominal = found.known(found.q), nominal.known(nominal.q)
+        solution = Solution(
+            q.reshape(*batch, axes),
+            np.where(np.isfinite(q), q_nominal, np.nan).reshape(*batch, axes),
+            np.zeros(batch, dtype=int),
+            self.ik.branches[:1],
+            np.where(found.reached, int(Status.REACHED), int(Status.UNREACHABLE)).reshape(batch),
+            found.known(found.position).reshape(batch),
+            found.known(found.rotation).reshape(batch),
+            np.full(batch, np.nan),
+            owner,
+        )
+        outside = found.reached & ~self.coupling.is_inside(self.coupling.to_dh(found.q))
+        beyond = int(Status.OUTSIDE_JOINT_LIMITS)
+        solution = replace(solution, status=np.where(outside.reshape(batch), beyond, solution.status))
+        return solution.map(T.new_tensor) if is_tensor(T) else solution
+
+    def _motion(self, q: Any, nominal: bool = False) -> tuple[Any, Any]:
+        """Pose and Jacobian at the controller's values of the calibrated arm, or of the nominal one."""
+        dh, slope = self.coupling.to_dh(q), self.coupling.slope(q)
+        if nominal:
+            robot = self.ik.model.robot
+            return forward_kinematics(robot, dh), joint_jacobian(robot, dh) @ slope
+        return self.ik.forward(dh), self.ik.jacobian(dh) @ slope
 
     def _inside(self, q: Any, near: Any) -> tuple[Any, Any]:
         """DH values turned so that the controller's are within its limits, and which of them cannot be."""

@@ -72,12 +72,14 @@ class Coupling:
         matrix: `(dof, axes)`: C, [rad or m] of a joint per [rad or m] of an axis.
         offset: `(dof,)`: b [rad or m].
         four_bars: per joint that a linkage drives, its number and the linkage.
+        stops: per joint that has mechanical limits beside those of the axes, its number and these [rad or m].
     """
 
     axes: tuple[Row, ...]
     matrix: Float64[np.ndarray, "dof axes"]
     offset: Float64[np.ndarray, " dof"]
     four_bars: tuple[tuple[int, FourBar], ...] = ()
+    stops: tuple[tuple[int, tuple[float, float]], ...] = ()
 
     def __post_init__(self) -> None:
         """Check that every axis can be told from the joints."""
@@ -128,9 +130,12 @@ class Coupling:
         return _sides(approach, np.sign(np.round(np.linalg.pinv(self.matrix), 12)))
 
     def is_inside(self, q: Float[np.ndarray, "*batch dof"]) -> Bool[np.ndarray, "*batch"]:
-        """Whether the controller's values at DH values are within its limits; NaN is not."""
+        """Whether DH values are within the stops, and the controller's there within its limits; NaN is not."""
         values, (lower, upper) = self.to_controller(q), self.limits.T
-        return np.asarray(((values >= lower - SLACK) & (values <= upper + SLACK)).all(-1))
+        inside = ((values >= lower - SLACK) & (values <= upper + SLACK)).all(-1)
+        for joint, (least, most) in self.stops:
+            inside &= (q[..., joint] >= least - SLACK) & (q[..., joint] <= most + SLACK)
+        return np.asarray(inside)
 
     def turned_inside(
         self, q: Float64[np.ndarray, "rows dof"], near: Float64[np.ndarray, "#rows dof"] | None = None
@@ -180,15 +185,27 @@ def hull(coupling: Coupling) -> Float64[np.ndarray, "dof 2"]:
     ends = coupling.matrix[..., None] * np.where(np.isfinite(coupling.limits), coupling.limits, 0.0)
     unbounded = ((coupling.matrix != 0) & ~np.isfinite(coupling.limits).all(1)).any(1)
     lower, upper = ends.min(-1).sum(1) + coupling.offset, ends.max(-1).sum(1) + coupling.offset
+    result = np.stack([np.where(unbounded, -np.inf, lower), np.where(unbounded, np.inf, upper)], 1)
+    stops = dict(coupling.stops)
     for joint, bar in coupling.four_bars:
-        with np.errstate(invalid="ignore"):  # complained of below
-            lower[joint], upper[joint] = bar.follow(lower[joint]), bar.follow(upper[joint])
-        if not np.isfinite([lower[joint], upper[joint]]).all() or unbounded[joint]:
-            raise RobotError(
-                f"coupling: the four-bar linkage of joint {joint + 1} does not close at all values within the limits "
-                "of the axes that move it; state these limits, or correct its lengths."
-            )
-    return np.stack([np.where(unbounded, -np.inf, lower), np.where(unbounded, np.inf, upper)], 1)
+        result[joint] = _driven(bar, result[joint], stops.get(joint, (-np.pi, np.pi)), joint)
+    for joint, (least, most) in coupling.stops:
+        result[joint] = max(least, result[joint, 0]), min(most, result[joint, 1])
+    return result
+
+
+def _driven(bar: FourBar, turn: np.ndarray, stops: tuple[float, float], joint: int) -> tuple[float, float]:
+    """Smallest and largest value [rad] of a joint that a linkage drives, which has to close all the way between."""
+    with np.errstate(invalid="ignore"):  # complained of below
+        ends = bar.drive(np.array(stops))
+        x = np.linspace(np.fmax(turn[0], ends[0]), np.fmin(turn[1], ends[1]), 181)
+        u = bar.follow(x)
+    if not (np.isfinite(u).all() and (np.diff(np.sign(np.sin(x + bar.zero))) == 0).all()):
+        raise RobotError(
+            f"coupling: the four-bar linkage of joint {joint + 1} does not close, or stretches out, at a value within "
+            "the limits; give the joint stops (limits_deg in its entry), or correct its lengths."
+        )
+    return float(u[0]), float(u[-1])
 
 
 def _functions(values: Any) -> Any:

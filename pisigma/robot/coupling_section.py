@@ -38,6 +38,8 @@ class CoupledJointSection(Section):
         offset_deg: of a joint that turns.
         offset_mm: of a joint that slides.
         four_bar: the linkage that drives it, if one does.
+        limits_deg: mechanical stops of a joint that turns, which hold besides the limits of the controller's values.
+        limits_mm: the same of a joint that slides.
     """
 
     joint: str
@@ -45,6 +47,8 @@ class CoupledJointSection(Section):
     offset_deg: Bounded = 0.0
     offset_mm: Bounded = 0.0
     four_bar: FourBarSection | None = None
+    limits_deg: tuple[Bounded, Bounded] | None = None
+    limits_mm: tuple[Bounded, Bounded] | None = None
 
 
 def coupled(
@@ -75,6 +79,7 @@ def coupled(
     axes = [joint for joint in joints if joint.name in used or joint.name not in by_name]
     matrix, offset = np.zeros((len(joints), len(axes))), np.zeros(len(joints))
     four_bars: list[tuple[int, FourBar]] = []
+    stops: list[tuple[int, tuple[float, float]]] = []
     for index, joint in enumerate(joints):
         section = by_name.get(joint.name, CoupledJointSection(joint=joint.name, factors={joint.name: 1.0}))
         matrix[index] = [
@@ -90,7 +95,9 @@ def coupled(
             )
         if section.four_bar is not None:
             four_bars.append((index, section.four_bar.to_si()))
-    coupling = Coupling(tuple(axes), matrix, offset, tuple(four_bars))
+        if limits := section.limits_deg or section.limits_mm:
+            stops.append((index, (joint.from_file_unit(limits[0]), joint.from_file_unit(limits[1]))))
+    coupling = Coupling(tuple(axes), matrix, offset, tuple(four_bars), tuple(stops))
     limits = iter(hull(coupling).tolist())
     return tuple(row if row.type == "fixed" else _within(row, *next(limits)) for row in rows), coupling
 
@@ -102,10 +109,13 @@ def _within(row: Row, lower: float, upper: float) -> Row:
 def _offset(joint: Row, section: CoupledJointSection) -> float:
     """The offset of a joint [rad or m]."""
     sliding = joint.type == "prismatic"
-    if section.offset_deg if sliding else section.offset_mm or (sliding and section.four_bar):
+    turning = section.offset_deg, section.limits_deg, section.four_bar
+    length = section.offset_mm, section.limits_mm
+    if any(turning if sliding else length):
+        unit = joint.file_unit
         raise RobotError(
-            f"coupling: the joint '{joint.name}' is {joint.type}; state offset_{joint.file_unit} and nothing that "
-            "belongs to the other kind."
+            f"coupling: the joint '{joint.name}' is {joint.type}; state offset_{unit} and limits_{unit} and nothing "
+            "that belongs to the other kind."
         )
     return section.offset_mm / 1e3 if sliding else float(np.deg2rad(section.offset_deg))
 
@@ -113,7 +123,7 @@ def _offset(joint: Row, section: CoupledJointSection) -> float:
 def coupling_document(coupling: Coupling, joints: Sequence[Row]) -> list[dict[str, object]]:
     """The sections that `coupled` makes a coupling of, as plain values."""
     result: list[dict[str, object]] = []
-    bars = dict(coupling.four_bars)
+    bars, stops = dict(coupling.four_bars), dict(coupling.stops)
     for index, (joint, factors) in enumerate(zip(joints, coupling.matrix.tolist(), strict=True)):
         stated = {
             axis.name: factor
@@ -122,10 +132,12 @@ def coupling_document(coupling: Coupling, joints: Sequence[Row]) -> list[dict[st
             if factor
         }
         offset = float(coupling.offset[index])
-        if stated == {joint.name: 1.0} and not offset and index not in bars:
+        if stated == {joint.name: 1.0} and not offset and index not in bars and index not in stops:
             continue
         entry: dict[str, object] = {"joint": joint.name, "factors": stated}
         entry |= {f"offset_{joint.file_unit}": joint.in_file_unit(offset)} if offset else {}
+        if index in stops:
+            entry[f"limits_{joint.file_unit}"] = [joint.in_file_unit(bound) for bound in stops[index]]
         if index in bars:
             bar = bars[index]
             lengths = ("ground", "crank", "coupler", "rocker")

@@ -69,6 +69,9 @@ class OrientationSection(Section):
         return home @ rotation_from_rpy(torch.deg2rad(self.spread_deg * draws))
 
 
+MORE_DRAWS = 9
+"""For each joint vector where coupled joints have stops, which refuse some."""
+
 Range = tuple[float, float]
 """Smallest and largest value."""
 
@@ -102,9 +105,23 @@ class JointsRandom(Section):
         """
         bounds = torch.from_numpy(self._bounds(robot))
         generator = torch.Generator().manual_seed(self.seed)
-        draws = torch.rand(self.count, len(bounds), generator=generator, dtype=torch.float64)
-        q: Tensor = robot.to_dh(bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) * draws)
-        return q
+
+        def drawn() -> Tensor:
+            draws = torch.rand(self.count, len(bounds), generator=generator, dtype=torch.float64)
+            q: Tensor = robot.to_dh(bounds[:, 0] + (bounds[:, 1] - bounds[:, 0]) * draws)
+            return q
+
+        q = drawn()
+        if robot.coupling is None or not robot.coupling.stops:
+            return q
+        many = torch.cat([q] + [drawn() for _ in range(MORE_DRAWS)])
+        kept = many[torch.from_numpy(robot.coupling.is_inside(many.numpy()))]
+        if len(kept) < self.count:
+            raise RecipeError(
+                f"joints_random: of {len(many)} draws only {len(kept)} keep the stops of robot '{robot.name}'; narrow "
+                "the ranges."
+            )
+        return kept[: self.count]
 
     def _bounds(self, robot: Robot) -> Float64[np.ndarray, "axes 2"]:
         limits = robot.axis_limits

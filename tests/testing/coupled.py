@@ -33,6 +33,7 @@ rows:
 coupling:
   - joint: theta_3
     factors: {theta_3: 1, theta_2: -1}
+    limits_deg: [-65, 65]
     four_bar: {ground_mm: 945, crank_mm: 400, coupler_mm: 945.4, rocker_mm: 400.2, zero_deg: 90}
   - {joint: tilt, factors: {theta_3: -1}}
 """

@@ -124,6 +124,8 @@ class ArmInCell:
         segments = self.capsules.segments(q)
         values, (lower, upper) = self.robot.to_controller(q), self.limits.t()
         outside = (values < lower - LIMIT_TOLERANCE) | (values > upper + LIMIT_TOLERANCE)
+        if self.robot.coupling is not None:
+            outside |= ~torch.from_numpy(self.robot.coupling.is_inside(q.numpy()))[:, None]
         faults = {"a joint is outside its limits or their margin": outside.any(-1)}
         faults |= {reason: gap < 0 for reason, gap in self._gaps(segments).items()}
         if self.cell.tracker is not None:
