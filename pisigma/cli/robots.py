@@ -1,13 +1,16 @@
-"""`pisigma robots`: the catalogue, and robots from files of controllers."""
+"""`pisigma robots`: the catalogue, robots from files of controllers, and poses to check a robot by."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pisigma.cli.arguments import AsJson, complete_robot
-from pisigma.cli.output import print_json, print_line, print_table
+from pisigma.cli.output import print_json, print_line, print_lines, print_table
 from pisigma.errors import OutputError
+
+if TYPE_CHECKING:
+    from pisigma.workflow.check_robot import PendantPose
 
 Read = Annotated[
     Path | None,
@@ -26,9 +29,29 @@ Like = Annotated[
 Out = Annotated[Path | None, typer.Option(help="With --read: the robot file (.yaml) to write.")]
 
 
-def robots(read: Read = None, like: Like = None, out: Out = None, as_json: AsJson = False) -> None:
-    """List the robots that come with pisigma, or turn a controller's own file into a robot file."""
-    if read is None and like is None and out is None:
+Check = Annotated[
+    str | None,
+    typer.Option(
+        help="Robot (name, YAML or URDF) whose tool to print with all axes at 0 and with each at 90 deg, to be "
+        "compared at the teach pendant.",
+        autocompletion=complete_robot,
+    ),
+]
+
+
+def robots(
+    read: Read = None,
+    like: Like = None,
+    out: Out = None,
+    check: Check = None,
+    base: Annotated[str | None, typer.Option(help="With --check: of a URDF file, the link of poses.")] = None,
+    tip: Annotated[str | None, typer.Option(help="With --check: of a URDF file, the tool's link.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """List the robots that come with pisigma, read a controller's own file, or check a robot description."""
+    if check is not None:
+        _check(check, base, tip, as_json)
+    elif read is None and like is None and out is None:
         _list(as_json)
     elif read is None or like is None or out is None:
         raise OutputError(
@@ -64,7 +87,7 @@ def _list(as_json: bool) -> None:
             {
                 "name": robot.name,
                 "maker": robot.maker,
-                "joints": [{"name": joint.name, "type": joint.type} for joint in robot.joints],
+                "joints": [{"name": joint.name, "type": joint.type} for joint in robot.axes],
                 "reach_mm": robot.reach * 1e3,
                 "source": robot.source,
             }
@@ -75,8 +98,8 @@ def _list(as_json: bool) -> None:
     rows = [
         (
             robot.name,
-            str(robot.dof),
-            "".join(joint.type[0].upper() for joint in robot.joints),
+            str(len(robot.axes)),
+            "".join(joint.type[0].upper() for joint in robot.axes),
             f"{robot.reach * 1e3:.0f}",
             robot.maker,
         )
@@ -84,3 +107,32 @@ def _list(as_json: bool) -> None:
     ]
     columns = ("name", "joints", "types", "reach [mm]", "maker")
     print_table("robots of the catalogue (R: revolute, P: prismatic joint)", columns, rows)
+
+
+def _check(robot: str, base: str | None, tip: str | None, as_json: bool) -> None:
+    """Print where a description has the tool."""
+    from pisigma.workflow.check_robot import check_robot
+
+    poses = check_robot(robot, base, tip)
+    if as_json:
+        print_json({"robot": robot, "poses": [pose.to_json() for pose in poses]})
+        return
+    rows = [_pendant_row(pose) for pose in poses]
+    columns = ("axis", "at", "x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]", "limits")
+    print_table(
+        f"tool of {Path(robot).stem} in its base frame, one axis moved, all others at 0", columns, rows
+    )
+    print_lines(
+        [
+            "Move the robot to these values, with the tool and frame of the description, and compare what the teach "
+            "pendant shows; the rotation is RotZ(roll) RotY(pitch) RotX(yaw). Where the first difference comes with an "
+            "axis, look at the rows from there on, its direction and its coupling."
+        ]
+    )
+
+
+def _pendant_row(pose: "PendantPose") -> tuple[str, ...]:
+    """The cells of a pose."""
+    at = f"{pose.in_file_unit:g} {pose.axis.file_unit}" if pose.axis else "all at 0"
+    numbers = (f"{value + 0.0:.3f}" for value in pose.tool_in_file_units.values())
+    return (pose.axis.name if pose.axis else "-", at, *numbers, "inside" if pose.inside else "outside")

@@ -4,6 +4,7 @@ import json
 
 import torch
 from testing.closeness import assert_close
+from testing.coupled import COUPLED, coupled_robot
 from testing.identified import geometric_model
 
 from pisigma.kinematics.forward import forward_kinematics
@@ -32,3 +33,21 @@ def test_a_calibration_goes_to_the_controller_and_comes_back(run, refuses, tmp_p
     }
     assert "--read, --like and --out go together" in refuses("robots", "--read", conf)
     assert "is an input of this command" in refuses("robots", "--read", out, "--like", "ur10", "--out", out)
+
+
+def test_a_description_is_checked_at_the_pendant(run, refuses, tmp_path):
+    file = tmp_path / "coupled.yaml"
+    file.write_text(COUPLED)
+    printed = json.loads(run("robots", "--check", file, "--json").stdout)
+    assert [pose["axis"] for pose in printed["poses"]] == [
+        None,
+        *(axis.name for axis in coupled_robot().axes),
+    ]
+    second = printed["poses"][2]
+    assert (second["value_deg"], second["within_limits"]) == (76.0, True)
+    T = forward_kinematics(coupled_robot(), torch.deg2rad(torch.tensor([0, 76.0, 76.0, 0, 0, 0]).double()))
+    assert_close([second[f"{axis}_mm"] / 1e3 for axis in "xyz"], T[:3, 3], atol=1e-12)
+    shown = run("robots", "--check", "ur5").stdout
+    assert "theta_3" in shown
+    assert "-817.250" in shown
+    assert "no robot of the catalogue" in refuses("robots", "--check", "nothing")

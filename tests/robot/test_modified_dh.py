@@ -33,7 +33,7 @@ def test_rows_are_converted_exactly():
         (30, 0.4, np.deg2rad(20), 0.05 + q[2]),
         (-40, 0.003, 0.0, 0.007),
     ):
-        T = T @ turn(0, np.deg2rad(alpha)) @ shift(a, 0, 0) @ turn(2, theta) @ shift(0, 0, d)
+        T = T @ turn(0, np.deg2rad(alpha)) @ shift(a, 0.0, 0.0) @ turn(2, theta) @ shift(0.0, 0.0, d)
     T = T @ frame_of(np.array([0, 0, 0.05, 0, 0, np.deg2rad(5)]))
     assert_close(pisigma.forward_kinematics(robot, q), T, atol=1e-15)
 

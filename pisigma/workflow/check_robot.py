@@ -1,0 +1,82 @@
+"""Where a robot description has the tool when one axis after the other moves, to be compared at the teach pendant."""
+
+import math
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from pisigma.kernels.array_kinematics import forward_kinematics
+from pisigma.robot.description import Robot
+from pisigma.robot.row import FRAME_COLUMNS, Row, in_file_units
+from pisigma.robot.urdf_frames import xyzrpy_of
+
+TURN, STROKE = math.pi / 2, 0.1
+"""How far an axis that turns [rad], or slides [m], is moved."""
+
+
+@dataclass(frozen=True, eq=False)
+class PendantPose:
+    """The tool with one axis moved and all others at 0.
+
+    Attributes:
+        axis: that is moved; None where all are at 0.
+        value: what the controller shows for it [rad or m].
+        tool: x, y, z [m], roll, pitch, yaw [rad] of `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)` in the base
+            frame.
+        inside: whether all of the controller's values are within its limits.
+    """
+
+    axis: Row | None
+    value: float
+    tool: Float64[np.ndarray, " 6"]
+    inside: bool
+
+    @property
+    def in_file_unit(self) -> float:
+        """What the controller shows [deg or mm]."""
+        return 0.0 if self.axis is None else self.axis.in_file_unit(self.value)
+
+    @property
+    def tool_in_file_units(self) -> dict[str, float]:
+        """The tool's pose by column [mm, deg]."""
+        return in_file_units(FRAME_COLUMNS, self.tool)
+
+    def to_json(self) -> dict[str, object]:
+        """Give all of it as plain values."""
+        unit = "deg" if self.axis is None else self.axis.file_unit
+        moved: dict[str, object] = {"axis": self.axis and self.axis.name, f"value_{unit}": self.in_file_unit}
+        return moved | self.tool_in_file_units | {"within_limits": self.inside}
+
+
+def check_robot(
+    robot: Robot | str | os.PathLike[str], base: str | None = None, tip: str | None = None
+) -> tuple[PendantPose, ...]:
+    """Give the tool's pose with all axes at 0, and with each at 90 deg (100 mm) or as far as its limits allow.
+
+    Args:
+        robot: a robot, a name of the catalogue, or a robot file (YAML or URDF).
+        base: of a URDF file the link that poses are given in.
+        tip: of a URDF file the link that is the tool.
+
+    Raises:
+        RobotError: the robot cannot be read.
+    """
+    drawn = robot if isinstance(robot, Robot) else Robot.load(robot, base, tip)
+    count, (lower, upper) = len(drawn.axes), drawn.axis_limits.T
+    values = np.zeros((count + 1, count))
+    for index, axis in enumerate(drawn.axes):
+        step = TURN if axis.type == "revolute" else STROKE
+        ends = min(step, upper[index]), max(-step, lower[index])
+        values[index + 1, index] = ends[0] if abs(ends[0]) >= abs(ends[1]) else ends[1]
+    inside = ((values >= lower) & (values <= upper)).all(1)
+    if drawn.coupling is not None:
+        inside &= drawn.coupling.is_inside(drawn.coupling.to_dh(values))
+    poses = forward_kinematics(drawn, values)
+    return tuple(
+        PendantPose(axis, float(value), xyzrpy_of(T), bool(allowed))
+        for axis, value, T, allowed in zip(
+            (None, *drawn.axes), (0.0, *values[1:].diagonal()), poses, inside, strict=True
+        )
+    )
