@@ -10,7 +10,7 @@ from pisigma.cli.output import print_json, print_line, print_lines, print_table
 from pisigma.errors import OutputError
 
 if TYPE_CHECKING:
-    from pisigma.workflow.check_robot import PendantPose
+    from pisigma.robot.pendant_poses import PendantPose
 
 Read = Annotated[
     Path | None,
@@ -111,9 +111,9 @@ def _list(as_json: bool) -> None:
 
 def _check(robot: str, base: str | None, tip: str | None, as_json: bool) -> None:
     """Print where a description has the tool."""
-    from pisigma.workflow.check_robot import check_robot
+    from pisigma.robot.pendant_poses import pendant_poses
 
-    poses = check_robot(robot, base, tip)
+    poses = pendant_poses(robot, base, tip)
     if as_json:
         print_json({"robot": robot, "poses": [pose.to_json() for pose in poses]})
         return

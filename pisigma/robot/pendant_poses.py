@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.kernels.array_kinematics import forward_kinematics
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS, Row, in_file_units
-from pisigma.robot.urdf_frames import xyzrpy_of
+from pisigma.robot.urdf_frames import Frame, frame_of, row_frame, xyzrpy_of
 
 TURN, STROKE = math.pi / 2, 0.1
 """How far an axis that turns [rad], or slides [m], is moved."""
@@ -50,7 +49,7 @@ class PendantPose:
         return moved | self.tool_in_file_units | {"within_limits": self.inside}
 
 
-def check_robot(
+def pendant_poses(
     robot: Robot | str | os.PathLike[str], base: str | None = None, tip: str | None = None
 ) -> tuple[PendantPose, ...]:
     """Give the tool's pose with all axes at 0, and with each at 90 deg (100 mm) or as far as its limits allow.
@@ -73,10 +72,18 @@ def check_robot(
     inside = ((values >= lower) & (values <= upper)).all(1)
     if drawn.coupling is not None:
         inside &= drawn.coupling.is_inside(drawn.coupling.to_dh(values))
-    poses = forward_kinematics(drawn, values)
+    moved = zip((None, *drawn.axes), (0.0, *values[1:].diagonal()), drawn.to_dh(values), inside, strict=True)
     return tuple(
-        PendantPose(axis, float(value), xyzrpy_of(T), bool(allowed))
-        for axis, value, T, allowed in zip(
-            (None, *drawn.axes), (0.0, *values[1:].diagonal()), poses, inside, strict=True
-        )
+        PendantPose(axis, float(value), xyzrpy_of(_tool(drawn, joints)), bool(allowed))
+        for axis, value, joints, allowed in moved
     )
+
+
+def _tool(robot: Robot, q: Float64[np.ndarray, " dof"]) -> Frame:
+    """T_base_tool at joint values [rad or m]."""
+    T, values = frame_of(robot.base), iter(q.tolist())
+    for row, (theta, d, a, alpha, beta) in zip(robot.rows, robot.dh.tolist(), strict=True):
+        value = 0.0 if row.type == "fixed" else row.direction * next(values)
+        turned, slid = (value, 0.0) if row.type == "revolute" else (0.0, value)
+        T = T @ row_frame(theta + turned, d + slid, a, alpha, beta)
+    return T @ frame_of(robot.tool)
