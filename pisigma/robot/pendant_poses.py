@@ -81,9 +81,11 @@ def pendant_poses(
 
 def _tool(robot: Robot, q: Float64[np.ndarray, " dof"]) -> Frame:
     """T_base_tool at joint values [rad or m]."""
-    T, values = frame_of(robot.base), iter(q.tolist())
+    T: Frame = frame_of(robot.base)
+    values = iter(q.tolist())
     for row, (theta, d, a, alpha, beta) in zip(robot.rows, robot.dh.tolist(), strict=True):
         value = 0.0 if row.type == "fixed" else row.direction * next(values)
         turned, slid = (value, 0.0) if row.type == "revolute" else (0.0, value)
         T = T @ row_frame(theta + turned, d + slid, a, alpha, beta)
-    return T @ frame_of(robot.tool)
+    T = T @ frame_of(robot.tool)
+    return T
