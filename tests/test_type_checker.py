@@ -1,0 +1,44 @@
+"""The type checker of the tests stops what the annotations exclude."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+from beartype.roar import BeartypeCallHintParamViolation, BeartypeCallHintReturnViolation
+from jaxtyping import Float64
+from testing.models import no_type_checker
+from testing.type_checker import type_checked
+from torch import Tensor
+
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.robot import Robot
+
+
+@type_checked
+def doubled(x: Float64[Tensor, " n"], y: Float64[Tensor, " n"]) -> Float64[Tensor, " n"]:
+    return torch.cat([x, y]) if len(x) > 2 else x + y
+
+
+@type_checked
+@dataclass(frozen=True)
+class Pair:
+    name: str
+    value: Float64[Tensor, " 2"]
+
+
+def test_arguments_results_and_fields_are_checked():
+    two, three = torch.zeros(2).double(), torch.zeros(3).double()
+    assert len(doubled(two, two)) == 2
+    assert Pair("a", two).value is two
+    for wrong in (lambda: doubled(two, three), lambda: doubled(two.float(), two), lambda: Pair("a", three)):
+        with pytest.raises(BeartypeCallHintParamViolation):
+            wrong()
+    with pytest.raises(BeartypeCallHintReturnViolation):
+        doubled(three, three)
+    with no_type_checker():
+        assert len(doubled(three, three)) == 6
+
+
+def test_pisigma_is_checked():
+    with pytest.raises(BeartypeCallHintParamViolation):
+        forward_kinematics(Robot.load("ur5"), [0.0] * 6)
