@@ -20,9 +20,11 @@ FrameChoice = Literal["fitted", "fixed"]
 """Whether base and tool of the second model are fitted to those of the first, or are the same by their names."""
 
 POINTS = 60
-"""Joint vectors at which models are aligned and compared with their uncertainties, from both models alike."""
+"""Joint vectors at which models are compared with their uncertainties, from both models alike."""
 SAMPLES = 3_000
 """Of the workspace."""
+FITTED = 300
+"""Of these, base and tool are fitted to so many."""
 DRAWN_ALIKE = 0.02
 """[rad, or of the reach] Drawings that differ by less are of one robot."""
 
@@ -64,7 +66,7 @@ class ModelPair:
         owner = _owners(first, second, frames)
         eye = torch.eye(4, dtype=torch.float64)
         pair = ModelPair(first, second, frames, owner, eye, eye)
-        T_first, T_second = pair.poses(pair.points)
+        T_first, T_second = pair.poses(pair.workspace[:: SAMPLES // FITTED])
         there = torch.isfinite(T_first + T_second).all(-1).all(-1)
         if not bool(there.any()):
             raise ModelError(

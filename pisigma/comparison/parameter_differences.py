@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pisigma.comparison.model_pair import ModelPair, as_drawn
-from pisigma.comparison.parameter_effects import ParameterEffects
+from pisigma.comparison.parameter_effects import Difference, ParameterEffects
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.model.accuracy import parameter_posterior
 from pisigma.model.calibrated_model import CalibratedModel
@@ -83,7 +83,7 @@ class ParameterDifferences:
     """
 
     parameters: tuple[ParameterDifference, ...]
-    differing: tuple[Moved, ...]
+    differing: tuple[Difference, ...]
     frames: tuple[Moved, ...]
     remainder: Remainder | None
     level: float

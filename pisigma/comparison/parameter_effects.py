@@ -1,7 +1,7 @@
 """Effects of parameters on the tool, in the metric of what two models do not know."""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.comparison.model_pair import ModelPair, frames_of
-from pisigma.identification.problem.parameters import ParameterSpace, row_labels
+from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.judging.frames.frame_fits import LEVER_SHARE
 from pisigma.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.measurement.conditions import JointState
@@ -30,6 +30,29 @@ FRAME_MOTIONS = ("along x", "along y", "along z", "about x", "about y", "about z
 
 Frames = tuple[Float64[Tensor, "4 4"], Float64[Tensor, "4 4"]]
 """A base and a tool."""
+
+
+@dataclass(frozen=True)
+class Difference:
+    """By how much one parameter differs.
+
+    Attributes:
+        shift: with its name, such as "joint 3" or "a_2"; that of a joint's zero counts in the joint's direction.
+        alike: names of parameters that have the same effect on the tool, so that it may be these instead.
+    """
+
+    shift: Moved
+    alike: tuple[str, ...]
+
+    @property
+    def sentence(self) -> str:
+        """It in words, with half the 95 % interval."""
+        alike = f" (or {' or '.join(self.alike)}, to the same effect)" if self.alike else ""
+        return f"{self.shift.what}{alike} by {self.shift.size}"
+
+    def to_json(self) -> dict[str, object]:
+        """Return it as plain values, the unit in the name of the shift."""
+        return {**self.shift.to_json(), "alike": list(self.alike)}
 
 
 class ParameterEffects:
@@ -77,7 +100,11 @@ class ParameterEffects:
         left, self._observable = self._left([])
         unit = left / left.norm(dim=0).clamp(min=1e-300)
         self._alike = ((unit.t() @ unit).abs() > ALIKE) & self._observable & self._observable[:, None]
-        first = self._alike.int().argmax(1) == torch.arange(len(self._alike))
+        rank = torch.tensor([not self._is_zero(number) for number in range(len(self._alike))]) * len(
+            self._alike
+        )
+        rank = rank + torch.arange(len(rank))
+        first = torch.where(self._alike, rank, 2 * len(rank)).amin(1) == rank
         self.tested = (first & self._observable).nonzero()[:, 0].tolist()
 
     def alike(self, number: int) -> tuple[int, ...]:
@@ -119,7 +146,7 @@ class ParameterEffects:
         of_both = torch.tensor([mean**2, square * mean], dtype=torch.float64) / half_variance / 2
         return float(torch.special.gammaincc(of_both[0], of_both[1]))
 
-    def differing(self, chosen: Sequence[int]) -> tuple[tuple[Moved, ...], tuple[Moved, ...]]:
+    def differing(self, chosen: Sequence[int]) -> tuple[tuple[Difference, ...], tuple[Moved, ...]]:
         """Estimate shifts of chosen parameters together with base and tool.
 
         Returns:
@@ -129,26 +156,34 @@ class ParameterEffects:
         inverse = torch.linalg.pinv(self._W[:, [*chosen, *self._free]])
         shift, covariance = (inverse @ self._y)[:, 0], inverse @ inverse.t()
         differing = tuple(
-            self._moved(number, float(by), float(variance) ** 0.5)
+            self._difference(number, float(by), float(variance) ** 0.5)
             for number, by, variance in zip(chosen, shift, covariance.diagonal(), strict=False)
         )
         first = len(chosen)
         return differing, self._frames(shift[first:], covariance[first:, first:]) if self._free else ()
 
-    def _moved(self, number: int, shift: float, deviation: float) -> Moved:
-        names, factors = zip(*(self._named(one) for one in (number, *self.alike(number))), strict=True)
+    def _difference(self, number: int, shift: float, deviation: float) -> Difference:
+        """A shift of a parameter with its name and unit."""
         unit, factor = UNITS[self._unit(number)]
-        return Moved(" or ".join(names), factors[0] * shift * factor, deviation * factor, unit)
+        name = self._name(number)
+        if self._is_zero(number):
+            row = self._pair.first.identified.rows[number // 5]
+            name, factor = f"joint {name.partition('_')[2]}", factor * row.direction
+        alike = tuple(map(self._name, self.alike(number)))
+        return Difference(Moved(name, shift * factor, deviation * abs(factor), unit), alike)
 
-    def _named(self, number: int) -> tuple[str, float]:
-        """What a parameter is called, and the sign with which its shift counts."""
-        if number >= self._arm:
-            what, motion = divmod(number - self._arm, 6)
-            return f"{('base', 'tool')[what]} {FRAME_MOTIONS[motion]}", 1.0
-        robot, (row, column) = self._pair.first.identified, divmod(number, 5)
-        if robot.rows[row].type == "fixed" or column != (robot.rows[row].type == "prismatic"):
-            return ParameterSpace(robot).names[number], 1.0
-        return f"joint {row_labels(robot)[row]}", float(robot.rows[row].direction)
+    def _name(self, number: int) -> str:
+        if number < self._arm:
+            return ParameterSpace(self._pair.first.identified).names[number]
+        what, motion = divmod(number - self._arm, 6)
+        return f"{('base', 'tool')[what]} {FRAME_MOTIONS[motion]}"
+
+    def _is_zero(self, number: int) -> bool:
+        """Whether a parameter is the zero of a joint: theta, or d of a joint that slides."""
+        row, column = divmod(number, 5)
+        if number >= self._arm or column > 1:
+            return False
+        return self._pair.first.identified.rows[row].type == ("revolute", "prismatic")[column]
 
     def _unit(self, number: int) -> str:
         if number >= self._arm:

@@ -248,7 +248,7 @@ def _parameters_in_words(differences: ParameterDifferences, first: str, second: 
     level = f"at a level of {differences.level:.2g} for all parameters together"
     lines = [f"No parameter of {second} differs from {first} beyond its uncertainty, {level}."]
     if differences.differing:
-        shifts = "; ".join(f"{one.what} by {one.size}" for one in differences.differing)
+        shifts = "; ".join(one.sentence for one in differences.differing)
         lines = [
             f"{second} differs from {first} in {shifts}. No other parameter differs beyond its uncertainty, {level}."
         ]

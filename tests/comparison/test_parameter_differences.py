@@ -18,7 +18,7 @@ from pisigma.recalibration.moved import NORMAL_95
 def test_exactly_the_joint_that_moved_differs_beside_a_base_that_moved(forth):
     models = model_of(50), after_collision()
     differences = parameter_differences(ModelPair.of(*models[:: 1 if forth else -1], "fitted"))
-    (joint,) = differences.differing
+    (joint,) = (one.shift for one in differences.differing)
     assert joint.what == "joint 3"
     assert_close(joint.shift, 0.1 if forth else -0.1, atol=0.005)
     assert joint.interval[0] < (0.1 if forth else -0.1) < joint.interval[1]
@@ -33,7 +33,7 @@ def test_exactly_the_joint_that_moved_differs_beside_a_base_that_moved(forth):
 def test_fixed_frames_find_the_same_joint():
     models = model_of(50), model_of(61, COLLISION)
     differences = parameter_differences(ModelPair.of(*models, "fixed"))
-    assert [one.what for one in differences.differing] == ["joint 3"]
+    assert [one.shift.what for one in differences.differing] == ["joint 3"]
     assert differences.frames == ()
 
 
