@@ -222,7 +222,8 @@ def compare(
     compared = None
     if rows is not None:
         data = rows if isinstance(rows, Measurements) else Measurements.read_csv(rows, pair.first.robot)
-        fitted = fitted_kinds(fit_frame=settings.frames == "fitted", fit_tool=False)
+        free = settings.frames == "fitted"
+        fitted = fitted_kinds(free, free)
         compared = compare_models(models, test_rows(data), settings.bootstrap, fitted)
     return ComparedModels(
         models=models,
