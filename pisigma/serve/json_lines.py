@@ -28,7 +28,7 @@ _TASKS = ("pose", "path", "q_deg", "q", "ask")
 """Keys of which a request has exactly one; it says what is wanted."""
 _NEAR = ("near_deg", "near")
 _KEYS = {
-    "pose": {*_NEAR, "branch", "approach", "accuracy"},
+    "pose": {*_NEAR, "branch", "approach", "accuracy", "brief"},
     "path": {*_NEAR, "branch"},
     "q_deg": {"approach", "accuracy"},
     "q": {"approach", "accuracy"},
@@ -199,6 +199,8 @@ def _solve(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, 
     approach = _numbers(request, "approach", len(model.ik.joints)) if "approach" in request else None
     solution = model.ik(_transform(request["pose"], "pose"), near=near, branch=branch, approach=approach)
     values = _record(model, solution)
+    if _flag(request, "brief"):
+        return values["status"], _brief(model, values)
     if _flag(request, "accuracy"):
         values["accuracy_mm"] = _millimetres(solution.accuracy)
     return values["status"], values
@@ -217,6 +219,12 @@ def _record(model: ServedModel, solution: Solution) -> dict[str, Any]:
     if status != Status.REACHED:
         values["sentence"] = status.sentence
     return values
+
+
+def _brief(model: ServedModel, values: dict[str, Any]) -> dict[str, Any]:
+    """Joint values to 1e-6 deg or mm, and the status: what controllers with short strings can read."""
+    q = values[model.joints_key]
+    return {model.joints_key: q and [round(value, 6) for value in q], "status": values["status"]}
 
 
 def _follow(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, Any]]:
