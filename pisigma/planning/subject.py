@@ -12,6 +12,7 @@ from pisigma.errors import PlanningError
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
+from pisigma.model.model_source import HoldsModel
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.cell.cell import Cell
 from pisigma.planning.knowledge import Knowledge
@@ -36,14 +37,15 @@ class Subject:
 
     @staticmethod
     def of(
-        subject: Robot | CalibratedModel | str | os.PathLike[str],
+        subject: Robot | CalibratedModel | HoldsModel | str | os.PathLike[str],
         base: str | None = None,
         tip: str | None = None,
     ) -> "Subject":
         """Load what is planned for.
 
         Args:
-            subject: a robot, a name of the catalogue, a robot file (YAML or URDF), a model or its folder.
+            subject: a robot, a name of the catalogue, a robot file (YAML or URDF), a model, what holds it,
+                or its folder.
             base: of a URDF file the link that poses are given in.
             tip: of a URDF file the link that is the tool.
 
@@ -53,6 +55,8 @@ class Subject:
         """
         if isinstance(subject, Robot):
             return Subject(subject)
+        if isinstance(subject, HoldsModel):
+            subject = subject.model
         if not isinstance(subject, CalibratedModel):
             if not Path(subject).is_dir():
                 return Subject(Robot.load(subject, base, tip))

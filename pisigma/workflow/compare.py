@@ -23,10 +23,10 @@ from pisigma.judging.frames.fitted_frames import fitted_kinds
 from pisigma.judging.model_comparison import Difference, ModelComparison, compare_models
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.planning.task import read_task
 from pisigma.workflow.evaluate import (
     REFERENCES,
-    ModelSource,
     labelled,
     load_models,
     test_rows,
@@ -186,8 +186,8 @@ class ComparedModels:
 
 
 def compare(
-    first: ModelSource,
-    second: ModelSource,
+    first: ModelSource | HoldsModel,
+    second: ModelSource | HoldsModel,
     rows: str | os.PathLike[str] | Measurements | None = None,
     program: str | os.PathLike[str] | None = None,
     settings: ComparisonSettings = ComparisonSettings(),
@@ -208,7 +208,7 @@ def compare(
         PlanningError: the first model does not reach a pose of the program.
         PoseError: the joint values do not fit the robot.
     """
-    begin = time.perf_counter()
+    begin, first, second = time.perf_counter(), model_or_folder(first), model_or_folder(second)
     if (
         isinstance(first, CalibratedModel)
         and isinstance(second, CalibratedModel)

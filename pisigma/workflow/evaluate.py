@@ -18,6 +18,7 @@ from pisigma.judging.reference_models import geometric_model, nominal_model
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
+from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.reporting.tables import figure_text
 from pisigma.verification.setup_fault import either
@@ -26,9 +27,6 @@ from pisigma.verification.setup_faults import find_setup_faults, is_implausible,
 REFERENCES = ("nominal", "geometric")
 """Names of what a model is compared with: the robot as drawn, and the geometry under a hybrid. Neither has to meet
 limits."""
-
-ModelSource = str | os.PathLike[str] | CalibratedModel
-"""A model, its folder, or one of `REFERENCES`."""
 
 _LIMITED = {
     "mean_mm": ("max-mean-mm", "mean position error"),
@@ -201,7 +199,7 @@ class Evaluation:
 
 
 def evaluate(
-    models: ModelSource | Sequence[ModelSource],
+    models: ModelSource | HoldsModel | Sequence[ModelSource | HoldsModel],
     data: str | os.PathLike[str] | Measurements,
     settings: EvaluationSettings | None = None,
 ) -> Evaluation:
@@ -221,7 +219,9 @@ def evaluate(
         PoseError: the joint values do not fit a robot.
     """
     settings, begin = settings or EvaluationSettings(), time.perf_counter()
-    sources = labelled([models] if isinstance(models, str | os.PathLike | CalibratedModel) else list(models))
+    if isinstance(models, str | os.PathLike | CalibratedModel | HoldsModel):
+        models = [models]
+    sources = labelled(models)
     loaded = load_models(sources)
     everything = data
     if not isinstance(everything, Measurements):
@@ -276,12 +276,13 @@ def _text(source: ModelSource) -> str:
     return source.name if isinstance(source, CalibratedModel) else os.fspath(source)
 
 
-def labelled(sources: Sequence[ModelSource]) -> dict[str, ModelSource]:
+def labelled(stated: Sequence[ModelSource | HoldsModel]) -> dict[str, ModelSource]:
     """Name models for tables: by the folder's last name, or by all that was given where two have the same.
 
     Raises:
         ModelError: a model is given twice.
     """
+    sources = [model_or_folder(source) for source in stated]
     texts = [_text(source) for source in sources]
     twice = next((text for text in texts if texts.count(text) > 1), None)
     if twice is not None:

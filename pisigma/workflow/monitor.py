@@ -19,6 +19,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.rules import is_date
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
+from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
 from pisigma.monitoring.history import Record, history_path, in_order, remember
@@ -158,7 +159,7 @@ class Monitoring:
 
 
 def monitor(
-    model: CalibratedModel | str | os.PathLike[str],
+    model: ModelSource | HoldsModel,
     sessions: Sequence[Measurements | str | os.PathLike[str]],
     settings: MonitorSettings = MonitorSettings(),
     progress: Progress = lambda what: None,
@@ -166,7 +167,8 @@ def monitor(
     """Say of every session whether the robot is unchanged or what moved, and chart all sessions.
 
     Args:
-        model: of `pisigma calibrate` or `pisigma recalibrate`, or its folder; only a folder has a history.
+        model: of `pisigma calibrate` or `pisigma recalibrate`, or what
+            holds it, or its folder; only a folder has a history.
         sessions: rows of any sensors, or their files; one with several days in the column `date` is several sessions.
         settings: see `MonitorSettings`.
         progress: called with what is being done.
@@ -179,7 +181,8 @@ def monitor(
         OutputError: the history cannot be used.
     """
     started = time.perf_counter()
-    loaded = model if isinstance(model, CalibratedModel) else load_model(model)
+    source = model_or_folder(model)
+    loaded = source if isinstance(source, CalibratedModel) else load_model(source)
     posterior = ModelPosterior.of(loaded)
     rows = [
         one if isinstance(one, Measurements) else Measurements.read_csv(one, posterior.space.robot)
@@ -201,8 +204,8 @@ def monitor(
             )
     new = in_order(judged)
     records = new
-    if settings.history and not isinstance(model, CalibratedModel):
-        records = remember(history_path(model), model_hash(model), new)
+    if settings.history and not isinstance(source, CalibratedModel):
+        records = remember(history_path(source), model_hash(source), new)
     return Monitoring(
         model=loaded,
         sessions=new,

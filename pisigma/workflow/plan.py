@@ -16,6 +16,7 @@ from pisigma.files.conflicts import Input
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.judging.progress import Progress
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.model_source import HoldsModel
 from pisigma.planning.candidates import Candidates, spread
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.cell.cell import Cell, read_cell
@@ -144,7 +145,7 @@ def check_files(
 
 
 def plan(
-    subject: Robot | CalibratedModel | Subject | str | os.PathLike[str],
+    subject: Robot | CalibratedModel | HoldsModel | Subject | str | os.PathLike[str],
     settings: PlanSettings | None = None,
     cell: Cell | str | os.PathLike[str] | None = None,
     progress: Progress = lambda what: None,
@@ -153,7 +154,7 @@ def plan(
 
     Args:
         subject: the robot as drawn, or a model of it: a robot, a name of the catalogue, a robot file (YAML or URDF),
-            a model or its folder.
+            a model, what holds it (a `CorrectedIK`, a `Calibration`), or its folder.
         settings: how. None: `PlanSettings()`.
         cell: what stands around the robot, or its YAML file; None for nothing.
         progress: called with what is being done.

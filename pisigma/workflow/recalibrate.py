@@ -23,6 +23,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.geometric_model import model_of_hybrid
+from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.recalibration.adaptation import Adaptation, adapt
 from pisigma.recalibration.candidates import FAR_BETTER, Gate, gate
@@ -104,7 +105,7 @@ class Recalibration(AbstractModelResult):
 
 
 def recalibrate(
-    model: CalibratedModel | str | os.PathLike[str],
+    model: ModelSource | HoldsModel,
     data: Measurements | str | os.PathLike[str],
     settings: RecalibrationSettings = RecalibrationSettings(),
     progress: Progress = lambda what: None,
@@ -112,7 +113,8 @@ def recalibrate(
     """Add new rows to what a model knows, and keep whichever model predicts left-out rows best.
 
     Args:
-        model: of `pisigma calibrate` or `pisigma recalibrate`, or its folder.
+        model: of `pisigma calibrate` or `pisigma recalibrate`, or what holds it (a
+            `CorrectedIK`, a `Calibration`), or its folder.
         data: new rows of any sensors, or a CSV file of them; those of the set "test" are left out.
         settings: see `RecalibrationSettings`.
         progress: called with what is being done.
@@ -124,8 +126,9 @@ def recalibrate(
         PoseError: the joint values do not fit the robot.
     """
     started = time.perf_counter()
-    parent = model if isinstance(model, CalibratedModel) else load_model(model)
-    sha256 = "" if isinstance(model, CalibratedModel) else model_hash(model)
+    source = model_or_folder(model)
+    parent = source if isinstance(source, CalibratedModel) else load_model(source)
+    sha256 = "" if isinstance(source, CalibratedModel) else model_hash(source)
     posterior = ModelPosterior.of(parent)
     drawn = posterior.space.robot
     measurements = data if isinstance(data, Measurements) else Measurements.read_csv(data, drawn)

@@ -18,6 +18,7 @@ from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
+from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.monitoring.session import Session
 from pisigma.verification.cause import length_text
@@ -151,7 +152,7 @@ def read_for_verification(path: str | os.PathLike[str], model: CalibratedModel) 
 
 
 def verify(
-    model: str | os.PathLike[str] | CalibratedModel,
+    model: ModelSource | HoldsModel,
     data: str | os.PathLike[str] | Measurements,
     settings: VerificationSettings | None = None,
 ) -> Verification:
@@ -170,7 +171,8 @@ def verify(
         PoseError: the joint values do not fit the robot.
     """
     settings, begin = settings or VerificationSettings(), time.perf_counter()
-    loaded = model if isinstance(model, CalibratedModel) else load_model(model)
+    source = model_or_folder(model)
+    loaded = source if isinstance(source, CalibratedModel) else load_model(source)
     rows = data if isinstance(data, Measurements) else read_for_verification(data, loaded)
     models = _compared_models(loaded, rows.rotation is not None)
     resamples = int(np.clip(MOST_DRAWN // max(rows.rows, 1), *RESAMPLES))
@@ -187,7 +189,7 @@ def verify(
     else:
         verdict = _verdict(loaded, comparison, difference, ratio, faults)
         sentence = _sentence(verdict, comparison, difference, ratio, faults)
-    name = loaded.name if isinstance(model, CalibratedModel) else os.fspath(model)
+    name = loaded.name if isinstance(source, CalibratedModel) else os.fspath(source)
     return Verification(
         model=name,
         data=rows.source,

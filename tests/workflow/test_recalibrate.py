@@ -10,6 +10,7 @@ from testing.closeness import assert_close
 
 import pisigma
 from pisigma.errors import AcceptanceError, IdentificationError, ModelError
+from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.recalibration.summary import RecalibrationSummary
@@ -21,7 +22,7 @@ COLLISION = (0.0, 0.0, math.radians(0.25), 0.0, 0.0, 0.0)
 
 @pytest.fixture(scope="module")
 def after_collision() -> Recalibration:
-    return recalibrate(model_before(), rows_later(10, 2, COLLISION))
+    return recalibrate(CorrectedIK(model_before()), rows_later(10, 2, COLLISION))
 
 
 def test_it_says_what_moved_and_what_is_kept(after_collision):

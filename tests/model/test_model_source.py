@@ -1,0 +1,22 @@
+"""What `pisigma.load` gives is taken wherever a model or its folder is."""
+
+import pytest
+from testing.models import hand_made_model
+
+from pisigma.errors import PlanningError
+from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.model.model_source import model_or_folder
+from pisigma.planning.subject import Subject
+from pisigma.workflow.evaluate import labelled
+
+
+@pytest.mark.usefixtures("without_type_checker")
+def test_the_model_of_a_corrected_ik_is_taken():
+    model = hand_made_model("kiro3")
+    ik = CorrectedIK(model)
+    assert model_or_folder(ik) is model
+    assert model_or_folder(model) is model
+    assert model_or_folder("models/kiro3") == "models/kiro3"
+    assert list(labelled(["nominal", ik]).values()) == ["nominal", model]
+    with pytest.raises(PlanningError, match="does not say how the robot is drawn"):
+        Subject.of(ik)
