@@ -86,6 +86,9 @@ def _suspects(explained: Explained[What]) -> list[dict[int, float]]:
         squares = (U.t() @ (a[chosen] * sigma)).square() / eigenvalues.clamp(min=1e-300)
         raised = gains(FACTORS, eigenvalues.clamp(min=0.0), squares)
         best = int(raised.argmax())
-        tried.append((float(raised[best]), number, float(FACTORS[best])))
+        if float(raised[best]) > NOTEWORTHY:
+            tried.append((float(raised[best]), number, float(FACTORS[best])))
+    if len(tried) == len(torch.unique(values.configuration)):
+        return []  # what explains no row at all is wrong itself
     tried = sorted(tried, reverse=True)[:SUSPECTS]
-    return [{**values.wrong, number: factor} for gain, number, factor in tried if gain > NOTEWORTHY]
+    return [{**values.wrong, number: factor} for _, number, factor in tried]
