@@ -2,7 +2,9 @@
 
 Run `OMP_NUM_THREADS=1 python benchmarks/monitoring.py [--draws N]` with the measured files in `PISIGMA_DATA`. A model
 is made of 600 random rows of a series; sessions are drawn from its other rows, with 0.05 deg added to the zero of one
-joint or none. In some cases the tracker is moved as well. The last line times twelve sessions of ten rows.
+joint or none. In some cases the tracker is moved as well. Then ten simulated arms (`PISIGMA_SIMULATED`) are monitored
+for two years with ten rows a month, with and without a drift of joint 2. The last lines time twelve sessions of ten
+rows.
 """
 
 import argparse
@@ -11,9 +13,11 @@ import os
 import tempfile
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import torch
+from recalibration import simulated_arm, simulated_rows
 
 import pisigma
 from pisigma.measurement.dataset import Measurements
@@ -26,6 +30,8 @@ DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data"))
 FILES = {"ur10": "ur10/series_b.csv", "ur5": "ur5/grid.csv"}
 ROWS = 600
 MOVED = math.radians(0.05)
+ARMS, ARM_ROWS, MONTHS = 10, 120, 24
+"""Simulated arms, rows of their calibrations, and months that they are monitored."""
 ELSEWHERE = (0.3, -0.2, 0.1, 0.5, 0.2, -0.3)
 CASES = (
     ("ur10", 5, (0, 1, 2, 3, 4, 5, 6), False),
@@ -65,11 +71,50 @@ def is_right(session: Session, joint: int) -> bool:
     return named == ([f"joint {joint}"] if joint else []) and session.verdict != "unclear"
 
 
+def months() -> None:
+    """Print when a drift of 0.01 deg a month raises the first alarm, and how many alarms there are without one."""
+    firsts, alarms = [], 0
+    settings = pisigma.MonitorSettings(
+        dates=tuple(f"{2026 + month // 12}-{month % 12 + 1:02d}-01" for month in range(MONTHS))
+    )
+    for seed in range(ARMS):
+        arm, model = simulated_arm(ARM_ROWS, seed)
+        for drift in (0.0, math.radians(0.01)):
+            sessions = []
+            for month in range(MONTHS):
+                arm.perturb[1] = drift * (month + 1)
+                q = arm.sample(10, 5000 + 100 * seed + month)
+                sessions.append(simulated_rows(arm, q, 9000 + 100 * seed + month))
+            alarmed = _alarmed(pisigma.monitor(model, sessions, settings))
+            if drift:
+                firsts.append(alarmed.index(True) + 1 if True in alarmed else MONTHS + 1)
+            else:
+                alarms += sum(now and not before for before, now in pairwise([False, *alarmed]))
+        print(f"arm {seed}: first alarm after {firsts[-1]} months; {alarms} false ones so far", flush=True)
+    years = ARMS * MONTHS / 12
+    print(
+        f"drift of 0.01 deg a month: first alarm after {max(firsts)} months at most; without drift {alarms} alarms in "
+        f"{years:g} years, {alarms / years:.3f} a year"
+    )
+
+
+def _alarmed(monitoring: pisigma.Monitoring) -> list[bool]:
+    """Per session, whether a chart is outside its limits or something is said to have moved."""
+    outside = torch.stack([one for chart in monitoring.charts for one in chart.outside.values()]).any(0)
+    moved = [one.session.verdict != "unchanged" for one in monitoring.sessions]
+    return [one or other for one, other in zip(outside.tolist(), moved, strict=True)]
+
+
 def main() -> None:
     """Print one line a robot, number of rows and joint."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--draws", type=int, default=100, help="Sessions of every line.")
-    draws = parser.parse_args().draws
+    parser.add_argument("--months", action="store_true", help="Only the simulated arms over the months.")
+    wanted = parser.parse_args()
+    draws = wanted.draws
+    if wanted.months:
+        months()
+        return
     made = {name: model_and_rest(name) for name in FILES}
     print("robot rows tracker  joint  right  seconds  unobservable")
     for name, count, joints, tracker in CASES:
@@ -88,13 +133,17 @@ def main() -> None:
                 f"{name:5} {count:4} {place:7} {joint or 'none':>6} {right / draws:6.1%} {seconds:8.2f}  {hidden}",
                 flush=True,
             )
+    months()
     model, rest = made["ur10"]
-    with tempfile.TemporaryDirectory() as folder:
-        files = []
-        for month in range(12):
-            files.append(Path(folder) / f"2026-{month + 1:02d}-01.csv")
-            rest.select(torch.arange(10 * month, 10 * month + 10)).write_csv(files[-1], model.robot)
-        print(f"12 sessions of 10 rows: {pisigma.monitor(model, files).seconds:.2f} s")
+    for tracker in (False, True):
+        with tempfile.TemporaryDirectory() as folder:
+            files = []
+            for month in range(12):
+                files.append(Path(folder) / f"2026-{month + 1:02d}-01.csv")
+                rows = rest.select(torch.arange(10 * month, 10 * month + 10))
+                moved(rows, 0, tracker).write_csv(files[-1], model.robot)
+            seconds, stands = pisigma.monitor(model, files).seconds, "moved" if tracker else "fixed"
+            print(f"12 sessions of 10 rows, tracker {stands}: {seconds:.2f} s")
 
 
 if __name__ == "__main__":

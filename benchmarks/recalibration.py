@@ -6,6 +6,7 @@ that were not recalibrated with [mm]; a draw is a random choice of rows.
 """
 
 import argparse
+import contextlib
 import importlib.util
 import math
 import os
@@ -15,6 +16,7 @@ import time
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import torch
@@ -140,41 +142,45 @@ def gate() -> None:
             )
 
 
-def simulator() -> ModuleType:
-    """The independent simulator."""
+@cache
+def simulator() -> tuple[ModuleType, Robot]:
+    """The independent simulator, and the robot that it simulates as drawn."""
     spec = importlib.util.spec_from_file_location("sim", SIMULATED / "sim.py")
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    return module
+    with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
+        module.write_urdf("kr10")
+        return module, Robot.load("kr10.urdf")
+
+
+def simulated_rows(arm: Any, q: np.ndarray, seed: int | None = None) -> Measurements:
+    """Positions that a simulated arm is measured at, with noise and repeatability where there is a seed."""
+    sigma, repeatability = (0.0, 0.0) if seed is None else (3e-5, 2e-5)
+    position, _ = arm.measure(q, sigma, rng=np.random.default_rng(seed), rep=repeatability)
+    return Measurements(torch.from_numpy(q), torch.from_numpy(position))
+
+
+def simulated_arm(rows: int, seed: int) -> tuple[Any, CalibratedModel]:
+    """A simulated arm, and its calibration with so many rows."""
+    sim, robot = simulator()
+    arm = sim.True_("kr10", seed)
+    before = simulated_rows(arm, arm.sample(rows, 1000 + seed), seed)
+    return arm, model_of_hybrid("kr10", robot, HybridCalibrator(robot).fit(before), before)
 
 
 def collision() -> None:
     """Joint 3 of the simulated kr10 collides: the error after ten poses over that before."""
-    sim = simulator()
-    with tempfile.TemporaryDirectory() as folder:
-        os.chdir(folder)
-        sim.write_urdf("kr10")
-        robot = Robot.load("kr10.urdf")
-
-    def rows_of(arm: object, q: np.ndarray, noise: bool, seed: int) -> Measurements:
-        position, _ = arm.measure(
-            q, *((3e-5,) if noise else (0.0,)), rng=np.random.default_rng(seed), rep=2e-5 if noise else 0.0
-        )
-        return Measurements(torch.from_numpy(q), torch.from_numpy(position))
-
     for rows in (60, 120, 300):
         ratios, joints = [], []
         for seed in COLLISION_SEEDS:
-            arm = sim.True_("kr10", seed)
-            before = rows_of(arm, arm.sample(rows, 1000 + seed), True, seed)
-            model = model_of_hybrid("kr10", robot, HybridCalibrator(robot).fit(before), before)
+            arm, model = simulated_arm(rows, seed)
             check = arm.sample(500, 7)
-            error = error_of(model, rows_of(arm, check, False, 0))
+            error = error_of(model, simulated_rows(arm, check))
             arm.perturb[2] = math.radians(0.25)
-            result = recalibrate(model, rows_of(arm, arm.sample(10, 500 + seed), True, 77 + seed))
-            ratios.append(error_of(result.model, rows_of(arm, check, False, 0)) / error)
+            result = recalibrate(model, simulated_rows(arm, arm.sample(10, 500 + seed), 77 + seed))
+            ratios.append(error_of(result.model, simulated_rows(arm, check)) / error)
             joints.append("; ".join(one.sentence for one in result.moved))
         shown = " ".join(f"{ratio:.2f}" for ratio in ratios)
         print(
