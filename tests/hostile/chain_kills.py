@@ -1,0 +1,111 @@
+"""Kill a chain of recalibrations, and the monitoring of its models, at random moments, and see that nothing is lost.
+
+`python tests/hostile/chain_kills.py --count 50 [--seed 0]`
+"""
+
+import argparse
+import signal
+import sqlite3
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import closing
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import numpy as np
+from hostile.kills import contents, start
+from testing.aged import model_before, rows_later
+
+from pisigma.model.folder.model_folder import load_model, save_model
+from pisigma.monitoring.history import history_path
+from pisigma.recalibration.model_posterior import ModelPosterior
+
+SECONDS = 6.0
+"""Of a command, to begin with."""
+
+
+class Chain:
+    """Models link-0, link-1, ... in a folder, each recalibrated from the one before, and the sessions of each.
+
+    Attributes:
+        folder: where all lies.
+        links: how many models are whole.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        """Write the first model."""
+        self.folder, self.links = folder, 1
+        (folder / "link-0").mkdir()
+        save_model(model_before(), folder / "link-0")
+        self._before = contents(folder)
+
+    def start(self, number: int, monitor: bool) -> subprocess.Popen[bytes]:
+        """Start to monitor the last model, or to recalibrate it, with rows of their own."""
+        rows = self.folder / f"2026-01-{number % 28 + 1:02d}.csv"
+        rows_later(10, number + 1000).write_csv(rows, model_before().robot)
+        self._before, self._sessions = contents(self.folder), self.sessions()
+        last = f"link-{self.links - 1}"
+        if monitor:
+            return start(("monitor", last, rows.name), self.folder)
+        return start(("recalibrate", last, rows.name, "--out", f"link-{self.links}"), self.folder)
+
+    def sessions(self) -> set[tuple[str, str]]:
+        """Sessions that the histories of all models hold, by model and rows."""
+        held: set[tuple[str, str]] = set()
+        for number in range(self.links):
+            path = history_path(self.folder / f"link-{number}")
+            if path.exists():
+                with closing(sqlite3.connect(path)) as database:
+                    assert database.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+                    if database.execute("SELECT name FROM sqlite_master").fetchall():
+                        held |= set(database.execute("SELECT model, rows FROM sessions"))
+        return held
+
+    def fault(self) -> str:
+        """What the last command lost or left in pieces; "" where all is well."""
+        now = contents(self.folder)
+        kept = (path for path in self._before if path[0] != "." and ".sqlite" not in path)
+        lost = [path for path in kept if now.get(path) != self._before[path]]
+        if lost or self._sessions - self.sessions():
+            return f"{lost} changed, {len(self._sessions - self.sessions())} sessions are gone"
+        following = self.folder / f"link-{self.links}"
+        if following.exists():
+            ModelPosterior.of(load_model(following))
+            self.links += 1
+        return ""
+
+
+def main() -> None:
+    """Kill recalibrations and monitorings in turn, and run each to its end at last."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    wanted = parser.parse_args()
+    rng, faults, killed, seconds = np.random.default_rng(wanted.seed), [], 0, [SECONDS, SECONDS]
+    with tempfile.TemporaryDirectory() as temporary:
+        chain = Chain(Path(temporary))
+        for number in range(-2, wanted.count + 2):
+            whole, began = not 0 <= number < wanted.count, time.monotonic()
+            process = chain.start(number, bool(number % 2))
+            if not whole:
+                time.sleep(seconds[number % 2] * float(rng.uniform(0.3, 1.1)))
+                process.kill()
+            status = process.wait()
+            seconds[number % 2] = time.monotonic() - began if whole else seconds[number % 2]
+            killed += status == -signal.SIGKILL
+            if whole and status not in (0, 3):
+                faults.append(f"command {number} ends with {status}")
+            if fault := chain.fault():
+                faults.append(f"command {number}: {fault}")
+        faults += [f"{path} was left" for path in contents(chain.folder) if path.startswith(".")]
+        print(f"{chain.links} models, {len(chain.sessions())} sessions.")
+    print("\n".join(faults))
+    print(f"{killed} of {wanted.count} killed, {len(faults)} faults.")
+    sys.exit(1 if faults else 0)
+
+
+if __name__ == "__main__":
+    main()
