@@ -34,7 +34,7 @@ CAUSES = {"base": "frame", "tool": "tool"}
 @torch.no_grad()
 def find_setup_faults(
     model: CalibratedModel,
-    nominal: CalibratedModel,
+    nominal: CalibratedModel | None,
     measurements: Measurements,
     fitted: Collection[FrameKind] = (),
     frames_only: bool = False,
@@ -52,6 +52,7 @@ def find_setup_faults(
     Args:
         model: the model.
         nominal: the nominal robot with the base and tool that suit it best; only shows what its errors fall to.
+            None not to show that.
         measurements: rows with positions in frames and of targets that the model has; limits do not matter.
         fitted: whether frames or targets are fitted anew: then any will do, and that one has moved is no fault.
         frames_only: try only that frames or tools have moved.
@@ -88,10 +89,10 @@ def find_setup_faults(
     return faults
 
 
-def _nominal_error(nominal: CalibratedModel, some: Measurements, other: Hypothesis) -> float:
+def _nominal_error(nominal: CalibratedModel | None, some: Measurements, other: Hypothesis) -> float:
     """Compute the root mean square of the position errors [m] of the nominal robot under a hypothesis."""
     kinds = {cause.kind for cause in other.causes}
-    if "correction" in kinds:
+    if nominal is None or "correction" in kinds:
         return float("nan")
     T = poses_of_rows(nominal, replace(some, q=other.q))
     tried = in_frames(PredictingArm(nominal.robot, nominal), some, Hypothesis(other.q, T, other.measured))

@@ -327,7 +327,8 @@ def _diagnostics(
     model: CalibratedModel, figures: ModelFigures, rows: Measurements, fitted: Sequence[FrameKind]
 ) -> Iterator[Diagnostic]:
     """Say why errors are too large to be those of a calibrated robot, or those of a base or a tool that has moved."""
-    nominal, implausible = nominal_model(model, rows.rotation is not None), is_implausible(figures, model)
+    implausible = is_implausible(figures, model)
+    nominal = nominal_model(model, rows.rotation is not None) if implausible else None
     faults = find_setup_faults(model, nominal, rows, fitted, frames_only=not implausible)
     if faults or implausible:
         sentence = either(faults).sentence if faults else unexplained(model)
