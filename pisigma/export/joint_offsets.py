@@ -5,6 +5,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 from jaxtyping import Float64
 
+from pisigma.errors import RobotError
 from pisigma.export.dh_table import TABLE_SUFFIXES, cells, csv_table, head
 from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.export.geometry import offset_remarks
@@ -21,7 +22,7 @@ class JointOffsets:
 
     Attributes:
         robot: as drawn but for theta of turning and d of sliding joints, base and tool.
-        values: per joint [rad or m], as the controller counts: the real robot commanded to q stands where the
+        values: per axis of the controller [rad or m], as it counts: the real robot commanded to q stands where the
             drawn one stands at q + offset.
         unobservable: joints whose offset is 0 because base or tool take the same in.
         lost: what is given up: departure from the whole model.
@@ -29,7 +30,7 @@ class JointOffsets:
     """
 
     robot: Robot
-    values: Float64[np.ndarray, " dof"]
+    values: Float64[np.ndarray, " axes"]
     unobservable: tuple[str, ...]
     lost: Departure
     nominal: Departure
@@ -44,6 +45,7 @@ def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
 
     Raises:
         ModelError: the model stores no joint values, or predicts none of their poses.
+        RobotError: see `joints_by_axes`.
     """
     nominal = model.robot
     fit = project_model(model, nominal, joint_offsets(nominal))
@@ -58,12 +60,32 @@ def fit_joint_offsets(model: CalibratedModel) -> JointOffsets:
     )
 
 
-def offsets_between(nominal: Robot, moved: Robot) -> Float64[np.ndarray, " dof"]:
-    """Joint offsets [rad or m] of a robot against another, as the controller counts."""
-    offsets: np.ndarray = (moved.dh - nominal.dh).reshape(-1)[
-        list(joint_offsets(nominal))
-    ] * nominal.directions
+def offsets_between(nominal: Robot, moved: Robot) -> Float64[np.ndarray, " axes"]:
+    """Offsets [rad or m] of a robot's zeros against another's, as the controller counts.
+
+    Raises:
+        RobotError: see `joints_by_axes`.
+    """
+    change = (moved.dh - nominal.dh).reshape(-1)[list(joint_offsets(nominal))]
+    offsets: np.ndarray = np.linalg.solve(joints_by_axes(nominal), change)
     return offsets
+
+
+def joints_by_axes(robot: Robot) -> Float64[np.ndarray, "dof axes"]:
+    """How theta or d of every joint changes with the offset of every axis that the controller commands.
+
+    Raises:
+        RobotError: a joint is passive or driven by a four-bar linkage, whose zero is not that of an axis alone.
+    """
+    if robot.coupling is None:
+        return np.diag(robot.directions)
+    if robot.coupling.passive or robot.coupling.four_bars:
+        raise RobotError(
+            f"robot '{robot.name}' has joints that are passive or driven by a linkage: no offset of an axis of "
+            "the controller stands for theirs. Take --format dh or targets."
+        )
+    matrix: np.ndarray = robot.directions[:, None] * robot.coupling.matrix
+    return matrix
 
 
 MEANING = (
@@ -110,8 +132,8 @@ def offsets_yaml(offsets: JointOffsets, comments: tuple[str, ...] = ()) -> str:
 
 def _joints(offsets: JointOffsets) -> list[dict[str, object]]:
     return [
-        {"name": joint.name, "type": joint.type, f"offset_{joint.file_unit}": joint.in_file_unit(value)}
-        for joint, value in zip(offsets.robot.joints, offsets.values, strict=True)
+        {"name": axis.name, "type": axis.type, f"offset_{axis.file_unit}": axis.in_file_unit(value)}
+        for axis, value in zip(offsets.robot.axes, offsets.values, strict=True)
     ]
 
 

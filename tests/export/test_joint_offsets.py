@@ -8,11 +8,12 @@ import torch
 from testing.closeness import assert_close
 from testing.models import hand_made_model, joints_around
 
-from pisigma.errors import ModelError
-from pisigma.export.joint_offsets import fit_joint_offsets
+from pisigma.errors import ModelError, RobotError
+from pisigma.export.joint_offsets import fit_joint_offsets, offsets_between
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot import Robot
+from pisigma.robot.coupling import Coupling, FourBar
 
 
 def geometric_model(name: str, calibrated: Robot) -> CalibratedModel:
@@ -84,3 +85,20 @@ def test_a_model_without_a_region_is_refused():
     far[:] = torch.nan
     with pytest.raises(ModelError, match="predicts no pose"):
         fit_joint_offsets(dataclasses.replace(model, starts=far))
+
+
+def test_offsets_of_coupled_joints_are_those_of_the_axes():
+    """The controller's zero of joint 2 moves joint 3 too."""
+    nominal, matrix = Robot.load("ur10"), np.eye(6)
+    matrix[2, 1], matrix[4, 4] = -1.0, 0.5
+    coupled = dataclasses.replace(nominal, coupling=Coupling(nominal.joints, matrix, np.full(6, 0.1)))
+    moved = with_offsets(coupled, [0.0, 0.02, -0.01, 0.03, 0.01, 0.0])
+    q = joints_around("ur10", 20)
+    there = forward_kinematics(coupled, coupled.to_dh(q + torch.from_numpy(offsets_between(coupled, moved))))
+    assert_close(there, forward_kinematics(moved, coupled.to_dh(q)), atol=1e-12)
+    bar = FourBar(0.5, 0.3, 0.5, 0.3, 1.0)
+    driven = dataclasses.replace(
+        coupled, coupling=dataclasses.replace(coupled.coupling, four_bars=((1, bar),))
+    )
+    with pytest.raises(RobotError, match="passive or driven by a linkage"):
+        offsets_between(driven, moved)

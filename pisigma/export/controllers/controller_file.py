@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from pisigma.export.projection import project_model, whole_geometry
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS, in_file_units
 
-UNTRIED = "Written from the published description ({source}), not tried on a controller."
 CONDITIONS = frozenset(("payload_kg", "temperature_c"))
 _NUMBER = r"-?\d+(?:\.\d+)?(?:e[-+]?\d+)?"
 
@@ -44,10 +43,11 @@ class ControllerFile:
         name: what `--format` calls it.
         contents: what a file holds, with its article.
         suffixes: endings that its files may have.
-        source: where it is described.
+        source: where it is described, and where it was tried, as a sentence; see `untried`.
         relies: sentences on what has to be true of the controller.
         text: gives the text of a file.
-        read: gives the robot that a text says, from the nominal one; the second argument is the file's name.
+        read: gives the robot that a text says, from the nominal one; the second argument is the file's name. None where
+            the file holds base and tool too and is loaded as a robot file.
         check: refuses robots that the file cannot hold; raises a `PisigmaError`.
         parameters: indices into the flattened `Robot.dh` that the file can hold.
         options: those of `OPTIONS` that it takes.
@@ -60,7 +60,7 @@ class ControllerFile:
     source: str
     relies: tuple[str, ...]
     text: Callable[[FileText], str]
-    read: Callable[[str, str, Robot], Robot]
+    read: Callable[[str, str, Robot], Robot] | None
     check: Callable[[Robot], None]
     parameters: Callable[[Robot], Sequence[int]] = whole_geometry
     options: frozenset[str] = field(default_factory=frozenset)
@@ -85,10 +85,12 @@ class ControllerFile:
         whole = len(parameters) == nominal.dh.size
         start = model.calibrated if whole and model.calibrated is not None else nominal
         fit = project_model(model, start, parameters)
-        held = self.read(self.text(FileText(fit.robot, nominal, request)), str(request.out), nominal)
+        draft, held = FileText(fit.robot, nominal, request), fit.robot
+        if self.read is not None:
+            held = self.read(self.text(draft), str(request.out), nominal)
         lost, drawn = fit.departure(held), fit.departure(nominal)
         title = f"{self.contents[0].upper()}{self.contents[1:]} of model {model.name} (robot {nominal.name})."
-        said = [title, UNTRIED.format(source=self.source), departure_sentence("This file is", lost, drawn)]
+        said = [title, self.source, departure_sentence("This file is", lost, drawn)]
         if corrects_joints(model):
             said.append(
                 "It holds no learned joint correction: its geometry is the one that comes nearest to both."
@@ -96,8 +98,13 @@ class ControllerFile:
         said += [*self.relies, *condition_remarks(model), *frame_remarks(model)]
         frames = {part: in_file_units(FRAME_COLUMNS, getattr(held, part)) for part in ("base", "tool")}
         facts = {"off_the_whole_model": asdict(lost), "robot_as_drawn": asdict(drawn), **frames}
-        text = self.text(FileText(fit.robot, nominal, request, tuple(said)))
+        text = self.text(replace(draft, said=tuple(said)))
         return Exported(text, model_facts(model) | facts, tuple(said))
+
+
+def untried(source: str) -> str:
+    """The sentence on a file that nobody could try."""
+    return f"Written from the published description ({source}), not tried on a controller."
 
 
 def frame_sentences(robot: Robot) -> tuple[str, ...]:

@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from pisigma.errors import OutputError
-from pisigma.export.controllers.controller_file import ControllerFile, FileText
+from pisigma.export.controllers.controller_file import ControllerFile, FileText, untried
 from pisigma.export.controllers.offset_table import read_offsets
 from pisigma.export.dh_table import cells, csv_table
 from pisigma.export.export_format import ExportRequest
-from pisigma.export.joint_offsets import offsets_between
+from pisigma.export.joint_offsets import joints_by_axes, offsets_between
 from pisigma.export.projection import joint_offsets
 from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS, in_file_units
@@ -32,19 +32,19 @@ class Counts:
         new: those that it shall have.
     """
 
-    per_turn: Float64[np.ndarray, " dof"]
-    present: Int64[np.ndarray, " dof"]
-    new: Int64[np.ndarray, " dof"]
+    per_turn: Float64[np.ndarray, " axes"]
+    present: Int64[np.ndarray, " axes"]
+    new: Int64[np.ndarray, " axes"]
 
-    def offsets(self, robot: Robot) -> Float64[np.ndarray, " dof"]:
+    def offsets(self, robot: Robot) -> Float64[np.ndarray, " axes"]:
         """The joint offsets [rad or m] that the new counts make."""
         offsets: np.ndarray = (self.present - self.new) / self.per_turn * _unit(robot)
         return offsets
 
 
-def _unit(robot: Robot) -> Float64[np.ndarray, " dof"]:
-    """What one turn, or 1 mm, is [rad or m] per joint."""
-    return np.where(robot.revolute, 2 * np.pi, 1e-3)
+def _unit(robot: Robot) -> Float64[np.ndarray, " axes"]:
+    """What one turn, or 1 mm, is [rad or m] per axis of the controller."""
+    return np.where([axis.type == "revolute" for axis in robot.axes], 2 * np.pi, 1e-3)
 
 
 def write_counts(content: FileText) -> str:
@@ -57,28 +57,32 @@ def write_counts(content: FileText) -> str:
     moved = offsets_between(nominal, robot) / _unit(nominal) * per_turn
     counts = Counts(per_turn, present.astype(np.int64), np.rint(present - moved).astype(np.int64))
     lines: list[dict[str, object]] = []
-    for joint, *values, offset in zip(
-        nominal.joints, counts.per_turn, counts.present, counts.new, counts.offsets(nominal), strict=True
-    ):
-        entry = {"part": "joint", "name": joint.name, f"offset_{joint.file_unit}": joint.in_file_unit(offset)}
+    columns = (counts.per_turn, counts.present, counts.new, counts.offsets(nominal))
+    for axis, *values, offset in zip(nominal.axes, *columns, strict=True):
+        entry = {"part": "joint", "name": axis.name, f"offset_{axis.file_unit}": axis.in_file_unit(offset)}
         lines.append(entry | {column: f"{value:.17g}" for column, value in zip(COLUMNS, values, strict=True)})
     lines += [{"part": part, **cells(FRAME_COLUMNS, getattr(robot, part))} for part in ("base", "tool")]
     frame = in_file_units(FRAME_COLUMNS, robot.base)
     return csv_table(("part", "name", "offset_deg", "offset_mm", *COLUMNS, *frame), lines, content.said)
 
 
-def _numbers(stated: str | None, option: str, robot: Robot) -> Float64[np.ndarray, " dof"]:
+def _numbers(stated: str | None, option: str, robot: Robot) -> Float64[np.ndarray, " axes"]:
     """Numbers of an option, one a joint."""
     try:
         values = np.array([float(word) for word in (stated or "").split(",")])
     except ValueError:
         values = np.array([np.nan])
-    if len(values) != robot.dof or not np.isfinite(values).all():
+    if len(values) != len(robot.axes) or not np.isfinite(values).all():
         raise OutputError(
-            f"--{option} '{stated}': {robot.dof} numbers with commas between were wanted, one a joint of robot "
+            f"--{option} '{stated}': {len(robot.axes)} numbers with commas between were wanted, one a joint of robot "
             f"'{robot.name}'."
         )
     return values
+
+
+def check_robot(robot: Robot) -> None:
+    """Refuse robots whose axes have no zeros of their own; see `joints_by_axes`."""
+    joints_by_axes(robot)
 
 
 def _refuse(request: ExportRequest) -> None:
@@ -107,11 +111,11 @@ def _file(name: str, contents: str, source: str, meaning: str) -> ControllerFile
         name=name,
         contents=contents,
         suffixes=(".csv",),
-        source=source,
+        source=untried(source),
         relies=(meaning, *_SIGN),
         text=write_counts,
         read=read_offsets,
-        check=lambda robot: None,
+        check=check_robot,
         parameters=joint_offsets,
         options=frozenset(("counts_per_turn", "present_counts")),
         refuse=_refuse,

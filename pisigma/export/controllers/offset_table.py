@@ -6,6 +6,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from pisigma.errors import RobotError
+from pisigma.export.joint_offsets import joints_by_axes
 from pisigma.export.projection import joint_offsets
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import FrameSection
@@ -23,14 +24,14 @@ def read_offsets(text: str, source: str, nominal: Robot) -> Robot:
     """
     entries = _csv_entries(text) if text.lstrip("# ").find("part,") >= 0 else _yaml_entries(text, source)
     joints = {str(entry.get("name")): entry for entry in entries if entry.get("part") == "joint"}
-    if set(joints) != {joint.name for joint in nominal.joints}:
-        names = ", ".join(joint.name for joint in nominal.joints)
+    if set(joints) != {axis.name for axis in nominal.axes}:
+        names = ", ".join(axis.name for axis in nominal.axes)
         raise RobotError(
             f"{source}: offsets of the joints {names} were wanted, got {', '.join(joints) or 'none'}."
         )
+    offsets = np.array([_offset(axis, joints[axis.name], source) for axis in nominal.axes])
     dh = nominal.dh.copy()
-    offsets = [_offset(joint, joints[joint.name], source) for joint in nominal.joints]
-    dh.reshape(-1)[list(joint_offsets(nominal))] += nominal.directions * offsets
+    dh.reshape(-1)[list(joint_offsets(nominal))] += joints_by_axes(nominal) @ offsets
     frames = {
         str(entry["part"]): _frame(entry, source)
         for entry in entries
@@ -55,16 +56,16 @@ def _yaml_entries(text: str, source: str) -> list[Mapping[str, object]]:
     return [*({"part": "joint", **joint} for joint in joints), *frames]
 
 
-def _offset(joint: Row, entry: Mapping[str, object], source: str) -> float:
+def _offset(axis: Row, entry: Mapping[str, object], source: str) -> float:
     """The offset [rad or m], of the counts where there are some."""
     turn, millimetre = 2 * np.pi, 1e-3
     if entry.get("new_count"):
         present, new, per_turn = (
             _number(entry, column, source) for column in ("present_count", "new_count", "counts_per_turn")
         )
-        return (present - new) / per_turn * (turn if joint.type == "revolute" else millimetre)
-    value = _number(entry, f"offset_{joint.file_unit}", source)
-    return float(np.deg2rad(value)) if joint.type == "revolute" else value * millimetre
+        return (present - new) / per_turn * (turn if axis.type == "revolute" else millimetre)
+    value = _number(entry, f"offset_{axis.file_unit}", source)
+    return float(np.deg2rad(value)) if axis.type == "revolute" else value * millimetre
 
 
 def _frame(entry: Mapping[str, object], source: str) -> np.ndarray:

@@ -10,6 +10,7 @@ from pisigma.export.controllers.controller_file import (
     FileText,
     check_plain_joints,
     frame_sentences,
+    untried,
     with_frames,
 )
 from pisigma.files.input_file import read_input
@@ -114,7 +115,7 @@ FILE = ControllerFile(
     name="staubli",
     contents="the dhOffset of a Staubli arm.cfx",
     suffixes=(".cfx",),
-    source="github.com/ros-industrial/staubli_experimental/issues/35",
+    source=untried("github.com/ros-industrial/staubli_experimental/issues/35"),
     relies=(
         "The controller adds these differences to its nominal DH parameters, which have to be those of this robot's "
         "description. In which order it multiplies is not published; taken is RotZ(theta) Trans(a, b, d) RotX(alpha) "

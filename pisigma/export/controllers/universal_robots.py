@@ -11,6 +11,7 @@ from pisigma.export.controllers.controller_file import (
     FileText,
     check_plain_joints,
     frame_sentences,
+    untried,
     with_frames,
 )
 from pisigma.export.dh_table import head
@@ -125,7 +126,7 @@ FILE = ControllerFile(
     name="ur-calibration",
     contents="the calibration.conf of a Universal Robots controller",
     suffixes=(".conf",),
-    source="forum.universal-robots.com/t/18921 and /t/1638",
+    source=untried("forum.universal-robots.com/t/18921 and /t/1638"),
     relies=(
         "The controller adds these differences to its nominal DH parameters, which have to be those of this robot's "
         "description; check them in urcontrol.conf.",

@@ -8,6 +8,7 @@ from pisigma.export.controllers.controller_file import (
     ControllerFile,
     FileText,
     frame_sentences,
+    untried,
     with_frames,
 )
 from pisigma.export.controllers.universal_robots import JOINTS, check_robot, without_beta
@@ -120,7 +121,9 @@ FILE = ControllerFile(
     name="ur-ros",
     contents="the kinematics YAML of Universal Robots' ROS driver",
     suffixes=(".yaml", ".yml"),
-    source="github.com/UniversalRobots/Universal_Robots_ROS2_Driver, ur_calibration/doc/algorithm.rst",
+    source=untried(
+        "github.com/UniversalRobots/Universal_Robots_ROS2_Driver, ur_calibration/doc/algorithm.rst"
+    ),
     relies=(
         "The driver warns where the hash is not that of the robot it connects to: it is that of the calibration.conf "
         "which --format ur-calibration writes of the same model.",

@@ -3,14 +3,10 @@
 import re
 
 from pisigma.errors import OutputError
-from pisigma.export.export_format import Exported, ExportFormat, ExportRequest
-from pisigma.export.urdf import FORMAT as URDF
+from pisigma.export.controllers.controller_file import ControllerFile, FileText
+from pisigma.export.export_format import ExportRequest
 from pisigma.robot.urdf_chain import XACRO
-
-SENTENCE = (
-    "The origins of the joints are properties, so one calibration can be exchanged for another; `xacro FILE` expands "
-    "it. Written from the published description (wiki.ros.org/xacro) and expanded with the package xacro 2.1.1."
-)
+from pisigma.robot.writing import robot_into_urdf
 
 
 def with_properties(urdf: str) -> str:
@@ -33,18 +29,35 @@ def with_properties(urdf: str) -> str:
     return f'<?xml version="1.0"?>\n{etree.tostring(top, encoding="unicode")}\n'
 
 
-def _check(request: ExportRequest) -> None:
-    URDF.check(request)
+def write_overlay(content: FileText) -> str:
+    """The text of the overlay over the URDF file that the nominal robot was loaded from."""
+    request = content.request
+    assert request.like is not None
+    return with_properties(
+        robot_into_urdf(content.robot, content.nominal, request.like, request.tip, content.said)
+    )
+
+
+def _refuse(request: ExportRequest) -> None:
     if request.like is None:
         raise OutputError(
             "--format xacro lays origins over a URDF file; give the one of the robot with --like."
         )
 
 
-def _write(request: ExportRequest) -> Exported:
-    exported = URDF.write(request)
-    assert isinstance(exported.content, str)
-    return Exported(with_properties(exported.content), exported.facts, (*exported.remarks, SENTENCE))
-
-
-FORMAT = ExportFormat("xacro", "a xacro overlay", (".xacro",), _write, frozenset(("like", "tip")), _check)
+FILE = ControllerFile(
+    name="xacro",
+    contents="a xacro overlay",
+    suffixes=(".xacro",),
+    source="Written from the published description (wiki.ros.org/xacro), and expanded with the package xacro 2.1.1.",
+    relies=(
+        "The origins of the joints are properties, so one calibration can be exchanged for another; `xacro FILE` "
+        "expands it. The link calibrated_frame is the frame of the poses, calibrated_tool the tool.",
+    ),
+    text=write_overlay,
+    read=None,
+    check=lambda robot: None,
+    options=frozenset(("like", "tip")),
+    refuse=_refuse,
+)
+FORMAT = FILE.export_format()

@@ -108,7 +108,7 @@ class ProgramCorrection:
         )
         before, after = base @ target.T_root_frame, invert(target.T_flange_tool) @ tool
         solution = self.solver(before @ T @ after, branch=self.branch)
-        drawn = forward_kinematics(robot, solution.q.detach().to("cpu", torch.float64))
+        drawn = forward_kinematics(robot, robot.to_dh(solution.q.detach().to("cpu", torch.float64)))
         return invert(before) @ drawn @ invert(after), solution
 
     def way_points(self, move: LinearMove) -> list[Frame] | str:

@@ -8,9 +8,10 @@ from itertools import count
 
 import torch
 
-from pisigma.export.programs.text import labelled, millimetres_and_euler
+from pisigma.export.programs.text import DIGITS, millimetres_and_euler, number
 from pisigma.export.rewriting.frame_file import FrameFile
 from pisigma.export.rewriting.scan import (
+    COMPUTED,
     IDENTITY,
     NUMBER,
     Edit,
@@ -18,11 +19,10 @@ from pisigma.export.rewriting.scan import (
     Pose,
     Scan,
     ScannedProgram,
-    numbers_in,
 )
 from pisigma.se3 import transform_from_xyzrpy
 
-_LINE = re.compile(r"(?m)^(?P<head>[ \t]*\d+:)(?P<body>(?:[^;\n]|\r?\n[ \t]*:)*)(?P<end>;[^\n]*\n)")
+_LINE = re.compile(r"(?m)^(?P<head>[ \t]*\d+:)(?P<body>(?:[^;\r\n]|\r?\n[ \t]*:)*)(?P<end>;[^\n]*\n)")
 _MOVE = re.compile(r"[ \t]*(?P<kind>[JLCA])[ \t]+(?P<target>(?:P|PR)\[[^\]]*\])(?P<rest>[\s\S]*)")
 _POSITION = re.compile(
     r"(?m)^P\[(?P<number>\d+)[^\]]*\]\s*\{\s*GP1:\s*UF\s*:\s*(?P<uf>\w+)\s*,\s*UT\s*:\s*(?P<ut>\w+)\s*,(?P<body>[^}]*)\};?[^\n]*\n"
@@ -33,6 +33,7 @@ _SIX = r"\s*,\s*".join(
     for letter in letters
 )
 _VALUES = re.compile(rf"(?P<config>\s*CONFIG\s*:\s*'[^']*'\s*,\s*)(?P<six>{_SIX})")
+_VALUE = re.compile(rf"(=\s*)({NUMBER})")
 _FLOW = re.compile(r"[ \t]*(LBL|JMP|IF|ELSE|ENDIF|FOR|ENDFOR|SELECT|CALL|RUN|END|ABORT)\b")
 _MODIFIED = re.compile(r"\b(Offset|Tool_Offset|INC|VOFFSET|TOOL_OFFSET|Skip|OFFSET)\b")
 
@@ -69,24 +70,24 @@ class _Reader:
                 self._move(line, move)
             else:
                 computed |= set(re.findall(r"\bP\[(\d+)", body))
-        for number in computed & set(self.positions):
-            if isinstance(pose := self._pose(number), Pose):
+        for name in computed & set(self.positions):
+            if isinstance(pose := self._pose(name), Pose):
                 self.scan.blur(pose)
-        return self.scan.program(_numbered)
+        return self.scan.program(finish=_numbered)
 
     def _move(self, line: re.Match[str], move: re.Match[str]) -> None:
         names = [move["target"], *re.findall(r":\s*(P\[[^\]]*\])", move["rest"])]
         for name in names:
-            number = re.match(r"P\[(\d+)", name)
-            found = self.positions.get(number[1]) if number else None
+            index = re.match(r"P\[(\d+)", name)
+            found = self.positions.get(index[1]) if index else None
             if found is not None and re.search(r"\bJ1\s*=", found["body"]):
                 self.scan.joints(line.start())
                 continue
-            pose: Pose | str = "the target is a register or not stated in this file"
+            pose: Pose | str = COMPUTED
             frame: Frame | str = ""
             tool: Frame | str = ""
-            if number and found is not None:
-                pose = self._pose(number[1])
+            if index and found is not None:
+                pose = self._pose(index[1])
                 frame = IDENTITY if found["uf"] == "0" else self.stated.frame(f"UFRAME {found['uf']}")
                 tool = IDENTITY if found["ut"] == "0" else self.stated.tool(f"UTOOL {found['ut']}")
                 if modified := _MODIFIED.search(move["rest"]):
@@ -97,38 +98,38 @@ class _Reader:
             cut = partial(self._way_points, line, move, found) if linear and found else None
             self.scan.move(line.start(), pose, frame, tool, cut)
 
-    def _pose(self, number: str) -> Pose | str:
-        found = self.positions[number]
+    def _pose(self, name: str) -> Pose | str:
+        found = self.positions[name]
         values = _VALUES.match(self.text, found.start("body"))
         if values is None or "GP2" in found["body"]:
-            return f"the values of P[{number}] are not understood"
-        six = torch.tensor(numbers_in(re.sub(r"[A-Za-z=]", " ", values["six"])), dtype=torch.float64)
+            return f"the values of P[{name}] are not understood"
+        six = torch.tensor([float(found[2]) for found in _VALUE.finditer(values["six"])], dtype=torch.float64)
         x, y, z, w, p, r = torch.cat([six[:3] / 1e3, torch.deg2rad(six[3:])])
         T = transform_from_xyzrpy(torch.stack([x, y, z, r, p, w]))
-        return Pose(values.span("six"), T, _written)
+        return Pose(values.span("six"), T, partial(_written, values["six"]))
 
     def _way_points(
         self, line: re.Match[str], move: re.Match[str], found: re.Match[str], poses: Sequence[Frame]
     ) -> list[Edit]:
         """Lines and positions of way points, with the speed of the move and continuous termination."""
-        line_end = "\r\n" if "\r\n" in self.text else "\n"
         speed = re.match(r"\s*(\S+)", move["rest"])
         lines, positions = [], []
         span = _VALUES.match(self.text, found.start("body"))
         assert span is not None
         for T in poses:
-            number = next(self.numbers)
-            lines.append(f"   1:L P[{number}] {speed[1] if speed else ''} CNT100 ;{line_end}")
-            head = re.sub(r"^P\[[^\]]*\]", f"P[{number}]", self.text[found.start() : span.start("six")])
-            positions.append(f"{head}{_written(T)}{self.text[span.end('six') : found.end()]}")
+            name = next(self.numbers)
+            lines.append(f"   1:L P[{name}] {speed[1] if speed else ''} CNT100 ;{self.scan.line_end}")
+            head = re.sub(r"^P\[[^\]]*\]", f"P[{name}]", self.text[found.start() : span.start("six")])
+            positions.append(f"{head}{_written(span['six'], T)}{self.text[span.end('six') : found.end()]}")
         end = self.text.rindex("/END")
         return [Edit((line.start(),) * 2, "".join(lines)), Edit((end, end), "".join(positions))]
 
 
-def _written(T: Frame) -> str:
+def _written(text: str, T: Frame) -> str:
+    """The values of a position with those of another pose."""
     x, y, z, r, p, w = millimetres_and_euler(T).tolist()
-    lengths = labelled([x, y, z], ["X =", "Y =", "Z ="], " mm")
-    return f"{lengths},\n\t{labelled([w, p, r], ['W =', 'P =', 'R ='], ' deg')}"
+    values = iter([x, y, z, w, p, r])
+    return _VALUE.sub(lambda found: found[1] + number(next(values), DIGITS), text)
 
 
 def _numbered(text: str) -> str:

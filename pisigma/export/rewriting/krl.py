@@ -10,13 +10,16 @@ import torch
 from pisigma.export.programs.text import labelled, millimetres_and_euler
 from pisigma.export.rewriting.frame_file import FrameFile
 from pisigma.export.rewriting.scan import (
+    COMPUTED,
     IDENTITY,
     NUMBER,
     Edit,
     Frame,
+    NamedPoses,
     Pose,
     Scan,
     ScannedProgram,
+    arguments,
     masked,
     numbers_in,
 )
@@ -28,6 +31,9 @@ _AGGREGATE = re.compile(rf"\{{\s*(?:(?:FRAME|E?\d?POS)\s*:\s*)?({_SIX})\s*(?:,[^
 _ASSIGNMENT = re.compile(
     r"(?im)^[ \t]*(?:DECL\s+|GLOBAL\s+)*(?:(?:E6|E3)?POS\s+|FRAME\s+)?(\w+)\s*=\s*(?=\{)"
 )
+_SET = re.compile(r"(?im)^[^\n=]*?\b(\w+)(?:\.\w+)*\s*=(?!=)")
+_AXES = re.compile(r"\{\s*(?:(?:AXIS|E6AXIS)\s*:|A1\b)", re.IGNORECASE)
+_NAME = re.compile(r"\w+(?![\w.:\[])")
 _STATEMENT = re.compile(
     r"^[ \t]*(?:"
     r"(?P<flow>(?:GLOBAL\s+)?DEF|END|IF|ELSE|ENDIF|FOR|ENDFOR|WHILE|ENDWHILE|LOOP|ENDLOOP|REPEAT|UNTIL|SWITCH|CASE|DEFAULT|"
@@ -59,16 +65,16 @@ class _Reader:
     text: str
     stated: FrameFile
     state: dict[str, Frame | str] = field(default_factory=dict)
-    poses: dict[str, Pose] = field(default_factory=dict)
-    uses: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.names = NamedPoses(self.text, _SET, str.upper)
 
     def read(self) -> ScannedProgram:
         self.state = {name: f"${name} is not stated before the move" for name in ("BASE", "TOOL")}
         for found in _ASSIGNMENT.finditer(self.text):
-            literal, name = _AGGREGATE.match(self.text, found.end()), found[1].upper()
-            others = re.findall(rf"(?im)^[^\n=]*\b{name}\b(?:\.\w+)?\s*=(?!=)", self.text)
-            if literal and len(others) == 1:
-                self.poses[name] = _pose(literal)
+            literal = _AGGREGATE.match(self.text, found.end())
+            if literal and self.names.is_set_once(found[1]):
+                self.names.add(found[1], _pose(literal))
         depth = 0
         for found in _STATEMENT.finditer(self.text):
             if word := found["flow"]:
@@ -78,10 +84,7 @@ class _Reader:
                 self._move(found)
             else:
                 self._set_frame(found, computed=depth > 1)
-        for name, pose in self.poses.items():
-            if len(re.findall(rf"(?i)\b{name}\b", self.text)) - 1 > self.uses.get(name, 0):
-                self.scan.blur(pose)
-        return self.scan.program()
+        return self.scan.program(self.names)
 
     def _set_frame(self, found: re.Match[str], computed: bool) -> None:
         name = (found["system"] or found["bas"]).upper()
@@ -96,39 +99,28 @@ class _Reader:
 
     def _move(self, found: re.Match[str]) -> None:
         start, kind = found.start("target"), found["move"].upper()
-        for count in range(2 if kind == "CIRC" else 1):
-            literal = _AGGREGATE.match(self.text, start)
-            name = re.compile(r"\w+(?![\w.:\[])").match(self.text, start)
-            if re.compile(r"\{\s*(?:(?:AXIS|E6AXIS)\s*:|A1\b)", re.IGNORECASE).match(self.text, start):
+        for begin, _ in [*arguments(found["target"] + ";", 0)][: 2 if kind == "CIRC" else 1]:
+            if _AXES.match(self.text, start + begin):
                 self.scan.joints(found.start())
-                return
-            pose: Pose | str = "the target is computed or not stated in this file"
-            operand = (start, start)
-            if not found["relative"] and literal:
-                pose, operand = _pose(literal), literal.span()
-            elif not found["relative"] and name and name[0].upper() in self.poses:
-                pose, operand = self.poses[name[0].upper()], name.span()
-                self.uses[name[0].upper()] = self.uses.get(name[0].upper(), 0) + 1
-            cut = (
-                partial(self._way_points, found, operand, pose)
-                if kind == "LIN" and isinstance(pose, Pose)
-                else None
-            )
+                continue
+            pose = self._target(start + begin) if not found["relative"] else COMPUTED
+            cut = None
+            if kind == "LIN" and isinstance(pose, Pose):
+                cut = partial(self._way_points, found, start + begin)
             self.scan.move(found.start(), pose, self.state["BASE"], self.state["TOOL"], cut)
-            comma = self.text.find(",", operand[1])
-            start = comma + 1 + len(self.text[comma + 1 :]) - len(self.text[comma + 1 :].lstrip(" \t"))
-            if count == 0 and (comma < 0 or comma > found.end()):
-                return
 
-    def _way_points(
-        self, move: re.Match[str], operand: tuple[int, int], pose: Pose, poses: Sequence[Frame]
-    ) -> list[Edit]:
+    def _target(self, start: int) -> Pose | str:
+        if literal := _AGGREGATE.match(self.text, start):
+            return _pose(literal)
+        name = _NAME.match(self.text, start)
+        return (self.names.get(name[0]) if name else None) or COMPUTED
+
+    def _way_points(self, move: re.Match[str], operand: int, poses: Sequence[Frame]) -> list[Edit]:
         """Straight moves to all way points, which are passed by distance."""
         start = self.scan.line_start(move.start())
-        end = "\r\n" if "\r\n" in self.scan.text else "\n"
-        word = self.text[start : operand[0]]
+        word = self.text[start:operand]
         smooth = "" if "SLIN" in word.upper() else " C_DIS"
-        lines = (f"{word}{{{_six(T)}}}{smooth}{end}" for T in poses)
+        lines = (f"{word}{{{_six(T)}}}{smooth}{self.scan.line_end}" for T in poses)
         return [Edit((start, start), "".join(lines))]
 
 

@@ -10,10 +10,12 @@ import torch
 from pisigma.export.programs.text import millimetres, numbers, quaternion
 from pisigma.export.rewriting.frame_file import FrameFile
 from pisigma.export.rewriting.scan import (
+    COMPUTED,
     IDENTITY,
     NUMBER,
     Edit,
     Frame,
+    NamedPoses,
     Pose,
     Scan,
     ScannedProgram,
@@ -40,6 +42,7 @@ _WOBJ = re.compile(
 _DATA = re.compile(
     r"(?im)^[ \t]*(?:LOCAL\s+|TASK\s+)?(?:CONST|PERS|VAR)\s+(robtarget|tooldata|wobjdata)\s+(\w+)\s*:=\s*"
 )
+_SET = re.compile(r"\b(\w+)(?:\.\w+)*\s*:=")
 _FLOW = (
     "PROC|ENDPROC|FUNC|ENDFUNC|TRAP|ENDTRAP|IF|ELSEIF|ELSE|ENDIF|FOR|ENDFOR|WHILE|ENDWHILE|TEST|CASE|DEFAULT|ENDTEST|"
     "GOTO|RETURN|ERROR"
@@ -68,17 +71,22 @@ class _Reader:
     scan: Scan
     text: str
     stated: FrameFile
-    data: dict[str, Pose | Frame] = field(default_factory=dict)
-    uses: dict[str, int] = field(default_factory=dict)
+    frames: dict[str, Frame] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.names = NamedPoses(self.text, _SET, str.upper)
 
     def read(self) -> ScannedProgram:
-        self.data = {"TOOL0": IDENTITY, "WOBJ0": IDENTITY}
+        self.frames = {"TOOL0": IDENTITY, "WOBJ0": IDENTITY}
         for found in _DATA.finditer(self.text):
             kind, name = found[1].lower(), found[2].upper()
             form = {"robtarget": _TARGET, "tooldata": _TOOL, "wobjdata": _WOBJ}[kind]
             literal = form.match(self.scan.text, found.end())  # where strings are not hidden
-            if literal and len(re.findall(rf"(?i)\b{name}(?:\.[\w.]+)?\s*:=", self.text)) == 1:
-                self.data[name] = _pose(literal) if kind == "robtarget" else _product(literal)
+            if literal and self.names.is_set_once(name):
+                if kind == "robtarget":
+                    self.names.add(name, _pose(literal))
+                else:
+                    self.frames[name] = _product(literal)
         for found in _STATEMENT.finditer(self.text):
             if found["flow"]:
                 self.scan.interrupt()
@@ -86,12 +94,7 @@ class _Reader:
                 self.scan.joints(found.start())
             else:
                 self._move(found)
-        for name, pose in self.data.items():
-            if isinstance(pose, Pose):
-                used = len(re.findall(rf"(?i)\b{name}\b", self.text)) - 1
-                if used > self.uses.get(name, 0):
-                    self.scan.blur(pose)
-        return self.scan.program()
+        return self.scan.program(self.names)
 
     def _move(self, found: re.Match[str]) -> None:
         spans = [
@@ -117,11 +120,7 @@ class _Reader:
     def _target(self, expression: str, span: tuple[int, int]) -> Pose | str:
         if literal := _TARGET.match(self.text, span[0]):
             return _pose(literal)
-        pose = self.data.get(expression.upper())
-        if not isinstance(pose, Pose):
-            return "the target is computed or not stated in this file"
-        self.uses[expression.upper()] = self.uses.get(expression.upper(), 0) + 1
-        return pose
+        return self.names.get(expression) or COMPUTED
 
     def _frames(self, expression: str) -> tuple[Frame | str, Frame | str]:
         """Work object and tool of a move, from its last argument."""
@@ -129,10 +128,10 @@ class _Reader:
         wobj = next(
             (word.split(":=")[1].strip() for word in words if re.match(r"(?i)WObj\s*:=", word)), "wobj0"
         )
-        frame, tool = self.data.get(wobj.upper()), self.data.get(words[0].upper())
+        frame, tool = self.frames.get(wobj.upper()), self.frames.get(words[0].upper())
         return (
-            frame if isinstance(frame, torch.Tensor) else self.stated.frame(wobj),
-            tool if isinstance(tool, torch.Tensor) else self.stated.tool(words[0]),
+            self.stated.frame(wobj) if frame is None else frame,
+            self.stated.tool(words[0]) if tool is None else tool,
         )
 
     def _way_points(
@@ -145,10 +144,9 @@ class _Reader:
         assert literal is not None
         rest = text[end : literal.end()]
         speed, last = text[slice(*spans[1])], text[slice(*spans[3])]
-        line_end = "\r\n" if "\r\n" in text else "\n"
         indent = re.match(r"[ \t]*", text[start:])
         lines = (
-            f"{indent[0] if indent else ''}MoveL [{pose.write(T)}{rest}, {speed}, z1, {last};{line_end}"
+            f"{indent[0] if indent else ''}MoveL [{pose.write(T)}{rest}, {speed}, z1, {last};{self.scan.line_end}"
             for T in poses
         )
         return [Edit((start, start), "".join(lines))]

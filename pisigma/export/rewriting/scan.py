@@ -2,6 +2,7 @@
 
 import bisect
 import re
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -12,6 +13,7 @@ from torch import Tensor
 Frame = Float64[Tensor, "4 4"]
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+COMPUTED = "the target is computed or not stated in this file"
 IDENTITY = torch.eye(4, dtype=torch.float64)
 
 
@@ -93,12 +95,49 @@ class ScannedProgram:
     finish: Callable[[str], str] = lambda text: text
 
 
+class NamedPoses:
+    """Poses that a program sets once, by their names, and whether moves are all that uses them."""
+
+    def __init__(self, text: str, assignment: re.Pattern[str], fold: Callable[[str], str]) -> None:
+        """Count the names of a text.
+
+        Args:
+            text: masked.
+            assignment: matches whatever sets a name, which is its first group.
+            fold: how the language writes a name alike, such as `str.upper`.
+        """
+        self._fold = fold
+        self._words = Counter(fold(word) for word in re.findall(r"\w+", text))
+        self._set = Counter(fold(found[1]) for found in assignment.finditer(text))
+        self._uses: Counter[str] = Counter()
+        self._poses: dict[str, Pose] = {}
+
+    def is_set_once(self, name: str) -> bool:
+        """Whether one statement sets the name."""
+        return self._set[self._fold(name)] == 1
+
+    def add(self, name: str, pose: Pose) -> None:
+        """A pose that is set once."""
+        self._poses[self._fold(name)] = pose
+
+    def get(self, name: str, target: bool = True) -> Pose | None:
+        """The pose of a name; as the target of a move, or as a frame."""
+        pose = self._poses.get(self._fold(name))
+        self._uses[self._fold(name)] += target and pose is not None
+        return pose
+
+    def used_otherwise(self) -> list[Pose]:
+        """Poses whose names stand elsewhere than where they are set and in moves to them."""
+        return [pose for name, pose in self._poses.items() if self._words[name] - 1 > self._uses[name]]
+
+
 class Scan:
     """Collects what a reader of a language understands, move after move in the order of the text."""
 
     def __init__(self, text: str) -> None:
         """Begin with the text of a program."""
         self.text = text
+        self.line_end = "\r\n" if "\r\n" in text else "\n"
         self._breaks = [found.start() for found in re.finditer("\n", text)]
         self._targets: dict[tuple[int, int], Target] = {}
         self._unclear: set[tuple[int, int]] = set()
@@ -169,8 +208,12 @@ class Scan:
             self._moves.append(LinearMove(self.line(position), before, target, way_points))
         self._previous = target
 
-    def program(self, finish: Callable[[str], str] = lambda text: text) -> ScannedProgram:
+    def program(
+        self, names: NamedPoses | None = None, finish: Callable[[str], str] = lambda text: text
+    ) -> ScannedProgram:
         """What was collected, without poses that are used in ways that are not understood."""
+        for pose in names.used_otherwise() if names else ():
+            self.blur(pose)
         for span, target in self._targets.items():
             if span in self._unclear:
                 self._left.setdefault(target.line, "the pose is also used in a way that is not understood")

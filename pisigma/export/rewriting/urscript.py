@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 
 import torch
@@ -10,10 +10,12 @@ import torch
 from pisigma.export.programs.text import metres_and_rotation_vector, number, numbers
 from pisigma.export.rewriting.frame_file import FrameFile
 from pisigma.export.rewriting.scan import (
+    COMPUTED,
     IDENTITY,
     NUMBER,
     Edit,
     Frame,
+    NamedPoses,
     Pose,
     Scan,
     ScannedProgram,
@@ -53,16 +55,16 @@ class _Reader:
     text: str
     stated: FrameFile
     tool: Frame | str = ""
-    poses: dict[str, Pose] = field(default_factory=dict)
-    uses: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.names = NamedPoses(self.text, _ASSIGNMENT, str)
 
     def read(self) -> ScannedProgram:
         self.tool, depth = self.stated.tool("tcp"), 0
         for found in _ASSIGNMENT.finditer(self.text):
             literal = _LITERAL.match(self.text, found.end())
-            once = len(re.findall(rf"(?m)^[ \t]*(?:global\s+|local\s+)?{found[1]}\s*=(?!=)", self.text)) == 1
-            if literal and once:
-                self.poses[found[1]] = _pose(self.text, literal.span())
+            if literal and self.names.is_set_once(found[1]):
+                self.names.add(found[1], _pose(self.text, literal.span()))
         for found in _STATEMENT.finditer(self.text):
             if found["flow"]:
                 self.scan.interrupt()
@@ -75,11 +77,7 @@ class _Reader:
                 )
             else:
                 self._move(found)
-        for name, pose in self.poses.items():
-            used = len(re.findall(rf"\b{name}\b", self.text)) - 1
-            if used > self.uses.get(name, 0):
-                self.scan.blur(pose)
-        return self.scan.program()
+        return self.scan.program(self.names)
 
     def _move(self, call: re.Match[str]) -> None:
         spans = list(arguments(self.text, call.end()))
@@ -101,19 +99,20 @@ class _Reader:
         expression = self.text[slice(*span)]
         if function := re.match(r"(get_inverse_kin|pose_trans)\s*\(", expression):
             inner = list(arguments(self.text, span[0] + function.end()))
+            if len(inner) < (1 if function[1] == "get_inverse_kin" else 2):
+                return COMPUTED, IDENTITY, span
             if function[1] == "get_inverse_kin":
                 return self._target(inner[0])
-            frame = self._constant(inner[0])
+            frame = self._constant(inner[0], target=False)
             pose, _, operand = self._target(inner[1])
             return pose, frame.T if frame else "the frame is computed", operand
-        pose = self._constant(span) or "the target is computed"
-        if expression in self.poses:
-            self.uses[expression] = self.uses.get(expression, 0) + 1
-        return pose, IDENTITY, span
+        return self._constant(span, target=True) or COMPUTED, IDENTITY, span
 
-    def _constant(self, span: tuple[int, int]) -> Pose | None:
+    def _constant(self, span: tuple[int, int], target: bool) -> Pose | None:
         expression = self.text[slice(*span)]
-        return _pose(self.text, span) if _LITERAL.fullmatch(expression) else self.poses.get(expression)
+        if _LITERAL.fullmatch(expression):
+            return _pose(self.text, span)
+        return self.names.get(expression, target)
 
     def _way_points(
         self,
@@ -125,6 +124,7 @@ class _Reader:
     ) -> list[Edit]:
         """The move again before itself, once a way point, with a small blend radius."""
         start, (before, after) = self.scan.line_start(call.start()), operand
+        line_end = self.scan.line_end
         ends = torch.stack([*poses, pose.T])[:, :3, 3]
         nearest = float((ends[1:] - ends[:-1]).norm(dim=-1).min())
         radius = f"r={number(min(BLEND, nearest / 4), 6)}"
@@ -133,7 +133,7 @@ class _Reader:
         rest = [radius if index in named else argument for index, argument in enumerate(rest)]
         rest += [] if named else [radius]
         head, tail = self.text[start:before], self.text[after : spans[0][1]]
-        lines = (f"{head}{', '.join([pose.write(T) + tail, *rest])})\n" for T in poses)
+        lines = (f"{head}{', '.join([pose.write(T) + tail, *rest])}){line_end}" for T in poses)
         return [Edit((start, start), "".join(lines))]
 
 

@@ -302,7 +302,7 @@ def test_all_else_stays_and_is_named(language, arm, tmp_path):
     computed = next(
         i for i, line in enumerate(old.splitlines(), 1) if re.search(r"pose_add|LIN_REL|Offs\(|PR\[1\]", line)
     )
-    assert re.search("computed|register|bench_2", reasons[computed])
+    assert re.search("computed|bench_2", reasons[computed])
     assert exported.facts["joint_lines"]
     assert exported.facts["largest_shift_mm"] > 0.1
     assert any("TEST IT AT LOW SPEED" in sentence for sentence in exported.doubts)
@@ -369,3 +369,13 @@ def test_the_facts_are_plain(arm, tmp_path):
     assert json.loads(json.dumps(dict(exported.facts)))["unreached"] == [
         {"line": 11, "status": "unreachable"}
     ]
+
+
+@pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
+def test_line_ends_stay(language, arm, tmp_path):
+    request = program(language, arm, tmp_path)
+    export_model("targets", request)
+    plain = request.out.read_bytes()
+    request.program.write_bytes(request.program.read_bytes().replace(b"\n", b"\r\n"))
+    export_model("targets", request)
+    assert request.out.read_bytes() == plain.replace(b"\n", b"\r\n")
