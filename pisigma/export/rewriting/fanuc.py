@@ -1,7 +1,7 @@
 """Poses of FANUC TP programs in ASCII: positions `P[n]` in millimetres and degrees."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import count
@@ -56,7 +56,7 @@ class _Reader:
     text: str
     stated: FrameFile
     positions: dict[str, re.Match[str]] = field(default_factory=dict)
-    numbers: "count[int]" = field(default_factory=count)
+    numbers: Iterator[int] = field(default_factory=count)
 
     def read(self) -> ScannedProgram:
         self.positions = {found["number"]: found for found in _POSITION.finditer(self.text)}
