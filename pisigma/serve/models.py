@@ -54,8 +54,11 @@ class ServedModel:
 
     @property
     def quick(self) -> bool:
-        """Whether the compiled kernels solve its poses, in microseconds."""
-        return self.ik.compiled is not None
+        """Whether the compiled kernels solve its poses, in microseconds; coupled joints are solved around them."""
+        controller = self.ik.controller
+        if controller is None:
+            return self.ik.compiled is not None
+        return controller.ik.compiled is not None and not controller.coupling.passive
 
 
 def model_folders(folder: Path) -> list[Path]:

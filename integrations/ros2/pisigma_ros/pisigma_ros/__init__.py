@@ -1,0 +1,1 @@
+"""Corrected joint values of a calibrated robot in ROS 2."""

@@ -1,0 +1,79 @@
+"""What stands between messages of MoveIt and the server, without any of ROS.
+
+Messages are those of moveit_msgs/srv/GetPositionIK, or whatever has their fields.
+"""
+
+import math
+from dataclasses import dataclass
+
+REACHED, OUTSIDE_JOINT_LIMITS, OUTSIDE_DOMAIN, INVALID_POSE = 0, 2, 3, 6
+"""Statuses of the server, see its protocol."""
+
+
+@dataclass(frozen=True)
+class Arm:
+    """What the messages are about.
+
+    Attributes:
+        joints: names of the joints in ROS, in the order of the model.
+        base_frame: name in ROS of the frame that the model's poses are given in.
+        model: index of the model on the server.
+        accept_outside_domain: whether joint values count whose correction is extrapolated.
+    """
+
+    joints: tuple[str, ...]
+    base_frame: str
+    model: int = 0
+    accept_outside_domain: bool = False
+
+
+def matrix_of(pose):
+    """The 16 numbers, row by row, of a geometry_msgs/Pose; NaN where its quaternion is none."""
+    q, p = pose.orientation, pose.position
+    norm = math.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2)
+    if not 0.99 < norm < 1.01:
+        return [math.nan] * 16
+    x, y, z, w = q.x / norm, q.y / norm, q.z / norm, q.w / norm
+    return [
+        *(1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), p.x),
+        *(2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), p.y),
+        *(2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), p.z),
+        *(0.0, 0.0, 0.0, 1.0),
+    ]
+
+
+def near_of(joint_state, joints):
+    """Joint values of a sensor_msgs/JointState in the order of `joints`; None where one of them is missing."""
+    stated = dict(zip(joint_state.name, joint_state.position, strict=False))
+    return [stated[name] for name in joints] if all(name in stated for name in joints) else None
+
+
+def answer(request, response, arm, solve):
+    """Fill the response of a GetPositionIK service, and give it back.
+
+    Args:
+        request: with `ik_request.pose_stamped` and, for the joint values to be near to, `ik_request.robot_state`.
+        response: gets `solution.joint_state` and `error_code`; where the pose is not reached, an error code alone.
+        arm: the arm.
+        solve: asks the server, such as `FrameClient.solve`; its OSError becomes COMMUNICATION_FAILURE.
+    """
+    wanted, code = request.ik_request, response.error_code
+    frame = wanted.pose_stamped.header.frame_id
+    if frame.lstrip("/") != arm.base_frame:
+        code.val = code.FRAME_TRANSFORM_FAILURE
+        return response
+    near = near_of(wanted.robot_state.joint_state, arm.joints)
+    try:
+        status, q, _ = solve(matrix_of(wanted.pose_stamped.pose), near, arm.model)
+    except OSError:
+        code.val = code.COMMUNICATION_FAILURE
+        return response
+    if status == REACHED or (status == OUTSIDE_DOMAIN and arm.accept_outside_domain):
+        response.solution.joint_state.name = list(arm.joints)
+        response.solution.joint_state.position = list(q)
+        code.val = code.SUCCESS
+    elif status == INVALID_POSE:
+        code.val = code.INVALID_GOAL_CONSTRAINTS
+    else:
+        code.val = code.NO_IK_SOLUTION
+    return response

@@ -1,0 +1,1 @@
+../../../../docs/clients/pisigma_client.py
