@@ -18,7 +18,7 @@ from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.judging.predicted_spread import WITHIN, PredictedSpread
 from pisigma.judging.validation_figures import LearningPoint
 from pisigma.measurement.dataset import Measurements
-from pisigma.reporting.figures import save_figure
+from pisigma.reporting.figures import save_figure, set_margins
 
 _UNITS = {"position": ("mm", 1e3), "rotation": ("deg", float(np.rad2deg(1.0)))}
 JOINT_UNITS = {
@@ -29,8 +29,8 @@ JOINT_UNITS = {
 _REDUNDANT = 1 - 1e-6
 STYLES = {"nominal": (":", "s"), "geometric": ("--", "o"), "hybrid": ("-", "^")}
 """Line and mark of every model, so that they differ without colour too."""
-POINTS = 2_000
-"""Points of a curve: 18 to a period of the 110th harmonic."""
+POINTS = 1_000
+"""Points of a curve: 9 to a period of the 110th harmonic, two a pixel."""
 MOST_DOTS = 2_000
 FAR_APART = 5.0
 """Axes of deviations are logarithmic where the largest is more than so many times the smallest."""
@@ -51,10 +51,11 @@ def draw_residuals(
     """
     shown = [name for name in _UNITS if name in residuals]
     count = max(len(shown), 1)
-    figure = Figure(figsize=(7.6, 3.3 * count), layout="constrained")
+    figure = Figure(figsize=(7.6, 3.3 * count))
     panels = figure.subplots(count, 1, squeeze=False)[:, 0]
     for axes, name in zip(panels, shown, strict=False):
         _draw_over_rows(axes, name, residuals[name], under)
+    set_margins(figure, left=0.8, right=0.05, bottom=0.5, top=0.35, up=0.85)
     save_figure(figure, path)
 
 
@@ -78,7 +79,7 @@ def draw_held_out(held_out: Mapping[str, Float64[np.ndarray, " held"]], path: Pa
         held_out: by model, lengths of the position errors [m].
         path: the PNG to write.
     """
-    figure = Figure(figsize=(7.6, 3.8), layout="constrained")
+    figure = Figure(figsize=(7.6, 3.8))
     axes = figure.subplots()
     for (name, lengths), style in zip(held_out.items(), ("--", "-", "-.", ":"), strict=False):
         errors = np.maximum(np.sort(lengths[np.isfinite(lengths)]) * 1e3, 1e-15)
@@ -94,6 +95,7 @@ def draw_held_out(held_out: Mapping[str, Float64[np.ndarray, " held"]], path: Pa
         axes.xaxis.set_minor_formatter(NullFormatter())
     axes.grid(alpha=0.3)
     axes.legend(loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2, fontsize=9, frameon=False)
+    set_margins(figure, left=0.65, right=0.05, bottom=0.95, top=0.3)
     save_figure(figure, path)
 
 
@@ -148,8 +150,9 @@ def draw_corrections(correction: JointCorrection, measurements: Measurements, pa
     """
     joints, q = correction.robot.joints, measurements.q
     rows = (len(joints) + 1) // 2
-    figure = Figure(figsize=(10.0, 2.3 * rows + 0.5), layout="constrained")
+    figure = Figure(figsize=(10.0, 2.3 * rows + 0.5))
     panels = figure.subplots(rows, 2, squeeze=False).flatten()
+    set_margins(figure, left=0.7, right=0.05, bottom=0.7, top=0.25, across=0.75, up=0.7)
     with torch.no_grad():
         corrections = correction.of_rows(measurements).numpy()
     for j, (axes, joint) in enumerate(zip(panels, joints, strict=False)):
@@ -195,8 +198,9 @@ def draw_learning_curve(points: Sequence[LearningPoint], path: Path) -> None:
     rows = [point.rows for point in points]
     names = [name for name in points[0].models if name != "nominal"]
     models = {name: [point.models[name].rms_mm or 0.0 for point in points] for name in names}
-    figure = Figure(figsize=(6.8, 4.4), layout="constrained")
+    figure = Figure(figsize=(6.8, 4.4))
     axes = figure.add_subplot()
+    set_margins(figure, left=0.75, right=0.15, bottom=0.55, top=0.15)
     for name, errors in models.items():
         line, mark = STYLES.get(name, ("-.", "x"))
         axes.plot(rows, errors, line, marker=mark, label=name, linewidth=1.6, markersize=6)
@@ -229,8 +233,9 @@ def draw_spread(spread: PredictedSpread, path: Path) -> None:
     sigma, error = spread.sigma[judged].numpy() * 1e3, np.abs(spread.error[judged].numpy()) * 1e3
     order = sigma.argsort(kind="stable")
     sigma, error = sigma[order], error[order]
-    figure = Figure(figsize=(6.8, 5.2), layout="constrained")
+    figure = Figure(figsize=(6.8, 5.2))
     axes = figure.add_subplot()
+    set_margins(figure, left=0.75, right=0.15, bottom=0.55, top=0.35)
     step = max(len(sigma) // (3 * MOST_DOTS), 1)
     axes.plot(sigma[::step], error[::step], ".", color="0.6", markersize=2, label="a coordinate of a row")
     ends = np.array([sigma[0], sigma[-1]])

@@ -93,4 +93,29 @@ def save_figure(figure: Figure, path: Path) -> None:
     canvas.draw()  # type: ignore[no-untyped-call]
     pixels = np.asarray(canvas.buffer_rgba())  # type: ignore[no-untyped-call]
     image = Image.fromarray(pixels).convert("RGB")
-    image.quantize(256).save(path, optimize=True)
+    image.quantize(256).save(path)
+
+
+def set_margins(
+    figure: Figure, left: float, right: float, bottom: float, top: float, across: float = 0.0, up: float = 0.0
+) -> None:
+    """Leave room [inch] around and between the axes, for texts of known size: to measure all texts takes as long again.
+
+    Args:
+        figure: to lay out.
+        left: of the first column.
+        right: of the last one.
+        bottom: of the last row.
+        top: of the first one.
+        across: between two columns.
+        up: between two rows.
+    """
+    width, height = figure.get_size_inches()
+    grid = figure.axes[0].get_gridspec()
+    assert grid is not None, "only figures of subplots have margins"
+    rows, columns = grid.get_geometry()
+    panel = (width - left - right - (columns - 1) * across) / columns
+    storey = (height - bottom - top - (rows - 1) * up) / rows
+    figure.subplots_adjust(
+        left / width, bottom / height, 1 - right / width, 1 - top / height, across / panel, up / storey
+    )
