@@ -63,7 +63,7 @@ class HybridCalibrator:
     """
 
     robot: Robot | GeometricCalibrator
-    features: tuple[str, ...] = ("gravity", "conditions", "backlash", "series")
+    features: tuple[str, ...] = ("gravity", "conditions", "backlash", "coupling", "series")
     harmonics: tuple[int, ...] = (8, 24, 56, 110, 160)
     products: bool = True
     gravity: tuple[float, float, float] | None = None

@@ -5,6 +5,7 @@ from typing import Any
 from pisigma.errors import nearest_choice
 from pisigma.joint_correction.backlash import Backlash
 from pisigma.joint_correction.conditions import ConditionFeatures
+from pisigma.joint_correction.coupled_series import CoupledSeries
 from pisigma.joint_correction.feature import AbstractFeature, FeatureSection
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
@@ -76,6 +77,7 @@ for _feature in (
     GravityTorques,
     ConditionFeatures,
     Backlash,
+    CoupledSeries,
     ScaledJoints,
     SinesCosines,
     NominalPose,

@@ -13,7 +13,7 @@ from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.kernels import arrays
 from pisigma.kernels.array_kinematics import KINDS, arm_ends, arm_rows
 from pisigma.kernels.description_file import write_description
-from pisigma.kernels.forms import KernelForms
+from pisigma.kernels.forms import MOST_JOINTS, KernelForms
 from pisigma.kinematics.closed_form import AbstractClosedForm, closed_form_solver
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stored_starts import StoredStarts, middle_of_starts
@@ -56,6 +56,11 @@ def describe(model: CalibratedModel) -> tuple[arrays.Description, tuple[str, ...
             compiled form, it has neither a closed-form inverse nor joint values to start from, or its joints are
             coupled: kernels take DH values, which nobody should command.
     """
+    if model.robot.dof > MOST_JOINTS:
+        raise ModelError(
+            f"model '{model.name}': its robot has {model.robot.dof} joints, but compiled models have "
+            f"{MOST_JOINTS} at most; use pisigma.load, which solves without kernels."
+        )
     if model.robot.coupling is not None:
         raise ModelError(
             f"model '{model.name}': its joints are coupled, which compiled models do not know; use pisigma.load, which "

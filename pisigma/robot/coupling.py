@@ -9,7 +9,7 @@ Files, answers of the inverse kinematics and programs hold the controller's valu
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -52,6 +52,16 @@ class FourBar:
         """Turn of the crank [rad] at a joint value u [rad]; the inverse of `follow`."""
         return self._other_end(u, self.rocker, self.crank, -1.0)
 
+    def length_slopes(self, x: Any) -> tuple[Any, Any, Any]:
+        """Derivatives of `follow` by crank, coupler and rocker, each times the length itself [rad]."""
+        step, result = 1e-5, []
+        for name in ("crank", "coupler", "rocker"):
+            length = getattr(self, name)
+            longer, shorter = (replace(self, **{name: length * (1 + h)}) for h in (step, -step))
+            result.append((longer.follow(x) - shorter.follow(x)) / (2 * step))
+        first, second, third = result
+        return first, second, third
+
     def _other_end(self, turn: Any, length: float, other: float, side: float) -> Any:
         """Turn of the bar at the other pivot, which is `side · ground` along x."""
         xp, angle = _functions(turn), turn + self.zero
@@ -69,15 +79,20 @@ class Coupling:
 
     Attributes:
         axes: what the controller commands, with the limits of its values.
+        turning: per joint, whether it turns.
         matrix: `(dof, axes)`: C, [rad or m] of a joint per [rad or m] of an axis.
         offset: `(dof,)`: b [rad or m].
         four_bars: per joint that a linkage drives, its number and the linkage.
+        driven: `(dof, axes)`: which axes the entry of a coupled joint names, be it with the factor 0; none of a joint
+            without entry.
         stops: per joint that has mechanical limits beside those of the axes, its number and these [rad or m].
     """
 
     axes: tuple[Row, ...]
+    turning: tuple[bool, ...]
     matrix: Float64[np.ndarray, "dof axes"]
     offset: Float64[np.ndarray, " dof"]
+    driven: Bool[np.ndarray, "dof axes"]
     four_bars: tuple[tuple[int, FourBar], ...] = ()
     stops: tuple[tuple[int, tuple[float, float]], ...] = ()
 
@@ -164,11 +179,6 @@ class Coupling:
         choices = [(-1, 0, 1) if both else (0,) for both in np.logical_and(coupled, self.turning).tolist()]
         return np.array(list(itertools.product(*choices)), dtype=np.float64)
 
-    @property
-    def turning(self) -> tuple[bool, ...]:
-        """For every joint, whether it turns: as the axes do that move it."""
-        return tuple(self.axes[int(np.abs(row).argmax())].type == "revolute" for row in self.matrix)
-
     def _by_four_bars(self, values: Any, change: Any) -> Any:
         """The values, those of joints with a linkage changed by it."""
         if not self.four_bars:
@@ -181,7 +191,7 @@ class Coupling:
 
 
 def hull(coupling: Coupling) -> Float64[np.ndarray, "dof 2"]:
-    """Smallest and largest DH value of every joint [rad or m] within the controller's limits."""
+    """Smallest and largest DH value of every joint [rad or m] within the controller's limits; infinite of no range."""
     ends = coupling.matrix[..., None] * np.where(np.isfinite(coupling.limits), coupling.limits, 0.0)
     unbounded = ((coupling.matrix != 0) & ~np.isfinite(coupling.limits).all(1)).any(1)
     lower, upper = ends.min(-1).sum(1) + coupling.offset, ends.max(-1).sum(1) + coupling.offset
@@ -191,6 +201,7 @@ def hull(coupling: Coupling) -> Float64[np.ndarray, "dof 2"]:
         result[joint] = _driven(bar, result[joint], stops.get(joint, (-np.pi, np.pi)), joint)
     for joint, (least, most) in coupling.stops:
         result[joint] = max(least, result[joint, 0]), min(most, result[joint, 1])
+    result[result[:, 0] == result[:, 1]] = -np.inf, np.inf
     return result
 
 
@@ -226,9 +237,12 @@ def _times(values: Any, matrix: np.ndarray) -> Any:
     """`matrix · values` along the last axis; what stands alone stays exactly what it is, NaN included."""
     columns: Sequence[Any] = [
         sum(
-            (values[..., j] if factor == 1 else factor * values[..., j])
-            for j, factor in enumerate(row.tolist())
-            if factor
+            (
+                (values[..., j] if factor == 1 else factor * values[..., j])
+                for j, factor in enumerate(row.tolist())
+                if factor
+            ),
+            start=0.0 * values[..., 0] if not row.any() else 0.0,
         )
         for row in matrix
     ]

@@ -34,7 +34,8 @@ class CoupledJointSection(Section):
     Attributes:
         joint: name of its row.
         factors: by name of a row, how far the joint moves for 1 deg (1 mm) of the controller's value of that name, in
-            the joint's own deg (mm); 0 for those that are not named, the joint's own included.
+            the joint's own deg (mm); 0 for those that are not named, the joint's own included. What is named, be it
+            with 0, is what the errors of the joint may depend on.
         offset_deg: of a joint that turns.
         offset_mm: of a joint that slides.
         four_bar: the linkage that drives it, if one does.
@@ -71,13 +72,14 @@ def coupled(
     joints = [row for row in rows if row.type != "fixed"]
     names, by_name = [joint.name for joint in joints], {section.joint: section for section in sections}
     used = {name for section in sections for name, factor in section.factors.items() if factor}
-    for name in (*(section.joint for section in sections), *used):
+    for name in (name for section in sections for name in (section.joint, *section.factors)):
         if name not in names:
             raise RobotError(f"coupling: there is no joint '{name}'; {nearest_choice(name, names)}")
     if len(by_name) < len(sections):
         raise RobotError("coupling: a joint has two entries; join them, one per joint.")
     axes = [joint for joint in joints if joint.name in used or joint.name not in by_name]
     matrix, offset = np.zeros((len(joints), len(axes))), np.zeros(len(joints))
+    driven = np.zeros(matrix.shape, dtype=bool)
     four_bars: list[tuple[int, FourBar]] = []
     stops: list[tuple[int, tuple[float, float]]] = []
     for index, joint in enumerate(joints):
@@ -89,6 +91,7 @@ def coupled(
             for axis in axes
         ]
         offset[index] = _offset(joint, section)
+        driven[index] = [joint.name in by_name and axis.name in section.factors for axis in axes]
         if joint not in axes and np.isfinite([joint.lower, joint.upper]).any():
             raise RobotError(
                 f"coupling: the joint '{joint.name}' is passive, so the controller has no limits for it; remove them."
@@ -97,7 +100,8 @@ def coupled(
             four_bars.append((index, section.four_bar.to_si()))
         if limits := section.limits_deg or section.limits_mm:
             stops.append((index, (joint.from_file_unit(limits[0]), joint.from_file_unit(limits[1]))))
-    coupling = Coupling(tuple(axes), matrix, offset, tuple(four_bars), tuple(stops))
+    turning = tuple(joint.type == "revolute" for joint in joints)
+    coupling = Coupling(tuple(axes), turning, matrix, offset, driven, tuple(four_bars), tuple(stops))
     limits = iter(hull(coupling).tolist())
     return tuple(row if row.type == "fixed" else _within(row, *next(limits)) for row in rows), coupling
 
@@ -128,11 +132,11 @@ def coupling_document(coupling: Coupling, joints: Sequence[Row]) -> list[dict[st
         stated = {
             axis.name: factor
             * (joint.in_file_unit(1.0) / axis.in_file_unit(1.0) if axis.type != joint.type else 1.0)
-            for axis, factor in zip(coupling.axes, factors, strict=True)
-            if factor
+            for axis, factor, named in zip(coupling.axes, factors, coupling.driven[index], strict=True)
+            if factor or named
         }
         offset = float(coupling.offset[index])
-        if stated == {joint.name: 1.0} and not offset and index not in bars and index not in stops:
+        if not coupling.driven[index].any():
             continue
         entry: dict[str, object] = {"joint": joint.name, "factors": stated}
         entry |= {f"offset_{joint.file_unit}": joint.in_file_unit(offset)} if offset else {}

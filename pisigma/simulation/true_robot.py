@@ -15,8 +15,10 @@ from pisigma.kinematics.numeric import solve_numeric
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
 from pisigma.simulation.errors.backlash import Backlash
+from pisigma.simulation.errors.coupling import CouplingDeviation
 from pisigma.simulation.errors.encoder import EncoderQuantisation
 from pisigma.simulation.errors.geometric import GeometricDeviation, RandomGeometricDeviation
+from pisigma.simulation.errors.guide import Guide
 from pisigma.simulation.errors.joint_compliance import JointCompliance
 from pisigma.simulation.errors.joint_offset import JointOffset
 from pisigma.simulation.errors.source import (
@@ -37,6 +39,8 @@ ERROR_SOURCES: dict[str, type[AbstractErrorSource]] = {
     "transmission": TransmissionHarmonics,
     "encoder": EncoderQuantisation,
     "backlash": Backlash,
+    "coupling": CouplingDeviation,
+    "guide": Guide,
 }
 """The registry: every error source by its kind."""
 

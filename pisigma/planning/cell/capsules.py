@@ -125,9 +125,12 @@ class Capsules:
     def random_joints(self) -> Float64[Tensor, "poses dof"]:
         """Joint values [rad or m] within the limits, the same at every call."""
         generator = torch.Generator().manual_seed(0)
-        draws = torch.rand(SAMPLES, self.robot.dof, generator=generator, dtype=torch.float64)
-        limits = torch.from_numpy(self.robot.limits).clamp(-np.pi, np.pi)
-        return limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws
+        limits = torch.from_numpy(self.robot.axis_limits).clamp(-np.pi, np.pi)
+        draws = torch.rand(SAMPLES, len(limits), generator=generator, dtype=torch.float64)
+        q: Float64[Tensor, "poses dof"] = self.robot.to_dh(
+            limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws
+        )
+        return q
 
 
 class _Piece(NamedTuple):

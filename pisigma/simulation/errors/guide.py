@@ -1,0 +1,90 @@
+"""Guides that are not straight: joints that err slowly along the travel of an axis."""
+
+from typing import Literal
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from pydantic import Field, model_validator
+from torch import Tensor
+
+from pisigma.errors import RecipeError, nearest_choice
+from pisigma.robot.description import Robot
+from pisigma.simulation.errors.source import AbstractJointSource, JointErrorFunction, joint_values
+from pisigma.yaml_file import Section
+
+
+class GuideWave(Section):
+    """One wave `amplitude · sin(harmonic · pi · q / travel + phase)` of one joint's error.
+
+    Attributes:
+        joint: that errs.
+        amplitude_deg: of a joint that turns [deg].
+        amplitude_mm: of a joint that slides [mm].
+        harmonic: half waves along the travel.
+        phase_deg: phase [deg].
+    """
+
+    joint: str
+    amplitude_deg: float | None = None
+    amplitude_mm: float | None = None
+    harmonic: int = Field(ge=1)
+    phase_deg: float = 0.0
+
+    @model_validator(mode="after")
+    def _one_amplitude(self) -> "GuideWave":
+        if (self.amplitude_deg is None) == (self.amplitude_mm is None):
+            raise ValueError(
+                "state either amplitude_deg (joint that turns) or amplitude_mm (joint that slides)"
+            )
+        return self
+
+
+class Guide(AbstractJointSource):
+    """Straightness and yaw of a rail along its travel, as errors of joints that follow it.
+
+    `e_j = Σ A · sin(harmonic · pi · q / travel + phase)` with q the controller's value of the axis and its travel
+    between its limits. In the robot's file the joints that err stand behind the rail and follow it with the factor 0.
+
+    Source: error motions of a linear axis of ISO 230-1:2012, 3.4 (straightness and angular error motions).
+
+    Attributes:
+        kind: "guide".
+        along: name of the axis, which slides and has limits.
+        waves: the waves.
+    """
+
+    kind: Literal["guide"]
+    along: str
+    waves: tuple[GuideWave, ...] = Field(min_length=1)
+
+    def bind(self, robot: Robot, place: str) -> JointErrorFunction:
+        """The waves as a function of the joint values. See `AbstractJointSource.bind`."""
+        names = [axis.name for axis in robot.axes]
+        if self.along not in names:
+            raise RecipeError(
+                f"{place}: robot '{robot.name}' has no axis '{self.along}'; {nearest_choice(self.along, names)}"
+            )
+        index = names.index(self.along)
+        travel = float(np.diff(robot.axis_limits[index])[0])
+        if robot.axes[index].type != "prismatic" or not np.isfinite(travel):
+            raise RecipeError(
+                f"{place}: the axis '{self.along}' does not slide between limits; name one that does."
+            )
+        amplitude = torch.from_numpy(np.stack([_amplitude(robot, wave, place) for wave in self.waves]))
+        harmonic = torch.tensor([wave.harmonic for wave in self.waves], dtype=torch.float64)
+        phase = torch.deg2rad(torch.tensor([wave.phase_deg for wave in self.waves], dtype=torch.float64))
+
+        def error(q: Float[Tensor, "*batch dof"]) -> Float[Tensor, "*batch dof"]:
+            along = robot.to_controller(q)[..., index, None] * (np.pi / travel)
+            return (torch.sin(along * harmonic.to(q) + phase.to(q))[..., None] * amplitude.to(q)).sum(-2)
+
+        return error
+
+
+def _amplitude(robot: Robot, wave: GuideWave, place: str) -> np.ndarray:
+    """The amplitude [rad or m] in the column of its joint, 0 elsewhere."""
+    degrees = {} if wave.amplitude_deg is None else {wave.joint: wave.amplitude_deg}
+    millimetres = {} if wave.amplitude_mm is None else {wave.joint: wave.amplitude_mm}
+    stated = joint_values(robot, degrees, millimetres, ("amplitude_deg", "amplitude_mm"), place)
+    return np.where(robot.revolute, np.deg2rad(stated), stated / 1e3)
