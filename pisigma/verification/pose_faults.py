@@ -3,16 +3,19 @@
 import itertools
 from collections.abc import Iterator
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from jaxtyping import Float64
-from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from pisigma.judging.frames.frame_fits import MeasuredPoses
 from pisigma.measurement.csv.columns import RPY
 from pisigma.verification.cause import Cause
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 UNITS = (
     (1e-3, "millimetres", "metres"),
@@ -61,6 +64,8 @@ def other_conventions(
     Returns:
         The rotations, what is wrong with those of the file, and how much that assumes, see `Cause.size`.
     """
+    from scipy.spatial.transform import Rotation  # here, since every calibration imports this file
+
     read = Rotation.from_matrix(rotation.numpy())
     wxyz = Rotation.from_quat(np.roll(read.as_quat(), -1, 1))
     inverse = "the orientations are inverse (a conjugate quaternion, or a transposed matrix)"
@@ -100,5 +105,5 @@ def _as_rotation_vector(angles: Float64[np.ndarray, "rows 3"]) -> Float64[np.nda
     return np.where(longer[:, None], other, angles)
 
 
-def _matrices(rotation: Rotation) -> Float64[Tensor, "rows 3 3"]:
+def _matrices(rotation: "Rotation") -> Float64[Tensor, "rows 3 3"]:
     return torch.from_numpy(rotation.as_matrix())
