@@ -6,13 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.export.programs.targets import WITH_TARGET
 from pisigma.export.rewriting.scan import Edit, Frame, LinearMove, ScannedProgram, Target
 from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.inverse.solution import Solution
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
 from pisigma.se3 import invert, rotation_from_vector, rotation_vector, transform, transform_from_xyzrpy
@@ -58,6 +57,26 @@ class CorrectedProgram:
         return "\n".join(lines)
 
 
+@dataclass(frozen=True, eq=False)
+class Commanded:
+    """What to command for wanted poses.
+
+    Attributes:
+        T: poses of the robot as drawn, in the frame of the wanted ones.
+        status: of every pose.
+        branches: those that they lie on.
+    """
+
+    T: Float64[Tensor, "poses 4 4"]
+    status: tuple[Status, ...]
+    branches: frozenset[int]
+
+    @property
+    def reached(self) -> bool:
+        """Whether all poses are."""
+        return set(self.status) <= set(WITH_TARGET)
+
+
 @dataclass(frozen=True)
 class ProgramCorrection:
     """Corrects programs for a controller that computes with the robot as drawn.
@@ -79,71 +98,75 @@ class ProgramCorrection:
         at the corrected joint values. A straight move is cut where the line between two of these leaves the corrected
         line by more than the tolerance.
         """
-        edits, statuses, shift = [], [], 0.0
-        for target in program.targets:
-            (T,), solution = self.commanded(target, target.pose.T[None])
-            status = Status(int(solution.status[0]))
-            statuses.append((target.line, status))
-            if status in WITH_TARGET:
-                edits.append(Edit(target.pose.span, target.pose.write(T)))
-                shift = max(shift, float((T - target.pose.T)[:3, 3].norm()))
-        count, left = 0, dict(program.left)
-        for move in program.moves:
-            points = self.way_points(move)
+        targets, moves = program.targets, [move for move in program.moves if move.start is not None]
+        unknown = "where the straight move begins is not stated, so only its end is corrected"
+        left = {move.line: unknown for move in program.moves if move.start is None} | dict(program.left)
+        paths = [_path(move) for move in moves]
+        found = self.commanded(
+            [*targets, *(move.end for move in moves)], [*(target.pose.T[None] for target in targets), *paths]
+        )
+        edits, count, shift = [], 0, 0.0
+        for target, there in zip(targets, found, strict=False):
+            if there.reached:
+                edits.append(Edit(target.pose.span, target.pose.write(there.T[0])))
+                shift = max(shift, float((there.T[0] - target.pose.T)[:3, 3].norm()))
+        for move, there in zip(moves, found[len(targets) :], strict=True):
+            points = self.way_points(there)
             if isinstance(points, str):
                 left.setdefault(move.line, points)
             elif points:
                 edits += move.way_points(points)
                 count += len(points)
         text = program.finish(_edited(program.text, edits))
+        statuses = ((target.line, there.status[0]) for target, there in zip(targets, found, strict=False))
         return CorrectedProgram(text, tuple(statuses), count, tuple(sorted(left.items())), shift)
 
     def commanded(
-        self, target: Target, T: Float64[Tensor, "poses 4 4"]
-    ) -> tuple[Float64[Tensor, "poses 4 4"], Solution]:
-        """Poses to command for wanted ones, both of a target's tool in its frame, and how they are reached."""
-        robot = self.solver.model.robot
+        self, targets: Sequence[Target], poses: Sequence[Float64[Tensor, "_poses 4 4"]]
+    ) -> list[Commanded]:
+        """What to command for the wanted poses of each target's tool in its frame."""
+        robot, counts = self.solver.model.robot, torch.tensor([len(T) for T in poses])
         base, tool = (
             transform_from_xyzrpy(torch.from_numpy(frame.copy())) for frame in (robot.base, robot.tool)
         )
-        before, after = base @ target.T_root_frame, invert(target.T_flange_tool) @ tool
-        solution = self.solver(before @ T @ after, branch=self.branch)
+        before = base @ torch.stack([target.T_root_frame for target in targets])
+        after = invert(torch.stack([target.T_flange_tool for target in targets])) @ tool
+        before, after = (T.repeat_interleave(counts, 0) for T in (before, after))
+        solution = self.solver(before @ torch.cat(list(poses)) @ after, branch=self.branch)
         drawn = forward_kinematics(robot, robot.to_dh(solution.q.detach().to("cpu", torch.float64)))
-        return invert(before) @ drawn @ invert(after), solution
+        parts = (invert(before) @ drawn @ invert(after), solution.status, solution.branch)
+        split = (part.split(counts.tolist()) for part in parts)
+        return [
+            Commanded(T, tuple(Status(value) for value in status.tolist()), frozenset(branch.tolist()))
+            for T, status, branch in zip(*split, strict=True)
+        ]
 
-    def way_points(self, move: LinearMove) -> list[Frame] | str:
+    def way_points(self, there: Commanded) -> list[Frame] | str:
         """The way points of a straight move; or why it is not cut."""
-        if move.start is None:
-            return "where the straight move begins is not stated, so only its end is corrected"
-        start, end = move.start, move.end
-        T_start = (
-            invert(end.T_root_frame)
-            @ start.T_root_frame
-            @ start.pose.T
-            @ invert(start.T_flange_tool)
-            @ end.T_flange_tool
-        )
-        wanted = _between(T_start, end.pose.T, _steps(T_start, end.pose.T))
-        T, solution = self.commanded(end, wanted)
-        if not bool(_reached(solution).all()):
+        if not there.reached:
             return "the straight move cannot be followed everywhere, so it has no way points"
-        if len(set(solution.branch.tolist())) > 1:
+        if len(there.branches) > 1:
             return "the straight move passes from one branch to another, so it has no way points"
-        stride = len(T) - 1
-        while stride > 1 and self._off_chords(T, stride) > self.tolerance:
+        stride = len(there.T) - 1
+        while stride > 1 and _off_chords(there.T, stride) > self.tolerance:
             stride //= 2
-        return list(T[stride:-1:stride])
-
-    def _off_chords(self, T: Float64[Tensor, "points 4 4"], stride: int) -> float:
-        """How far poses are at most off the straight lines between every so many of them [m]."""
-        chords = [_between(T[i], T[i + stride], stride)[:-1] for i in range(0, len(T) - 1, stride)]
-        chord = torch.cat(chords)
-        turn = rotation_vector(chord[:, :3, :3].mT @ T[:-1, :3, :3]).norm(dim=-1)
-        return float(((chord - T[:-1])[:, :3, 3].norm(dim=-1) + LEVER * turn).max())
+        return list(there.T[stride:-1:stride])
 
 
-def _reached(solution: Solution) -> Bool[Tensor, " poses"]:
-    return torch.isin(solution.status.cpu(), torch.tensor([int(status) for status in WITH_TARGET]))
+def _path(move: LinearMove) -> Float64[Tensor, "points 4 4"]:
+    """The straight way that the program means, of the end's tool in the end's frame."""
+    start, end = move.start, move.end
+    assert start is not None
+    T_flange = start.T_root_frame @ start.pose.T @ invert(start.T_flange_tool)
+    T_start = invert(end.T_root_frame) @ T_flange @ end.T_flange_tool
+    return _between(T_start[None], end.pose.T[None], _steps(T_start, end.pose.T))[0]
+
+
+def _off_chords(T: Float64[Tensor, "points 4 4"], stride: int) -> float:
+    """How far poses are at most off the straight lines between every so many of them [m]."""
+    chord = _between(T[:-1:stride], T[stride::stride], stride)[:, :-1].flatten(0, 1)
+    turn = rotation_vector(chord[:, :3, :3].mT @ T[:-1, :3, :3]).norm(dim=-1)
+    return float(((chord - T[:-1])[:, :3, 3].norm(dim=-1) + LEVER * turn).max())
 
 
 def _steps(start: Frame, end: Frame) -> int:
@@ -156,12 +179,14 @@ def _steps(start: Frame, end: Frame) -> int:
     return steps
 
 
-def _between(start: Frame, end: Frame, steps: int) -> Float64[Tensor, "points 4 4"]:
-    """Poses from one to another: a straight line, and a turn about one axis."""
+def _between(
+    start: Float64[Tensor, "ways 4 4"], end: Float64[Tensor, "ways 4 4"], steps: int
+) -> Float64[Tensor, "ways points 4 4"]:
+    """Poses from ones to others: a straight line, and a turn about one axis."""
     share = torch.linspace(0, 1, steps + 1, dtype=torch.float64)[:, None]
-    turn = rotation_vector(start[:3, :3].mT @ end[:3, :3])
-    R = start[:3, :3] @ rotation_from_vector(share * turn)
-    return transform(R, start[:3, 3] + share * (end - start)[:3, 3])
+    turn = rotation_vector(start[:, :3, :3].mT @ end[:, :3, :3])
+    R = start[:, None, :3, :3] @ rotation_from_vector(share * turn[:, None])
+    return transform(R, start[:, None, :3, 3] + share * (end - start)[:, None, :3, 3])
 
 
 def _edited(text: str, edits: Sequence[Edit]) -> str:
