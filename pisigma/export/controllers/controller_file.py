@@ -122,8 +122,8 @@ def with_frames(robot: Robot, text: str) -> Robot:
     for part in ("base", "tool"):
         columns = in_file_units(FRAME_COLUMNS, np.zeros(6))
         pattern = f"{part}: " + ", ".join(f"{column} ({_NUMBER})" for column in columns)
-        if found := re.search(pattern, text):
-            values = [float(value) for value in found.groups()]
+        if match := re.search(pattern, text):
+            values = [float(value) for value in match.groups()]
             frames[part] = np.array([*(value / 1e3 for value in values[:3]), *np.deg2rad(values[3:])])
     return robot.with_geometry(base=frames.get("base"), tool=frames.get("tool"))
 

@@ -102,15 +102,15 @@ class ProgramCorrection:
         unknown = "where the straight move begins is not stated, so only its end is corrected"
         left = {move.line: unknown for move in program.moves if move.start is None} | dict(program.left)
         paths = [_path(move) for move in moves]
-        found = self.commanded(
+        answers = self.commanded(
             [*targets, *(move.end for move in moves)], [*(target.pose.T[None] for target in targets), *paths]
         )
         edits, count, shift = [], 0, 0.0
-        for target, there in zip(targets, found, strict=False):
+        for target, there in zip(targets, answers, strict=False):
             if there.reached:
                 edits.append(Edit(target.pose.span, target.pose.write(there.T[0])))
                 shift = max(shift, float((there.T[0] - target.pose.T)[:3, 3].norm()))
-        for move, there in zip(moves, found[len(targets) :], strict=True):
+        for move, there in zip(moves, answers[len(targets) :], strict=True):
             points = self.way_points(there)
             if isinstance(points, str):
                 left.setdefault(move.line, points)
@@ -118,7 +118,7 @@ class ProgramCorrection:
                 edits += move.way_points(points)
                 count += len(points)
         text = program.finish(_edited(program.text, edits))
-        statuses = ((target.line, there.status[0]) for target, there in zip(targets, found, strict=False))
+        statuses = ((target.line, there.status[0]) for target, there in zip(targets, answers, strict=False))
         return CorrectedProgram(text, tuple(statuses), count, tuple(sorted(left.items())), shift)
 
     def commanded(

@@ -59,7 +59,7 @@ class _Reader:
     numbers: Iterator[int] = field(default_factory=count)
 
     def read(self) -> ScannedProgram:
-        self.positions = {found["number"]: found for found in _POSITION.finditer(self.text)}
+        self.positions = {match["number"]: match for match in _POSITION.finditer(self.text)}
         self.numbers = count(1 + max(map(int, self.positions), default=0))
         computed: set[str] = set()
         for line in _LINE.finditer(self.text):
@@ -79,48 +79,48 @@ class _Reader:
         names = [move["target"], *re.findall(r":\s*(P\[[^\]]*\])", move["rest"])]
         for name in names:
             index = re.match(r"P\[(\d+)", name)
-            found = self.positions.get(index[1]) if index else None
-            if found is not None and re.search(r"\bJ1\s*=", found["body"]):
+            match = self.positions.get(index[1]) if index else None
+            if match is not None and re.search(r"\bJ1\s*=", match["body"]):
                 self.scan.joints(line.start())
                 continue
             pose: Pose | str = COMPUTED
             frame: Frame | str = ""
             tool: Frame | str = ""
-            if index and found is not None:
+            if index and match is not None:
                 pose = self._pose(index[1])
-                frame = IDENTITY if found["uf"] == "0" else self.stated.frame(f"UFRAME {found['uf']}")
-                tool = IDENTITY if found["ut"] == "0" else self.stated.tool(f"UTOOL {found['ut']}")
+                frame = IDENTITY if match["uf"] == "0" else self.stated.frame(f"UFRAME {match['uf']}")
+                tool = IDENTITY if match["ut"] == "0" else self.stated.tool(f"UTOOL {match['ut']}")
                 if modified := _MODIFIED.search(move["rest"]):
                     if isinstance(pose, Pose):
                         self.scan.blur(pose)
                     pose = f"{modified[0]} moves the target"
             linear = move["kind"] == "L" and isinstance(pose, Pose)
-            cut = partial(self._way_points, line, move, found) if linear and found else None
+            cut = partial(self._way_points, line, move, match) if linear and match else None
             self.scan.move(line.start(), pose, frame, tool, cut)
 
     def _pose(self, name: str) -> Pose | str:
-        found = self.positions[name]
-        values = _VALUES.match(self.text, found.start("body"))
-        if values is None or "GP2" in found["body"]:
+        match = self.positions[name]
+        values = _VALUES.match(self.text, match.start("body"))
+        if values is None or "GP2" in match["body"]:
             return f"the values of P[{name}] are not understood"
-        six = torch.tensor([float(found[2]) for found in _VALUE.finditer(values["six"])], dtype=torch.float64)
+        six = torch.tensor([float(match[2]) for match in _VALUE.finditer(values["six"])], dtype=torch.float64)
         x, y, z, w, p, r = torch.cat([six[:3] / 1e3, torch.deg2rad(six[3:])])
         T = transform_from_xyzrpy(torch.stack([x, y, z, r, p, w]))
         return Pose(values.span("six"), T, partial(_written, values["six"]))
 
     def _way_points(
-        self, line: re.Match[str], move: re.Match[str], found: re.Match[str], poses: Sequence[Frame]
+        self, line: re.Match[str], move: re.Match[str], match: re.Match[str], poses: Sequence[Frame]
     ) -> list[Edit]:
         """Lines and positions of way points, with the speed of the move and continuous termination."""
         speed = re.match(r"\s*(\S+)", move["rest"])
         lines, positions = [], []
-        span = _VALUES.match(self.text, found.start("body"))
+        span = _VALUES.match(self.text, match.start("body"))
         assert span is not None
         for T in poses:
             name = next(self.numbers)
             lines.append(f"   1:L P[{name}] {speed[1] if speed else ''} CNT100 ;{self.scan.line_end}")
-            head = re.sub(r"^P\[[^\]]*\]", f"P[{name}]", self.text[found.start() : span.start("six")])
-            positions.append(f"{head}{_written(span['six'], T)}{self.text[span.end('six') : found.end()]}")
+            head = re.sub(r"^P\[[^\]]*\]", f"P[{name}]", self.text[match.start() : span.start("six")])
+            positions.append(f"{head}{_written(span['six'], T)}{self.text[span.end('six') : match.end()]}")
         end = self.text.rindex("/END")
         return [Edit((line.start(),) * 2, "".join(lines)), Edit((end, end), "".join(positions))]
 
@@ -129,7 +129,7 @@ def _written(text: str, T: Frame) -> str:
     """The values of a position with those of another pose."""
     x, y, z, r, p, w = millimetres_and_euler(T).tolist()
     values = iter([x, y, z, w, p, r])
-    return _VALUE.sub(lambda found: found[1] + number(next(values), DIGITS), text)
+    return _VALUE.sub(lambda match: match[1] + number(next(values), DIGITS), text)
 
 
 def _numbered(text: str) -> str:

@@ -71,25 +71,25 @@ class _Reader:
 
     def read(self) -> ScannedProgram:
         self.state = {name: f"${name} is not stated before the move" for name in ("BASE", "TOOL")}
-        for found in _ASSIGNMENT.finditer(self.text):
-            literal = _AGGREGATE.match(self.text, found.end())
-            if literal and self.names.is_set_once(found[1]):
-                self.names.add(found[1], _pose(literal))
+        for match in _ASSIGNMENT.finditer(self.text):
+            literal = _AGGREGATE.match(self.text, match.end())
+            if literal and self.names.is_set_once(match[1]):
+                self.names.add(match[1], _pose(literal))
         depth = 0
-        for found in _STATEMENT.finditer(self.text):
-            if word := found["flow"]:
+        for match in _STATEMENT.finditer(self.text):
+            if word := match["flow"]:
                 self.scan.interrupt()
                 depth += bool(_OPENS.fullmatch(word)) - bool(_CLOSES.fullmatch(word))
-            elif found["move"]:
-                self._move(found)
+            elif match["move"]:
+                self._move(match)
             else:
-                self._set_frame(found, computed=depth > 1)
+                self._set_frame(match, computed=depth > 1)
         return self.scan.program(self.names)
 
-    def _set_frame(self, found: re.Match[str], computed: bool) -> None:
-        name = (found["system"] or found["bas"]).upper()
+    def _set_frame(self, match: re.Match[str], computed: bool) -> None:
+        name = (match["system"] or match["bas"]).upper()
         look_up = self.stated.frame if name == "BASE" else self.stated.tool
-        value = f"{name}_DATA[{found['number']}]" if found["bas"] else found["value"]
+        value = f"{name}_DATA[{match['number']}]" if match["bas"] else match["value"]
         if computed:
             self.state[name] = f"${name} depends on which way the program takes"
         elif literal := _AGGREGATE.fullmatch(value):
@@ -97,17 +97,17 @@ class _Reader:
         else:
             self.state[name] = IDENTITY if value.upper() == "$NULLFRAME" else look_up(value)
 
-    def _move(self, found: re.Match[str]) -> None:
-        start, kind = found.start("target"), found["move"].upper()
-        for begin, _ in [*arguments(found["target"] + ";", 0)][: 2 if kind == "CIRC" else 1]:
+    def _move(self, match: re.Match[str]) -> None:
+        start, kind = match.start("target"), match["move"].upper()
+        for begin, _ in [*arguments(match["target"] + ";", 0)][: 2 if kind == "CIRC" else 1]:
             if _AXES.match(self.text, start + begin):
-                self.scan.joints(found.start())
+                self.scan.joints(match.start())
                 continue
-            pose = self._target(start + begin) if not found["relative"] else COMPUTED
+            pose = self._target(start + begin) if not match["relative"] else COMPUTED
             cut = None
             if kind == "LIN" and isinstance(pose, Pose):
-                cut = partial(self._way_points, found, start + begin)
-            self.scan.move(found.start(), pose, self.state["BASE"], self.state["TOOL"], cut)
+                cut = partial(self._way_points, match, start + begin)
+            self.scan.move(match.start(), pose, self.state["BASE"], self.state["TOOL"], cut)
 
     def _target(self, start: int) -> Pose | str:
         if literal := _AGGREGATE.match(self.text, start):

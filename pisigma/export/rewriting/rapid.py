@@ -32,11 +32,11 @@ def _list(count: int) -> str:
     return rf"\[\s*{NUMBER}(?:\s*,\s*{NUMBER}){{{count - 1}}}\s*\]"
 
 
-_PLACE = rf"{_list(3)}\s*,\s*{_list(4)}"
-_TARGET = re.compile(rf"\[\s*({_PLACE})\s*,\s*{_list(4)}\s*,\s*{_list(6)}\s*\]")
-_TOOL = re.compile(rf"\[\s*TRUE\s*,\s*\[\s*({_PLACE})\s*\]", re.IGNORECASE)
+_PLACEMENT = rf"{_list(3)}\s*,\s*{_list(4)}"
+_TARGET = re.compile(rf"\[\s*({_PLACEMENT})\s*,\s*{_list(4)}\s*,\s*{_list(6)}\s*\]")
+_TOOL = re.compile(rf"\[\s*TRUE\s*,\s*\[\s*({_PLACEMENT})\s*\]", re.IGNORECASE)
 _WOBJ = re.compile(
-    rf"\[\s*FALSE\s*,\s*TRUE\s*,\s*(?:\"\")?\s*,\s*\[\s*({_PLACE})\s*\]\s*,\s*\[\s*({_PLACE})\s*\]",
+    rf"\[\s*FALSE\s*,\s*TRUE\s*,\s*(?:\"\")?\s*,\s*\[\s*({_PLACEMENT})\s*\]\s*,\s*\[\s*({_PLACEMENT})\s*\]",
     re.IGNORECASE,
 )
 _DATA = re.compile(
@@ -78,32 +78,32 @@ class _Reader:
 
     def read(self) -> ScannedProgram:
         self.frames = {"TOOL0": IDENTITY, "WOBJ0": IDENTITY}
-        for found in _DATA.finditer(self.text):
-            kind, name = found[1].lower(), found[2].upper()
+        for match in _DATA.finditer(self.text):
+            kind, name = match[1].lower(), match[2].upper()
             form = {"robtarget": _TARGET, "tooldata": _TOOL, "wobjdata": _WOBJ}[kind]
-            literal = form.match(self.scan.text, found.end())  # where strings are not hidden
+            literal = form.match(self.scan.text, match.end())  # where strings are not hidden
             if literal and self.names.is_set_once(name):
                 if kind == "robtarget":
                     self.names.add(name, _pose(literal))
                 else:
                     self.frames[name] = _product(literal)
-        for found in _STATEMENT.finditer(self.text):
-            if found["flow"]:
+        for match in _STATEMENT.finditer(self.text):
+            if match["flow"]:
                 self.scan.interrupt()
-            elif found["move"].upper() == "MOVEABSJ":
-                self.scan.joints(found.start())
+            elif match["move"].upper() == "MOVEABSJ":
+                self.scan.joints(match.start())
             else:
-                self._move(found)
+                self._move(match)
         return self.scan.program(self.names)
 
-    def _move(self, found: re.Match[str]) -> None:
+    def _move(self, match: re.Match[str]) -> None:
         spans = [
-            span for span in arguments(self.text, found.end()) if not self.text[slice(*span)].startswith("\\")
+            span for span in arguments(self.text, match.end()) if not self.text[slice(*span)].startswith("\\")
         ]
-        kind = re.match(r"Move([JLC])", found["move"], re.IGNORECASE)
+        kind = re.match(r"Move([JLC])", match["move"], re.IGNORECASE)
         count = 2 if kind and kind[1].upper() == "C" else 1
         if kind is None or len(spans) < count + 3:
-            self.scan.move(found.start(), "the move is of a kind that is not understood", IDENTITY, IDENTITY)
+            self.scan.move(match.start(), "the move is of a kind that is not understood", IDENTITY, IDENTITY)
             return
         frame, tool = self._frames(self.text[slice(*spans[count + 2])])
         timed = re.search(r"(?i)\\T\s*:=", self.text[slice(*spans[count])])
@@ -112,10 +112,10 @@ class _Reader:
             cut = None
             if kind[1].upper() == "L" and isinstance(pose, Pose):
                 if timed:
-                    self.scan.leave(found.start(), "the move has a time, so no way points are put in")
+                    self.scan.leave(match.start(), "the move has a time, so no way points are put in")
                 else:
-                    cut = partial(self._way_points, found, spans, pose)
-            self.scan.move(found.start(), pose, frame, tool, cut)
+                    cut = partial(self._way_points, match, spans, pose)
+            self.scan.move(match.start(), pose, frame, tool, cut)
 
     def _target(self, expression: str, span: tuple[int, int]) -> Pose | str:
         if literal := _TARGET.match(self.text, span[0]):
@@ -164,8 +164,8 @@ def _pose(literal: re.Match[str]) -> Pose:
 def _product(literal: re.Match[str]) -> Frame:
     """The frames of tooldata or wobjdata, one in the other."""
     T = IDENTITY
-    for place in literal.groups():
-        T = T @ _frame(place)
+    for frame in literal.groups():
+        T = T @ _frame(frame)
     return T
 
 

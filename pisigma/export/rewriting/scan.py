@@ -108,7 +108,7 @@ class NamedPoses:
         """
         self._fold = fold
         self._words = Counter(fold(word) for word in re.findall(r"\w+", text))
-        self._set = Counter(fold(found[1]) for found in assignment.finditer(text))
+        self._set = Counter(fold(match[1]) for match in assignment.finditer(text))
         self._uses: Counter[str] = Counter()
         self._poses: dict[str, Pose] = {}
 
@@ -138,7 +138,7 @@ class Scan:
         """Begin with the text of a program."""
         self.text = text
         self.line_end = "\r\n" if "\r\n" in text else "\n"
-        self._breaks = [found.start() for found in re.finditer("\n", text)]
+        self._breaks = [match.start() for match in re.finditer("\n", text)]
         self._targets: dict[tuple[int, int], Target] = {}
         self._unclear: set[tuple[int, int]] = set()
         self._moves: list[LinearMove] = []
@@ -235,7 +235,7 @@ class Scan:
 
 def masked(text: str, hidden: re.Pattern[str]) -> str:
     """The text with blanks in place of comments and strings, so that every place stays where it is."""
-    return hidden.sub(lambda found: re.sub(r"[^\n]", " ", found[0]), text)
+    return hidden.sub(lambda match: re.sub(r"[^\n]", " ", match[0]), text)
 
 
 def arguments(text: str, start: int) -> Iterator[tuple[int, int]]:

@@ -61,22 +61,22 @@ class _Reader:
 
     def read(self) -> ScannedProgram:
         self.tool, depth = self.stated.tool("tcp"), 0
-        for found in _ASSIGNMENT.finditer(self.text):
-            literal = _LITERAL.match(self.text, found.end())
-            if literal and self.names.is_set_once(found[1]):
-                self.names.add(found[1], _pose(self.text, literal.span()))
-        for found in _STATEMENT.finditer(self.text):
-            if found["flow"]:
+        for match in _ASSIGNMENT.finditer(self.text):
+            literal = _LITERAL.match(self.text, match.end())
+            if literal and self.names.is_set_once(match[1]):
+                self.names.add(match[1], _pose(self.text, literal.span()))
+        for match in _STATEMENT.finditer(self.text):
+            if match["flow"]:
                 self.scan.interrupt()
-                opens = found["flow"].strip() in ("def", "thread", "while", "if", "for")
-                depth += 1 if opens else -1 if found["flow"].strip() == "end" else 0
-            elif found["name"] == "set_tcp":
-                literal = _LITERAL.match(self.text, found.end())
+                opens = match["flow"].strip() in ("def", "thread", "while", "if", "for")
+                depth += 1 if opens else -1 if match["flow"].strip() == "end" else 0
+            elif match["name"] == "set_tcp":
+                literal = _LITERAL.match(self.text, match.end())
                 self.tool = (
                     _pose(self.text, literal.span()).T if literal and depth < 2 else "the tool is computed"
                 )
             else:
-                self._move(found)
+                self._move(match)
         return self.scan.program(self.names)
 
     def _move(self, call: re.Match[str]) -> None:
