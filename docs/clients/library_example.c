@@ -31,8 +31,8 @@ int main(int count, char **words) {
         printf("%d", status);
         for (int j = 0; j < joints; j++) printf(" %.17g", solution.q[j]);
         printf(" %.17g %.17g", solution.position_residual, solution.rotation_residual);
-        int known = pisigma_forward(model, solution.q, NULL, reached) == 0;
-        for (int i = 0; known && i < 16; i++) printf(" %.17g", reached[i]);
+        int moves = pisigma_forward(model, solution.q, NULL, reached) == 0;
+        for (int i = 0; moves && i < 16; i++) printf(" %.17g", reached[i]);
         printf("\n");
     }
     pisigma_free(model);

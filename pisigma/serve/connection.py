@@ -111,6 +111,8 @@ class Connection:
                 del self._received[:length]
                 answered = True
                 self._answer(message)
+            if self._token is not None and len(self._received) >= CHUNK:
+                raise BrokenStreamError(self._protocol.admission(False))
         except BrokenStreamError as problem:
             self._received.clear()
             self._ending = True

@@ -6,6 +6,7 @@ import gc
 import ipaddress
 import selectors
 import socket
+import sys
 import time
 from collections import deque
 from collections.abc import Callable
@@ -24,6 +25,8 @@ from pisigma.serve.zeromq import ZeroMq
 MOST_CONNECTIONS = 512
 PATIENCE = 10.0
 """[s] A client may take for the rest of a message, for its token, or to take an answer; then it is cut off."""
+SWITCHING = 1e-4
+"""[s] A thread that works out a path holds the interpreter at most, while quick answers wait for it."""
 LAST = 5.0
 """[s] What was begun may take when the server stops."""
 
@@ -98,6 +101,8 @@ class Server:
         """Answer until `stop`, then finish what was begun."""
         gc.collect()
         gc.freeze()  # what is loaded is never looked through again, which would take milliseconds
+        switching = sys.getswitchinterval()
+        sys.setswitchinterval(SWITCHING)
         swept, interval = time.monotonic(), self._settings.patience / 10
         while not self._stopping:
             self._turn(interval)
@@ -105,6 +110,8 @@ class Server:
                 swept = time.monotonic()
                 self._sweep(swept)
         self._finish()
+        sys.setswitchinterval(switching)
+        gc.unfreeze()
 
     def stop(self) -> None:
         """Have `run` end; from any thread, or a signal's handler."""
@@ -149,6 +156,8 @@ class Server:
             stream, _ = listener.accept()
         except OSError:
             return
+        if len(self._connections) >= MOST_CONNECTIONS:
+            self._sweep(time.monotonic())  # some of them may be closed
         if len(self._connections) >= MOST_CONNECTIONS:
             stream.close()
             self.metrics.cut_off += 1
@@ -215,7 +224,6 @@ class Server:
         self._selector.close()
         self._wake.close()
         self._woken.close()
-        gc.unfreeze()
 
 
 def check_host(settings: ServeSettings) -> None:

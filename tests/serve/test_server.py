@@ -53,6 +53,10 @@ def test_nothing_is_answered_before_the_token(kiro4):
                 client.ask(pose=POSE)
         with pytest.raises(ConnectionError, match="not the right one"), frame_client(server, token="wrong"):
             pass
+        with socket.create_connection(("127.0.0.1", server.json_port), 5) as stranger:
+            stranger.sendall(b"x" * 4096)  # and no more is kept of somebody who has no token
+            assert b"the token is missing" in stranger.recv(1000)
+            assert stranger.recv(1000) == b""
 
 
 def test_slow_clients_are_cut_off_and_the_others_served(kiro4):
