@@ -1,6 +1,6 @@
 """Numeric inverse kinematics from a given start, for any robot: damped Newton, batched."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -19,6 +19,8 @@ from pisigma.kinematics.singularity import (
     smallest_singular_value,
 )
 from pisigma.kinematics.status import Status
+from pisigma.kinematics.task_axes import WHOLE, TaskAxes
+from pisigma.kinematics.task_error import task_error
 from pisigma.robot.description import Robot
 from pisigma.se3 import check_transforms, pose_error
 
@@ -84,6 +86,8 @@ def solve_numeric(
     tolerance: float | None = None,
     max_iterations: int = tolerances.ITERATIONS,
     motion: Motion | None = None,
+    axes: TaskAxes = WHOLE,
+    weights: Sequence[float] | None = None,
 ) -> NumericSolution:
     """Joint values near a start that take the tool to the poses.
 
@@ -101,6 +105,8 @@ def solve_numeric(
         max_iterations: when to give up.
         motion: where the tool of an arm with joint corrections is and how it moves; its Jacobian need not be
             exact. None: that of the robot.
+        axes: which axes of the tool count.
+        weights: of these axes in least squares, 0 for one that does not count; None for `axes.weights`.
 
     Returns:
         The solution nearest in the sense of the iteration. Where no solution was found the status is
@@ -116,16 +122,17 @@ def solve_numeric(
     batch = np.broadcast_shapes(T.shape[:-2], start.shape[:-1])
     T_flat = T.detach().expand(*batch, 4, 4).reshape(-1, 4, 4)
     with torch.no_grad():
-        moving: Motion = motion or partial(joint_jacobian, robot)
-        state = _begin(moving, T_flat, start.detach().expand(*batch, robot.dof).reshape(-1, robot.dof))
+        counted = T_flat.new_tensor(weights or axes.weights(robot.dof))
+        task = TaskMotion(motion or partial(joint_jacobian, robot), axes, counted)
+        state = _begin(task, T_flat, start.detach().expand(*batch, robot.dof).reshape(-1, robot.dof))
         active = (~state.converged(tolerance)).nonzero()[:, 0]
         for _ in range(max_iterations):
             if active.numel() == 0:
                 break
-            _iterate(robot, moving, T_flat, state, active)
+            _iterate(robot, task, T_flat, state, active)
             stalled = state.damping[active] > tolerances.MOST_DAMPING
             active = active[~(state.converged(tolerance)[active] | stalled)]
-        return _finish(robot, state, tolerance, batch)
+        return _finish(robot, state, tolerance, batch, task.rows)
 
 
 def _check_start(robot: Robot, T: Tensor, start: Tensor) -> None:
@@ -147,26 +154,53 @@ def _check_start(robot: Robot, T: Tensor, start: Tensor) -> None:
         )
 
 
-def _begin(motion: Motion, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]) -> _Iterate:
-    T_now, J = motion(q)
+@dataclass(frozen=True, eq=False)
+class TaskMotion:
+    """The pose errors of an arm in the axes that count, by their weights.
+
+    Attributes:
+        motion: where the tool is and how it moves.
+        axes: which axes of the tool count.
+        weights: of them in least squares.
+    """
+
+    motion: Motion
+    axes: TaskAxes
+    weights: Float[Tensor, " 6"]
+
+    @property
+    def rows(self) -> int:
+        """How many axes count."""
+        return int(self.weights.count_nonzero())
+
+    def errors(
+        self, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]
+    ) -> tuple[Float[Tensor, "poses 6"], Float[Tensor, "poses 6 dof"]]:
+        """Error from the wanted poses at joint values, and its Jacobian."""
+        reached, J = self.motion(q)
+        if self.axes.whole:
+            return pose_error(T, reached), J.clone()
+        error, turn = task_error(self.axes, T, reached)
+        return self.weights * error, self.weights[:, None] * (turn @ J)
+
+
+def _begin(task: TaskMotion, T: Float[Tensor, "poses 4 4"], q: Float[Tensor, "poses dof"]) -> _Iterate:
+    error, J = task.errors(T, q)
     damping = torch.full_like(q[:, 0], tolerances.FIRST_DAMPING)
-    return _Iterate(
-        q.clone(), pose_error(T, T_now), J.clone(), damping, torch.ones_like(damping, dtype=torch.int64)
-    )
+    return _Iterate(q.clone(), error, J, damping, torch.ones_like(damping, dtype=torch.int64))
 
 
 def _iterate(
     robot: Robot,
-    motion: Motion,
+    task: TaskMotion,
     T: Float[Tensor, "poses 4 4"],
     state: _Iterate,
     active: Int64[Tensor, " active"],
 ) -> None:
     """Try one step for the active poses and keep those that bring the tool nearer."""
     old = _scaled(robot, state.error[active])
-    trial = state.q[active] + damped_step(robot, state.J[active], old, state.damping[active])
-    T_trial, J = motion(trial)
-    error = pose_error(T[active], T_trial)
+    trial = state.q[active] + damped_step(robot, state.J[active], old, state.damping[active], task.rows)
+    error, J = task.errors(T[active], trial)
     better = _scaled(robot, error).square().sum(-1) < old.square().sum(-1)
     state.iterations[active] += 1
     factor = torch.where(better, tolerances.DAMPING_DOWN, tolerances.DAMPING_UP).to(state.damping)
@@ -184,6 +218,7 @@ def damped_step(
     J: Float[Tensor, "poses 6 dof"],
     scaled_error: Float[Tensor, "poses 6"],
     damping: Float[Tensor, " poses"],
+    rows: int = 6,
 ) -> Float[Tensor, "poses dof"]:
     """The damped least-squares step [rad or m], from the smaller of the two forms of the normal equations.
 
@@ -192,15 +227,16 @@ def damped_step(
         J: joint Jacobian.
         scaled_error: pose error with translation in characteristic lengths.
         damping: factor of the squared error in the damping; rounding sets a floor under the product.
+        rows: how many rows of the Jacobian count; the others are 0.
     """
     A = dimensionless_jacobian(robot, J).contiguous()
-    small = A.mT @ A if robot.dof < 6 else A @ A.mT
+    small = A.mT @ A if robot.dof < rows else A @ A.mT
     floor = 4 * torch.finfo(A.dtype).eps * small.diagonal(dim1=-2, dim2=-1).sum(-1)
     weight = damping * scaled_error.square().sum(-1) + floor
     small = small + weight[:, None, None] * torch.eye(small.shape[-1], dtype=A.dtype, device=A.device)
     error = scaled_error[..., None]
     factor, _ = torch.linalg.cholesky_ex(small)
-    if robot.dof < 6:
+    if robot.dof < rows:
         step = torch.cholesky_solve(A.mT @ error, factor)[..., 0]
     else:
         step = (A.mT @ torch.cholesky_solve(error, factor))[..., 0]
@@ -208,10 +244,12 @@ def damped_step(
     return step * step.new_tensor(lengths)
 
 
-def _finish(robot: Robot, state: _Iterate, tolerance: float, batch: tuple[int, ...]) -> NumericSolution:
+def _finish(
+    robot: Robot, state: _Iterate, tolerance: float, batch: tuple[int, ...], rows: int
+) -> NumericSolution:
     q, inside = wrap_into_limits(robot, state.q)
     singular_tolerance = tolerances.SINGULAR_TOLERANCE if q.dtype == torch.float64 else 3e-3
-    singular = smallest_singular_value(robot, state.J) < singular_tolerance
+    singular = smallest_singular_value(robot, state.J, rows) < singular_tolerance
     status = torch.where(singular, int(Status.SINGULAR), int(Status.REACHED))
     status = torch.where(inside, status, int(Status.OUTSIDE_JOINT_LIMITS))
     converged = state.converged(tolerance)

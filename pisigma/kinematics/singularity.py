@@ -41,7 +41,9 @@ def singularity_measure(robot: Robot, q: Float[Tensor, "*batch dof"]) -> Float[T
     return smallest_singular_value(robot, J)
 
 
-def smallest_singular_value(robot: Robot, J: Float[Tensor, "*batch 6 dof"]) -> Float[Tensor, "*batch"]:
-    """What `singularity_measure` gives, from a joint Jacobian that is there already."""
+def smallest_singular_value(
+    robot: Robot, J: Float[Tensor, "*batch 6 dof"], rows: int = 6
+) -> Float[Tensor, "*batch"]:
+    """What `singularity_measure` gives, from a joint Jacobian that is there already; all but so many rows are 0."""
     values: Tensor = torch.linalg.svdvals(dimensionless_jacobian(robot, J).contiguous())
-    return values[..., -1]
+    return values[..., min(rows, robot.dof) - 1]

@@ -6,6 +6,7 @@ from torch import Tensor
 
 from pisigma.kinematics.closed_form import AbstractClosedForm
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.task_axes import WHOLE, TaskAxes
 from pisigma.robot.description import Robot
 
 MAXIMUM_STARTS = 512
@@ -33,16 +34,20 @@ class StoredStarts:
         self.lever = robot.reach / 2 / 2**0.5
         self.points = self.as_points(self.T)
 
-    def nearest(self, T: Float64[Tensor, "poses 4 4"], count: int) -> Int64[Tensor, "poses _nearest"]:
+    def nearest(
+        self, T: Float64[Tensor, "poses 4 4"], count: int, axes: TaskAxes = WHOLE
+    ) -> Int64[Tensor, "poses _nearest"]:
         """For every pose the indices of the starts whose poses are nearest, nearest first.
 
         Args:
             T: wanted poses.
             count: how many are wanted; fewer where there are fewer starts.
+            axes: which axes of the tool count.
         """
+        counted = torch.tensor([True] * 3 + 3 * list(axes.directions))
         count = min(count, len(self.q))
-        chunks = torch.split(self.as_points(T), _CHUNK)
-        nearest = [torch.cdist(chunk, self.points).topk(count, largest=False).indices for chunk in chunks]
+        chunks, points = torch.split(self.as_points(T)[:, counted], _CHUNK), self.points[:, counted]
+        nearest = [torch.cdist(chunk, points).topk(count, largest=False).indices for chunk in chunks]
         return torch.cat(nearest)
 
     def as_points(self, T: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses 12"]:
