@@ -1,6 +1,7 @@
 """How many reachable poses the corrected inverse kinematics reaches, and how exactly, by both routes.
 
-Run `OMP_NUM_THREADS=1 python benchmarks/inverse_reach.py`. Poses are those of random joint values, inside the joint
+Run `OMP_NUM_THREADS=1 python benchmarks/inverse_reach.py`, and with `--tasks` for tasks in which not all axes of the
+tool count and for arms with fewer or more joints than six. Poses are those of random joint values, inside the joint
 limits and where the model says that its correction holds. kiro3 and kiro4 are the trained models of this repository,
 which correct nominal joint values; the others are catalogue robots with the errors and the correction of
 `inverse_speed.py`, and a UR5 as a URDF file whose right angles are rounded to 1.5708. Residuals are those of the
@@ -8,7 +9,9 @@ calibrated model.
 """
 
 import argparse
+import math
 import tempfile
+import time
 from pathlib import Path
 
 import numpy as np
@@ -17,10 +20,15 @@ from inverse_speed import draw_joints, make_model
 
 from pisigma.errors import ModelError
 from pisigma.inverse.compiled_ik import CompiledIK
+from pisigma.inverse.identified_arm import search
 from pisigma.inverse.reference import ReferenceIK
+from pisigma.kernels.array_kinematics import transform_of
 from pisigma.kinematics.status import Status
+from pisigma.kinematics.task_axes import task_axes
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
+from pisigma.robot import Robot
+from pisigma.robot.row import Row
 
 MODELS = Path(__file__).parents[1] / "models"
 NEAR = 0.3
@@ -94,6 +102,85 @@ def figures(status: np.ndarray, position: np.ndarray, rotation: np.ndarray) -> s
     )
 
 
+FIVE = Robot(
+    "five",
+    "",
+    "made up: three parallel axes and a wrist of two",
+    tuple(
+        Row(f"theta_{i}", "revolute", lower=-half, upper=half)
+        for i, half in enumerate((2.9, 1.5, 2.6, 2.1, 3.1), 1)
+    ),
+    np.array(
+        [
+            (0, 0.4, 0.1, math.pi / 2, 0),
+            (0, 0, 0.45, 0, 0),
+            (0, 0, 0.4, 0, 0),
+            (math.pi / 2, 0, 0, math.pi / 2, 0),
+            (0, 0.15, 0, 0, 0),
+        ]
+    ),
+)
+
+
+def on_rail(name: str) -> Robot:
+    """A robot of the catalogue on a rail of 3 m."""
+    arm = Robot.load(name)
+    rows = (Row("rail", "prismatic", lower=0.0, upper=3.0), Row("upright", "fixed"), *arm.rows)
+    dh = np.array([(0, 0, 0, -math.pi / 2, 0), (0, 0, 0, math.pi / 2, 0), *arm.dh.tolist()])
+    return Robot("rail", arm.maker, arm.source, rows, dh)
+
+
+TASKS: tuple[tuple[str, Robot | str, tuple[str, ...] | None], ...] = (
+    ("SCARA, rounded to 1e-7 m", "kiro3", None),
+    ("five axes", FIVE, None),
+    ("torch on six", "ur10", ("yaw",)),
+    ("rail + six", on_rail("ur10"), None),
+    ("seven axes", "panda", None),
+)
+"""What the task is, the robot, and the axes of the tool that do not count; None for the default."""
+
+
+def report_tasks(rows: int) -> None:
+    """Print how many poses are reached in the axes that count, and how long one takes on one thread."""
+    for label, robot, ignored in TASKS:
+        rng = np.random.default_rng(0)
+        model = make_model(robot, 24, rng)
+        kernels = CompiledIK.of(model)
+        T = kernels.forward(draw_joints(model.robot, rows, rng).numpy())[0]
+        axes = task_axes(kernels.axes, ignored)
+        if "yaw" in axes.ignored:
+            angles = rng.uniform(-math.pi, math.pi, rows)
+            T = T @ np.stack([transform_of((0, 0, 0, angle, 0, 0)) for angle in angles])
+        if "SCARA" in label:
+            T = T.round(7)
+        kernels.solve_batch(T[:10], axes=axes)
+        start = time.perf_counter()
+        found = kernels.solve_batch(T, axes=axes, threads=1)
+        took = (time.perf_counter() - start) / rows * 1e6
+        line = figures(found.status, found.position_residual, found.rotation_residual)
+        print(f"{label:24s} {rows} poses, {line}, {took:.0f} us a pose", flush=True)
+
+
+def report_branches(rows: int, starts: int = 40) -> None:
+    """Print how many solutions of a calibrated UR10 that a search from random starts gives are among its branches."""
+    rng = np.random.default_rng(0)
+    model = make_model("ur10", 24, rng)
+    kernels = CompiledIK.of(model)
+    T = kernels.forward(draw_joints(model.robot, rows, rng).numpy())[0]
+    start = time.perf_counter()
+    every = kernels.all_branches(T, threads=1)
+    took = (time.perf_counter() - start) / rows * 1e6
+    begun = draw_joints(model.robot, rows * starts, rng).reshape(rows * starts, 1, 6)
+    q, _ = search(model.identified, torch.from_numpy(np.repeat(T, starts, 0)), begun, model.hybrid)
+    off = np.sin((q.numpy().reshape(rows, starts, 1, 6) - every.q[:, None]) / 2)
+    missed = np.nan_to_num(np.abs(off).max(-1), nan=1.0).min(-1) > 1e-4
+    searched = np.isfinite(q.numpy()).all(-1).reshape(rows, starts)
+    print(
+        f"all branches of a UR10: {100 * (1 - (missed & searched).sum() / searched.sum()):.2f} % of {searched.sum()} "
+        f"solutions found by search are among them, {took:.0f} us a pose"
+    )
+
+
 def main() -> None:
     """Print the figures of all robots, or of those named."""
     parser = argparse.ArgumentParser()
@@ -101,7 +188,12 @@ def main() -> None:
         "robots", nargs="*", default=["kiro3", "kiro4", "rb5", "panda", "ur5", "ur10", "urdf"]
     )
     parser.add_argument("--poses", type=int, default=10_000)
+    parser.add_argument("--tasks", action="store_true", help="tasks with fewer freedoms, 1,000 poses each")
     options = parser.parse_args()
+    if options.tasks:
+        report_tasks(1_000)
+        report_branches(200)
+        return
     with tempfile.TemporaryDirectory() as folder:
         for name in options.robots:
             if (MODELS / name).is_dir():

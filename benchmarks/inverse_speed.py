@@ -62,9 +62,9 @@ def draw_between(starts: torch.Tensor, rows: int, rng: np.random.Generator) -> t
     return first + torch.from_numpy(rng.uniform(size=first.shape)) * (second - first)
 
 
-def make_model(name: str, harmonics: int, rng: np.random.Generator) -> CalibratedModel:
-    """A calibrated arm with a correction of about 1 mrad."""
-    robot = Robot.load(name).with_geometry(base=BASE, tool=TOOL)
+def make_model(name: str | Robot, harmonics: int, rng: np.random.Generator) -> CalibratedModel:
+    """A calibrated arm with a correction of about 1 mrad; of the catalogue, a file, or another."""
+    robot = (Robot.load(name) if isinstance(name, str) else name).with_geometry(base=BASE, tool=TOOL)
     geometric = robot.with_geometry(dh=robot.dh + ERRORS * rng.normal(size=robot.dh.shape))
     features = [FourierSeries(robot, harmonics), GravityTorques(robot)]
     correction = JointCorrection(robot, features, (2, 2))
@@ -74,7 +74,9 @@ def make_model(name: str, harmonics: int, rng: np.random.Generator) -> Calibrate
         correction.weight.copy_(0.01 * torch.from_numpy(rng.normal(size=correction.weight.shape)))
     starts = draw_joints(robot, 400, rng)
     arm = HybridArm(geometric, correction.requires_grad_(False), JointCoverage.of(robot, starts))
-    return CalibratedModel(name, "benchmark", robot, None, None, (), starts, calibrated=geometric, hybrid=arm)
+    return CalibratedModel(
+        robot.name, "benchmark", robot, None, None, (), starts, calibrated=geometric, hybrid=arm
+    )
 
 
 def time_scipy(kernels: object, T: np.ndarray, q: np.ndarray) -> float:

@@ -45,6 +45,22 @@ def ik(
             help="The rows of --poses are a path: stay on one branch as long as possible and say where that ends.",
         ),
     ] = False,
+    ignore_axes: Annotated[
+        str | None,
+        typer.Option(
+            help="Axes of the tool that do not count, such as roll,pitch: of x, y, z (along them) and roll, pitch, yaw "
+            "(about the tool's x, y, z); or none. [default: by the number of joints]"
+        ),
+    ] = None,
+    tolerance_mm: Annotated[
+        str | None, typer.Option(help="How far the tool may be off along its axes [mm]: one number or three.")
+    ] = None,
+    tolerance_deg: Annotated[
+        str | None, typer.Option(help="How far it may be off about its axes [deg]: one number or three.")
+    ] = None,
+    elbow_deg: Annotated[
+        float | None, typer.Option(help="Elbow angle of an arm with seven joints [deg].")
+    ] = None,
     payload_kg: PayloadKg = None,
     temperature_c: TemperatureC = None,
     as_json: AsJson = False,
@@ -67,22 +83,47 @@ def ik(
     stated = {"payload_kg": payload_kg, "temperature_c": temperature_c}
     if conditions := {name: value for name, value in stated.items() if value is not None}:
         solver = solver.under(**conditions)
+    solver = solver.for_task(
+        None if ignore_axes is None else [name for name in _words(ignore_axes) if name != "none"],
+        _numbers("--tolerance-mm", tolerance_mm),
+        _numbers("--tolerance-deg", tolerance_deg),
+        None if elbow_deg is None else math.radians(elbow_deg),
+    )
     if poses is not None and out is not None:
         _write_file(solver, poses, out, branch, accuracy, path, as_json)
     elif pose is not None:
         _print_pose(solver, pose, branch, all_branches, as_json)
 
 
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",") if word.strip()]
+
+
+def _numbers(option: str, text: str | None) -> list[float] | None:
+    """The numbers of an option, None where it is not given."""
+    try:
+        return None if text is None else [float(word) for word in _words(text)]
+    except ValueError:
+        raise typer.BadParameter(
+            f"'{text}' is no number, nor three with commas", param_hint=f"'{option}'"
+        ) from None
+
+
 def _print_pose(
     solver: "CorrectedIK", pose: Pose, branch: str | None, all_branches: bool, as_json: bool
 ) -> None:
     """Print the solutions of one pose."""
+    import numpy as np
+
     from pisigma.cli.ik.solutions import failure, print_solutions, solution_records
 
     T, places = _transform(pose), [f"the pose {' '.join(f'{value:g}' for value in pose)}"]
     if all_branches:
         solution = solver.all_branches(T).select(0)
-        places = [f"{places[0]}, branch {name}" for name in solver.branches]
+        if not solver.closed_form:  # a number of solutions, and nothing behind them
+            solution = solution.select(slice(0, max(1, int(np.isfinite(solution.q).all(-1).sum()))))
+        names = (solver.branches[branch] for branch in solution.branch.tolist())
+        places = [f"{places[0]}, branch {name}" for name in names]
     else:
         solution = solver(T, branch=branch)
     if as_json:

@@ -37,6 +37,9 @@ def solution_records(solution: Solution, solver: CorrectedIK) -> list[dict[str, 
                 ]
         record["branch"] = solution.branches[int(solution.branch[row])]
         record["domain_measure"] = _or_none(measures[row])
+        record["position_residual_mm"] = _or_none(float(solution.position_residual[row]) * 1e3)
+        record["rotation_residual_deg"] = _or_none(math.degrees(solution.rotation_residual[row]))
+        record["ignored_axes"] = list(solution.ignored_axes)
         records.append(record)
     return records
 
@@ -52,6 +55,8 @@ def print_solutions(solution: Solution, solver: CorrectedIK) -> None:
         title = f"{status.name.lower()}, branch {solution.branches[int(solution.branch[row])]}"
         print_table(title, ("joint", "corrected", "nominal", "correction", "unit"), lines)
         print_line(status.sentence)
+    if solution.ignored_axes:
+        print_line(f"Axes of the tool that do not count: {', '.join(solution.ignored_axes)}.")
 
 
 def failure(solution: Solution, places: Sequence[str], any_will_do: bool) -> str | None:
