@@ -17,6 +17,7 @@ from pisigma.kernels.description_file import read_description
 from pisigma.kernels.forms import KernelForms
 from pisigma.kernels.layout import make_memory, pack
 from pisigma.kernels.machine_code import address_of, kernel_forms, load_kernels
+from pisigma.kinematics.task_axes import TaskAxes, default_axes
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import pisigma.inverse.corrected_ik
@@ -24,6 +25,11 @@ if TYPE_CHECKING:  # names in full, which type checkers at run time find without
 
 CHUNK = 2_048
 """Poses that a thread takes at a time."""
+
+SOLUTIONS = 8
+"""Different solutions of a pose that are looked for on arms without closed form."""
+
+_WHOLE = TaskAxes().row
 
 _WRONG = {
     arrays.NOT_FINITE: "T_base_tool{} has entries that are not finite numbers; give 16 finite numbers.",
@@ -65,6 +71,7 @@ class CompiledIK:
         branches: names of the branches.
         joints: names of the joints.
         belongs_to: SHA-256 of the model folder that says the same; "" where there is none.
+        axes: which axes of the tool count where no task is stated.
     """
 
     def __init__(
@@ -88,6 +95,8 @@ class CompiledIK:
         self.name = name
         self.belongs_to = belongs_to
         self._none = np.zeros((0, len(self.joints)))
+        whole = description.network.used and not description.forms.closed_forms
+        self.axes = TaskAxes() if whole else default_axes(len(self.joints))
         self._kernels = _kernels(description.forms)
         self._threads = threading.local()
 
@@ -122,6 +131,7 @@ class CompiledIK:
         throw: bool = True,
         approach: Any = None,
         owner: "pisigma.inverse.corrected_ik.CorrectedIK | None" = None,
+        axes: TaskAxes | None = None,
     ) -> Solution:
         """Find corrected joint values for one pose.
 
@@ -136,6 +146,7 @@ class CompiledIK:
                 status is INVALID_POSE.
             approach: `(dof,)`: +1 or -1 for the side from which every joint comes, 0 where that is not stated.
             owner: see `Solution`.
+            axes: which axes of the tool count; None for `axes` of the arm.
 
         Raises:
             PoseError: the matrix is no pose, a shape does not fit, or there is no such branch.
@@ -148,14 +159,19 @@ class CompiledIK:
         dof = len(self.joints)
         beside, sides = self._rows(near, (), "near", throw), self._rows(approach, (), "approach", True)
         out = np.empty((1, 1, 2 * dof + 5))
-        wrong = self._run(arrays.SOLVE, T, 0, 1, beside, sides, self._branch(branch), not throw, out)
+        task = self.axes if axes is None else self.checked_axes(axes)
+        wrong = self._run(
+            arrays.SOLVE, T, 0, 1, beside, sides, self._branch(branch), not throw, out, task.row
+        )
         if wrong >= 0:
             raise PoseError(_WRONG[wrong % 8].format(""))
         row = out[0, 0]
         position, rotation, measure, status, index = row[2 * dof :].tolist()
         q, nominal = row[:dof], row[dof : 2 * dof]
         index, status = int(index), int(status)
-        return Solution(q, nominal, index, self.branches, status, position, rotation, measure, owner)
+        return Solution(
+            q, nominal, index, self.branches, status, position, rotation, measure, owner, task.ignored
+        )
 
     def solve_batch(
         self,
@@ -167,6 +183,7 @@ class CompiledIK:
         approach: Any = None,
         single: bool = False,
         owner: "pisigma.inverse.corrected_ik.CorrectedIK | None" = None,
+        axes: TaskAxes | None = None,
     ) -> Solution:
         """Find corrected joint values for poses `(*batch, 4, 4)`, several threads at a time.
 
@@ -179,15 +196,17 @@ class CompiledIK:
             approach: `(*batch, dof)` or `(dof,)`: see `solve`.
             single: whether the poses were rounded to float32, which widens what counts as rounding.
             owner: see `Solution`.
+            axes: see `solve`.
 
         Raises:
             PoseError: a matrix is no pose (the message gives its index), or see `solve`.
         """
+        task = self.axes if axes is None else self.checked_axes(axes)
         T = self._poses(T_base_tool, throw)
         batch = T.shape[:-2]
         beside, sides = self._rows(near, batch, "near", throw), self._rows(approach, batch, "approach", True)
-        out = self._solve_rows(T, beside, sides, self._branch(branch), 1, threads, throw, single)
-        return self._solution(out.reshape(*batch, out.shape[-1]), owner)
+        out = self._solve_rows(T, beside, sides, self._branch(branch), 1, threads, throw, single, task)
+        return self._solution(out.reshape(*batch, out.shape[-1]), owner, task)
 
     def all_branches(
         self,
@@ -197,13 +216,34 @@ class CompiledIK:
         approach: Any = None,
         single: bool = False,
         owner: "pisigma.inverse.corrected_ik.CorrectedIK | None" = None,
+        axes: TaskAxes | None = None,
     ) -> Solution:
-        """Solutions `(*batch, branches)` of poses `(*batch, 4, 4)` on every branch; for the rest see `solve_batch`."""
+        """Solutions `(*batch, branches)` of poses `(*batch, 4, 4)` on every branch; for the rest see `solve_batch`.
+
+        An arm without closed form gets up to `SOLUTIONS` different ones, as `(*batch, SOLUTIONS)`, UNREACHABLE where
+        there are fewer; with joints to spare each is away from the limits as far as it can be reached without leaving
+        the pose.
+        """
+        task = self.axes if axes is None else self.checked_axes(axes)
         T = self._poses(T_base_tool, throw)
         sides = self._rows(approach, T.shape[:-2], "approach", True)
-        count = len(self.branches)
-        out = self._solve_rows(T, self._none, sides, arrays.EVERY_BRANCH, count, threads, throw, single)
-        return self._solution(out.reshape(*T.shape[:-2], count, out.shape[-1]), owner)
+        several = not self.description.forms.closed_forms and not self.description.network.used
+        count = SOLUTIONS if several else len(self.branches)
+        out = self._solve_rows(T, self._none, sides, arrays.EVERY_BRANCH, count, threads, throw, single, task)
+        return self._solution(out.reshape(*T.shape[:-2], count, out.shape[-1]), owner, task)
+
+    def checked_axes(self, axes: TaskAxes) -> TaskAxes:
+        """Give back which axes of the tool count.
+
+        Raises:
+            PoseError: others are left out than usual, and the model corrects nominal joint values by the whole pose.
+        """
+        if self.description.network.used and axes != self.axes:
+            raise PoseError(
+                f"model '{self.name}' corrects nominal joint values by the whole pose, so that other axes of the tool "
+                f"than the usual ones ({', '.join(self.axes.ignored) or 'none'}) cannot be ignored; calibrate a hybrid."
+            )
+        return axes
 
     def forward(self, q: Any, arm: int | None = None, approach: Any = None) -> tuple[Any, Any, Any, Any]:
         """Where the calibrated arm goes.
@@ -223,17 +263,23 @@ class CompiledIK:
         sides = self._rows(approach, (len(rows),), "approach", True)
         T, out = np.empty((len(rows), 4, 4)), np.empty((len(rows), 7 * dof + 1))
         default = arrays.CORRECTED if self.description.arms.corrected else arrays.IDENTIFIED
-        self._run(arrays.EVALUATE, T, 0, len(rows), rows, sides, default if arm is None else arm, False, out)
+        self._run(
+            arrays.EVALUATE, T, 0, len(rows), rows, sides, default if arm is None else arm, False, out, _WHOLE
+        )
         J = out[:, : 6 * dof].reshape(-1, 6, dof)
         return T, J, out[:, 6 * dof : 7 * dof], out[:, 7 * dof]
 
-    def _solution(self, out: Any, owner: "pisigma.inverse.corrected_ik.CorrectedIK | None") -> Solution:
+    def _solution(
+        self, out: Any, owner: "pisigma.inverse.corrected_ik.CorrectedIK | None", axes: TaskAxes
+    ) -> Solution:
         """The solutions of poses, `(*batch, 2 · dof + 5)`."""
         dof = len(self.joints)
         position, rotation, measure, status, branch = np.moveaxis(out[..., 2 * dof :], -1, 0)
         q, nominal = out[..., :dof], out[..., dof : 2 * dof]
         branch, status = branch.astype(int), status.astype(int)
-        return Solution(q, nominal, branch, self.branches, status, position, rotation, measure, owner)
+        return Solution(
+            q, nominal, branch, self.branches, status, position, rotation, measure, owner, axes.ignored
+        )
 
     def _solve_rows(
         self,
@@ -245,6 +291,7 @@ class CompiledIK:
         threads: int | None,
         throw: bool,
         single: bool,
+        axes: TaskAxes,
     ) -> Any:
         """What the kernels write, `(poses, count, 2 · dof + 5)`."""
         if threads is not None and threads < 1:
@@ -254,7 +301,9 @@ class CompiledIK:
 
         def solve_chunk(start: int) -> int:
             stop = min(start + CHUNK, len(rows))
-            return self._run(arrays.SOLVE, rows, start, stop, near, approach, branch, not throw, out, single)
+            return self._run(
+                arrays.SOLVE, rows, start, stop, near, approach, branch, not throw, out, axes.row, single
+            )
 
         starts = range(0, len(rows), CHUNK)
         workers = min(threads or _processors(), len(starts))
@@ -280,6 +329,7 @@ class CompiledIK:
         branch: int,
         mark: bool,
         out: Any,
+        axes: Any,
         single: bool = False,
     ) -> int:
         """Have the kernels work on the rows from `start` to `stop`; what they say, with the row of the whole."""
@@ -294,6 +344,8 @@ class CompiledIK:
             stop - start,
             address_of(T) + start * 128,
             *pairs,
+            address_of(axes),
+            len(axes),
             branch,
             mark,
             single,

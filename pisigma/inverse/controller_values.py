@@ -1,5 +1,6 @@
 """Corrected inverse kinematics of coupled joints: the controller's values in and out, DH values in between."""
 
+from copy import copy
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -11,6 +12,7 @@ from pisigma.inverse.passive_joints import nearest_starts, solve, solve_from
 from pisigma.inverse.solution import Solution
 from pisigma.kernels.array_kinematics import forward_kinematics, is_tensor, joint_jacobian
 from pisigma.kinematics.status import Status
+from pisigma.kinematics.task_axes import TaskAxes
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import pisigma.inverse.corrected_ik
@@ -29,6 +31,12 @@ class ControllerValues:
     ) -> None:
         """Take the inverse kinematics of DH values, and how these follow the controller's."""
         self.ik, self.coupling = ik, coupling
+
+    def for_axes(self, axes: TaskAxes) -> "ControllerValues":
+        """The same where other axes of the tool count."""
+        ik = copy(self.ik)
+        ik.axes = axes
+        return ControllerValues(ik, self.coupling)
 
     def solve(self, T: Any, near: Any, owner: Any, branch: str | None = None, **options: Any) -> Solution:
         """See `CorrectedIK.__call__`.

@@ -1,7 +1,8 @@
 """Corrected inverse kinematics: joint values that really reach a pose."""
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -13,6 +14,7 @@ from pisigma.errors import ModelError, PoseError
 from pisigma.files.model_files import COMPILED, model_hash, ready_hash
 from pisigma.inverse.joint_input import Postures, as_array, checked_approach, pose_array
 from pisigma.kernels.array_kinematics import by_torch, is_tensor
+from pisigma.kinematics.task_axes import TaskAxes, task_axes
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import pytorch_kinematics
@@ -128,8 +130,15 @@ class CorrectedIK:
         branch: str | None = None,
         throw: bool = True,
         approach: Any = None,
+        ignore_axes: Sequence[str] | None = None,
+        tolerance_mm: float | Sequence[float] | None = None,
+        tolerance_deg: float | Sequence[float] | None = None,
+        elbow_angle: float | None = None,
     ) -> "pisigma.inverse.solution.Solution":
         """Find corrected joint values for poses.
+
+        A robot with more joints than axes of the tool count comes as near to `near` as it can; without `near` it keeps
+        away from joint limits and singularities.
 
         Args:
             T_base_tool: `(*batch, 4, 4)` wanted poses of the tool in the base frame [m].
@@ -142,50 +151,84 @@ class CorrectedIK:
                 robot, raises nothing but gets the status INVALID_POSE and NaN.
             approach: `(*batch, dof)` or `(dof,)`: +1 or -1 for the side from which every joint will come to the pose,
                 which matters to joints with backlash; 0, or None for all, where that is not stated.
+            ignore_axes: axes of the tool's frame that do not count, of "x", "y", "z" (along them) and "roll", "pitch",
+                "yaw" (about x, y and z): ("yaw",) for a torch that may turn about its z axis. None: none from six
+                joints on, "yaw" with five, with four "roll" and "pitch" up to 10 deg, with three all rotations.
+            tolerance_mm: how far the tool may be off along its axes where it cannot reach the pose exactly [mm], one
+                number or three; the deviations are then least, each over its tolerance.
+            tolerance_deg: the same about its axes [deg]. An axis without tolerance that is not ignored counts exactly.
+            elbow_angle: of an arm with seven revolute joints [rad], see `kinematics.task_axes.TaskAxes`.
 
         Returns:
             One solution per pose: arrays for arrays, in float64; tensors for tensors, in their dtype and on their
             device.
 
         Raises:
-            PoseError: a matrix is no pose, `near` does not fit or lies far beyond the joint limits, or the branch is
-                unknown.
+            PoseError: a matrix is no pose, `near` does not fit or lies far beyond the joint limits, the branch is
+                unknown, or the model or its robot cannot leave out the axes.
         """
+        task = self.for_task(ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
         if near is not None:
             near = self.postures.checked(near, throw)
         approach = checked_approach(approach)
-        if self.controller is not None:
-            return self.controller.solve(T_base_tool, near, self, branch, throw=throw, approach=approach)
+        if task.controller is not None:
+            return task.controller.solve(T_base_tool, near, self, branch, throw=throw, approach=approach)
         kernels = self.compiled
         if isinstance(T_base_tool, np.ndarray) and T_base_tool.shape == (4, 4) and kernels is not None:
-            return kernels.solve(T_base_tool, near, branch, throw, approach, self)  # the way of control loops
+            # the way of control loops
+            return kernels.solve(T_base_tool, near, branch, throw, approach, self, task.axes)
         T, single = pose_array(T_base_tool)
         if kernels is None:
             solution = self.reference(
-                T, near=near, branch=branch, throw=throw, approach=approach, single=single
+                T, near=near, branch=branch, throw=throw, approach=approach, single=single, axes=task.axes
             )
-            return self._like(T_base_tool, solution)
+            return self._like(T_base_tool, solution, task.axes)
         if T.ndim == 2 and not single:
-            solution = kernels.solve(T, near, branch, throw, approach, self)
+            solution = kernels.solve(T, near, branch, throw, approach, self, task.axes)
         else:
             solution = kernels.solve_batch(
-                T, near, branch, throw=throw, approach=approach, single=single, owner=self
+                T, near, branch, throw=throw, approach=approach, single=single, owner=self, axes=task.axes
             )
-        return self._like(T_base_tool, solution)
+        return self._like(T_base_tool, solution, task.axes)
 
-    def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> "pisigma.inverse.solution.Solution":
-        """Solutions on every branch, as `(*batch, branches)`; one for a robot without closed-form inverse."""
+    def all_branches(
+        self,
+        T_base_tool: Any,
+        *,
+        approach: Any = None,
+        ignore_axes: Sequence[str] | None = None,
+        tolerance_mm: float | Sequence[float] | None = None,
+        tolerance_deg: float | Sequence[float] | None = None,
+        elbow_angle: float | None = None,
+    ) -> "pisigma.inverse.solution.Solution":
+        """Solutions on every branch, as `(*batch, branches)`; see `__call__`.
+
+        A robot without closed-form inverse gets up to eight different solutions instead, such as those of an elbow to
+        either side, where it has kernels, and else one.
+        """
+        task = self.for_task(ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
         approach = checked_approach(approach)
-        if self.controller is not None:
-            return self.controller.all_branches(T_base_tool, self, approach=approach)
+        if task.controller is not None:
+            return task.controller.all_branches(T_base_tool, self, approach=approach)
         T, single = pose_array(T_base_tool)
         if self.compiled is None:
-            return self._like(T_base_tool, self.reference.all_branches(T, approach=approach, single=single))
-        every = self.compiled.all_branches(T, approach=approach, single=single, owner=self)
-        return self._like(T_base_tool, every)
+            every = self.reference.all_branches(T, approach=approach, single=single, axes=task.axes)
+        else:
+            every = self.compiled.all_branches(
+                T, approach=approach, single=single, owner=self, axes=task.axes
+            )
+        return self._like(T_base_tool, every, task.axes)
 
     def path(
-        self, T_base_tool: Any, *, near: Any = None, branch: str | None = None
+        self,
+        T_base_tool: Any,
+        *,
+        near: Any = None,
+        branch: str | None = None,
+        ignore_axes: Sequence[str] | None = None,
+        tolerance_mm: float | Sequence[float] | None = None,
+        tolerance_deg: float | Sequence[float] | None = None,
+        elbow_angle: float | None = None,
     ) -> "pisigma.inverse.path.JointPath":
         """Find joint values along a path: one branch as long as possible, and word of every place where that ends.
 
@@ -195,13 +238,18 @@ class CorrectedIK:
             T_base_tool: `(poses, 4, 4)` wanted poses in order [m]; as NumPy array or nested lists.
             near: `(dof,)` joint values [rad or m] where the robot is before the path.
             branch: name of the branch to begin on if that costs no jump.
+            ignore_axes: see `__call__`, also for what follows.
+            tolerance_mm: of positions.
+            tolerance_deg: of orientations.
+            elbow_angle: of an arm with seven joints.
 
         Raises:
             PoseError: see `__call__`.
         """
         from pisigma.inverse.path import follow_path
 
-        return follow_path(self, T_base_tool, near, branch)
+        task = self.for_task(ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
+        return follow_path(task, T_base_tool, near, branch)
 
     def forward(self, q: Any, *, approach: Any = None) -> Any:
         """Pose T_base_tool `(*batch, 4, 4)` that the calibrated arm takes at commanded joint values `(*batch, dof)`.
@@ -279,8 +327,42 @@ class CorrectedIK:
             return None
         return None if forward and self.compiled.description.network.used else self.compiled
 
+    @cached_property
+    def axes(self) -> TaskAxes:
+        """Which axes of the tool count where a call does not state that."""
+        if self.controller is not None:
+            return self.controller.ik.axes
+        return self.reference.axes if self.compiled is None else self.compiled.axes
+
+    def for_task(
+        self,
+        ignore_axes: Sequence[str] | None = None,
+        tolerance_mm: float | Sequence[float] | None = None,
+        tolerance_deg: float | Sequence[float] | None = None,
+        elbow_angle: float | None = None,
+    ) -> "CorrectedIK":
+        """The same, where what is stated here counts in calls that do not state it; see `__call__`.
+
+        Raises:
+            PoseError: see `__call__`.
+        """
+        if ignore_axes is None and tolerance_mm is None and tolerance_deg is None and elbow_angle is None:
+            return self
+        if elbow_angle is not None and not (
+            self.revolute.tolist() == [True] * 7 and np.isfinite(elbow_angle)
+        ):
+            raise PoseError(
+                f"elbow_angle={elbow_angle:g}: only a robot of seven revolute joints has an elbow to turn; give it a "
+                "finite angle [rad], and other robots none."
+            )
+        ik = copy(self)
+        ik.axes = task_axes(self.axes, ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
+        if self.controller is not None:
+            ik.controller = self.controller.for_axes(ik.axes)
+        return ik
+
     def _like(
-        self, poses: Any, solution: "pisigma.inverse.solution.Solution"
+        self, poses: Any, solution: "pisigma.inverse.solution.Solution", axes: TaskAxes
     ) -> "pisigma.inverse.solution.Solution":
         """The solutions of tensors as tensors, with gradients where these are wanted; other ones as arrays."""
         if not is_tensor(poses):
@@ -288,7 +370,7 @@ class CorrectedIK:
             return solution if arrays else replace(solution.map(as_array), owner=self)
         from pisigma.inverse.pose_gradients import as_tensors
 
-        return as_tensors(solution, poses, self.model if poses.requires_grad else None, self)
+        return as_tensors(solution, poses, self.model if poses.requires_grad else None, self, axes)
 
 
 def _flat(values: Any) -> Any:

@@ -11,6 +11,7 @@ from pisigma.inverse.solution import Solution
 from pisigma.kinematics.joint_limits import wrap_into_limits
 from pisigma.kinematics.singularity import singularity_measure
 from pisigma.kinematics.status import Status
+from pisigma.kinematics.task_axes import TaskAxes
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE, SINGULAR_TOLERANCE
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stored_starts import middle_of_starts
@@ -20,15 +21,18 @@ from pisigma.robot.description import Robot
 class Finishing:
     """The last steps to solutions of one model, the same for all ways that lead to joint values."""
 
-    def __init__(self, model: CalibratedModel, branches: tuple[str, ...], trained: Sequence[int]) -> None:
+    def __init__(
+        self, model: CalibratedModel, branches: tuple[str, ...], trained: Sequence[int], axes: TaskAxes
+    ) -> None:
         """Prepare for a model.
 
         Args:
             model: the model.
             branches: names of all branches.
             trained: indices of those that training rows lie on.
+            axes: which axes of the tool count.
         """
-        self._model, self._branches = model, branches
+        self._model, self._branches, self._axes = model, branches, axes
         self._trained = torch.tensor(trained)
 
     def of_nominal(
@@ -85,7 +89,7 @@ class Finishing:
         if hybrid.correction.is_periodic:
             return q, inside
         flat = q.reshape(-1, 1, q.shape[-1])
-        solved, status = search(self._model.identified, T.reshape(-1, 4, 4), flat, hybrid)
+        solved, status = search(self._model.identified, T.reshape(-1, 4, 4), flat, hybrid, axes=self._axes)
         settled = torch.where((status == Status.UNREACHABLE)[:, None], flat[:, 0], solved).reshape(q.shape)
         turned, within = wrap_into_limits(self._model.robot, settled)
         return settled, within & (turned == settled).all(-1)

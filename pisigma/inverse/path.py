@@ -72,7 +72,8 @@ def follow_path(
     """Find joint values along a path.
 
     On arms with a closed form the branches are chosen for the path as a whole, by dynamic programming: as few jumps
-    as possible, then as little squared joint motion as possible. On others every pose is solved from the one before.
+    as possible, then as little squared joint motion as possible. On others, and where the task leaves the arm joints to
+    spare, every pose is solved from the one before.
 
     Args:
         ik: the corrected inverse kinematics.
@@ -89,7 +90,8 @@ def follow_path(
     if branch is not None and branch not in ik.branches:
         raise PoseError(f"there is no branch '{branch}'; {nearest_choice(branch, ik.branches)}")
     beside = None if near is None else np.asarray(ik.postures.checked(near), dtype=np.float64)
-    guide = _guide(ik, T, beside, branch) if ik.closed_form else _one_by_one(ik, T, beside)
+    on_branches = ik.closed_form and len(ik.joints) <= ik.axes.free.count(False)
+    guide = _guide(ik, T, beside, branch) if on_branches else _one_by_one(ik, T, beside)
     solution = _solve(ik, T, guide, _approaches(guide, beside))
     return JointPath(solution, _switches(ik, T, np.asarray(solution.q), solution))
 

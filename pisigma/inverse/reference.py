@@ -13,11 +13,14 @@ from torch import Tensor
 
 from pisigma.errors import ModelError, PoseError, nearest_choice
 from pisigma.inverse.finishing import Finishing
-from pisigma.inverse.identified_arm import IdentifiedArm, search
+from pisigma.inverse.identified_arm import IdentifiedArm, levelled, search, tolerated
 from pisigma.inverse.joint_input import as_array, checked_approach, pose_array
 from pisigma.inverse.solution import Solution
+from pisigma.inverse.spare_joints import solve_with_spare_joints
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.kinematics.status import Status
+from pisigma.kinematics.task_axes import TaskAxes, default_axes
+from pisigma.kinematics.task_error import task_error
 from pisigma.kinematics.tolerances import ATTEMPTS, AWAY, MORE_ATTEMPTS, POSE_TOLERANCE, POSE_TOLERANCE_SINGLE
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.stored_starts import StoredStarts, nearest_branch
@@ -35,10 +38,15 @@ class ReferenceIK:
         branches: names of the branches.
         order: indices of the branches: those that training rows lie on, most frequent first, then the others.
         arm: its identified arm, where it has one and the nominal one a closed form.
+        axes: which axes of the tool count.
     """
 
-    def __init__(self, model: CalibratedModel) -> None:
+    def __init__(self, model: CalibratedModel, axes: TaskAxes | None = None) -> None:
         """Prepare a model.
+
+        Args:
+            model: the model.
+            axes: which axes of the tool count; None for those that do by default. The elbow angle has no part here.
 
         Raises:
             ModelError: the model names branches that its robot does not have, or gives the numeric inverse no
@@ -58,10 +66,14 @@ class ReferenceIK:
         trained = [self.branches.index(name) for name in model.branches] or list(range(len(self.branches)))
         self.order = (*trained, *(index for index in range(len(self.branches)) if index not in trained))
         self._starts = StoredStarts(model.identified, model.starts)
+        whole = model.network is not None and self._solver is None
+        self.axes = axes or (TaskAxes() if whole else default_axes(model.robot.dof))
         self.arm: IdentifiedArm | None = None
         if model.calibrated is not None and self._solver is not None:
-            self.arm = IdentifiedArm(model.robot, model.identified, self._solver, self._starts, model.hybrid)
-        self._finishing = Finishing(model, self.branches, trained)
+            self.arm = IdentifiedArm(
+                model.robot, model.identified, self._solver, self._starts, model.hybrid, self.axes
+            )
+        self._finishing = Finishing(model, self.branches, trained, self.axes)
 
     def __call__(
         self,
@@ -72,6 +84,7 @@ class ReferenceIK:
         throw: bool = True,
         approach: Any = None,
         single: bool | None = None,
+        axes: TaskAxes | None = None,
     ) -> Solution:
         """Find corrected joint values for poses; for arguments, errors and what comes back see `CorrectedIK`.
 
@@ -85,7 +98,12 @@ class ReferenceIK:
             throw: whether what is no pose, or no posture, raises.
             approach: `(*batch, dof)` or `(dof,)`.
             single: whether the poses were rounded to float32; None to see that from their type.
+            axes: which axes of the tool count, where these are others than `axes`.
         """
+        if axes is not None and axes != self.axes:
+            return ReferenceIK(self.model, axes)(
+                T_base_tool, near=near, branch=branch, throw=throw, approach=approach, single=single
+            )
         if branch is not None and branch not in self.branches:
             raise PoseError(f"there is no branch '{branch}'; {nearest_choice(branch, self.branches)}")
         T, given, fine = _checked_poses(T_base_tool, single, throw)
@@ -97,8 +115,17 @@ class ReferenceIK:
         result = self._by_approach(approach, T.shape[:-2], lambda ik: ik._solve(T, given, start, order))
         return _marked(self._with_residuals(result, T), fine)
 
-    def all_branches(self, T_base_tool: Any, *, approach: Any = None, single: bool | None = None) -> Solution:
+    def all_branches(
+        self,
+        T_base_tool: Any,
+        *,
+        approach: Any = None,
+        single: bool | None = None,
+        axes: TaskAxes | None = None,
+    ) -> Solution:
         """Solutions on every branch, as `(*batch, branches)`; one for a robot without closed-form inverse."""
+        if axes is not None and axes != self.axes:
+            return ReferenceIK(self.model, axes).all_branches(T_base_tool, approach=approach, single=single)
         T, given, _ = _checked_poses(T_base_tool, single, True)
         result = self._by_approach(approach, T.shape[:-2], lambda ik: ik._solve_branches(T, given))
         return self._with_residuals(result, T.unsqueeze(-3).expand(*result.status.shape, 4, 4))
@@ -115,7 +142,7 @@ class ReferenceIK:
         result = solve(self) if not len(kinds) else None
         for kind, side in enumerate(kinds):
             arm = replace(hybrid, approach=side)
-            solved = solve(ReferenceIK(replace(self.model, hybrid=arm)))
+            solved = solve(ReferenceIK(replace(self.model, hybrid=arm), self.axes))
             result = solved if result is None else _where(index.reshape(tuple(batch)) == kind, solved, result)
         assert result is not None
         return result
@@ -154,11 +181,17 @@ class ReferenceIK:
         rows = torch.isfinite(q).all(-1).nonzero()[:, 0]
         if len(rows):
             reached = self.model.forward(q[rows])
-            error = pose_error(T.reshape(-1, 4, 4)[rows], torch.nan_to_num(reached))
+            wanted, safe = T.reshape(-1, 4, 4)[rows], torch.nan_to_num(reached)
+            error = pose_error(wanted, safe) if self.axes.whole else task_error(self.axes, wanted, safe)[0]
             left[rows] = torch.where(torch.isfinite(reached).flatten(1).all(-1)[:, None], error, torch.nan)
         left = left.reshape(*result.status.shape, 6)
+        if not self.axes.whole:
+            result = _without(result, ~tolerated(self.axes, left.nan_to_num()), Status.UNREACHABLE)
+            left = torch.where(torch.tensor(self.axes.free), 0.0 * left, left)
         position, rotation = left[..., :3].norm(dim=-1), left[..., 3:].norm(dim=-1)
-        return replace(result, position_residual=position, rotation_residual=rotation)
+        return replace(
+            result, position_residual=position, rotation_residual=rotation, ignored_axes=self.axes.ignored
+        )
 
     def _solve(self, T: Tensor, given: Tensor, near: Tensor | None, order: Sequence[int]) -> Solution:
         """Find a solution for every pose.
@@ -218,7 +251,7 @@ class ReferenceIK:
     def _on_branches(self, T: Tensor, given: Tensor, near: Tensor | None, indices: Sequence[int]) -> Solution:
         """Solutions on some branches, as a last batch axis, each from its nominal joint values on."""
         assert self._solver is not None
-        result = self._solver.solve(given)
+        result = self._solver.solve(levelled(self._solver, given, self.axes))
         branch = torch.tensor(indices).expand(*T.shape[:-2], len(indices))
         q, status = result.q[..., indices, :].double(), result.status[..., indices]
         each = T.unsqueeze(-3).expand(*branch.shape, 4, 4)
@@ -254,9 +287,9 @@ class ReferenceIK:
         off = (q_found - q_near).norm(dim=-1).nan_to_num(torch.inf)
         away = (off > AWAY).nonzero()[:, 0]
         T_away, start = T.reshape(-1, 4, 4)[away], q_near[away]
-        q, status = search(self.arm.identified, T_away, start[:, None], self.model.hybrid)
+        q, status = search(self.arm.identified, T_away, start[:, None], self.model.hybrid, axes=self.axes)
         lies = nearest_branch(self.arm.solver, q)
-        nominal, _ = search(self.model.robot, T_away, q[:, None])
+        nominal, _ = search(self.model.robot, T_away, q[:, None], axes=self.axes)
         other = self._finishing.of_identified(T_away, q, nominal, status, lies, start)
         good = (other.status != Status.UNREACHABLE) & (other.status != Status.OUTSIDE_JOINT_LIMITS)
         kept = (good & ((other.q - start).norm(dim=-1) < off[away])).nonzero()[:, 0]
@@ -264,22 +297,32 @@ class ReferenceIK:
 
     def _numeric(self, T: Tensor, near: Tensor | None) -> Solution:
         """Numeric inverse from `near`, then from the training rows whose poses are nearest, then from more of them."""
-        flat, shape = T.reshape(-1, 4, 4), T.shape[:-2]
-        dof = self.model.robot.dof
-        starts = self.model.starts[self._starts.nearest(flat, ATTEMPTS)]
+        flat, dof = T.reshape(-1, 4, 4), self.model.robot.dof
+        if self.model.network is None and sum(self.axes.weights(dof)) < dof:
+            beside = None if near is None else near.reshape(-1, dof)
+            q, status = solve_with_spare_joints(self._starts, self.model.hybrid, flat, beside, self.axes)
+            return self._finished_numeric(T, q, status, near)
+        starts = self.model.starts[self._starts.nearest(flat, ATTEMPTS, self.axes)]
         if near is not None:
             starts = torch.cat([near.reshape(-1, 1, dof), starts], 1)
-        q, status = search(self._starts.robot, flat, starts, self.model.hybrid)
+        q, status = search(self._starts.robot, flat, starts, self.model.hybrid, axes=self.axes)
         left = ((status == Status.UNREACHABLE) | (status == Status.OUTSIDE_JOINT_LIMITS)).nonzero()[:, 0]
         if len(left):
-            more = self.model.starts[self._starts.nearest(flat[left], MORE_ATTEMPTS)]
-            other, fate = search(self._starts.robot, flat[left], more, self.model.hybrid, inside=True)
+            more = self.model.starts[self._starts.nearest(flat[left], MORE_ATTEMPTS, self.axes)]
+            other, fate = search(
+                self._starts.robot, flat[left], more, self.model.hybrid, inside=True, axes=self.axes
+            )
             better = (status[left] == Status.UNREACHABLE) | (fate < Status.OUTSIDE_JOINT_LIMITS)
             q[left[better]], status[left[better]] = other[better], fate[better]
+        return self._finished_numeric(T, q, status, near)
+
+    def _finished_numeric(self, T: Tensor, q: Tensor, status: Tensor, near: Tensor | None) -> Solution:
+        """Solutions from joint values `(poses, dof)` that reach all poses, one after the other."""
+        flat, shape, dof = T.reshape(-1, 4, 4), T.shape[:-2], q.shape[-1]
         branch = torch.zeros(shape, dtype=torch.int64)
         if self.model.calibrated is None:
             return self._finishing.of_nominal(T, q.reshape(*shape, dof), status.reshape(shape), branch, near)
-        nominal, _ = search(self.model.robot, flat, q[:, None])
+        nominal, _ = search(self.model.robot, flat, q[:, None], axes=self.axes)
         q, nominal = (values.reshape(*shape, dof) for values in (q, nominal))
         return self._finishing.of_identified(T, q, nominal, status.reshape(shape), branch, near)
 
@@ -311,13 +354,18 @@ def _checked_poses(values: Any, single: bool | None, throw: bool) -> tuple[Tenso
 
 def _marked(result: Solution, fine: Tensor) -> Solution:
     """The solutions, INVALID_POSE and NaN where there was no pose to solve for."""
-    if bool(fine.all()):
+    return _without(result, ~fine, Status.INVALID_POSE)
+
+
+def _without(result: Solution, lost: Tensor, status: Status) -> Solution:
+    """The solutions, NaN and with another status where something holds."""
+    if not bool(lost.any()):
         return result
     nothing = result.map(
         lambda values: torch.full_like(values, torch.nan) if values.is_floating_point() else values
     )
-    kept = _where(fine, result, nothing)
-    return replace(kept, status=torch.where(fine, result.status, int(Status.INVALID_POSE)))
+    kept = _where(lost, nothing, result)
+    return replace(kept, status=torch.where(lost, int(status), result.status))
 
 
 def _where(condition: Tensor, first: Solution, second: Solution) -> Solution:

@@ -32,11 +32,15 @@ class Solution:
             limits, singular, outside domain, reached. Limits are those of the corrected values, which are commanded.
         position_residual: `(*batch,)`: distance of the tool from the wanted position [m], as far as the model knows and
             before joint values are rounded to float32; NaN without solution.
-        rotation_residual: `(*batch,)`: the same of the angle to the wanted orientation [rad].
+        rotation_residual: `(*batch,)`: the same of the angle to the wanted orientation [rad]. Both without the
+            ignored axes.
         domain_measure: `(*batch,)`: distance to the training rows over their spacing; above 1 the correction is
             extrapolated, whatever the status says. For a hybrid 1 plus the angle [rad] of the joint that is farthest
             beyond its measured values. NaN where nothing is learned or there is no solution.
         owner: whose solution it is, which knows how accurate that is.
+        ignored_axes: axes of the tool that do not count, neither for the status nor in the residuals: those that the
+            task ignores or, of an arm with fewer than six joints, that are left to the arm by default; see
+            `kinematics.task_axes.TaskAxes`.
     """
 
     q: Any
@@ -48,6 +52,7 @@ class Solution:
     rotation_residual: Any
     domain_measure: Any
     owner: "pisigma.inverse.corrected_ik.CorrectedIK | None" = None
+    ignored_axes: tuple[str, ...] = ()
 
     @property
     def correction(self) -> Any:

@@ -133,7 +133,22 @@ class _Chain:
         at, poses, rows = address_of(values), address_of(T), math.prod(batch)
         jacobians = address_of(J) if with_jacobian else 0
         self._run(
-            self._address, memory, FORWARD, rows, poses, at, rows, 0, 0, 0, 0, 0, jacobians, with_jacobian
+            self._address,
+            memory,
+            FORWARD,
+            rows,
+            poses,
+            at,
+            rows,
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+            0,
+            jacobians,
+            with_jacobian,
         )
         return T, J
 

@@ -92,7 +92,7 @@ def _content() -> tuple[dict[str, Any] | None, bytes]:
 
 ENTRY = "pisigma_run"
 """Name of the one function in the code that is called from outside."""
-ARGUMENTS = "ppiippipiiiipi"
+ARGUMENTS = "ppiippipipiiiipi"
 """Of `kernels.run`: p for a pointer, i for a number."""
 
 _MACHINE = re.compile(r"^target (?:triple|datalayout) = .*\n", re.MULTILINE)

@@ -13,25 +13,33 @@ def scaled_square(reach: float, error: Array) -> float:
     """Squared pose error with translation in characteristic lengths."""
     scale = 1 / (reach * reach)
     position = error[0] * error[0] + error[1] * error[1] + error[2] * error[2]
-    return scale * position + error[3] * error[3] + error[4] * error[4] + error[5] * error[5]
+    rotation = error[3] * error[3] + error[4] * error[4] + error[5] * error[5]
+    return scale * position + rotation + error[6] * error[6]
 
 
 @contracted_kernel
-def _normal(arms: Record, reach: float, J: Array, memory: Record) -> tuple[int, float]:
-    """Write the dimensionless Jacobian A and the smaller of `A A^T` and `A^T A`; give its size and trace."""
-    A, S, dof = memory.scaled, memory.square, arms.dof
-    for j in range(dof):
-        length = 1.0 if arms.revolute[j] else reach
+def _scale(arms: Record, reach: float, J: Array, memory: Record) -> None:
+    """Write the dimensionless Jacobian A."""
+    A, inverse = memory.scaled, 1 / reach
+    for j in range(arms.dof):
+        length = memory.scale[j]
         for i in range(3):
-            A[i, j] = J[i, j] * length / reach
+            A[i, j] = J[i, j] * length * inverse
             A[i + 3, j] = J[i + 3, j] * length
-    size = min(6, dof)
-    trace = 0.0
+        if memory.height > 6:
+            A[6, j] = J[6, j] * length
+
+
+@contracted_kernel
+def _normal(memory: Record, dof: int, by_row: bool, rows: int) -> tuple[int, float]:
+    """Write `A A^T` or `A^T A` of the first rows of A; give its size and trace."""
+    A, S = memory.scaled, memory.square
+    size, trace = rows if by_row else dof, 0.0
     for i in range(size):
         for k in range(i + 1):
             total = 0.0
-            if dof < 6:
-                for m in range(6):
+            if not by_row:
+                for m in range(rows):
                     total += A[m, i] * A[m, k]
             else:
                 for m in range(dof):
@@ -77,15 +85,17 @@ def damped_step(arms: Record, reach: float, J: Array, error: Array, damping: flo
     Returns:
         Whether there is such a step.
     """
-    size, trace = _normal(arms, reach, J, memory)
     A, S, x, dof = memory.scaled, memory.square, memory.right, arms.dof
+    by_row = memory.rows <= dof
+    _scale(arms, reach, J, memory)
+    size, trace = _normal(memory, dof, by_row, memory.height)
     weight = damping * scaled_square(reach, error) + _FLOOR * trace
     for i in range(size):
         S[i, i] += weight
     if _factor(S, size) == 0.0:
         return False
     for i in range(size):
-        if dof < 6:
+        if not by_row:
             x[i] = A[3, i] * error[3] + A[4, i] * error[4] + A[5, i] * error[5]
             x[i] += (A[0, i] * error[0] + A[1, i] * error[1] + A[2, i] * error[2]) / reach
         else:
@@ -101,11 +111,11 @@ def damped_step(arms: Record, reach: float, J: Array, error: Array, damping: flo
             total -= S[k, i] * x[k]
         x[i] = total * S[i, i]
     for j in range(dof):
-        total = x[j] if dof < 6 else 0.0
-        if dof >= 6:
-            for i in range(6):
+        total = 0.0 if by_row else x[j]
+        if by_row:
+            for i in range(size):
                 total += A[i, j] * x[i]
-        memory.step[j] = total if arms.revolute[j] else total * reach
+        memory.step[j] = total * memory.scale[j]
     return True
 
 
@@ -113,22 +123,44 @@ def damped_step(arms: Record, reach: float, J: Array, error: Array, damping: flo
 def is_singular(arms: Record, reach: float, J: Array, tolerance: float, memory: Record) -> bool:
     """Whether the smallest singular value of the dimensionless Jacobian is below a tolerance.
 
-    The determinant of the normal equations over the largest that the other values can have is a lower bound, which
-    settles it but near singularities.
+    Only the axes count that the task asks for. The determinant of the normal equations over the largest that the other
+    values can have is a lower bound, which settles it but near singularities.
     """
-    size, trace = _normal(arms, reach, J, memory)
+    rows = _compact(arms, reach, J, memory)
+    size, trace = _normal(memory, arms.dof, rows <= arms.dof, rows)
     determinant = _factor(memory.square, size)
     others = (trace / (size - 1)) ** (size - 1) if size > 1 else 1.0
     if determinant > 2 * tolerance * tolerance * others:
         return False
-    return _smallest_singular_value(memory.scaled, size, arms.dof) < tolerance
+    return _smallest_singular_value(memory.scaled, rows, arms.dof) < tolerance
 
 
 @contracted_kernel
-def _smallest_singular_value(A: Array, size: int, dof: int) -> float:
+def singularity_measure(arms: Record, reach: float, J: Array, memory: Record) -> float:
+    """Smallest singular value of the dimensionless Jacobian in the axes that the task asks for."""
+    return _smallest_singular_value(memory.scaled, _compact(arms, reach, J, memory), arms.dof)
+
+
+@contracted_kernel
+def _compact(arms: Record, reach: float, J: Array, memory: Record) -> int:
+    """Write the rows of the dimensionless Jacobian that count, without that of the elbow; how many they are."""
+    _scale(arms, reach, J, memory)
+    if memory.whole:
+        return 6
+    count, A = 0, memory.scaled
+    for i in range(6):
+        if memory.weight[i] > 0.0:
+            for j in range(arms.dof):
+                A[count, j] = A[i, j]
+            count += 1
+    return count
+
+
+@contracted_kernel
+def _smallest_singular_value(A: Array, rows: int, dof: int) -> float:
     """One-sided Jacobi rotations of A's columns, or of its rows where they are fewer; A is overwritten."""
-    by_column = dof == size
-    length = 6 if by_column else dof
+    size, by_column = min(rows, dof), dof <= rows
+    length = rows if by_column else dof
     for _ in range(_SWEEPS):
         largest = 0.0
         for i in range(size - 1):

@@ -5,12 +5,23 @@ import math
 from pisigma.kernels import arrays
 from pisigma.kernels.closed_form import all_branches, nearest_turn, wrap_into_limits
 from pisigma.kernels.damped_step import is_singular
-from pisigma.kernels.motion import beyond_measured, move
+from pisigma.kernels.joint_correction import beyond_measured, move
 from pisigma.kernels.network import add_correction, choose_corrected, finish_corrected
-from pisigma.kernels.newton import newton, search
-from pisigma.kernels.recovery import branch_of, nearest_starts, recover, within_reach
+from pisigma.kernels.newton import search
+from pisigma.kernels.recovery import (
+    branch_of,
+    distance_from,
+    distinct_solutions,
+    is_redundant,
+    nearest_starts,
+    recover,
+    solve_nominal,
+    solve_redundant,
+    within_reach,
+)
 from pisigma.kernels.rotations import pose_error, wrap
 from pisigma.kernels.rows import Array, Record, copy, fill, kernel
+from pisigma.kernels.task_axes import level_pose, write_residuals
 from pisigma.kinematics import tolerances
 
 
@@ -29,11 +40,14 @@ def solve_pose(description: Record, memory: Record, has_near: bool, branch: int,
     form, chosen = description.closed_form, -1
     wanted = form.order[0] if branch < 0 else branch
     fill(memory.nominal, math.nan)
+    level = level_pose(description, memory)
     if description.network.used:
         _solve_by_network(description, memory, has_near, branch, wanted, out)
         return
-    if not within_reach(description, memory.pose):
+    if not level or not within_reach(description, memory, memory.pose):
         pass
+    elif is_redundant(description, memory):
+        chosen = solve_redundant(description, memory, has_near, branch)
     elif form.kind == arrays.NO_CLOSED_FORM:
         chosen = 0 if _solve_without_branches(description, memory, has_near) else -1
     else:
@@ -50,12 +64,30 @@ def solve_pose(description: Record, memory: Record, has_near: bool, branch: int,
 
 
 @kernel
+def solve_every(description: Record, memory: Record, out: Array) -> None:
+    """Write different solutions of the pose in `memory.pose` of an arm without closed form, as `solve_pose` does."""
+    reachable = level_pose(description, memory) and within_reach(description, memory, memory.pose)
+    count = distinct_solutions(description, memory, out.shape[0]) if reachable else 0
+    for row in range(out.shape[0]):
+        fill(memory.nominal, math.nan)
+        if row < count:
+            copy(memory.candidates[row], memory.solution)
+            copy(memory.solution, memory.q)
+            solve_nominal(description, memory)
+            fill(memory.checked, math.nan)
+        reached, status = finish(description, memory, False, row < count, out[row])
+        _write(description, memory, reached, status, 0, out[row])
+
+
+@kernel
 def _solve_by_network(
     description: Record, memory: Record, has_near: bool, branch: int, wanted: int, out: Array
 ) -> None:
     """The same where a network corrects the nominal joint values."""
     chosen, inside = choose_corrected(description, memory, has_near, branch, wanted)
-    numeric = description.closed_form.kind == arrays.NO_CLOSED_FORM and within_reach(description, memory.pose)
+    numeric = description.closed_form.kind == arrays.NO_CLOSED_FORM and within_reach(
+        description, memory, memory.pose
+    )
     if numeric and _solve_without_branches(description, memory, has_near):
         copy(memory.solution, memory.nominal)
         chosen, inside = 0, add_correction(description, memory, has_near)
@@ -84,10 +116,10 @@ def _solve_in_order(description: Record, memory: Record, wanted: int) -> int:
     """
     arms, form, outside = description.arms, description.closed_form, -1
     first = form.order[0] if wanted < 0 else wanted
-    all_branches(arms, form, memory.pose, first, memory.rounding, memory.wanted, memory.branches)
+    all_branches(arms, form, memory.level, first, memory.rounding, memory.wanted, memory.branches)
     for place in range(form.branches if wanted < 0 else 1):
         if place == 1:
-            all_branches(arms, form, memory.pose, -1, memory.rounding, memory.wanted, memory.branches)
+            all_branches(arms, form, memory.level, -1, memory.rounding, memory.wanted, memory.branches)
         branch = form.order[place] if wanted < 0 else wanted
         if math.isnan(memory.branches[branch, 0]) or not _follow(description, memory, branch):
             continue
@@ -123,7 +155,7 @@ def _solve_nearest(description: Record, memory: Record) -> int:
     The nearest of the branches that reach the pose inside the limits is best, else of the others.
     """
     arms, form, others = description.arms, description.closed_form, memory.others
-    all_branches(arms, form, memory.pose, -1, memory.rounding, memory.wanted, memory.branches)
+    all_branches(arms, form, memory.level, -1, memory.rounding, memory.wanted, memory.branches)
     for index in range(form.branches):
         copy(memory.branches[index], others[index])
     best, best_rank, best_distance = -1, 2, math.inf
@@ -139,7 +171,7 @@ def _solve_nearest(description: Record, memory: Record) -> int:
         copy(memory.q, memory.trial)
         rank = 0 if wrap_into_limits(arms, memory.trial) else 1
         nearest_turn(arms, memory.trial, memory.near, True)
-        distance = _distance(arms, memory.trial, memory.near)
+        distance = distance_from(arms, memory.trial, memory.near)
         if rank < best_rank or (rank == best_rank and distance < best_distance):
             best, best_rank, best_distance = branch, rank, distance
             copy(memory.q, memory.solution)
@@ -154,7 +186,7 @@ def _continue(description: Record, memory: Record, chosen: int) -> int:
         copy(memory.solution, memory.trial)
         wrap_into_limits(arms, memory.trial)
         nearest_turn(arms, memory.trial, memory.near, True)
-        off = math.sqrt(_distance(arms, memory.trial, memory.near))
+        off = math.sqrt(distance_from(arms, memory.trial, memory.near))
     if off <= tolerances.AWAY:
         return chosen
     copy(memory.near, memory.q)
@@ -163,25 +195,13 @@ def _continue(description: Record, memory: Record, chosen: int) -> int:
     copy(memory.q, memory.trial)
     inside = wrap_into_limits(arms, memory.trial)
     nearest_turn(arms, memory.trial, memory.near, True)
-    if not inside or not math.sqrt(_distance(arms, memory.trial, memory.near)) < off:
+    if not inside or not math.sqrt(distance_from(arms, memory.trial, memory.near)) < off:
         return chosen
     copy(memory.q, memory.solution)
     lies = branch_of(description, memory, memory.q)
     fill(memory.checked, math.nan)
-    _solve_nominal(description, memory)
+    solve_nominal(description, memory)
     return lies
-
-
-@kernel
-def _solve_nominal(description: Record, memory: Record) -> None:
-    """Write joint values of the nominal arm near `memory.q` into `memory.nominal`, NaN where there are none."""
-    newton(description, memory, arrays.NOMINAL, memory.pose, memory.q, tolerances.TOLERANCE)
-    square = 0.0
-    for i in range(6):
-        square += memory.best[i] ** 2
-    fill(memory.nominal, math.nan)
-    if square < tolerances.ACCEPTED * tolerances.ACCEPTED:
-        copy(memory.q, memory.nominal)
 
 
 @kernel
@@ -193,18 +213,10 @@ def _nearest(description: Record, memory: Record) -> tuple[int, float]:
             continue
         copy(memory.others[branch], memory.q)
         nearest_turn(arms, memory.q, memory.near, True)
-        distance = _distance(arms, memory.q, memory.near)
+        distance = distance_from(arms, memory.q, memory.near)
         if distance < least:
             nearest, least = branch, distance
     return nearest, least
-
-
-@kernel
-def _distance(arms: Record, q: Array, near: Array) -> float:
-    total = 0.0
-    for j in range(arms.dof):
-        total += (q[j] - near[j]) ** 2
-    return total
 
 
 @kernel
@@ -231,7 +243,7 @@ def _solve_without_branches(description: Record, memory: Record, has_near: bool)
     if reached:
         copy(memory.kept, memory.solution)
         fill(memory.checked, math.nan)
-        _solve_nominal(description, memory)
+        solve_nominal(description, memory)
     return reached
 
 
@@ -247,15 +259,13 @@ def finish(
     if not reached:
         out[place], out[place + 1], out[place + 2] = math.nan, math.nan, math.nan
         return False, arrays.UNREACHABLE
-    fresh = True
+    fresh = memory.whole == 1
     for j in range(arms.dof):
         fresh = fresh and memory.checked[j] == q[j]
     if not fresh:
         move(description, memory, arrays.CORRECTED if arms.corrected else arrays.IDENTIFIED, q)
         pose_error(memory.pose, memory.T, memory.R, memory.error)
-    e = memory.error
-    out[place] = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
-    out[place + 1] = math.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
+    write_residuals(arms, memory, memory.error, out)
     beyond = beyond_measured(description, q) if arms.corrected else math.nan
     out[place + 2] = 1 + beyond
     nearest_turn(arms, memory.nominal, q, False)

@@ -7,9 +7,10 @@ from numba import carray  # type: ignore[attr-defined]
 
 from pisigma.kernels import arrays
 from pisigma.kernels.chain import walk_many
-from pisigma.kernels.inverse import solve_pose
-from pisigma.kernels.motion import beyond_measured, move
+from pisigma.kernels.inverse import solve_every, solve_pose
+from pisigma.kernels.joint_correction import beyond_measured, move
 from pisigma.kernels.rows import Array, Record, fill, kernel
+from pisigma.kernels.task_axes import state_task
 from pisigma.kinematics.tolerances import POSE_TOLERANCE, POSE_TOLERANCE_SINGLE, ROUNDINGS
 
 Pointer = Any
@@ -29,6 +30,8 @@ def run(
     near_rows: int,
     approach: Pointer,
     approach_rows: int,
+    axes: Pointer,
+    axes_rows: int,
     branch: int,
     mark: int,
     single: int,
@@ -49,6 +52,8 @@ def run(
         near_rows: 0, 1 or as many as poses.
         approach: `(approach_rows, dof)`: +1 or -1 for the side from which a joint comes, 0 where that is not stated.
         approach_rows: 0, 1 or as many as poses.
+        axes: `(axes_rows, 8)`: which axes of the tool count, see `kinematics.task_axes.TaskAxes.row`.
+        axes_rows: 0 where all six count, else 1.
         branch: which branch, or which arm to evaluate.
         mark: 1 to mark what is no pose, 0 to stop there.
         single: 1 where the poses were rounded to float32, else 0.
@@ -62,7 +67,8 @@ def run(
     if task == arrays.SOLVE:
         sides = carray(approach, (approach_rows, dof))
         solutions = carray(out, (rows, count, 2 * dof + 5))
-        return solve_poses(arm, work, poses, joints, sides, branch, mark != 0, single != 0, solutions)
+        stated = carray(axes, (axes_rows, 8))
+        return solve_poses(arm, work, poses, joints, sides, stated, branch, mark != 0, single != 0, solutions)
     if task == arrays.EVALUATE:
         sides = carray(approach, (approach_rows, dof))
         return evaluate(arm, work, branch, joints, sides, poses, carray(out, (rows, 7 * dof + 1)))
@@ -77,6 +83,7 @@ def solve_poses(
     T: Array,
     near: Array,
     approach: Array,
+    axes: Array,
     branch: int,
     mark: bool,
     single: bool,
@@ -88,6 +95,8 @@ def solve_poses(
     """
     dof, has_near = description.arms.dof, near.shape[0] > 0
     tolerance = POSE_TOLERANCE_SINGLE if single else POSE_TOLERANCE
+    state_task(description.arms, memory, description.arms.reach[arrays.IDENTIFIED], axes)
+    every = branch == arrays.EVERY_BRANCH and description.closed_form.kind == arrays.NO_CLOSED_FORM
     memory.rounding = ROUNDINGS * (_EPSILON_SINGLE if single else _EPSILON)
     for row in range(T.shape[0]):
         wrong = _check_pose(T[row], tolerance)
@@ -101,6 +110,9 @@ def solve_poses(
         for i in range(4):
             for k in range(4):
                 memory.pose[i, k] = T[row, i, k]
+        if wrong == arrays.FINE and every and not description.network.used:
+            solve_every(description, memory, out[row])
+            continue
         for index in range(out.shape[1]):
             asked = index if branch == arrays.EVERY_BRANCH else branch
             if wrong == arrays.FINE:

@@ -14,8 +14,8 @@ from pisigma.kernels.forms import MOST_JOINTS, MOST_KINDS, MOST_VALUES, KernelFo
 DOF = MOST_JOINTS
 ROWS, FACTORS, UNITS, STRETCHES, STARTS = 24, 24, 12, 96, 512
 """The largest numbers of rows, factors and product units, stretches and starts."""
-BRANCHES = 8
-"""The largest number of branches of a closed form."""
+BRANCHES, CANDIDATES = 8, 16
+"""The largest numbers of branches of a closed form, and of joint values that are kept to search from."""
 INPUTS = 2 * DOF
 """The largest number of inputs of product units."""
 GROUPS, SEEN, GROUP_INPUTS, SAMPLES, ENTRIES = 8, 512, 80, 2048, 2048 * 320
@@ -96,11 +96,11 @@ MEMORY = np.dtype(
         nominal=(DOF,),  # those of the nominal arm
         axes=(DOF, 6),  # of the joints: direction and origin
         T=(3, 4),  # pose and Jacobian of an arm
-        J=(6, DOF),
+        J=(7, DOF),
         R=(3, 3),
-        error=(6,),  # of the pose at a trial
-        best=(6,),  # of the pose at the best so far, and the Jacobian there
-        J_best=(6, DOF),
+        error=(7,),  # of the pose at a trial, and of the elbow angle
+        best=(7,),  # of the pose at the best so far, and the Jacobian there
+        J_best=(7, DOF),
         trial=(DOF,),
         theta=(DOF,),  # joint values with correction
         delta=(DOF,),  # the correction, and the slope of its series
@@ -109,9 +109,12 @@ MEMORY = np.dtype(
         turning=(2, DOF),  # sines and cosines
         phi=(INPUTS,),  # inputs of product units
         frames=(DOF, 18),  # on which gravity acts
-        scaled=(6, DOF),  # dimensionless Jacobian, normal equations and their right side
-        square=(6, 6),
-        right=(6,),
+        scaled=(7, DOF),  # dimensionless Jacobian, normal equations and their right side
+        square=(7, 7),
+        right=(7,),
+        scale=(
+            DOF,
+        ),  # of the columns of the Jacobian: [rad or m] that count as one; 0 for a joint that is held
         branches=(BRANCHES, DOF),  # closed-form joint values of all branches
         others=(BRANCHES, DOF),  # the same of other poses, or as near to the pose as branches come
         wanted=(4, 4),  # a pose in the frames of the closed form
@@ -124,9 +127,31 @@ MEMORY = np.dtype(
         lane_axes=(DOF, 6, LANES),  # directions and origins of the joints
         seen=(SEEN,),  # scaled inputs of a network
         angles=(3,),  # roll, pitch and yaw
+        tolerance=(6,),  # of the axes of the tool, see `kinematics.task_axes.TaskAxes.row`
+        weight=(6,),  # of these axes in least squares
+        turned=(6,),  # an error in these axes
+        elbow=(),  # elbow angle wanted, NaN where any will do, and on the way there
+        elbow_now=(),
+        line=(3,),  # from shoulder to wrist; upright, bend and beside go with it
+        upright=(3,),
+        bend=(3,),
+        beside=(3,),
+        level=(4, 4),  # the wanted pose as the nominal arm can take it
+        candidates=(CANDIDATES, DOF),  # joint values to search from, the most promising first
+        rank=(CANDIDATES,),
+        preferred=(DOF,),  # joint values that a redundant arm is to come near to
+        chosen=(DOF,),  # the best of several solutions
+        first=(DOF,),  # joint values that a search began at
         distance=(SAMPLES,),  # squared, of scaled inputs from rows of a domain, or of poses from stored ones
     )
-    + _integers(nearest=(128,))  # stored starts
+    + _integers(
+        nearest=(128,),  # stored starts
+        whole=(),  # 1 where all six axes count exactly, else 0
+        loose=(),  # 1 where the arm has too few joints for all axes that count, so that tolerances weigh them
+        pivot=(),  # the axis about which rotations are split into twist and swing, or -1
+        rows=(),  # how many axes count now
+        height=(),  # 6, or 7 where the elbow angle counts too
+    )
 )
 """What kernels work in: overwritten all the time, and nothing in it outlives a pose."""
 

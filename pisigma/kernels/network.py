@@ -9,9 +9,10 @@ from pisigma.kernels import arrays
 from pisigma.kernels.chain import walk
 from pisigma.kernels.closed_form import all_branches, nearest_turn, wrap_into_limits
 from pisigma.kernels.damped_step import is_singular
-from pisigma.kernels.motion import move
+from pisigma.kernels.joint_correction import move
 from pisigma.kernels.rotations import pose_error
 from pisigma.kernels.rows import Array, Record, copy, kernel
+from pisigma.kernels.task_axes import miss, write_residuals
 from pisigma.kinematics import tolerances
 
 
@@ -131,7 +132,7 @@ def choose_corrected(
     if form.kind == arrays.NO_CLOSED_FORM:
         return -1, False
     only = -1 if branch < 0 else branch
-    all_branches(arms, form, memory.pose, only, memory.rounding, memory.wanted, memory.branches)
+    all_branches(arms, form, memory.level, only, memory.rounding, memory.wanted, memory.branches)
     best, best_rank, best_distance = -1, 2, math.inf
     for place in range(form.branches if branch < 0 else 1):
         candidate = place if has_near else form.order[place]
@@ -182,6 +183,7 @@ def finish_corrected(description: Record, memory: Record, branch: int, inside: b
     if not inside:
         return arrays.OUTSIDE_LIMITS
     move(description, memory, arrays.NOMINAL, memory.nominal)
+    miss(arms, memory, memory.pose, memory.error)
     if is_singular(arms, arms.reach[arrays.NOMINAL], memory.J, tolerances.SINGULAR_TOLERANCE, memory):
         return arrays.SINGULAR
     trained = False
@@ -214,6 +216,4 @@ def _settle(description: Record, memory: Record, out: Array) -> None:
         return
     walk(arms, arrays.NOMINAL, q, memory.axes, memory.T)
     pose_error(memory.pose, memory.T, memory.R, memory.error)
-    e = memory.error
-    out[place] = math.sqrt(e[0] * e[0] + e[1] * e[1] + e[2] * e[2])
-    out[place + 1] = math.sqrt(e[3] * e[3] + e[4] * e[4] + e[5] * e[5])
+    write_residuals(arms, memory, memory.error, out)

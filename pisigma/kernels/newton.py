@@ -4,10 +4,10 @@ import math
 
 from pisigma.kernels.arrays import CORRECTED, IDENTIFIED
 from pisigma.kernels.damped_step import damped_step, scaled_square
-from pisigma.kernels.joint_correction import correction_slope
-from pisigma.kernels.motion import correct, move
+from pisigma.kernels.joint_correction import correct, correction_slope, move
 from pisigma.kernels.rotations import pose_error
 from pisigma.kernels.rows import Array, Record, copy, copy_rows, fill, kernel
+from pisigma.kernels.task_axes import count_axes, in_task_axes, is_tolerated, miss, use_axes
 from pisigma.kinematics import tolerances
 
 _CLOSE, _LAST, _SETTLED = 0.05, 1e-15, 3e-12
@@ -16,9 +16,10 @@ _SETTLED: joint values [rad or m] move less after a step that is the last one.""
 
 
 @kernel
-def _within(error: Array, position: float, rotation: float) -> bool:
+def within(error: Array, position: float, rotation: float) -> bool:
+    """Whether an error is below a distance [m] and an angle [rad], that of the elbow with the others."""
     linear = error[0] * error[0] + error[1] * error[1] + error[2] * error[2]
-    angular = error[3] * error[3] + error[4] * error[4] + error[5] * error[5]
+    angular = error[3] * error[3] + error[4] * error[4] + error[5] * error[5] + error[6] * error[6]
     return linear < position * position and angular < rotation * rotation
 
 
@@ -37,11 +38,11 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
     arms, dof = description.arms, description.arms.dof
     reach = arms.reach[IDENTIFIED if arm == CORRECTED else arm]
     _move_steeply(description, memory, arm, q)
-    pose_error(T, memory.T, memory.R, memory.best)
+    miss(arms, memory, T, memory.best)
     copy_rows(memory.J, memory.J_best)
     old, damping, stalled = scaled_square(reach, memory.best), tolerances.FIRST_DAMPING, 0
     for _ in range(tolerances.ITERATIONS):
-        if _within(memory.best, tolerance, tolerance) or damping > tolerances.MOST_DAMPING:
+        if within(memory.best, tolerance, tolerance) or damping > tolerances.MOST_DAMPING:
             break
         possible = damped_step(arms, reach, memory.J_best, memory.best, damping, memory)
         new = math.inf
@@ -49,7 +50,7 @@ def newton(description: Record, memory: Record, arm: int, T: Array, q: Array, to
             for j in range(dof):
                 memory.trial[j] = q[j] + memory.step[j]
             _move_steeply(description, memory, arm, memory.trial)
-            pose_error(T, memory.T, memory.R, memory.error)
+            miss(arms, memory, T, memory.error)
             new = scaled_square(reach, memory.error)
         if new < old:
             stalled = stalled + 1 if new > tolerances.STALLED * old else 0
@@ -79,7 +80,50 @@ def _move_steeply(description: Record, memory: Record, arm: int, q: Array) -> No
 
 @kernel
 def search(description: Record, memory: Record, T: Array, q: Array) -> bool:
-    """Bring q to a pose of the calibrated arm, and say whether that succeeded.
+    """Bring q to a pose of the calibrated arm in the axes that count, and say whether that succeeded.
+
+    Axes with tolerances are first to be met like the exact ones, if the arm has joints enough for that; then by least
+    squares, each weighed by its tolerance.
+    """
+    if memory.whole:
+        return _search_exactly(description, memory, T, q)
+    copy(q, memory.first)
+    if not memory.loose and _search_exactly(description, memory, T, q):
+        return _is_tolerable(description, memory, T, q)
+    exact = count_axes(memory, False)
+    if exact >= description.arms.dof or count_axes(memory, True) == exact:
+        return False
+    copy(memory.first, q)
+    return _search_loosely(description, memory, T, q) and _is_tolerable(description, memory, T, q)
+
+
+@kernel
+def _is_tolerable(description: Record, memory: Record, T: Array, q: Array) -> bool:
+    """Whether joint values keep within the tolerances of all axes."""
+    move(description, memory, CORRECTED if description.arms.corrected else IDENTIFIED, q)
+    pose_error(T, memory.T, memory.R, memory.error)
+    in_task_axes(description.arms, memory, T, memory.error, True)
+    fill(memory.checked, math.nan)
+    return is_tolerated(memory, memory.error)
+
+
+@kernel
+def _search_loosely(description: Record, memory: Record, T: Array, q: Array) -> bool:
+    """Bring q to the least weighted deviations, then without any to the axes that count exactly."""
+    arm = CORRECTED if description.arms.corrected else IDENTIFIED
+    fill(memory.checked, math.nan)
+    use_axes(memory, True, True)
+    newton(description, memory, IDENTIFIED, T, q, tolerances.TOLERANCE)
+    newton(description, memory, arm, T, q, tolerances.TOLERANCE)
+    use_axes(memory, False, False)
+    newton(description, memory, arm, T, q, tolerances.HYBRID_TOLERANCE)
+    use_axes(memory, True, False)
+    return within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)
+
+
+@kernel
+def _search_exactly(description: Record, memory: Record, T: Array, q: Array) -> bool:
+    """The same for the axes that count now, none of which may deviate.
 
     First the arm without its correction, then from there with it, which may reach a little farther; where the start
     is near already, a shorter way to the same joint values.
@@ -93,11 +137,11 @@ def search(description: Record, memory: Record, T: Array, q: Array) -> bool:
         copy(memory.start, q)
     newton(description, memory, IDENTIFIED, T, q, tolerances.TOLERANCE)
     if not arms.corrected:
-        return _within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)
-    if not _within(memory.best, tolerances.NEARLY * arms.reach[IDENTIFIED], tolerances.NEARLY):
+        return within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)
+    if not within(memory.best, tolerances.NEARLY * arms.reach[IDENTIFIED], tolerances.NEARLY):
         return False
     newton(description, memory, CORRECTED, T, q, tolerances.HYBRID_TOLERANCE)
-    return _within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)
+    return within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)
 
 
 @kernel
@@ -112,7 +156,7 @@ def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
         return False
     if not arms.corrected:
         move(description, memory, IDENTIFIED, q)
-        pose_error(T, memory.T, memory.R, memory.error)
+        miss(arms, memory, T, memory.error)
         return _checked(memory, q, tolerances.TOLERANCE * 4)
     copy(q, memory.trial)
     before = 1.0
@@ -130,14 +174,14 @@ def _quick(description: Record, memory: Record, T: Array, q: Array) -> bool:
             break
         before = moved
     move(description, memory, CORRECTED, q)
-    pose_error(T, memory.T, memory.R, memory.error)
+    miss(arms, memory, T, memory.error)
     return _checked(memory, q, tolerances.ACCEPTED)
 
 
 @kernel
 def _checked(memory: Record, q: Array, tolerance: float) -> bool:
     """Whether the pose is reached; if so, keep that the pose, Jacobian and error in memory are those of q."""
-    if not _within(memory.error, tolerance, tolerance):
+    if not within(memory.error, tolerance, tolerance):
         return False
     copy(q, memory.checked)
     return True
@@ -150,7 +194,7 @@ def _converge(description: Record, memory: Record, T: Array, q: Array) -> bool:
     reach, before = arms.reach[IDENTIFIED], _CLOSE * _CLOSE
     for _ in range(8):
         move(description, memory, IDENTIFIED, q)
-        pose_error(T, memory.T, memory.R, memory.error)
+        miss(arms, memory, T, memory.error)
         square = scaled_square(reach, memory.error)
         if not square < before:
             return square < 1e-26

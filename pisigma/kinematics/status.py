@@ -46,8 +46,8 @@ _SENTENCES = {
         "guess or left out; measure there too, or do not rely on it."
     ),
     Status.UNREACHABLE: (
-        "No joint values reach the pose on this branch; bring the pose into the workspace or choose another "
-        "branch."
+        "No joint values reach the pose, in position and orientation, on this branch, or none were found; choose "
+        "another branch, ignore axes of the tool that the task leaves free or give them tolerances, or move the pose."
     ),
     Status.NOT_CONVERGED: (
         "The search stopped before it reached the pose, and the joint values given do not reach it; start "

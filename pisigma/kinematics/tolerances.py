@@ -66,3 +66,9 @@ LARGEST_CORRECTION = 1.0
 FORWARD_ITERATIONS, FORWARD_TOLERANCE, FORWARD_ACCEPTED = 100, 1e-12, 1e-9
 """Rounds after which nominal joint values of corrected ones are given up; change [rad or m] in a round at which they
 have settled, and at which they will do after the last round."""
+
+ROUNDS, STRIDE = 40, 0.3
+"""The largest number and size [rad or m] of steps by which joints to spare come to where they are preferred."""
+
+STILL, COMFORTABLE = 1e-9, 1e-3
+"""[rad or m] Steps that are shorter are the last ones, to joint values to be near to, and away from joint limits."""

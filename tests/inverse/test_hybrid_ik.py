@@ -9,6 +9,7 @@ import torch
 from testing.closeness import assert_close
 from testing.hybrid import hybrid_of, joints_in
 
+from pisigma.inverse.compiled_ik import SOLUTIONS
 from pisigma.inverse.corrected_ik import CorrectedIK, load
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.singularity import singularity_measure
@@ -70,7 +71,7 @@ def test_all_branches_take_the_poses(solver):
     arm, ik = solver
     _, T = wanted(arm, ik, 40)
     every = ik.all_branches(T)
-    assert every.q.shape == (40, len(ik.branches), ik.model.robot.dof)
+    assert every.q.shape == (40, len(ik.branches) if ik.closed_form else SOLUTIONS, ik.model.robot.dof)
     reached = found(every)
     assert bool(reached.any(-1).all())
     each = T[:, None].expand(*reached.shape, 4, 4)

@@ -61,13 +61,24 @@ def calibrated_arm(
         shared: features besides the series and gravity.
         size: of the correction [1e-3 rad].
     """
+    return calibrated_robot(Robot.load(name), hybrid, covered, shared, size)
+
+
+def calibrated_robot(
+    robot: Robot,
+    hybrid: bool = True,
+    covered: float = 1.0,
+    shared: tuple[str, ...] = ("sin_cos",),
+    size: float = 1.0,
+) -> CalibratedModel:
+    """The same of any robot."""
     rng = np.random.default_rng(0)
-    robot = Robot.load(name).with_geometry(base=BASE, tool=TOOL)
+    robot = robot.with_geometry(base=BASE, tool=TOOL)
     geometric = robot.with_geometry(dh=robot.dh + ERRORS * rng.normal(size=robot.dh.shape))
     arm, starts = None, joints_of(robot, 400, share=covered)
     if hybrid:
         other = geometric.with_geometry(dh=geometric.dh + 0.2 * ERRORS * rng.normal(size=robot.dh.shape))
         arm = HybridArm(other, random_correction(robot, shared, size=size), JointCoverage.of(robot, starts))
     return CalibratedModel(
-        f"calibrated {name}", "test", robot, None, None, (), starts, calibrated=geometric, hybrid=arm
+        f"calibrated {robot.name}", "test", robot, None, None, (), starts, calibrated=geometric, hybrid=arm
     )
