@@ -11,13 +11,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pisigma.errors import PoseError, nearest_choice
+from pisigma.inverse.joint_input import FAULTS
 from pisigma.inverse.solution import Solution
 from pisigma.kernels import arrays
 from pisigma.kernels.description_file import read_description
 from pisigma.kernels.forms import KernelForms
 from pisigma.kernels.layout import make_memory, pack
 from pisigma.kernels.machine_code import address_of, kernel_forms, load_kernels
-from pisigma.kinematics.task_axes import TaskAxes, default_axes
+from pisigma.kinematics.task_axes import WHOLE, TaskAxes, default_axes
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import pisigma.inverse.corrected_ik
@@ -25,23 +26,9 @@ if TYPE_CHECKING:  # names in full, which type checkers at run time find without
 
 CHUNK = 2_048
 """Poses that a thread takes at a time."""
-
 SOLUTIONS = 8
 """Different solutions of a pose that are looked for on arms without closed form."""
 
-_WHOLE = TaskAxes().row
-
-_WRONG = {
-    arrays.NOT_FINITE: "T_base_tool{} has entries that are not finite numbers; give 16 finite numbers.",
-    arrays.LAST_ROW: "T_base_tool{} does not end with the row 0 0 0 1; give a homogeneous transform.",
-    arrays.NOT_ORTHONORMAL: (
-        "T_base_tool{} has a rotation part that is not orthonormal; normalise it or check its source."
-    ),
-    arrays.LEFT_HANDED: (
-        "T_base_tool{} has a left-handed rotation part (determinant -1); a reflection is no pose, check its axes."
-    ),
-    arrays.NEAR_NOT_FINITE: "near{} holds joint values that are no finite numbers; give a number for every joint.",
-}
 
 _PATIENCE = 2.0
 """[s] Kernels that are on disk are loaded in far less."""
@@ -96,7 +83,7 @@ class CompiledIK:
         self.belongs_to = belongs_to
         self._none = np.zeros((0, len(self.joints)))
         whole = description.network.used and not description.forms.closed_forms
-        self.axes = TaskAxes() if whole else default_axes(len(self.joints))
+        self.axes = WHOLE if whole else default_axes(len(self.joints))
         self._kernels = _kernels(description.forms)
         self._threads = threading.local()
 
@@ -159,12 +146,12 @@ class CompiledIK:
         dof = len(self.joints)
         beside, sides = self._rows(near, (), "near", throw), self._rows(approach, (), "approach", True)
         out = np.empty((1, 1, 2 * dof + 5))
-        task = self.axes if axes is None else self.checked_axes(axes)
+        task = self._checked(axes)
         wrong = self._run(
             arrays.SOLVE, T, 0, 1, beside, sides, self._branch(branch), not throw, out, task.row
         )
         if wrong >= 0:
-            raise PoseError(_WRONG[wrong % 8].format(""))
+            raise PoseError(FAULTS[wrong % 8].format(""))
         row = out[0, 0]
         position, rotation, measure, status, index = row[2 * dof :].tolist()
         q, nominal = row[:dof], row[dof : 2 * dof]
@@ -201,7 +188,7 @@ class CompiledIK:
         Raises:
             PoseError: a matrix is no pose (the message gives its index), or see `solve`.
         """
-        task = self.axes if axes is None else self.checked_axes(axes)
+        task = self._checked(axes)
         T = self._poses(T_base_tool, throw)
         batch = T.shape[:-2]
         beside, sides = self._rows(near, batch, "near", throw), self._rows(approach, batch, "approach", True)
@@ -220,30 +207,15 @@ class CompiledIK:
     ) -> Solution:
         """Solutions `(*batch, branches)` of poses `(*batch, 4, 4)` on every branch; for the rest see `solve_batch`.
 
-        An arm without closed form gets up to `SOLUTIONS` different ones, as `(*batch, SOLUTIONS)`, UNREACHABLE where
-        there are fewer; with joints to spare each is away from the limits as far as it can be reached without leaving
-        the pose.
+        An arm without closed form gets up to `SOLUTIONS` different ones instead, UNREACHABLE where there are fewer.
         """
-        task = self.axes if axes is None else self.checked_axes(axes)
+        task = self._checked(axes)
         T = self._poses(T_base_tool, throw)
         sides = self._rows(approach, T.shape[:-2], "approach", True)
         several = not self.description.forms.closed_forms and not self.description.network.used
         count = SOLUTIONS if several else len(self.branches)
         out = self._solve_rows(T, self._none, sides, arrays.EVERY_BRANCH, count, threads, throw, single, task)
         return self._solution(out.reshape(*T.shape[:-2], count, out.shape[-1]), owner, task)
-
-    def checked_axes(self, axes: TaskAxes) -> TaskAxes:
-        """Give back which axes of the tool count.
-
-        Raises:
-            PoseError: others are left out than usual, and the model corrects nominal joint values by the whole pose.
-        """
-        if self.description.network.used and axes != self.axes:
-            raise PoseError(
-                f"model '{self.name}' corrects nominal joint values by the whole pose, so that other axes of the tool "
-                f"than the usual ones ({', '.join(self.axes.ignored) or 'none'}) cannot be ignored; calibrate a hybrid."
-            )
-        return axes
 
     def forward(self, q: Any, arm: int | None = None, approach: Any = None) -> tuple[Any, Any, Any, Any]:
         """Where the calibrated arm goes.
@@ -264,10 +236,28 @@ class CompiledIK:
         T, out = np.empty((len(rows), 4, 4)), np.empty((len(rows), 7 * dof + 1))
         default = arrays.CORRECTED if self.description.arms.corrected else arrays.IDENTIFIED
         self._run(
-            arrays.EVALUATE, T, 0, len(rows), rows, sides, default if arm is None else arm, False, out, _WHOLE
+            arrays.EVALUATE,
+            T,
+            0,
+            len(rows),
+            rows,
+            sides,
+            default if arm is None else arm,
+            False,
+            out,
+            WHOLE.row,
         )
         J = out[:, : 6 * dof].reshape(-1, 6, dof)
         return T, J, out[:, 6 * dof : 7 * dof], out[:, 7 * dof]
+
+    def _checked(self, axes: TaskAxes | None) -> TaskAxes:
+        """Which axes count; models that correct by the whole pose leave out no others than usual."""
+        if axes is None or not self.description.network.used or axes == self.axes:
+            return axes or self.axes
+        raise PoseError(
+            f"model '{self.name}' corrects nominal joint values by the whole pose, so that other axes of the tool than "
+            f"the usual ones ({', '.join(self.axes.ignored) or 'none'}) cannot be ignored; calibrate a hybrid."
+        )
 
     def _solution(
         self, out: Any, owner: "pisigma.inverse.corrected_ik.CorrectedIK | None", axes: TaskAxes
@@ -275,11 +265,8 @@ class CompiledIK:
         """The solutions of poses, `(*batch, 2 · dof + 5)`."""
         dof = len(self.joints)
         position, rotation, measure, status, branch = np.moveaxis(out[..., 2 * dof :], -1, 0)
-        q, nominal = out[..., :dof], out[..., dof : 2 * dof]
-        branch, status = branch.astype(int), status.astype(int)
-        return Solution(
-            q, nominal, branch, self.branches, status, position, rotation, measure, owner, axes.ignored
-        )
+        lies, found = (branch.astype(int), self.branches, status.astype(int)), (position, rotation, measure)
+        return Solution(out[..., :dof], out[..., dof : 2 * dof], *lies, *found, owner, axes.ignored)
 
     def _solve_rows(
         self,
@@ -315,7 +302,7 @@ class CompiledIK:
         if wrong >= 0:
             index = tuple(int(i) for i in np.unravel_index(wrong // 8, T.shape[:-2])) if T.ndim > 2 else ()
             at = f" at index {index if len(index) > 1 else index[0]}" if index else ""
-            raise PoseError(_WRONG[wrong % 8].format(at))
+            raise PoseError(FAULTS[wrong % 8].format(at))
         return out
 
     def _run(

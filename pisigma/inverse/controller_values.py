@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from pisigma.errors import PoseError
 from pisigma.inverse.joint_input import as_array, pose_array
 from pisigma.inverse.passive_joints import nearest_starts, solve, solve_from
 from pisigma.inverse.solution import Solution
@@ -33,7 +34,15 @@ class ControllerValues:
         self.ik, self.coupling = ik, coupling
 
     def for_axes(self, axes: TaskAxes) -> "ControllerValues":
-        """The same where other axes of the tool count."""
+        """The same where other axes of the tool count.
+
+        Raises:
+            PoseError: the arm has passive joints, which are solved in the usual axes only.
+        """
+        if self.coupling.passive:
+            raise PoseError(
+                "an arm with passive joints takes no other axes of the tool than the usual; state none."
+            )
         ik = copy(self.ik)
         ik.axes = axes
         return ControllerValues(ik, self.coupling)

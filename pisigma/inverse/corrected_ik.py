@@ -137,9 +137,6 @@ class CorrectedIK:
     ) -> "pisigma.inverse.solution.Solution":
         """Find corrected joint values for poses.
 
-        A robot with more joints than axes of the tool count comes as near to `near` as it can; without `near` it keeps
-        away from joint limits and singularities.
-
         Args:
             T_base_tool: `(*batch, 4, 4)` wanted poses of the tool in the base frame [m].
             near: joint values `(*batch, dof)` or `(dof,)` [rad or m], such as the robot's present ones; of the branches
@@ -151,21 +148,17 @@ class CorrectedIK:
                 robot, raises nothing but gets the status INVALID_POSE and NaN.
             approach: `(*batch, dof)` or `(dof,)`: +1 or -1 for the side from which every joint will come to the pose,
                 which matters to joints with backlash; 0, or None for all, where that is not stated.
-            ignore_axes: axes of the tool's frame that do not count, of "x", "y", "z" (along them) and "roll", "pitch",
-                "yaw" (about x, y and z): ("yaw",) for a torch that may turn about its z axis. None: none from six
-                joints on, "yaw" with five, with four "roll" and "pitch" up to 10 deg, with three all rotations.
-            tolerance_mm: how far the tool may be off along its axes where it cannot reach the pose exactly [mm], one
-                number or three; the deviations are then least, each over its tolerance.
-            tolerance_deg: the same about its axes [deg]. An axis without tolerance that is not ignored counts exactly.
-            elbow_angle: of an arm with seven revolute joints [rad], see `kinematics.task_axes.TaskAxes`.
+            ignore_axes: see `for_task`.
+            tolerance_mm: see there.
+            tolerance_deg: see there.
+            elbow_angle: see there [rad].
 
         Returns:
             One solution per pose: arrays for arrays, in float64; tensors for tensors, in their dtype and on their
             device.
 
         Raises:
-            PoseError: a matrix is no pose, `near` does not fit or lies far beyond the joint limits, the branch is
-                unknown, or the model or its robot cannot leave out the axes.
+            PoseError: a matrix is no pose, `near` lies far beyond the joint limits, or an argument does not fit.
         """
         task = self.for_task(ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
         if near is not None:
@@ -175,7 +168,6 @@ class CorrectedIK:
             return task.controller.solve(T_base_tool, near, self, branch, throw=throw, approach=approach)
         kernels = self.compiled
         if isinstance(T_base_tool, np.ndarray) and T_base_tool.shape == (4, 4) and kernels is not None:
-            # the way of control loops
             return kernels.solve(T_base_tool, near, branch, throw, approach, self, task.axes)
         T, single = pose_array(T_base_tool)
         if kernels is None:
@@ -191,44 +183,23 @@ class CorrectedIK:
             )
         return self._like(T_base_tool, solution, task.axes)
 
-    def all_branches(
-        self,
-        T_base_tool: Any,
-        *,
-        approach: Any = None,
-        ignore_axes: Sequence[str] | None = None,
-        tolerance_mm: float | Sequence[float] | None = None,
-        tolerance_deg: float | Sequence[float] | None = None,
-        elbow_angle: float | None = None,
-    ) -> "pisigma.inverse.solution.Solution":
-        """Solutions on every branch, as `(*batch, branches)`; see `__call__`.
+    def all_branches(self, T_base_tool: Any, *, approach: Any = None) -> "pisigma.inverse.solution.Solution":
+        """Solutions on every branch, as `(*batch, branches)`; see `__call__` and `for_task`.
 
         A robot without closed-form inverse gets up to eight different solutions instead, such as those of an elbow to
         either side, where it has kernels, and else one.
         """
-        task = self.for_task(ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
         approach = checked_approach(approach)
-        if task.controller is not None:
-            return task.controller.all_branches(T_base_tool, self, approach=approach)
+        if self.controller is not None:
+            return self.controller.all_branches(T_base_tool, self, approach=approach)
         T, single = pose_array(T_base_tool)
+        options = {"approach": approach, "single": single, "axes": self.axes}
         if self.compiled is None:
-            every = self.reference.all_branches(T, approach=approach, single=single, axes=task.axes)
-        else:
-            every = self.compiled.all_branches(
-                T, approach=approach, single=single, owner=self, axes=task.axes
-            )
-        return self._like(T_base_tool, every, task.axes)
+            return self._like(T_base_tool, self.reference.all_branches(T, **options), self.axes)
+        return self._like(T_base_tool, self.compiled.all_branches(T, owner=self, **options), self.axes)
 
     def path(
-        self,
-        T_base_tool: Any,
-        *,
-        near: Any = None,
-        branch: str | None = None,
-        ignore_axes: Sequence[str] | None = None,
-        tolerance_mm: float | Sequence[float] | None = None,
-        tolerance_deg: float | Sequence[float] | None = None,
-        elbow_angle: float | None = None,
+        self, T_base_tool: Any, *, near: Any = None, branch: str | None = None
     ) -> "pisigma.inverse.path.JointPath":
         """Find joint values along a path: one branch as long as possible, and word of every place where that ends.
 
@@ -238,18 +209,13 @@ class CorrectedIK:
             T_base_tool: `(poses, 4, 4)` wanted poses in order [m]; as NumPy array or nested lists.
             near: `(dof,)` joint values [rad or m] where the robot is before the path.
             branch: name of the branch to begin on if that costs no jump.
-            ignore_axes: see `__call__`, also for what follows.
-            tolerance_mm: of positions.
-            tolerance_deg: of orientations.
-            elbow_angle: of an arm with seven joints.
 
         Raises:
             PoseError: see `__call__`.
         """
         from pisigma.inverse.path import follow_path
 
-        task = self.for_task(ignore_axes, tolerance_mm, tolerance_deg, elbow_angle)
-        return follow_path(task, T_base_tool, near, branch)
+        return follow_path(self, T_base_tool, near, branch)
 
     def forward(self, q: Any, *, approach: Any = None) -> Any:
         """Pose T_base_tool `(*batch, 4, 4)` that the calibrated arm takes at commanded joint values `(*batch, dof)`.
@@ -341,10 +307,22 @@ class CorrectedIK:
         tolerance_deg: float | Sequence[float] | None = None,
         elbow_angle: float | None = None,
     ) -> "CorrectedIK":
-        """The same, where what is stated here counts in calls that do not state it; see `__call__`.
+        """The same for paths, all branches and calls that do not state what is stated here.
+
+        A robot with more joints than axes of the tool count comes as near to `near` as it can; without `near` it keeps
+        away from joint limits and singularities.
+
+        Args:
+            ignore_axes: axes of the tool's frame that do not count, of "x", "y", "z" (along them) and "roll", "pitch",
+                "yaw" (about x, y and z): ("yaw",) for a torch that may turn about its z axis. None: none from six
+                joints on, "yaw" with five, with four "roll" and "pitch" up to 10 deg, with three all rotations.
+            tolerance_mm: how far the tool may be off along its axes where it cannot reach the pose exactly [mm], one
+                number or three; the deviations are then least, each over its tolerance.
+            tolerance_deg: the same about its axes [deg]. An axis without tolerance that is not ignored counts exactly.
+            elbow_angle: of an arm with seven revolute joints [rad], see `kinematics.task_axes.TaskAxes`.
 
         Raises:
-            PoseError: see `__call__`.
+            PoseError: there is no such axis, a tolerance is none, or the robot has no elbow.
         """
         if ignore_axes is None and tolerance_mm is None and tolerance_deg is None and elbow_angle is None:
             return self

@@ -6,7 +6,21 @@ from typing import Any
 import numpy as np
 
 from pisigma.errors import PoseError
+from pisigma.kernels import arrays
 from pisigma.kernels.array_kinematics import is_tensor
+
+FAULTS = {
+    arrays.NOT_FINITE: "T_base_tool{} has entries that are not finite numbers; give 16 finite numbers.",
+    arrays.LAST_ROW: "T_base_tool{} does not end with the row 0 0 0 1; give a homogeneous transform.",
+    arrays.NOT_ORTHONORMAL: (
+        "T_base_tool{} has a rotation part that is not orthonormal; normalise it or check its source."
+    ),
+    arrays.LEFT_HANDED: (
+        "T_base_tool{} has a left-handed rotation part (determinant -1); a reflection is no pose, check its axes."
+    ),
+    arrays.NEAR_NOT_FINITE: "near{} holds joint values that are no finite numbers; give a number for every joint.",
+}
+"""What the kernels find wrong with a pose, or with joint values to be near to."""
 
 _POSES = "homogeneous transforms of shape (*batch, 4, 4)"
 

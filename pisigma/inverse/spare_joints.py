@@ -95,10 +95,9 @@ def best_of_starts(
     beside = None if near is None else near.repeat_interleave(count, 0)[found]
     preferred = limits.mean(-1).expand(len(found), dof) if beside is None else beside
     units = half if beside is None else torch.ones_like(half)
-    still = tolerances.COMFORTABLE if beside is None else tolerances.STILL
     solved, _ = wrap_into_limits(robot, q[found])
     task = TaskMotion(motion, axes, T.new_tensor(axes.weights(dof)))
-    solved = approach_preferred(robot, task, each[found], solved, preferred, units, still)
+    solved = approach_preferred(robot, task, each[found], solved, preferred, units)
     solved, inside = wrap_into_limits(robot, solved)
     if beside is None:
         margin = torch.minimum(solved - limits[:, 0], limits[:, 1] - solved).div(half).clamp(max=1.0).amin(-1)
@@ -125,7 +124,6 @@ def approach_preferred(
     q: Float64[Tensor, "poses dof"],
     preferred: Float64[Tensor, "poses dof"],
     units: Float64[Tensor, " dof"],
-    still: float,
 ) -> Float64[Tensor, "poses dof"]:
     """Move joints as near to preferred values as the pose and the limits allow.
 
@@ -139,7 +137,6 @@ def approach_preferred(
         q: joint values that reach them [rad or m].
         preferred: joint values to come near to [rad or m].
         units: joint motions that count as one [rad or m].
-        still: steps that are shorter are the last ones [rad or m].
     """
     length, limits = characteristic_length(robot), torch.from_numpy(robot.limits)
     rows = T.new_tensor([1 / length] * 3 + [1.0] * 3)
@@ -162,7 +159,7 @@ def approach_preferred(
         inside = torch.minimum(torch.maximum(trial, limits[:, 0]), limits[:, 1])
         scale = torch.where(active[:, None] & (inside != trial), 0.0, scale)
         best = torch.where(active[:, None], inside, best)
-        active &= (moved >= still)[:, 0]
+        active &= (moved >= tolerances.STILL)[:, 0]
     start = torch.where(torch.isfinite(best).all(-1, keepdim=True), best, q)
     result = solve_numeric(
         robot, T, start, tolerance=tolerances.HYBRID_TOLERANCE, motion=task.motion, axes=task.axes

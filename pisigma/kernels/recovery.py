@@ -243,9 +243,7 @@ def settle(description: Record, memory: Record, has_near: bool, q: Array) -> boo
             memory.kept[j] = memory.scale[j]
             memory.scale[j] = 1.0 if has_near else half
         copy(q, memory.first)
-        if not _approach_preferred(
-            description, memory, tolerances.STILL if has_near else tolerances.COMFORTABLE, q
-        ):
+        if not _approach_preferred(description, memory, q):
             copy(memory.first, q)
         copy(memory.kept, memory.scale)
     if not math.isnan(memory.elbow):
@@ -255,7 +253,7 @@ def settle(description: Record, memory: Record, has_near: bool, q: Array) -> boo
 
 
 @kernel
-def _approach_preferred(description: Record, memory: Record, still: float, q: Array) -> bool:
+def _approach_preferred(description: Record, memory: Record, q: Array) -> bool:
     """Move joints as near to preferred values as the pose and the limits allow; whether they still reach the pose.
 
     Every step solves the linearised problem: `min |dq - pull|` in units of `memory.scale` where `J dq = e` holds
@@ -285,7 +283,7 @@ def _approach_preferred(description: Record, memory: Record, still: float, q: Ar
             if not arms.limits[j, 0] <= q[j] <= arms.limits[j, 1]:
                 q[j] = min(max(q[j], arms.limits[j, 0]), arms.limits[j, 1])
                 memory.scale[j] = 0.0
-        if moved < still:
+        if moved < tolerances.STILL:
             break
     newton(description, memory, arm, memory.pose, q, tolerances.HYBRID_TOLERANCE)
     return within(memory.best, tolerances.ACCEPTED, tolerances.ACCEPTED)

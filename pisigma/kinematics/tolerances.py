@@ -70,5 +70,5 @@ have settled, and at which they will do after the last round."""
 ROUNDS, STRIDE = 40, 0.3
 """The largest number and size [rad or m] of steps by which joints to spare come to where they are preferred."""
 
-STILL, COMFORTABLE = 1e-9, 1e-3
-"""[rad or m] Steps that are shorter are the last ones, to joint values to be near to, and away from joint limits."""
+STILL = 1e-9
+"""[rad or m] Such a step that is shorter is the last one."""

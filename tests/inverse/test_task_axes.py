@@ -208,7 +208,7 @@ def test_a_path_uses_the_freedom_about_the_torch():
     ik = CorrectedIK(model_of("ur5"))
     q = np.linspace([0.3, -1.1, 1.4, -0.9, 0.8, 0.3], [0.6, -0.9, 1.2, -0.7, 0.9, 0.5], 40)
     T = turned(ik.forward(q), np.linspace(0, 3, 40))  # the line itself would need a turn of the wrist
-    path = ik.path(T, near=q[0], ignore_axes=("yaw",))
+    path = ik.for_task(ignore_axes=("yaw",)).path(T, near=q[0])
     assert not path.switches
     assert np.abs(np.diff(path.solution.q, axis=0)).max() < 0.03
     assert path.solution.ignored_axes == ("yaw",)

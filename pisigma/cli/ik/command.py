@@ -17,6 +17,21 @@ if TYPE_CHECKING:
 
 Pose = tuple[float, float, float, float, float, float]
 
+IgnoreAxes = Annotated[
+    str | None,
+    typer.Option(
+        help="Axes of the tool that do not count, such as roll,pitch: of x, y, z (along them) and roll, pitch, yaw "
+        "(about the tool's x, y, z); or none. [default: by the number of joints]"
+    ),
+]
+ToleranceMm = Annotated[
+    str | None, typer.Option(help="How far the tool may be off along its axes [mm]: one number or three.")
+]
+ToleranceDeg = Annotated[
+    str | None, typer.Option(help="How far it may be off about its axes [deg]: one number or three.")
+]
+ElbowDeg = Annotated[float | None, typer.Option(help="Elbow angle of an arm with seven joints [deg].")]
+
 
 def ik(
     model: ModelFolder,
@@ -45,22 +60,10 @@ def ik(
             help="The rows of --poses are a path: stay on one branch as long as possible and say where that ends.",
         ),
     ] = False,
-    ignore_axes: Annotated[
-        str | None,
-        typer.Option(
-            help="Axes of the tool that do not count, such as roll,pitch: of x, y, z (along them) and roll, pitch, yaw "
-            "(about the tool's x, y, z); or none. [default: by the number of joints]"
-        ),
-    ] = None,
-    tolerance_mm: Annotated[
-        str | None, typer.Option(help="How far the tool may be off along its axes [mm]: one number or three.")
-    ] = None,
-    tolerance_deg: Annotated[
-        str | None, typer.Option(help="How far it may be off about its axes [deg]: one number or three.")
-    ] = None,
-    elbow_deg: Annotated[
-        float | None, typer.Option(help="Elbow angle of an arm with seven joints [deg].")
-    ] = None,
+    ignore_axes: IgnoreAxes = None,
+    tolerance_mm: ToleranceMm = None,
+    tolerance_deg: ToleranceDeg = None,
+    elbow_deg: ElbowDeg = None,
     payload_kg: PayloadKg = None,
     temperature_c: TemperatureC = None,
     as_json: AsJson = False,
@@ -83,16 +86,23 @@ def ik(
     stated = {"payload_kg": payload_kg, "temperature_c": temperature_c}
     if conditions := {name: value for name, value in stated.items() if value is not None}:
         solver = solver.under(**conditions)
-    solver = solver.for_task(
-        None if ignore_axes is None else [name for name in _words(ignore_axes) if name != "none"],
-        _numbers("--tolerance-mm", tolerance_mm),
-        _numbers("--tolerance-deg", tolerance_deg),
-        None if elbow_deg is None else math.radians(elbow_deg),
-    )
+    solver = _for_task(solver, ignore_axes, tolerance_mm, tolerance_deg, elbow_deg)
     if poses is not None and out is not None:
         _write_file(solver, poses, out, branch, accuracy, path, as_json)
     elif pose is not None:
         _print_pose(solver, pose, branch, all_branches, as_json)
+
+
+def _for_task(
+    solver: "CorrectedIK", ignore: str | None, mm: str | None, deg: str | None, elbow_deg: float | None
+) -> "CorrectedIK":
+    """The same where the options say which axes of the tool count."""
+    return solver.for_task(
+        None if ignore is None else [name for name in _words(ignore) if name != "none"],
+        _numbers("--tolerance-mm", mm),
+        _numbers("--tolerance-deg", deg),
+        None if elbow_deg is None else math.radians(elbow_deg),
+    )
 
 
 def _words(text: str) -> list[str]:

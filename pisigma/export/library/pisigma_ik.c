@@ -16,7 +16,8 @@ enum { SOLVE = 0, EVALUATE = 1 };
  * approach_rows, branch, mark, single, out, count. */
 int32_t pisigma_run(int64_t *result, void **raised, const void *description, void *memory, int64_t task, int64_t rows,
                     double *T, const double *near_q, int64_t near_rows, const double *approach, int64_t approach_rows,
-                    int64_t branch, int64_t mark, int64_t single, double *out, int64_t count);
+                    const double *axes, int64_t axes_rows, int64_t branch, int64_t mark, int64_t single, double *out,
+                    int64_t count);
 
 typedef struct {
     char magic[8];
@@ -30,6 +31,8 @@ struct pisigma_model {
     char *names; /* of the branches, each with a zero behind it */
     unsigned char *description;
 };
+
+#define PISIGMA_LEAN 0.17453292519943295 /* [rad] how far the tool of an arm with four joints may lean */
 
 static uint32_t checksum(uint32_t sum, const void *data, size_t size) {
     const unsigned char *bytes = data;
@@ -104,9 +107,16 @@ static int64_t run(const pisigma_model *model, int64_t task, double *pose, const
                    int64_t branch, double *out) {
     _Alignas(64) unsigned char memory[PISIGMA_MEMORY_SIZE];
     int64_t result[2] = {0, 0};
+    /* Which axes of the tool count: tolerances [m, rad], infinity to ignore an axis, no elbow angle, and the axis that
+       rotations are split about. As in Python they go by the number of joints; all six count from six joints on. */
+    static const double few[3][8] = {{0, 0, 0, INFINITY, INFINITY, INFINITY, NAN, -1},
+                                     {0, 0, 0, -PISIGMA_LEAN, -PISIGMA_LEAN, 0, NAN, 2},
+                                     {0, 0, 0, 0, 0, INFINITY, NAN, 2}};
+    int joints = pisigma_joints(model);
+    const double *axes = joints >= 3 && joints <= 5 ? few[joints - 3] : NULL;
     memset(memory, 0, sizeof memory);
     pisigma_run(&result[0], (void **)&result[1], model->description, memory, task, 1, pose, near_q, near_q != NULL,
-                approach, approach != NULL, branch, 1, 0, out, 1);
+                approach, approach != NULL, axes, axes != NULL, branch, 1, 0, out, 1);
     return result[0];
 }
 

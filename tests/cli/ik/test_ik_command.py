@@ -383,7 +383,7 @@ def test_axes_of_the_tool_that_do_not_count(run, calibrated_folder, tmp_path):
         "ik", calibrated_folder, "--poses", tmp_path / "poses.csv", "--out", tmp_path / "q.csv", *options
     )
     assert result.exit_code == 0, result.output
-    lines = list(csv.DictReader((tmp_path / "q.csv").open()))
+    lines = list(csv.DictReader((tmp_path / "q.csv").read_text().splitlines()))
     assert all(float(line["position_residual_mm"]) < 1e-6 for line in lines)
     result = run("ik", calibrated_folder, "--pose", *rows[0], "--ignore-axes", "yaw", "--json")
     (solution,) = json.loads(result.stdout)["solutions"]
