@@ -4,6 +4,7 @@
 """
 
 import argparse
+import os
 import signal
 import sqlite3
 import subprocess
@@ -27,6 +28,11 @@ SECONDS = 6.0
 """Of a command, to begin with."""
 
 
+def _files(folder: Path) -> set[str]:
+    """All files below a folder, while others come and go."""
+    return {os.path.join(place, name) for place, _, names in os.walk(folder) for name in names}
+
+
 class Chain:
     """Models link-0, link-1, ... in a folder, each recalibrated from the one before, and the sessions of each.
 
@@ -40,17 +46,23 @@ class Chain:
         self.folder, self.links = folder, 1
         (folder / "link-0").mkdir()
         save_model(model_before(), folder / "link-0")
-        self._before = contents(folder)
+        self._before, self._files = contents(folder), _files(folder)
 
     def start(self, number: int, monitor: bool) -> subprocess.Popen[bytes]:
         """Start to monitor the last model, or to recalibrate it, with rows of their own."""
         rows = self.folder / f"2026-01-{number % 28 + 1:02d}.csv"
         rows_later(10, number + 1000).write_csv(rows, model_before().robot)
         self._before, self._sessions = contents(self.folder), self.sessions()
+        self._files = _files(self.folder)
         last = f"link-{self.links - 1}"
         if monitor:
             return start(("monitor", last, rows.name), self.folder)
         return start(("recalibrate", last, rows.name, "--out", f"link-{self.links}"), self.folder)
+
+    def wait_for_writing(self, process: subprocess.Popen[bytes]) -> None:
+        """Wait until the command begins to write beside the models, or ends."""
+        while process.poll() is None and _files(self.folder) == self._files:
+            time.sleep(0.001)
 
     def sessions(self) -> set[tuple[str, str]]:
         """Sessions that the histories of all models hold, by model and rows."""
@@ -79,7 +91,7 @@ class Chain:
 
 
 def main() -> None:
-    """Kill recalibrations and monitorings in turn, and run each to its end at last."""
+    """Kill recalibrations and monitorings in turn, at any time or while they write; run each to its end at last."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
@@ -91,7 +103,11 @@ def main() -> None:
             whole, began = not 0 <= number < wanted.count, time.monotonic()
             process = chain.start(number, bool(number % 2))
             if not whole:
-                time.sleep(seconds[number % 2] * float(rng.uniform(0.3, 1.1)))
+                if number % 4 < 2:
+                    time.sleep(seconds[number % 2] * float(rng.uniform(0.3, 1.1)))
+                else:
+                    chain.wait_for_writing(process)
+                    time.sleep(float(rng.uniform(0.0, 0.3)))
                 process.kill()
             status = process.wait()
             seconds[number % 2] = time.monotonic() - began if whole else seconds[number % 2]
