@@ -29,6 +29,7 @@ _NAMES = {
     "workflow.distill": "Distillation DistillationSettings distill",
     "workflow.evaluate": "EvaluationSettings Limits evaluate",
     "workflow.fleet": "FleetRun run_fleet",
+    "workflow.fleet_prior": "estimate_fleet_prior",
     "workflow.fleet_robot": "FleetSettings",
     "workflow.import_rows": "ImportSettings import_rows",
     "workflow.monitor": "Monitoring MonitorSettings monitor",

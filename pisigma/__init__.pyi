@@ -30,6 +30,7 @@ from pisigma.workflow.evaluate import Limits as Limits
 from pisigma.workflow.evaluate import evaluate as evaluate
 from pisigma.workflow.fleet import FleetRun as FleetRun
 from pisigma.workflow.fleet import run_fleet as run_fleet
+from pisigma.workflow.fleet_prior import estimate_fleet_prior as estimate_fleet_prior
 from pisigma.workflow.fleet_robot import FleetSettings as FleetSettings
 from pisigma.workflow.import_rows import ImportSettings as ImportSettings
 from pisigma.workflow.import_rows import import_rows as import_rows

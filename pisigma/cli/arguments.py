@@ -44,3 +44,12 @@ PayloadKg = Annotated[
 TemperatureC = Annotated[
     float | None, typer.Option(help="Temperature of the robot [deg C], likewise. [default: the usual]")
 ]
+
+AcceptImplausible = Annotated[
+    bool,
+    typer.Option(
+        "--accept-implausible",
+        help="Write the model also where the result must not be trusted; its card says why.",
+    ),
+]
+"""The option of commands that check a model before they write it."""

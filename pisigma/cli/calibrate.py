@@ -1,19 +1,25 @@
 """`pisigma calibrate`: geometric or hybrid calibration of measured data."""
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pisigma.cli.arguments import AsJson, Overwrite, complete_robot
-from pisigma.cli.output import command_line, print_json, print_line, print_lines, print_table, progress_of
-from pisigma.errors import AcceptanceError, IdentificationError
+from pisigma.cli.arguments import AcceptImplausible, AsJson, Overwrite, complete_model, complete_robot
+from pisigma.cli.lifetime.recalibrate import recalibrate_into
+from pisigma.cli.output import (
+    command_line,
+    print_json,
+    print_line,
+    print_lines,
+    print_table,
+    progress_of,
+    saved,
+)
+from pisigma.errors import IdentificationError
 
 if TYPE_CHECKING:
     from pisigma.judging.calibration_summary import CalibrationSummary
-    from pisigma.workflow.result import AbstractModelResult
 
 RobotName = Annotated[
     str,
@@ -82,11 +88,12 @@ Base = Annotated[str | None, typer.Option(help="Of a URDF file: link that is the
 Tip = Annotated[
     str | None, typer.Option(help="Of a URDF file: link that is the tool. [default: its only leaf]")
 ]
-AcceptImplausible = Annotated[
-    bool,
+Prior = Annotated[
+    Path | None,
     typer.Option(
-        "--accept-implausible",
-        help="Write the model also where the result must not be trusted; its card says why.",
+        help="Model folder of `pisigma fleet prior` to begin with; left-out rows decide whether it helps. Then only "
+        "--out, --overwrite, --accept-implausible and --json count.",
+        autocompletion=complete_model,
     ),
 ]
 Verbose = Annotated[bool, typer.Option("--verbose", help="Print all parameters.")]
@@ -113,6 +120,7 @@ def calibrate(
     socket_distance: SocketDistance = None,
     base: Base = None,
     tip: Tip = None,
+    prior: Prior = None,
     accept_implausible: AcceptImplausible = False,
     overwrite: Overwrite = False,
     verbose: Verbose = False,
@@ -128,7 +136,11 @@ def calibrate(
     from pisigma.robot.robot_file import robot_file
     from pisigma.workflow import calibrate as workflow
 
-    check_folder(out, overwrite, inputs=(robot_file(robot), data))
+    check_folder(out, overwrite, inputs=(robot_file(robot), data, prior))
+    if prior is not None:
+        drawn = Robot.load(robot, base, tip)
+        recalibrate_into(context, prior, data, out, accept_implausible, overwrite, as_json, drawn=drawn)
+        return
     stated: dict[str, Any] = {"model": model, "folds": folds, "hold_out": hold_out, "split": split}
     stated |= {"repeats": repeats, "seed": seed, "train_rows": train_rows, "robust": robust}
     settings = workflow.CalibrationSettings(
@@ -148,30 +160,6 @@ def calibrate(
             print_json({"model": folder and str(folder), **calibration.to_json()})
         else:
             print_calibration(calibration.summary, folder, calibration.seconds, verbose)
-
-
-@contextmanager
-def saved(
-    result: "AbstractModelResult", folder: Path, accept_implausible: bool, overwrite: bool, **texts: str
-) -> Iterator[Path | None]:
-    """Write a result as a model folder; while it is printed, give where it was written, None where it was not.
-
-    Args:
-        result: with its diagnostics.
-        folder: to write.
-        accept_implausible: write it also where it must not be trusted.
-        overwrite: replace the model that the folder holds.
-        texts: name and command, see `AbstractModelResult.save`.
-
-    Raises:
-        AcceptanceError: at the end, where it must not be trusted.
-    """
-    try:
-        result.save(folder, accept_implausible=accept_implausible, overwrite=overwrite, **texts)
-    except AcceptanceError:
-        yield None
-        raise
-    yield folder
 
 
 def print_calibration(

@@ -13,11 +13,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
-from pisigma.errors import printable
+from pisigma.errors import AcceptanceError, printable
 
 if TYPE_CHECKING:
     from rich.table import Table
     from rich.text import Text
+
+    from pisigma.workflow.result import AbstractModelResult
 
 WIDTH_WITHOUT_TERMINAL = 80
 
@@ -92,6 +94,30 @@ def progress_of(title: str) -> Iterator[Callable[[str], None]]:
         yield tell
     finally:
         status.stop()
+
+
+@contextmanager
+def saved(
+    result: "AbstractModelResult", folder: Path, accept_implausible: bool, overwrite: bool, **texts: str
+) -> Iterator[Path | None]:
+    """Write a result as a model folder; while it is printed, give where it was written, None where it was not.
+
+    Args:
+        result: with its diagnostics.
+        folder: to write.
+        accept_implausible: write it also where it must not be trusted.
+        overwrite: replace the model that the folder holds.
+        texts: name and command, see `AbstractModelResult.save`.
+
+    Raises:
+        AcceptanceError: at the end, where it must not be trusted.
+    """
+    try:
+        result.save(folder, accept_implausible=accept_implausible, overwrite=overwrite, **texts)
+    except AcceptanceError:
+        yield None
+        raise
+    yield folder
 
 
 def screen_width() -> int:

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, Overwrite
-from pisigma.cli.calibrate import AcceptImplausible, print_calibration, saved
-from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of
+from pisigma.cli.arguments import AcceptImplausible, AsJson, Overwrite
+from pisigma.cli.calibrate import print_calibration
+from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of, saved
 from pisigma.errors import printable
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Literal, get_args
 
@@ -49,6 +49,12 @@ class Gate:
     kept: Kept
     rms: Mapping[Kept, float | None]
     rows: int
+
+    @property
+    def with_least_error(self) -> "Gate":
+        """The same where the candidate with the least error is kept, by however little."""
+        sizes = {name: size for name, size in self.rms.items() if size is not None}
+        return replace(self, kept=min(sizes, key=lambda name: sizes[name])) if sizes else self
 
     @property
     def sentence(self) -> str:

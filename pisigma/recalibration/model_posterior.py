@@ -18,6 +18,9 @@ from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 
+FLEET_PRIOR = "fleet_prior"
+"""Kind of a model of what robots of one type have in common; each robot stands elsewhere."""
+
 
 @dataclass(frozen=True, eq=False)
 class ModelPosterior:

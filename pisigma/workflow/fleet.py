@@ -185,6 +185,7 @@ def _key(member: Member, settings: FleetSettings, plan: CalibrationSettings) -> 
         "version": __version__,
         "task": settings.task,
         "validate": settings.validate,
+        "prior": None if settings.prior is None else model_hash(settings.prior),
         "plan": repr(plan),
         "robot": _hash_of(drawn) if drawn.is_file() else member.robot,
         "model": None if model is None else model_hash(model) if is_model(model) else str(model),

@@ -11,6 +11,7 @@ from pisigma.errors import FleetError, OutputError, PisigmaError, nearest_choice
 from pisigma.fleet.members import Member, SessionFile
 from pisigma.fleet.record import REFUSED, ParameterValue, RobotRecord, SessionRecord, write_record
 from pisigma.judging.validation_figures import AbstractValidationFigures
+from pisigma.robot.description import Robot
 from pisigma.workflow.calibrate import Calibration, CalibrationSettings, calibrate
 from pisigma.workflow.monitor import MonitorSettings, monitor
 from pisigma.workflow.recalibrate import Recalibration, recalibrate
@@ -34,6 +35,7 @@ class FleetSettings:
         engine: "processes" on this machine, or "ray".
         jobs: processes that work side by side; None for one per core.
         address: of a Ray cluster; None for Ray on this machine.
+        prior: folder of a model of `pisigma fleet prior` that calibrations begin with.
 
     Raises:
         FleetError: something is no choice, or there are no jobs.
@@ -45,6 +47,7 @@ class FleetSettings:
     engine: EngineName = "processes"
     jobs: int | None = None
     address: str | None = None
+    prior: Path | None = None
 
     def __post_init__(self) -> None:
         """Refuse what is no choice."""
@@ -126,17 +129,19 @@ def _worked_out(
         OutputError: a model cannot be written.
     """
     parent = member.model
+    result: Calibration | Recalibration
     for number, session in enumerate(member.sessions):
         folder = out / "models" / member.id / session.name
         try:
-            if parent is None or settings.task == "calibrate":
+            if settings.prior is not None and (parent is None or settings.task == "calibrate"):
+                recalibration = recalibrate(settings.prior, session.data, drawn=Robot.load(member.robot))
+                record, result = _recalibrated(recalibration, session), recalibration
+            elif parent is None or settings.task == "calibrate":
                 calibration = replace(calibrate(member.robot, session.data, plan), figures=settings.validate)
-                record = _calibrated(calibration, session)
-                result: Calibration | Recalibration = calibration
+                record, result = _calibrated(calibration, session), calibration
             elif settings.task == "recalibrate":
                 recalibration = recalibrate(parent, session.data)
-                record = _recalibrated(recalibration, session)
-                result = recalibration
+                record, result = _recalibrated(recalibration, session), recalibration
             else:
                 yield from _monitored(parent, member.sessions[number:])
                 return

@@ -7,10 +7,12 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
 import torch
 
-from pisigma.errors import IdentificationError, nearest_choice
+from pisigma.errors import IdentificationError, ModelError, nearest_choice
 from pisigma.files.model_files import model_hash
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.result import HybridResult
@@ -28,7 +30,7 @@ from pisigma.model.stated_conditions import condition_warnings
 from pisigma.recalibration.adaptation import Adaptation, adapt
 from pisigma.recalibration.candidates import FAR_BETTER, Gate, gate
 from pisigma.recalibration.elsewhere import owners_elsewhere
-from pisigma.recalibration.model_posterior import ModelPosterior
+from pisigma.recalibration.model_posterior import FLEET_PRIOR, ModelPosterior
 from pisigma.recalibration.moved import Moved, moved_by, what_moved
 from pisigma.recalibration.recalibrated_model import KIND, recalibrated_model
 from pisigma.recalibration.recalibration_problem import Owner, owners_in, recalibration_problem
@@ -41,6 +43,9 @@ from pisigma.recalibration.summary import (
 from pisigma.reporting.recalibration_card import write_recalibration_card
 from pisigma.robot.description import Robot
 from pisigma.workflow.result import AbstractModelResult
+
+if TYPE_CHECKING:
+    from pisigma.fleet.prior import Likeness
 
 FEW_ROWS = 5
 """Different poses below which nothing can be said of left-out rows."""
@@ -109,18 +114,20 @@ def recalibrate(
     data: Measurements | str | os.PathLike[str],
     settings: RecalibrationSettings = RecalibrationSettings(),
     progress: Progress = lambda what: None,
+    drawn: Robot | None = None,
 ) -> Recalibration:
     """Add new rows to what a model knows, and keep whichever model predicts left-out rows best.
 
     Args:
-        model: of `pisigma calibrate` or `pisigma recalibrate`, or what holds it (a
+        model: of `pisigma calibrate`, `pisigma recalibrate` or `pisigma fleet prior`, or what holds it (a
             `CorrectedIK`, a `Calibration`), or its folder.
         data: new rows of any sensors, or a CSV file of them; those of the set "test" are left out.
         settings: see `RecalibrationSettings`.
         progress: called with what is being done.
+        drawn: the robot that the model has to be of; None for any.
 
     Raises:
-        ModelError: the folder holds no model, or the model holds no posterior.
+        ModelError: the folder holds no model, it is of another robot, or holds no posterior.
         MeasurementError: the data cannot be read.
         IdentificationError: the rows do not determine where something stands.
         PoseError: the joint values do not fit the robot.
@@ -130,6 +137,11 @@ def recalibrate(
     parent = source if isinstance(source, CalibratedModel) else load_model(source)
     sha256 = "" if isinstance(source, CalibratedModel) else model_hash(source)
     posterior = ModelPosterior.of(parent)
+    if drawn is not None and not np.array_equal(drawn.dh, posterior.space.robot.dh):
+        raise ModelError(
+            f"model '{parent.name}' is of robot '{posterior.space.robot.name}' and not of '{drawn.name}'; choose the "
+            "model of this robot."
+        )
     drawn = posterior.space.robot
     measurements = data if isinstance(data, Measurements) else Measurements.read_csv(data, drawn)
     rows = posterior.renamed(measurements.split_sets()[0])
@@ -145,6 +157,9 @@ def recalibrate(
     problem = adaptation.problem
     calibrator = HybridCalibrator(drawn)
     judged = gate(parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation"))
+    likeness = _likeness(parent, rows)
+    if likeness is not None and likeness.odd:
+        judged = judged.with_least_error
     if judged.kept == "scratch":
         result = fit(calibrator, rows, stage(progress, "from scratch"))
         assert isinstance(result, HybridResult)
@@ -152,12 +167,15 @@ def recalibrate(
     else:
         chosen = adapt(problem.without_arm(), adaptation.noise) if judged.kept == "old" else adaptation
         kept = recalibrated_model(parent, chosen, rows)
-    moved = moved_by(adaptation) if _believable(judged, drawn) else None
+    believable = likeness is None and _believable(judged, drawn)
+    moved = moved_by(adaptation) if believable else None
     summary = _summary(parent, rows, adaptation, judged, moved).having(
         parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=sha256),
         outliers=outliers,
         elsewhere=tuple(" ".join(owner).strip() for owner in sorted(elsewhere)),
     )
+    if likeness is not None:
+        summary = summary.having(changed=likeness.sentence)
     kept = replace(kept, metrics=summary.to_json())
     return Recalibration(
         kept, parent, adaptation, judged, moved or (), summary, seconds=time.perf_counter() - started
@@ -219,10 +237,24 @@ def _summary(
     )
 
 
+def _likeness(model: CalibratedModel, rows: Measurements) -> "Likeness | None":
+    """How like its fleet the robot of some rows is; None where the model is not the prior of a fleet."""
+    if model.kind != FLEET_PRIOR:
+        return None
+    from pisigma.fleet.prior import Likeness  # brings statistics that take half a second
+
+    return Likeness.of(model, rows)
+
+
 def _elsewhere(
     model: CalibratedModel, posterior: ModelPosterior, rows: Measurements, settings: RecalibrationSettings
 ) -> frozenset[Owner]:
-    """Bases and tools that stand elsewhere: all those of the rows that are stated to, or what the evidence says."""
+    """Bases and tools that stand elsewhere: those of the rows that are stated to, or what the evidence says.
+
+    Every robot of a fleet has its own.
+    """
+    if model.kind == FLEET_PRIOR:
+        return owners_in(rows, ("base", "tool"))
     if settings.moved is None:
         return owners_elsewhere(model, posterior, rows, posterior.noise)
     return owners_in(rows, settings.moved)

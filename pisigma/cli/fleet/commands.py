@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pisigma.cli.arguments import AsJson
+from pisigma.cli.arguments import AsJson, Overwrite
 from pisigma.cli.endings import NOT_ACCEPTED, tell_problems
-from pisigma.cli.output import print_json, print_lines, print_table, progress_of
+from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
 from pisigma.errors import FleetError
 
 if TYPE_CHECKING:
@@ -40,10 +40,15 @@ Validate = Annotated[
     bool,
     typer.Option("--validate", help="Cross-validate every calibration and draw the figures of its card."),
 ]
+PriorFolder = Annotated[
+    Path | None,
+    typer.Option("--prior", help="Model folder of `pisigma fleet prior` that calibrations begin with."),
+]
 Model = Annotated[str, typer.Option(help="hybrid or geometric.")]
 EngineName = Annotated[str, typer.Option(help="processes: of this machine; or ray.")]
 Jobs = Annotated[int | None, typer.Option(help="Processes that work side by side. [default: one per core]")]
 Address = Annotated[str | None, typer.Option(help="Of a Ray cluster. [default: Ray on this machine]")]
+PriorOut = Annotated[Path, typer.Option("--out", help="Model folder to write.")]
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Folder that `pisigma fleet run` wrote.")]
 Page = Annotated[Path | None, typer.Option(help="HTML page to write, with filters by state and name.")]
 OverdueDays = Annotated[
@@ -63,6 +68,7 @@ def run(
     task: Task = "calibrate",
     validate: Validate = False,
     model: Model = "hybrid",
+    prior: PriorFolder = None,
     engine: EngineName = "processes",
     jobs: Jobs = None,
     address: Address = None,
@@ -80,7 +86,9 @@ def run(
     stated: dict[str, Any] = {"task": task, "engine": engine}
     kind: Any = model
     calibration = CalibrationSettings(model=kind)
-    settings = FleetSettings(validate=validate, calibration=calibration, jobs=jobs, address=address, **stated)
+    settings = FleetSettings(
+        validate=validate, calibration=calibration, jobs=jobs, address=address, prior=prior, **stated
+    )
     with progress_of("fleet") as progress:
         result = run_fleet(source, out, settings, robot, progress)
     if as_json:
@@ -89,6 +97,38 @@ def run(
         _print_run(result)
     if result.refused:
         raise typer.Exit(NOT_ACCEPTED)
+
+
+@fleet.command("prior")
+@tell_problems
+def estimate_prior(
+    context: typer.Context,
+    source: Source,
+    out: PriorOut,
+    robot: RobotName = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Estimate what robots of one type have in common, from the first session of each, as a model folder.
+
+    `pisigma calibrate --prior DIR` and `pisigma plan DIR` begin with it.
+    """
+    from pisigma.files.output_folder import check_folder
+    from pisigma.workflow.fleet_prior import estimate_fleet_prior
+
+    check_folder(out, overwrite, inputs=(source,))
+    with progress_of("fleet prior") as progress:
+        result = estimate_fleet_prior(source, robot, progress)
+    result.save(out, command=command_line(context), overwrite=overwrite)
+    if as_json:
+        print_json({"model": str(out), **result.to_json()})
+        return
+    from pisigma.reporting.fleet_prior_card import common_table, spectrum_table
+
+    print_table(f"what {result.summary.robots} robots have in common", *common_table(result.summary))
+    print_table("joint correction", *spectrum_table(result.summary))
+    print_lines(f"Warning: {sentence}" for sentence in result.summary.warnings)
+    print_lines([f"Model written to {out} in {result.seconds:.1f} s; calibrate with --prior {out}."])
 
 
 @fleet.command()

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, ModelFolder, Overwrite
-from pisigma.cli.calibrate import AcceptImplausible, saved
-from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of
+from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelFolder, Overwrite
+from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of, saved
 
 if TYPE_CHECKING:
+    from pisigma.robot.description import Robot
     from pisigma.workflow.recalibrate import Recalibration
 
 Data = Annotated[
@@ -43,15 +43,48 @@ def recalibrate(
     from scratch; the folder holds the winner. Exit status 3, and no folder, where the result must not be trusted.
     """
     from pisigma.files.output_folder import check_folder
-    from pisigma.workflow import recalibrate as workflow
 
     if (out is None) is not dry_run:
         raise typer.BadParameter("either --out DIR or --dry-run was wanted.", param_hint="'--out'")
     if out is not None:
         check_folder(out, overwrite, inputs=(model, data))
-    settings = workflow.RecalibrationSettings(stated_to_move(moved))
+    recalibrate_into(
+        context, model, data, out, accept_implausible, overwrite, as_json, moved=stated_to_move(moved)
+    )
+
+
+def recalibrate_into(
+    context: typer.Context,
+    model: Path,
+    data: Path,
+    out: Path | None,
+    accept_implausible: bool,
+    overwrite: bool,
+    as_json: bool,
+    moved: tuple[str, ...] | None = None,
+    drawn: "Robot | None" = None,
+) -> None:
+    """Add rows to a model, write what was kept where a folder is stated, and print it.
+
+    Args:
+        context: of the command, for the card.
+        model: folder of the model.
+        data: file of the rows.
+        out: folder to write; None for none.
+        accept_implausible: write also what must not be trusted.
+        overwrite: replace the model that the folder holds.
+        as_json: print one JSON object.
+        moved: what is stated to stand elsewhere.
+        drawn: the robot that the model has to be of; None for any.
+
+    Raises:
+        ModelError: the model is of another robot.
+    """
+    from pisigma.workflow import recalibrate as workflow
+
+    settings = workflow.RecalibrationSettings(moved)
     with progress_of("recalibration") as progress:
-        recalibration = workflow.recalibrate(model, data, settings, progress)
+        recalibration = workflow.recalibrate(model, data, settings, progress, drawn)
     if out is None:
         _print(recalibration, None, as_json)
         return

@@ -1,0 +1,335 @@
+"""What robots of one type have in common: means and covariances of their errors, by empirical Bayes."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from scipy.stats import chi2
+from torch import Tensor
+
+from pisigma.errors import FleetError
+from pisigma.hybrid.arm import HybridArm, JointCoverage
+from pisigma.hybrid.covariance_root import CovarianceRoot
+from pisigma.hybrid.uncertainty import PositionUncertainty
+from pisigma.identification.problem.setup import IdentifiedGeometry
+from pisigma.joint_correction.feature import AbstractFeature
+from pisigma.joint_correction.joint_correction import JointCorrection
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel, Provenance
+from pisigma.model.geometric_model import branches_of
+from pisigma.model.stored_starts import spread_rows
+from pisigma.planning.knowledge import Instrument, Knowledge
+from pisigma.recalibration.adaptation import adapt
+from pisigma.recalibration.model_posterior import FLEET_PRIOR, ModelPosterior
+from pisigma.recalibration.recalibration_problem import ELSEWHERE, owners_in, recalibration_problem
+from pisigma.robot.description import Robot
+
+FEWEST_ROBOTS = 5
+"""Below, scatter between robots cannot be told from what each is uncertain by."""
+LINEARISATIONS = 2
+EM_STEPS = 60
+CLASS_ROBOTS = 0.2
+"""The class of the robot counts like so many robots in the variances of the fleet."""
+ODD = 1e-3
+"""Probability that any robot of a fleet without odd ones is called odd."""
+
+
+@dataclass(frozen=True, eq=False)
+class RobotEvidence:
+    """What the rows of one robot say of the unknowns of its arm, base and tool integrated out.
+
+    Attributes:
+        normal: information on the unknowns.
+        descent: its product with their most likely values.
+        noise: per sensor, see `Adaptation.noise`.
+    """
+
+    normal: Float64[Tensor, "unknowns unknowns"]
+    descent: Float64[Tensor, " unknowns"]
+    noise: Mapping[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class Population:
+    """Normal errors of the robots of a fleet.
+
+    Attributes:
+        mean: of the unknowns [m or rad].
+        covariance: between robots: of geometric parameters in full, of the weights of the correction each by itself.
+        geometric: number of geometric parameters, which come first.
+    """
+
+    mean: Float64[Tensor, " unknowns"]
+    covariance: Float64[Tensor, "unknowns unknowns"]
+    geometric: int
+
+    def surprise(self, robot: RobotEvidence) -> tuple[float, int]:
+        """How far a robot is from the fleet: a sum of squares that is chi-squared for a robot of it, and of how many.
+
+        In the coordinates in which the covariance is the identity and the information diagonal, `λ`, the descent minus
+        what the mean lets expect has the variance `λ + λ²`.
+        """
+        root = torch.linalg.cholesky(self.covariance)
+        information, axes = torch.linalg.eigh(root.t() @ robot.normal @ root)
+        seen = information > 0.1
+        along = axes.t() @ (root.t() @ (robot.descent - robot.normal @ self.mean))
+        squares = along.square() / (information + information.square())
+        return float(squares[seen].sum()), int(seen.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class FleetPrior:
+    """What a fleet has in common.
+
+    Attributes:
+        model: the mean robot; its uncertainty is the scatter between robots.
+        population: the same in numbers.
+        names: of the geometric parameters.
+        odd: numbers of the robots that are unlike the others and did not count.
+    """
+
+    model: CalibratedModel
+    population: Population
+    names: tuple[str, ...]
+    odd: tuple[int, ...]
+
+
+def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> FleetPrior:
+    """Estimate what the robots of a fleet have in common.
+
+    Every robot has errors `u ~ N(μ, Σ)` and rows that are linear in them. The expectation-maximisation of Dempster,
+    Laird and Rubin 1977 (J. Royal Statistical Society B 39(1), 1-38) finds μ and Σ, so that each robot counts by what
+    its rows determine; the usual errors of the robot's class (`pisigma.planning.robot_class`) count like two more
+    robots. Robots whose rows the others make too improbable are left out, and the rest is estimated anew.
+
+    Args:
+        name: of the fleet.
+        robot: as drawn, the same for all.
+        fleet: rows of each robot.
+
+    Raises:
+        FleetError: there are too few robots.
+        IdentificationError: the rows of a robot do not determine where it stands.
+    """
+    if len(fleet) < FEWEST_ROBOTS:
+        raise FleetError(
+            f"{FEWEST_ROBOTS} robots or more of one type were wanted to estimate what they have in common, got "
+            f"{len(fleet)}."
+        )
+    knowledge = Knowledge.of_robot(robot)
+    space = knowledge.uncertainty.space
+    everything = torch.arange(len(knowledge.uncertainty.root))
+    chosen = torch.cat([everything[: space.arm_size], everything[len(space.parameters) :]])
+    usual = knowledge.uncertainty.root[chosen].square().sum(1)
+    population = Population(torch.zeros_like(usual), usual.diag(), space.arm_size)
+    noise: Mapping[str, float] = {"position": Instrument().sigma}
+    odd: tuple[int, ...] = ()
+    for _ in range(LINEARISATIONS):
+        model = _model(name, knowledge, population, fleet, noise)
+        evidence = [_evidence(model, population.mean, rows) for rows in fleet]
+        population, odd = _without_odd(evidence, population, usual)
+        noise = _medians([one.noise for one in evidence])
+    model = _model(name, knowledge, population, fleet, noise)
+    return FleetPrior(model, population, space.names[: space.arm_size], odd)
+
+
+def _model(
+    name: str,
+    knowledge: Knowledge,
+    population: Population,
+    fleet: Sequence[Measurements],
+    noise: Mapping[str, float],
+) -> CalibratedModel:
+    """The mean robot of a population, which is uncertain by the scatter between robots."""
+    usual, size = knowledge.uncertainty, population.geometric
+    space, drawn = usual.space, usual.space.robot
+    dh = drawn.dh + population.mean[:size].numpy().reshape(drawn.dh.shape)
+    mean = drawn.with_geometry(dh=dh)
+    correction = _correction(drawn, usual.features, population.mean[size:])
+    q = torch.cat([rows.q.cpu() for rows in fleet])
+    starts = spread_rows(torch.unique(q, dim=0))
+    root = torch.zeros(len(usual.root), len(population.mean), dtype=torch.float64)
+    factor = torch.linalg.cholesky(population.covariance)
+    root[: space.arm_size], root[len(space.parameters) :] = factor[:size], factor[size:]
+    frames = {"": np.array(drawn.base)}, {"": np.array(drawn.tool)}
+    return CalibratedModel(
+        name=name,
+        kind=FLEET_PRIOR,
+        robot=drawn,
+        network=None,
+        domain=None,
+        branches=branches_of(drawn, starts),
+        starts=starts,
+        calibrated=mean,
+        bases=frames[0],
+        tools=frames[1],
+        hybrid=HybridArm(mean, correction, JointCoverage.of(drawn, q)),
+        hybrid_bases=frames[0],
+        hybrid_tools=frames[1],
+        uncertainty=PositionUncertainty(
+            space,
+            IdentifiedGeometry(mean, *frames, {}),
+            usual.features,
+            CovarianceRoot(root.float().double()),
+            1.0,
+            noise,
+        ),
+        provenance=Provenance(
+            data_source=f"{len(fleet)} robots",
+            rows=sum(rows.rows for rows in fleet),
+            versions=Provenance.present_versions(),
+        ),
+    )
+
+
+def _correction(
+    robot: Robot, features: tuple[AbstractFeature, ...], weights: Float64[Tensor, " weights"]
+) -> JointCorrection:
+    """The joint correction with some weights, of the used columns of all features."""
+    correction, start = JointCorrection(robot, list(features), ()), 0
+    with torch.no_grad():
+        for parameter, feature in zip(correction.linear, features, strict=True):
+            count = int(feature.used.sum())
+            values = weights[start : start + count]
+            parameter.copy_(torch.zeros(feature.used.shape).to(weights).masked_scatter(feature.used, values))
+            start += count
+    correction.requires_grad_(False)
+    return correction
+
+
+def _evidence(
+    model: CalibratedModel, mean: Float64[Tensor, " unknowns"], rows: Measurements
+) -> RobotEvidence:
+    """What the rows of a robot say, linearised at its most probable errors."""
+    posterior = ModelPosterior.of(model)
+    rows = posterior.renamed(rows)
+    problem = recalibration_problem(model, posterior, rows, owners_in(rows, ("base", "tool")))
+    problem = replace(problem, groups=tuple(group for group in problem.groups if group.stands))
+    adaptation = adapt(problem, posterior.noise)
+    values, space = adaptation.values, problem.design.problem.space
+    deviation = values.deviation(adaptation.drift.noise)
+    X, y = values.X / deviation[:, None], values.y / deviation
+    others = X[:, space.arm_size : len(space.parameters)]
+    own = torch.cat([X[:, : space.arm_size], X[:, len(space.parameters) :]], 1)
+    inner = others.t() @ others
+    inner.diagonal().add_(ELSEWHERE**-2)
+    taken = torch.linalg.solve(inner, others.t() @ torch.cat([own, y[:, None]], 1))
+    normal = own.t() @ own - own.t() @ others @ taken[:, :-1]
+    descent = own.t() @ y - own.t() @ others @ taken[:, -1]
+    normal = (normal + normal.t()) / 2
+    return RobotEvidence(normal, descent + normal @ mean, adaptation.noise)
+
+
+def _without_odd(
+    evidence: Sequence[RobotEvidence], start: Population, usual: Float64[Tensor, " unknowns"]
+) -> tuple[Population, tuple[int, ...]]:
+    """The population of the robots that are alike, and the numbers of the others."""
+    odd: tuple[int, ...] = ()
+    while True:
+        alike = [number for number in range(len(evidence)) if number not in odd]
+        population = expectation_maximisation([evidence[number] for number in alike], start, usual)
+        now = {number for number in alike if _is_odd(number, alike, evidence, population, usual)}
+        if not now or len(alike) - len(now) < FEWEST_ROBOTS:
+            return population, odd
+        odd = tuple(sorted({*odd, *now}))
+
+
+def _is_odd(
+    number: int,
+    alike: Sequence[int],
+    evidence: Sequence[RobotEvidence],
+    population: Population,
+    usual: Float64[Tensor, " unknowns"],
+) -> bool:
+    """Whether a robot is too far from a population of the others, which it would stretch to itself."""
+    others = [evidence[one] for one in alike if one != number]
+    square, count = _maximised(others, population, usual).surprise(evidence[number])
+    return bool(chi2.sf(square, count) < ODD / len(evidence))
+
+
+def expectation_maximisation(
+    evidence: Sequence[RobotEvidence], start: Population, usual: Float64[Tensor, " unknowns"]
+) -> Population:
+    """Mean and covariance of the robots' errors.
+
+    Args:
+        evidence: of the robots.
+        start: to begin with.
+        usual: variances of the class of the robots.
+    """
+    population = start
+    for _ in range(EM_STEPS):
+        population = _maximised(evidence, population, usual)
+    return population
+
+
+def _maximised(
+    evidence: Sequence[RobotEvidence], now: Population, usual: Float64[Tensor, " unknowns"]
+) -> Population:
+    """One step of expectation and maximisation.
+
+    The covariance of geometric parameters is drawn towards its diagonal, the more the fewer robots there are.
+    """
+    size, count = now.geometric, len(evidence)
+    precision = torch.linalg.inv(now.covariance)
+    inverses = torch.linalg.inv(torch.stack([one.normal for one in evidence]) + precision)
+    right = torch.stack([one.descent for one in evidence]) + precision @ now.mean
+    x = torch.einsum("rij,rj->ri", inverses, right)
+    off = x - x.mean(0)
+    scatter = inverses.sum(0) + off.t() @ off
+    diagonal = (CLASS_ROBOTS * usual + scatter.diagonal()) / (CLASS_ROBOTS + count)
+    covariance = diagonal.diag()
+    covariance[:size, :size] = count / (count + size) * scatter[:size, :size] / (CLASS_ROBOTS + count)
+    covariance.diagonal().copy_(diagonal)
+    return Population(x.mean(0), covariance, size)
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """How like the other robots of a fleet one is.
+
+    Attributes:
+        probability: that a robot of the fleet is as far from its mean, or farther.
+    """
+
+    probability: float
+
+    @staticmethod
+    def of(model: CalibratedModel, rows: Measurements) -> "Likeness":
+        """See how far the robot of some rows is from the mean of a fleet prior.
+
+        Args:
+            model: of the prior.
+            rows: of the robot.
+
+        Raises:
+            IdentificationError: the rows do not determine where the robot stands.
+        """
+        known = model.uncertainty
+        assert known is not None
+        root = torch.cat([known.root[: known.space.arm_size], known.root[len(known.space.parameters) :]])
+        mean = torch.zeros_like(root[:, 0])
+        population = Population(mean, root @ root.t(), known.space.arm_size)
+        square, count = population.surprise(_evidence(model, mean, rows))
+        return Likeness(float(chi2.sf(square, count)))
+
+    @property
+    def odd(self) -> bool:
+        """Whether the fleet says little of the robot."""
+        return self.probability < ODD
+
+    @property
+    def sentence(self) -> str:
+        """The same in words."""
+        if self.odd:
+            return f"This robot is unlike the fleet: fewer than 1 in {1 / ODD:,.0f} of it are as far from the mean."
+        return f"This robot is like the fleet: {self.probability:.0%} of it are as far from the mean, or farther."
+
+
+def _medians(noises: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """Median noise per sensor."""
+    names = dict.fromkeys(name for noise in noises for name in noise)
+    values = {name: sorted(noise[name] for noise in noises if name in noise) for name in names}
+    return {name: those[len(those) // 2] for name, those in values.items()}

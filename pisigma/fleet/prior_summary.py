@@ -1,0 +1,97 @@
+"""The figures of a fleet prior as one typed value, which its card, tables and JSON render."""
+
+import math
+from collections.abc import Sequence
+
+from pisigma.fleet.prior import FleetPrior
+from pisigma.judging.summary import AbstractSummary
+from pisigma.recalibration.model_posterior import FLEET_PRIOR
+from pisigma.yaml_file import Section
+
+
+class CommonFigures(Section):
+    """What the robots have in common of one parameter.
+
+    Attributes:
+        name: such as "theta_1".
+        unit: "mm" or "deg".
+        mean: of the errors.
+        deviation: standard deviation between robots.
+    """
+
+    name: str
+    unit: str
+    mean: float
+    deviation: float
+
+
+class SpectrumFigures(Section):
+    """Standard deviation between robots of the weights of a feature.
+
+    Attributes:
+        group: such as "harmonics 1 to 1".
+        deg: root mean square over the weights of the group [deg, or the same of lengths over the reach].
+    """
+
+    group: str
+    deg: float
+
+
+class FleetPriorSummary(AbstractSummary):
+    """All figures of a fleet prior.
+
+    Attributes:
+        robots: number of robots that count.
+        odd: ids of those that are unlike the others and do not.
+        rows: of all robots.
+        parameters: what they have in common.
+        spectrum: of the joint correction.
+    """
+
+    kinds = (FLEET_PRIOR,)
+
+    robots: int
+    odd: tuple[str, ...]
+    rows: int
+    parameters: tuple[CommonFigures, ...]
+    spectrum: tuple[SpectrumFigures, ...]
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to heed, a sentence each."""
+        return tuple(f"Robot '{name}' is unlike the others and did not count." for name in self.odd)
+
+
+def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:
+    """Give all figures.
+
+    Args:
+        prior: of the fleet.
+        ids: of its robots.
+    """
+    population, known = prior.population, prior.model.uncertainty
+    assert known is not None
+    deviation = population.covariance.diagonal().sqrt()
+    parameters = []
+    for number, name in enumerate(prior.names):
+        length = known.space.parameters[number].unit == "m"
+        scale = 1e3 if length else math.degrees(1.0)
+        mean, spread = float(population.mean[number]) * scale, float(deviation[number]) * scale
+        parameters.append(
+            CommonFigures(name=name, unit="mm" if length else "deg", mean=mean, deviation=spread)
+        )
+    weights, start, spectrum = deviation[population.geometric :], 0, []
+    for feature in known.features:
+        group = feature.group[feature.used]
+        own = weights[start : start + len(group)]
+        start += len(group)
+        for number, what in enumerate(feature.group_names):
+            size = float(own[group == number].square().mean().sqrt())
+            spectrum.append(SpectrumFigures(group=f"{feature.name}: {what}", deg=math.degrees(size)))
+    return FleetPriorSummary(
+        robots=len(ids) - len(prior.odd),
+        odd=tuple(ids[number] for number in prior.odd),
+        rows=prior.model.provenance.rows,
+        parameters=tuple(parameters),
+        spectrum=tuple(spectrum),
+    )

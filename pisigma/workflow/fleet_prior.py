@@ -1,0 +1,88 @@
+"""Estimate what the robots of a fleet have in common, as a model that calibrations of few rows begin with."""
+
+import os
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pisigma.errors import FleetError
+from pisigma.fleet.members import Member, read_fleet
+from pisigma.fleet.prior import FleetPrior, fleet_prior
+from pisigma.fleet.prior_summary import FleetPriorSummary, summarise_prior
+from pisigma.judging.progress import Progress
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.reporting.fleet_prior_card import write_fleet_prior_card
+from pisigma.robot.description import Robot
+from pisigma.workflow.result import AbstractModelResult
+
+
+@dataclass(frozen=True, eq=False)
+class FleetPriorResult(AbstractModelResult):
+    """What a fleet has in common, and all figures of it.
+
+    Attributes:
+        model: the mean robot, uncertain by the scatter between robots.
+        prior: the same in numbers.
+        summary: all figures.
+        seconds: time it took [s].
+    """
+
+    model: CalibratedModel
+    prior: FleetPrior
+    summary: FleetPriorSummary
+    seconds: float
+
+    def _describe(self, model: CalibratedModel, summary: Any, folder: Path) -> None:
+        write_fleet_prior_card(model, summary, folder)
+
+
+def estimate_fleet_prior(
+    source: str | os.PathLike[str],
+    robot: str | None = None,
+    progress: Progress = lambda what: None,
+) -> FleetPriorResult:
+    """Estimate means and covariances of the errors of robots of one type from the first session of each.
+
+    Args:
+        source: manifest (CSV) or folder; see `pisigma.fleet.members.read_fleet`.
+        robot: as drawn, of those robots that state none.
+        progress: called with what is being done.
+
+    Raises:
+        FleetError: the fleet cannot be used, its robots are of several types, or too few.
+        MeasurementError: a file cannot be read.
+        IdentificationError: the rows of a robot do not determine where it stands.
+    """
+    started = time.perf_counter()
+    members = read_fleet(source, robot)
+    drawn = _common_robot(members)
+    progress(f"{len(members)} robots")
+    rows = [Measurements.read_csv(member.sessions[0].data, drawn).split_sets()[0] for member in members]
+    name = Path(source).resolve().stem
+    prior = fleet_prior(name, drawn, rows)
+    summary = summarise_prior(prior, [member.id for member in members])
+    summary = summary.having(command=f"pisigma.estimate_fleet_prior({Path(source).name!r})")
+    model = replace(prior.model, metrics=summary.to_json())
+    return FleetPriorResult(model, prior, summary, time.perf_counter() - started)
+
+
+def _common_robot(members: tuple[Member, ...]) -> Robot:
+    """The drawing that all robots have.
+
+    Raises:
+        FleetError: there are several.
+    """
+    drawn = {member.robot: Robot.load(member.robot) for member in members}
+    first = drawn[members[0].robot]
+    for member in members:
+        other = drawn[member.robot]
+        if other.dh.shape != first.dh.shape or not np.array_equal(other.dh, first.dh):
+            raise FleetError(
+                f"robots '{members[0].id}' and '{member.id}' are of different types ({first.name} and {other.name}); "
+                "estimate what robots of one type have in common from a manifest of these alone."
+            )
+    return first

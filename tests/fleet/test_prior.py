@@ -1,0 +1,88 @@
+"""What robots of one type have in common, and how far it carries ten poses of another one."""
+
+import pytest
+import torch
+from testing.fleet_robots import DRAWN, common_errors, rows_of
+from testing.models import no_type_checker
+
+from pisigma.errors import FleetError
+from pisigma.fleet.prior import Likeness, Population, RobotEvidence, expectation_maximisation, fleet_prior
+from pisigma.fleet.prior_summary import summarise_prior
+from pisigma.workflow.calibrate import CalibrationSettings, calibrate
+from pisigma.workflow.recalibrate import recalibrate
+
+ROBOTS = 8
+
+
+@pytest.fixture(scope="module")
+def prior():
+    """Of eight robots, of which the last is of another type."""
+    with no_type_checker():
+        return fleet_prior("fleet", DRAWN, [rows_of(k, 40, k, odd=k == ROBOTS - 1) for k in range(ROBOTS)])
+
+
+def rms(errors):
+    return float(errors["position"].square().sum(1).mean().sqrt())
+
+
+def test_the_odd_robot_is_named_and_does_not_count(prior):
+    assert prior.odd == (ROBOTS - 1,)
+    summary = summarise_prior(prior, [f"r{k}" for k in range(ROBOTS)])
+    assert (summary.robots, summary.odd) == (ROBOTS - 1, ("r7",))
+    assert "r7" in summary.warnings[0]
+
+
+def test_shared_errors_are_estimated(prior):
+    """Of parameters that the rows determine by themselves."""
+    mean = dict(zip(prior.names, prior.population.mean.tolist(), strict=False))
+    true = dict(zip(prior.names, common_errors().flatten().tolist(), strict=True))
+    for name in ("a_2", "a_3", "alpha_2", "alpha_3", "theta_3", "d_5"):
+        assert abs(mean[name] - true[name]) < 4e-4, name
+
+
+def test_ten_poses_with_the_prior_are_far_better_than_without(prior):
+    few, test = rows_of(50, 10, 1), rows_of(50, 300, 2, noise=0.0)
+    with no_type_checker():
+        begun = recalibrate(prior.model, few)
+        without = calibrate(DRAWN, few, CalibrationSettings(folds=0)).result
+    assert begun.gate.kept != "scratch"
+    assert begun.moved == ()
+    assert "like the fleet" in begun.summary.changed
+    assert rms(begun.adaptation.errors_of(test)) < 0.3 * rms(without.errors_of(test))
+
+
+def test_a_robot_of_another_type_is_unlike_the_fleet(prior):
+    with no_type_checker():
+        assert Likeness.of(prior.model, rows_of(60, 20, 3, odd=True)).odd
+        assert not Likeness.of(prior.model, rows_of(61, 20, 4)).odd
+
+
+def test_expectation_maximisation_finds_a_population():
+    """Many robots, each of which sees its errors nearly exactly."""
+    g = torch.Generator().manual_seed(0)
+    mean, deviation = torch.tensor([1.0, -2.0]).double(), torch.tensor([0.5, 0.1]).double()
+    x = mean + deviation * torch.randn(4000, 2, generator=g, dtype=torch.float64)
+    evidence = [RobotEvidence(1e8 * torch.eye(2).double(), 1e8 * one, {}) for one in x]
+    start = Population(torch.zeros(2).double(), torch.eye(2).double(), 1)
+    found = expectation_maximisation(evidence, start, torch.ones(2).double())
+    assert (found.mean - mean).abs().max() < 0.03
+    assert (found.covariance.diagonal().sqrt() / deviation - 1).abs().max() < 0.05
+
+
+def test_a_robot_without_information_does_not_count():
+    g = torch.Generator().manual_seed(0)
+    x = 0.3 * torch.randn(50, 2, generator=g, dtype=torch.float64)
+    evidence = [RobotEvidence(1e6 * torch.eye(2).double(), 1e6 * one, {}) for one in x]
+    nothing = RobotEvidence(torch.zeros(2, 2).double(), torch.zeros(2).double(), {})
+    start = Population(torch.zeros(2).double(), torch.eye(2).double(), 1)
+    few, many = (
+        expectation_maximisation(those, start, torch.ones(2).double())
+        for those in (evidence, [*evidence, nothing])
+    )
+    assert (few.mean - many.mean).abs().max() < 1e-4
+    assert (few.covariance - many.covariance).abs().max() < 0.02
+
+
+def test_few_robots_are_refused():
+    with pytest.raises(FleetError, match="5 robots or more"):
+        fleet_prior("fleet", DRAWN, [rows_of(0, 20, 0)] * 4)
