@@ -28,10 +28,10 @@ from pisigma.workflow.distill import distill as distill
 from pisigma.workflow.evaluate import EvaluationSettings as EvaluationSettings
 from pisigma.workflow.evaluate import Limits as Limits
 from pisigma.workflow.evaluate import evaluate as evaluate
-from pisigma.workflow.fleet import FleetRun as FleetRun
-from pisigma.workflow.fleet import run_fleet as run_fleet
-from pisigma.workflow.fleet_prior import estimate_fleet_prior as estimate_fleet_prior
-from pisigma.workflow.fleet_robot import FleetSettings as FleetSettings
+from pisigma.workflow.fleet.one_robot import FleetSettings as FleetSettings
+from pisigma.workflow.fleet.prior import estimate_fleet_prior as estimate_fleet_prior
+from pisigma.workflow.fleet.run import FleetRun as FleetRun
+from pisigma.workflow.fleet.run import run_fleet as run_fleet
 from pisigma.workflow.import_rows import ImportSettings as ImportSettings
 from pisigma.workflow.import_rows import import_rows as import_rows
 from pisigma.workflow.monitor import Monitoring as Monitoring

@@ -13,7 +13,7 @@ from pisigma.errors import FleetError
 
 if TYPE_CHECKING:
     from pisigma.fleet.status import FleetStatus
-    from pisigma.workflow.fleet import FleetRun
+    from pisigma.workflow.fleet.run import FleetRun
 
 SHOWN = 10
 """Robots that a table for people has at most."""
@@ -80,8 +80,8 @@ def run(
     status 3 then.
     """
     from pisigma.workflow.calibrate import CalibrationSettings
-    from pisigma.workflow.fleet import run_fleet
-    from pisigma.workflow.fleet_robot import FleetSettings
+    from pisigma.workflow.fleet.one_robot import FleetSettings
+    from pisigma.workflow.fleet.run import run_fleet
 
     stated: dict[str, Any] = {"task": task, "engine": engine}
     kind: Any = model
@@ -114,7 +114,7 @@ def estimate_prior(
     `pisigma calibrate --prior DIR` and `pisigma plan DIR` begin with it.
     """
     from pisigma.files.output_folder import check_folder
-    from pisigma.workflow.fleet_prior import estimate_fleet_prior
+    from pisigma.workflow.fleet.prior import estimate_fleet_prior
 
     check_folder(out, overwrite, inputs=(source,))
     with progress_of("fleet prior") as progress:

@@ -10,9 +10,9 @@ from pisigma.errors import FleetError, OutputError
 from pisigma.fleet.processes import ProcessEngine
 from pisigma.fleet.record import read_records
 from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.workflow import fleet as workflow
-from pisigma.workflow.fleet import run_fleet
-from pisigma.workflow.fleet_robot import FleetSettings
+from pisigma.workflow.fleet import run as workflow
+from pisigma.workflow.fleet.one_robot import FleetSettings
+from pisigma.workflow.fleet.run import run_fleet
 
 parquet = pytest.importorskip("pyarrow.parquet", reason="Parquet comes with the extra fleet")
 

@@ -23,7 +23,7 @@ from pisigma.fleet.record import MARK, RobotRecord, read_record, read_records, r
 from pisigma.fleet.results_table import RESULTS, write_results
 from pisigma.judging.progress import Progress
 from pisigma.workflow.calibrate import CalibrationSettings
-from pisigma.workflow.fleet_robot import FleetSettings, work_out
+from pisigma.workflow.fleet.one_robot import FleetSettings, work_out
 
 ROBOTS_A_CHUNK = 4
 """Calibrations that a worker gets at once: some seconds of work."""
