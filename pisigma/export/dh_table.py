@@ -2,12 +2,14 @@
 
 import csv
 import io
+import json
 from collections.abc import Iterable, Mapping
 
 import numpy as np
 
 from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
 from pisigma.export.geometry import calibrated_geometry, remarks
+from pisigma.robot.coupling_section import coupling_document
 from pisigma.robot.description import Robot
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, in_file_units
 from pisigma.robot.writing import robot_to_yaml
@@ -42,7 +44,17 @@ def dh_csv(robot: Robot, comments: tuple[str, ...] = ()) -> str:
                 line[f"{side}_{row.file_unit}"] = repr(row.in_file_unit(limit))
         lines.append(line | cells(DH_COLUMNS, values))
     lines.append({"part": "tool", **cells(FRAME_COLUMNS, robot.tool)})
-    return csv_table(columns, lines, (CONVENTION, *comments))
+    return csv_table(columns, lines, (CONVENTION, *_coupling_sentences(robot), *comments))
+
+
+def _coupling_sentences(robot: Robot) -> tuple[str, ...]:
+    """How coupled joints follow the controller's values, of which the table holds the limits of the joints alone."""
+    if robot.coupling is None:
+        return ()
+    stated = json.dumps(coupling_document(robot.coupling, robot.joints))
+    return (
+        f"q_i are the joints' values, which follow the controller's as a robot file says: coupling: {stated}",
+    )
 
 
 def csv_table(

@@ -156,9 +156,14 @@ def export_onnx(model: CalibratedModel, model_sha256: str = "") -> bytes:
 
     Raises:
         MissingExtraError: onnx is not installed.
-        ModelError: the model has no network, or one without ONNX form.
+        ModelError: the model has no network, or one without ONNX form, or its joints are coupled.
     """
     import_onnx()
+    if model.robot.coupling is not None:
+        raise ModelError(
+            f"model '{model.name}': its joints are coupled, and a graph would take their values, not the controller's; "
+            "use pisigma.load, which turns one into the other."
+        )
     if model.network is not None:
         return _inverse(model, model.network, model_sha256)
     if model.hybrid is not None:

@@ -63,12 +63,19 @@ class NextPose:
         count: of all poses in that plan.
         q: joint values [rad or m].
         check: whether it judges the calibration.
+        commanded: the same as the controller counts, where its values are others.
     """
 
     number: int
     count: int
     q: Float64[np.ndarray, " dof"]
     check: bool
+    commanded: Float64[np.ndarray, " axes"] | None = None
+
+    @property
+    def values(self) -> Float64[np.ndarray, " axes"]:
+        """What the controller is to show [rad or m]."""
+        return self.q if self.commanded is None else self.commanded
 
 
 @dataclass(frozen=True)
@@ -144,7 +151,7 @@ class SessionState:
         reached: accuracy so far, a point for each time that it was worked out, the last one holds.
         expected: accuracy that the poses that are left would bring.
         advice: whether to go on.
-        revolute: per joint, whether it turns (values in rad) or slides (in m).
+        revolute: per axis of the controller, whether it turns (values in rad) or slides (in m).
         base: `T_sensor_base`, where the robot's base is in the frame of the sensor [m]; None as long as it is unknown.
     """
 
@@ -182,7 +189,7 @@ class SessionState:
                 "number": following.number,
                 "of": following.count,
                 "set": "test" if following.check else "train",
-                "joints": self.in_file_units(following.q),
+                "joints": self.in_file_units(following.values),
             },
             "coverage": [
                 {"joint": span.name, "lower": lower, "upper": upper, "share_of_plan": span.planned}
@@ -200,7 +207,7 @@ class SessionState:
         }
 
     def in_file_units(self, q: Iterable[float]) -> list[float]:
-        """Joint values in deg, or mm of joints that slide; of any number of the first joints."""
+        """The controller's values in deg, or mm of joints that slide; of any number of the first joints."""
         return [
             float(np.rad2deg(value) if turns else value * 1e3)
             for value, turns in zip(q, self.revolute, strict=False)

@@ -66,9 +66,9 @@ class SessionPanel:
             state: the state.
             top: error [m] at which the scale of colours ends.
         """
-        self._advice.content = str(self._text.advice(state, self._robot.joints, self._limit))
+        self._advice.content = str(self._text.advice(state, self._robot.axes, self._limit))
         self._rows.content = str(
-            self._text.rows(state, self._robot.joints, state.alarms[: -MOST_ALARMS - 1 : -1], top, RAMP)
+            self._text.rows(state, self._robot.axes, state.alarms[: -MOST_ALARMS - 1 : -1], top, RAMP)
         )
         points = (*state.expected, *state.reached)
         curves = _curves(points, self._limit)

@@ -182,6 +182,11 @@ def _check_parent(parent: CalibratedModel) -> None:
             f"model '{parent.name}' has no identified geometry with joint values it was measured at, so there is "
             "nothing to distil; give a model of `pisigma calibrate`."
         )
+    if parent.robot.coupling is not None:
+        raise ModelError(
+            f"model '{parent.name}': its joints are coupled, and networks of nominal joint values do not know the "
+            "controller's; use the model as it is."
+        )
 
 
 def _provenance(parent: CalibratedModel, sha256: str, settings: DistillationSettings) -> Provenance:

@@ -198,10 +198,9 @@ class MeasuringSession:
         rows, open_poses, model = self._so_far(), self._open, self._judgement.model
         following = None
         if len(open_poses):
-            first = int(open_poses[0])
-            following = NextPose(
-                first + 1, len(self.plan.q), self.plan.q[first].numpy(), bool(self.plan.check[first])
-            )
+            first, count = int(open_poses[0]), len(self.plan.q)
+            q, check = self.plan.q[first].numpy(), bool(self.plan.check[first])
+            following = NextPose(first + 1, count, q, check, self.plan.arm.robot.to_controller(q))
         base = None
         if model is not None:
             base = transform_from_xyzrpy(torch.from_numpy(next(iter(model.geometry.bases.values())))).numpy()
@@ -214,7 +213,7 @@ class MeasuringSession:
             reached=tuple(self._reached),
             expected=self._expected,
             advice=self._advice(len(open_poses)),
-            revolute=self.plan.arm.robot.revolute,
+            revolute=tuple(axis.type == "revolute" for axis in self.plan.arm.robot.axes),
             base=base,
         )
 
@@ -377,12 +376,14 @@ class MeasuringSession:
         """What was measured of every joint, by the rows that count."""
         if self._rows is None or not bool(self._counting.any()):
             return ()
-        lower, upper = self._rows.q[self._counting].aminmax(dim=0)
-        planned = self._planned.amax(0) - self._planned.amin(0)
+        robot = self.plan.arm.robot
+        lower, upper = robot.to_controller(self._rows.q[self._counting]).aminmax(dim=0)
+        every = robot.to_controller(self._planned)
+        planned = every.amax(0) - every.amin(0)
         return tuple(
             JointSpan(joint.name, low, high, min(1.0, (high - low) / max(width, 1e-9)))
             for joint, low, high, width in zip(
-                self.plan.arm.robot.joints, lower.tolist(), upper.tolist(), planned.tolist(), strict=True
+                robot.axes, lower.tolist(), upper.tolist(), planned.tolist(), strict=True
             )
         )
 

@@ -320,8 +320,9 @@ def _warnings(
     motion: Session | None,
 ) -> list[str]:
     warnings = []
-    lower, upper = torch.from_numpy(model.robot.limits).unbind(1)
-    outside = ((rows.q < lower - LIMIT_TOLERANCE) | (rows.q > upper + LIMIT_TOLERANCE)).any(1)
+    lower, upper = torch.from_numpy(model.robot.axis_limits).unbind(1)
+    q = model.robot.to_controller(rows.q)
+    outside = ((q < lower - LIMIT_TOLERANCE) | (q > upper + LIMIT_TOLERANCE)).any(1)
     if bool(outside.any()):
         first = int(outside.nonzero()[0, 0])
         warnings.append(

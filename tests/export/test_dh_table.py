@@ -5,7 +5,9 @@ import math
 
 import numpy as np
 import pytest
+import yaml
 from testing.closeness import assert_close
+from testing.coupled import coupled_robot
 
 from pisigma.export.dh_table import dh_csv, dh_yaml
 from pisigma.robot import DH_COLUMNS, FRAME_COLUMNS, Robot, catalogue
@@ -64,3 +66,9 @@ def test_the_csv_holds_the_same(name):
         if row.type != "fixed":
             found = [float(line[f"{side}_{unit}"]) * factor for side in ("lower", "upper")]
             assert_close(found, [row.lower, row.upper], rtol=1e-15, atol=0)
+
+
+def test_the_coupling_of_joints_stands_above_the_table():
+    (line,) = [line for line in dh_csv(coupled_robot()).splitlines() if "coupling" in line]
+    stated = yaml.safe_load(line.partition(" says: ")[2])
+    assert stated == {"coupling": [{"joint": "theta_3", "factors": {"theta_2": 1.0, "theta_3": 1.0}}]}
