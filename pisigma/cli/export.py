@@ -60,8 +60,8 @@ Config = Annotated[
 Program = Annotated[
     Path | None,
     typer.Option(
-        help="With targets: existing program (.script, .src, .mod, .ls) whose pose targets are rewritten into --out; "
-        "all else stays."
+        help="With targets: existing program (.script, .src or .dat, .mod, .ls) whose pose targets are "
+        "rewritten into --out; all else stays."
     ),
 ]
 Frames = Annotated[

@@ -14,7 +14,7 @@ from pisigma.export.export_format import Exported, ExportFormat, ExportRequest
 from pisigma.export.programs.languages import LANGUAGES, cautions, check_program, program_text
 from pisigma.export.programs.targets import Targets, targets_of
 from pisigma.export.programs.text import millimetres_and_euler
-from pisigma.export.rewriting.export import check_rewriting, rewrite_program
+from pisigma.export.rewriting.export import SCANNERS, check_rewriting, rewrite_program
 from pisigma.inverse.corrected_ik import load
 from pisigma.measurement.csv.poses import read_poses
 from pisigma.planning.plan_file import joint_columns
@@ -72,6 +72,8 @@ def _check(request: ExportRequest) -> None:
         )
     if request.program is not None:
         check_rewriting(request)
+    elif request.out.suffix.lower() in set(SCANNERS) - set(LANGUAGES):
+        raise OutputError(f"{request.out}: is written with --program only; take a .csv file or a program.")
     elif request.frames is not None or request.tolerance_mm is not None:
         raise OutputError("--frames and --tolerance-mm go with --program; leave them out.")
 
@@ -126,7 +128,7 @@ def _write(request: ExportRequest) -> Exported:
 FORMAT = ExportFormat(
     "targets",
     "a table or program of targets",
-    (".csv", *LANGUAGES),
+    (".csv", *SCANNERS),
     _write,
     frozenset(
         (

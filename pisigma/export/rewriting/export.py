@@ -10,7 +10,7 @@ from pisigma.export.programs.languages import LANGUAGES
 from pisigma.export.rewriting.correction import CorrectedProgram, ProgramCorrection
 from pisigma.export.rewriting.fanuc import scan_fanuc
 from pisigma.export.rewriting.frame_file import FrameFile
-from pisigma.export.rewriting.krl import scan_krl
+from pisigma.export.rewriting.krl import scan_krl, scan_krl_data
 from pisigma.export.rewriting.rapid import scan_rapid
 from pisigma.export.rewriting.scan import ScannedProgram
 from pisigma.export.rewriting.urscript import scan_urscript
@@ -21,6 +21,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 SCANNERS: dict[str, Callable[[str, FrameFile], ScannedProgram]] = {
     ".script": scan_urscript,
     ".src": scan_krl,
+    ".dat": scan_krl_data,
     ".mod": scan_rapid,
     ".ls": scan_fanuc,
 }
@@ -90,6 +91,7 @@ def _exported(
     """The new program, with what is to be said of it."""
     assert request.program is not None
     diff = corrected.diff(scanned.text, (str(request.program), str(request.out)))
+    language = LANGUAGES.get(request.program.suffix.lower())
     reached = len(corrected.statuses) - len(corrected.unreached)
     shift = corrected.largest_shift * 1e3
     return Exported(
@@ -109,7 +111,7 @@ def _exported(
             "diff": diff,
         },
         remarks=(*condition_remarks(model), *frame_remarks(model)),
-        doubts=(TEST, *LANGUAGES[request.program.suffix.lower()].cartesian_cautions, *_left_alone(corrected)),
+        doubts=(TEST, *(language.cartesian_cautions if language else ()), *_left_alone(corrected)),
         summary=f"Program with {reached} corrected targets (by {shift:.3f} mm at most) "
         f"and {corrected.way_points} way points",
         shortfall=_shortfall(corrected, str(request.program)),

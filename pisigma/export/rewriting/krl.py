@@ -57,6 +57,36 @@ def scan_krl(text: str, stated: FrameFile) -> ScannedProgram:
     return _Reader(Scan(text), masked(text, _HIDDEN), stated).read()
 
 
+_POINT = re.compile(r"(?im)^[ \t]*(?:DECL\s+|GLOBAL\s+)+E?\d?POS\s+X(\w+)\s*=\s*(?=\{)")
+_FRAMES = re.compile(
+    r"(?im)^[ \t]*(?:DECL\s+|GLOBAL\s+)+FDAT\s+F(\w+)\s*=\s*\{\s*TOOL_NO\s+(\d+)\s*,\s*BASE_NO\s+(\d+)\s*,"
+    r"\s*IPO_FRAME\s+#(\w+)"
+)
+
+
+def scan_krl_data(text: str, stated: FrameFile) -> ScannedProgram:
+    """Read a data list (`.dat`): points of inline forms, whose frame and tool stand in the `FDAT` of their name.
+
+    The moves stand in the program that belongs to it, so straight ones get no way points.
+
+    Args:
+        text: of the data list.
+        stated: `BASE_DATA[n]` and `TOOL_DATA[n]`; number 0 is the origin and the flange.
+    """
+    scan, visible = Scan(text), masked(text, _HIDDEN)
+    frames = {match[1].upper(): match for match in _FRAMES.finditer(visible)}
+    for match in _POINT.finditer(visible):
+        literal, data = _AGGREGATE.match(visible, match.end()), frames.get(match[1].upper())
+        if data is None or literal is None or data[4].upper() != "BASE":
+            reason = f"no FDAT F{match[1]} with IPO_FRAME #BASE states the frame and the tool of the point"
+            scan.move(match.start(), reason, IDENTITY, IDENTITY)
+            continue
+        tool = IDENTITY if data[2] == "0" else stated.tool(f"TOOL_DATA[{data[2]}]")
+        frame = IDENTITY if data[3] == "0" else stated.frame(f"BASE_DATA[{data[3]}]")
+        scan.move(match.start(), _pose(literal), frame, tool)
+    return scan.program()
+
+
 @dataclass
 class _Reader:
     """Walks through the statements of a program."""

@@ -347,7 +347,7 @@ def test_a_pose_of_several_tools_stays(arm, tmp_path):
 @pytest.mark.parametrize(
     ("options", "complaint"),
     [
-        ({"program": Path("cell.txt")}, "a program ends in .script, .src, .mod, .ls"),
+        ({"program": Path("cell.txt")}, "a program ends in .script, .src, .dat, .mod, .ls"),
         ({"out": Path("new.src")}, "--out ends as the program does"),
         ({"targets": "joints"}, "--targets goes with --poses"),
         ({"tolerance_mm": 0.0}, "--tolerance-mm 0: a length above 0 was wanted"),
@@ -379,3 +379,33 @@ def test_line_ends_stay(language, arm, tmp_path):
     request.program.write_bytes(request.program.read_bytes().replace(b"\n", b"\r\n"))
     export_model("targets", request)
     assert request.out.read_bytes() == plain.replace(b"\n", b"\r\n")
+
+
+DATA = """DEFDAT CELL
+DECL E6POS XP1={{{P0},S 2,T 35,E1 0.0,E2 0.0}}
+DECL FDAT FP1={{TOOL_NO 4,BASE_NO 3,IPO_FRAME #BASE,POINT2[] " ",TQ_STATE FALSE}}
+DECL E6POS XP2={{{P1},S 2,T 35,E1 0.0,E2 0.0}}
+DECL FDAT FP2={{TOOL_NO 4,BASE_NO 3,IPO_FRAME #TCP,POINT2[] " ",TQ_STATE FALSE}}
+DECL E6POS XP3={{{P2},S 2,T 35}}
+DECL E6AXIS XP4={{A1 0,A2 0,A3 0,A4 0,A5 0,A6 0}}
+ENDDAT
+"""
+
+
+def test_points_of_inline_forms(arm, tmp_path):
+    """Their frames are numbers; a fixed tool, and a point without frames, are left alone."""
+    T = wanted_poses(load_model(arm).robot)
+    program_file, out = tmp_path / "cell.dat", tmp_path / "new.dat"
+    program_file.write_text(DATA.format(**{f"P{i}": six(T[i]) for i in range(3)}))
+    columns = ("x_mm", "y_mm", "z_mm", "roll_deg", "pitch_deg", "yaw_deg")
+    frame, tool = (dict(zip(columns, millimetres_and_euler(F).tolist(), strict=True)) for F in (FRAME, TOOL))
+    frames = tmp_path / "frames.yaml"
+    frames.write_text(json.dumps({"frames": {"BASE_DATA[3]": frame}, "tools": {"TOOL_DATA[4]": tool}}))
+    exported = export_model("targets", ExportRequest(arm, out, program=program_file, frames=frames))
+    (target,) = scanned(out, frames).targets
+    real = really(arm, target.pose.T[None], T[:1])
+    assert_close(real[0, :3, 3], T[0, :3, 3], atol=1e-8)
+    assert [entry["line"] for entry in exported.facts["left_alone"]] == [4, 6]
+    assert out.read_text().splitlines()[2:] == program_file.read_text().splitlines()[2:]
+    with pytest.raises(OutputError, match="is written with --program only"):
+        export_model("targets", ExportRequest(arm, out, poses=tmp_path / "poses.csv"))
