@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pisigma.errors import PisigmaError, RequestError, nearest_choice, printable
+from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.inverse.solution import Solution
 from pisigma.kernels.array_kinematics import transform_of, xyzrpy_of
 from pisigma.kinematics.status import Status
@@ -27,9 +28,10 @@ LONGEST_ID = 200
 _TASKS = ("pose", "path", "q_deg", "q", "ask")
 """Keys of which a request has exactly one; it says what is wanted."""
 _NEAR = ("near_deg", "near")
+_AXES = ("ignore_axes", "tolerance_mm", "tolerance_deg", "elbow_deg")
 _KEYS = {
-    "pose": {*_NEAR, "branch", "approach", "accuracy", "brief"},
-    "path": {*_NEAR, "branch"},
+    "pose": {*_NEAR, *_AXES, "branch", "approach", "accuracy", "brief"},
+    "path": {*_NEAR, *_AXES, "branch"},
     "q_deg": {"approach", "accuracy"},
     "q": {"approach", "accuracy"},
     "ask": set(),
@@ -197,7 +199,8 @@ def _solve(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, 
     """Solve one pose."""
     near, branch = _near(model, request), _branch(request)
     approach = _numbers(request, "approach", len(model.ik.joints)) if "approach" in request else None
-    solution = model.ik(_transform(request["pose"], "pose"), near=near, branch=branch, approach=approach)
+    ik = _for_task(model, request)
+    solution = ik(_transform(request["pose"], "pose"), near=near, branch=branch, approach=approach)
     values = _record(model, solution)
     if _flag(request, "brief"):
         return values["status"], _brief(model, values)
@@ -216,6 +219,8 @@ def _record(model: ServedModel, solution: Solution) -> dict[str, Any]:
         values["position_residual_mm"] = _millimetres(solution.position_residual)
         values["rotation_residual_deg"] = math.degrees(solution.rotation_residual)
         values["domain_measure"] = _or_none(solution.domain_measure)
+    if solution.ignored_axes:
+        values["ignored_axes"] = solution.ignored_axes
     if status != Status.REACHED:
         values["sentence"] = status.sentence
     return values
@@ -235,7 +240,7 @@ def _follow(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str,
             "'path' has to be a list of poses [x_mm, y_mm, z_mm, roll_deg, pitch_deg, yaw_deg]."
         )
     T = np.stack([_transform(pose, f"path[{row}]") for row, pose in enumerate(poses)])
-    path = model.ik.path(T, near=_near(model, request), branch=_branch(request))
+    path = _for_task(model, request).path(T, near=_near(model, request), branch=_branch(request))
     q = (np.asarray(path.solution.q) * model.per_file_unit).tolist()
     return "path", {
         model.joints_key: [row if math.isfinite(row[0]) else None for row in q],
@@ -306,6 +311,34 @@ def _numbers(request: dict[str, Any], key: str, count: int) -> list[float]:
                 f"'{key}' holds {str(value)[:40]!r}; give {count} numbers [mm or deg] below {LARGEST:g}."
             )
     return values
+
+
+def _for_task(model: ServedModel, request: dict[str, Any]) -> CorrectedIK:
+    """The inverse kinematics for the axes of the tool that count.
+
+    Raises:
+        RequestError: a value is of another kind.
+        PoseError: see `CorrectedIK.for_task`.
+    """
+    if not request.keys() & {*_AXES}:
+        return model.ik
+    names = request.get("ignore_axes")
+    if names is not None and not (isinstance(names, list) and all(isinstance(name, str) for name in names)):
+        raise RequestError(f"'ignore_axes' is {names!r}; give a list of names of axes.")
+    elbow = None
+    if "elbow_deg" in request:
+        elbow = math.radians(_numbers({"elbow_deg": [request["elbow_deg"]]}, "elbow_deg", 1)[0])
+    return model.ik.for_task(
+        names, _tolerance(request, "tolerance_mm"), _tolerance(request, "tolerance_deg"), elbow
+    )
+
+
+def _tolerance(request: dict[str, Any], key: str) -> list[float] | None:
+    """Tolerances of three axes, of which one number says all; None where none is stated."""
+    if key not in request:
+        return None
+    stated = request[key]
+    return _numbers(request if isinstance(stated, list) else {key: [stated] * 3}, key, 3)
 
 
 def _branch(request: dict[str, Any]) -> str | None:

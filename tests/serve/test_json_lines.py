@@ -6,11 +6,13 @@ import socket
 
 import numpy as np
 import pytest
+from testing.calibrated_arm import calibrated_arm
 from testing.closeness import assert_close
-from testing.serving import json_client
+from testing.serving import json_client, running
 
 import pisigma
-from pisigma.kernels.array_kinematics import transform_of
+from pisigma.kernels.array_kinematics import transform_of, xyzrpy_of
+from pisigma.model.folder.model_folder import save_model
 
 POSE = [800.0, 200.0, 600.0, 10.0, -80.0, 170.0]
 NEAR = [15.0, 3.0, -1.0, -85.0, 19.0, 92.0]
@@ -74,6 +76,37 @@ def test_a_path_is_that_of_python(ask, ik):
     assert_close(answer["q_deg"], np.degrees(path.solution.q), rtol=1e-15)
     assert answer["status"] == ["reached"] * 20
     assert answer["switches"] == []
+
+
+def test_axes_that_do_not_count_are_those_of_python(repository, tmp_path):
+    model = calibrated_arm("ur10")
+    save_model(model, tmp_path)
+    ik = pisigma.load(tmp_path)
+    T = np.asarray(ik.forward(np.array([0.3, -1.2, 1.4, -0.6, -1.2, 0.4])))
+    x, y, z, *angles = xyzrpy_of(T)
+    pose = [x * 1e3, y * 1e3, z * 1e3, *np.degrees(angles)]
+    near = np.array([0.2, -1.0, 1.2, -0.5, -1.0, 1.4])
+    with running(tmp_path) as server, json_client(server) as client:
+        asked = {"pose": pose, "near_deg": np.degrees(near).tolist()}
+        answer = client.ask(**asked, ignore_axes=["yaw"])
+        solution = ik(_matrix(pose), near=near, ignore_axes=["yaw"])
+        assert answer["ignored_axes"] == ["yaw"]
+        assert_close(answer["q_deg"], np.degrees(solution.q), atol=1e-9)
+        answer = client.ask(**asked, tolerance_mm=0.5, tolerance_deg=[0, 0, 1])
+        solution = ik(_matrix(pose), near=near, tolerance_mm=0.5, tolerance_deg=[0, 0, 1])
+        assert_close(answer["q_deg"], np.degrees(solution.q), atol=1e-9)
+        path = client.ask(path=[pose, pose], near_deg=np.degrees(near).tolist(), ignore_axes=["yaw"])
+        assert path["status"] == ["reached"] * 2
+        for wrong, sentence in (
+            ({"ignore_axes": ["jaw"]}, "did you mean 'yaw'"),
+            ({"ignore_axes": "yaw"}, "give a list of names of axes"),
+            ({"tolerance_mm": [1, 2]}, "a list of 3 numbers"),
+            ({"tolerance_deg": "1"}, "'tolerance_deg' holds '1'"),
+            ({"tolerance_deg": -1}, "give a number of at least 0"),
+            ({"elbow_deg": 10}, "only a robot of seven revolute joints has an elbow"),
+        ):
+            with pytest.raises(RuntimeError, match=sentence):
+                client.ask(**asked, **wrong)
 
 
 def test_a_robot_with_a_linear_joint_says_q(ask):

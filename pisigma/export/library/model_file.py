@@ -5,15 +5,15 @@ import zlib
 
 import numpy as np
 
+from pisigma.inverse.compiled_ik import CompiledIK
 from pisigma.inverse.joint_input import Postures
 from pisigma.kernels.arrays import CORRECTED, IDENTIFIED
 from pisigma.kernels.build import source_hash
 from pisigma.kernels.layout import DESCRIPTION, DOF, MEMORY, pack
 from pisigma.kernels.machine_code import kernel_forms
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.compiled_model import describe
 
-_HEAD = struct.Struct(f"=8s7Qq{2 * DOF}d")
+_HEAD = struct.Struct(f"=8s7Qq{2 * DOF}dQ8d")
 _WORD = 8
 _GAP = 16
 """Words of zeros that are written rather than a new segment begun."""
@@ -33,7 +33,8 @@ def model_file(model: CalibratedModel) -> bytes:
     Raises:
         ModelError: the model corrects by something that has no compiled form.
     """
-    description, branches = describe(model)
+    compiled = CompiledIK.of(model)
+    description, branches = compiled.description, compiled.branches
     packed = pack(description, model.name, kernel_forms(description.forms))
     postures = Postures(
         model.robot.limits, np.array(model.robot.revolute), [j.name for j in model.robot.joints]
@@ -45,7 +46,10 @@ def model_file(model: CalibratedModel) -> bytes:
     arm = -1 if description.network.used else CORRECTED if description.arms.corrected else IDENTIFIED
     segments = _segments(packed)
     sizes = DESCRIPTION.itemsize, MEMORY.itemsize, model.robot.dof, len(branches), len(segments), len(names)
-    content = _HEAD.pack(b"PSIGIK01", layout_key(), *sizes, arm, *bounds.ravel()) + names + b"".join(segments)
+    axes = np.zeros(8)
+    axes[: compiled.axes.row.size] = compiled.axes.row.ravel()
+    head = _HEAD.pack(b"PSIGIK01", layout_key(), *sizes, arm, *bounds.ravel(), len(compiled.axes.row), *axes)
+    content = head + names + b"".join(segments)
     return content + struct.pack("=I", zlib.crc32(content))
 
 

@@ -24,6 +24,8 @@ typedef struct {
     uint64_t layout, description_size, memory_size, joints, branches, segments, names_size;
     int64_t arm; /* to evaluate; -1 for none */
     double lowest[PISIGMA_MOST_JOINTS], highest[PISIGMA_MOST_JOINTS]; /* that `near_q` may be */
+    uint64_t axes_rows; /* 0 where all axes of the tool count */
+    double axes[8];     /* else which do, see pisigma/kinematics/task_axes.py */
 } head;
 
 struct pisigma_model {
@@ -31,8 +33,6 @@ struct pisigma_model {
     char *names; /* of the branches, each with a zero behind it */
     unsigned char *description;
 };
-
-#define PISIGMA_LEAN 0.17453292519943295 /* [rad] how far the tool of an arm with four joints may lean */
 
 static uint32_t checksum(uint32_t sum, const void *data, size_t size) {
     const unsigned char *bytes = data;
@@ -107,16 +107,9 @@ static int64_t run(const pisigma_model *model, int64_t task, double *pose, const
                    int64_t branch, double *out) {
     _Alignas(64) unsigned char memory[PISIGMA_MEMORY_SIZE];
     int64_t result[2] = {0, 0};
-    /* Which axes of the tool count: tolerances [m, rad], infinity to ignore an axis, no elbow angle, and the axis that
-       rotations are split about. As in Python they go by the number of joints; all six count from six joints on. */
-    static const double few[3][8] = {{0, 0, 0, INFINITY, INFINITY, INFINITY, NAN, -1},
-                                     {0, 0, 0, -PISIGMA_LEAN, -PISIGMA_LEAN, 0, NAN, 2},
-                                     {0, 0, 0, 0, 0, INFINITY, NAN, 2}};
-    int joints = pisigma_joints(model);
-    const double *axes = joints >= 3 && joints <= 5 ? few[joints - 3] : NULL;
     memset(memory, 0, sizeof memory);
     pisigma_run(&result[0], (void **)&result[1], model->description, memory, task, 1, pose, near_q, near_q != NULL,
-                approach, approach != NULL, axes, axes != NULL, branch, 1, 0, out, 1);
+                approach, approach != NULL, model->said.axes, (int64_t)model->said.axes_rows, branch, 1, 0, out, 1);
     return result[0];
 }
 
