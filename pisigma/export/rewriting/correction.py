@@ -37,6 +37,7 @@ class CorrectedProgram:
         way_points: how many were put in.
         left: line and reason of whatever was left alone.
         largest_shift: of a target [m].
+        branches: names of those that the targets were corrected on.
     """
 
     text: str
@@ -44,6 +45,7 @@ class CorrectedProgram:
     way_points: int
     left: tuple[tuple[int, str], ...]
     largest_shift: float
+    branches: tuple[str, ...]
 
     @property
     def unreached(self) -> tuple[tuple[int, Status], ...]:
@@ -119,7 +121,17 @@ class ProgramCorrection:
                 count += len(points)
         text = program.finish(_edited(program.text, edits))
         statuses = ((target.line, there.status[0]) for target, there in zip(targets, answers, strict=False))
-        return CorrectedProgram(text, tuple(statuses), count, tuple(sorted(left.items())), shift)
+        branches = sorted(
+            {index for there in answers[: len(targets)] if there.reached for index in there.branches}
+        )
+        return CorrectedProgram(
+            text,
+            tuple(statuses),
+            count,
+            tuple(sorted(left.items())),
+            shift,
+            tuple(self.solver.branches[index] for index in branches),
+        )
 
     def commanded(
         self, targets: Sequence[Target], poses: Sequence[Float64[Tensor, "_poses 4 4"]]

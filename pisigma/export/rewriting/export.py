@@ -103,6 +103,7 @@ def _exported(
             "unreached": [
                 {"line": line, "status": status.name.lower()} for line, status in corrected.unreached
             ],
+            "branches": list(corrected.branches),
             "way_points": corrected.way_points,
             "tolerance_mm": tolerance_mm,
             "largest_shift_mm": shift,
@@ -111,7 +112,7 @@ def _exported(
             "diff": diff,
         },
         remarks=(*condition_remarks(model), *frame_remarks(model)),
-        doubts=(TEST, *(language.cartesian_cautions if language else ()), *_left_alone(corrected)),
+        doubts=(TEST, *(language.cartesian_cautions if language else ()), *_in_doubt(corrected)),
         summary=f"Program with {reached} corrected targets (by {shift:.3f} mm at most) "
         f"and {corrected.way_points} way points",
         shortfall=_shortfall(corrected, str(request.program)),
@@ -119,10 +120,15 @@ def _exported(
     )
 
 
-def _left_alone(corrected: CorrectedProgram) -> tuple[str, ...]:
-    if not corrected.left:
-        return ()
-    return (f"Left alone: {'; '.join(f'line {line}: {reason}' for line, reason in corrected.left)}.",)
+def _in_doubt(corrected: CorrectedProgram) -> tuple[str, ...]:
+    """On which branches targets were corrected, and what was left alone."""
+    said = [
+        f"Targets are corrected for the branch {' and '.join(corrected.branches) or 'of the model'}. The program's "
+        "configuration was not compared: where the arm stands otherwise, state --branch."
+    ]
+    if corrected.left:
+        said.append(f"Left alone: {'; '.join(f'line {line}: {reason}' for line, reason in corrected.left)}.")
+    return tuple(said)
 
 
 def _shortfall(corrected: CorrectedProgram, source: str) -> str | None:

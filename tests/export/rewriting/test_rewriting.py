@@ -306,6 +306,8 @@ def test_all_else_stays_and_is_named(language, arm, tmp_path):
     assert exported.facts["joint_lines"]
     assert exported.facts["largest_shift_mm"] > 0.1
     assert any("TEST IT AT LOW SPEED" in sentence for sentence in exported.doubts)
+    (branch,) = exported.facts["branches"]
+    assert any(f"corrected for the branch {branch}." in sentence for sentence in exported.doubts)
     if language.suffix == ".ls":
         lines = re.findall(r"(?m)^ *(\d+):", text)
         assert lines == [str(i) for i in range(1, len(lines) + 1)]
