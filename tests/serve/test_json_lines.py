@@ -3,6 +3,7 @@
 import json
 import math
 import socket
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -185,3 +186,34 @@ def test_half_a_line_is_never_answered(raw):
 def test_a_line_that_is_too_long_ends_the_connection(raw):
     (answer,) = raw(b" " * (2**20 + 1))
     assert "longer than" in answer["error"]
+
+
+@contextmanager
+def _lines_of(server):
+    with (
+        socket.create_connection(("127.0.0.1", server.json_port), 5) as stream,
+        stream.makefile("rwb") as file,
+    ):
+
+        def exchange(request):
+            file.write(json.dumps(request).encode() + b"\n")
+            file.flush()
+            return json.loads(file.readline())
+
+        yield exchange
+
+
+def test_the_example_of_the_documentation_is_answered_so(repository):
+    page = (repository / "docs" / "reference" / "serve-protocol.md").read_text()
+    lines = [json.loads(line) for line in page.split("```text\n")[1].split("```")[0].splitlines()]
+    with running(repository / "models" / "kiro4") as server, _lines_of(server) as exchange:
+        for request, documented in zip(lines[::2], lines[1::2], strict=True):
+            answer = exchange(request)
+            assert answer.keys() == documented.keys()
+            for key, value in documented.items():
+                if key in ("uptime_s", "p50_us", "p99_us"):
+                    assert answer[key] > 0
+                elif isinstance(value, float | list):
+                    assert_close(answer[key], value, atol=5e-5)
+                else:
+                    assert answer[key] == value
