@@ -28,6 +28,7 @@ LAYERS = (
     "files",
     "yaml_file",
     "templates",
+    "engines",
     "se3",
     "robot",
     "kinematics",

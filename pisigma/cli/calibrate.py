@@ -48,6 +48,10 @@ Repeats = Annotated[
         help="Repeats of the cross-validation. [default: 200 / number of different joint values, 1 to 10]",
     ),
 ]
+Jobs = Annotated[
+    int | None,
+    typer.Option(help="Processes that judge folds side by side, with one thread each. [default: threads]"),
+]
 Seed = Annotated[int, typer.Option(help="Seed of the split, and of drawing training rows.")]
 TrainRows = Annotated[
     int | None,
@@ -109,6 +113,7 @@ def calibrate(
     hold_out: HoldOut = None,
     split: Split = "joints",
     repeats: Repeats = None,
+    jobs: Jobs = None,
     seed: Seed = 0,
     train_rows: TrainRows = None,
     free: Free = "identifiable",
@@ -142,7 +147,7 @@ def calibrate(
         recalibrate_into(context, prior, data, out, accept_implausible, overwrite, as_json, drawn=drawn)
         return
     stated: dict[str, Any] = {"model": model, "folds": folds, "hold_out": hold_out, "split": split}
-    stated |= {"repeats": repeats, "seed": seed, "train_rows": train_rows, "robust": robust}
+    stated |= {"repeats": repeats, "jobs": jobs, "seed": seed, "train_rows": train_rows, "robust": robust}
     settings = workflow.CalibrationSettings(
         free=_free(free),
         prior_length=prior_mm / 1e3,

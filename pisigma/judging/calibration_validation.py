@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Protocol, runtime_checkable
 
 import torch
@@ -13,8 +14,8 @@ from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.judging.pose_statistics import PoseErrors, error_statistics
 from pisigma.judging.predicted_spread import PredictedSpread, predicted_spread
-from pisigma.judging.progress import Progress, stage
-from pisigma.judging.side_by_side import side_by_side
+from pisigma.judging.progress import Progress, silent, stage
+from pisigma.judging.side_by_side import in_processes, side_by_side
 from pisigma.judging.trained_calibrations import (
     Calibrator,
     Result,
@@ -187,8 +188,17 @@ def validate_repeatedly(
     measurements: Measurements,
     repeats: Sequence[Sequence[TrainTest]],
     progress: Progress = lambda what: None,
+    jobs: int | None = None,
 ) -> CalibrationValidation:
-    """Validate on several repeats of folds; see `validate` and `pisigma.measurement.splits.repeats`."""
+    """Validate on several repeats of folds; see `validate` and `pisigma.measurement.splits.repeats`.
+
+    Args:
+        calibrator: see `validate`.
+        measurements: the rows.
+        repeats: training and test rows of every fold, per repeat.
+        progress: called with the fold that is being judged, and what is being tried; not from other processes.
+        jobs: processes that judge folds side by side; None for threads of this one.
+    """
     tasks = []
     for number, splits in enumerate(repeats, 1):
         of_repeat = progress
@@ -196,17 +206,21 @@ def validate_repeatedly(
             of_repeat = stage(progress, f"repeat {number} of {len(repeats)}", ", ")
         names = (f"fold {fold} of {len(splits)}" for fold in range(1, len(splits) + 1))
         tasks += [(name, split, of_repeat) for name, split in zip(names, splits, strict=True)]
-    judged = side_by_side(
-        lambda task: _judged_fold(calibrator, measurements, *task), tasks, measurements.rows > FEW_ROWS
-    )
+    work = partial(_judged_fold, calibrator, measurements)
+    if jobs is None:
+        judged = side_by_side(work, tasks, measurements.rows > FEW_ROWS)
+    else:
+        progress(f"{len(tasks)} folds in {jobs} processes")
+        judged = in_processes(work, [(fold, split, silent) for fold, split, _ in tasks], jobs)
     first, *again = [_joined(measurements, [next(judged) for _ in splits], len(splits)) for splits in repeats]
     return replace(first, again=tuple(again))
 
 
 def _judged_fold(
-    calibrator: Calibrator, measurements: Measurements, fold: str, split: TrainTest, progress: Progress
+    calibrator: Calibrator, measurements: Measurements, task: tuple[str, TrainTest, Progress]
 ) -> _JudgedFold:
     """Calibrate on the training rows of one split and judge on its test rows."""
+    fold, split, progress = task
     progress(fold)
     train, test = split
     training = measurements.select(train)

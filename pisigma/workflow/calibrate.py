@@ -57,6 +57,7 @@ class CalibrationSettings:
         hold_out: share of the rows that are held out once, instead of folds.
         split: how rows are split: see `pisigma.measurement.splits.SplitBy`.
         repeats: of the cross-validation; None for 1 to 10, the more the fewer different joint values there are.
+        jobs: processes that judge folds side by side, with one thread each; None for threads of this one.
         seed: of the split, and of drawing training rows.
         train_rows: number of rows, drawn at random, to calibrate with, in the cross-validation too; None for all.
         free: "identifiable", "joint_offsets", or names of parameters.
@@ -80,6 +81,7 @@ class CalibrationSettings:
     hold_out: float | None = None
     split: SplitBy = "joints"
     repeats: int | None = None
+    jobs: int | None = None
     seed: int = 0
     train_rows: int | None = None
     free: Literal["identifiable", "joint_offsets"] | tuple[str, ...] = "identifiable"
@@ -112,6 +114,8 @@ class CalibrationSettings:
                 f"a seed from 0 to 2^63 - 1 and at most {LARGEST_REPEATS:,} repeats were wanted, got {self.seed} and "
                 f"{self.repeats or 'the usual'}."
             )
+        if self.jobs is not None and self.jobs < 1:
+            raise MeasurementError(f"jobs: 1 or more were wanted, got {self.jobs}.")
         if self.gravity is not None and self.model != "hybrid":
             raise IdentificationError(
                 f"gravity {self.gravity}: a geometric calibration has no use for it; leave it out, or take the hybrid."
@@ -246,7 +250,8 @@ def calibrate(
         raise explained(refusal, nominal, rows) from refusal
     validation = None
     if splits:
-        validation = validate_repeatedly(calibrator, training, splits, stage(progress, "cross-validation"))
+        validating = stage(progress, "cross-validation")
+        validation = validate_repeatedly(calibrator, training, splits, validating, settings.jobs)
     test = None if test_rows is None else judge(calibrator, result, rows, test_rows)
     summary = summarise(result)
     if faulty:
@@ -339,7 +344,11 @@ def _call(robot: Robot, measurements: Measurements, settings: CalibrationSetting
     """The call that gives this calibration again, with the settings that are not the default."""
     usual = CalibrationSettings()
     named = {item.name: getattr(settings, item.name) for item in fields(settings)}
-    stated = [f"{name}={value!r}" for name, value in named.items() if value != getattr(usual, name)]
+    stated = [
+        f"{name}={value!r}"
+        for name, value in named.items()
+        if value != getattr(usual, name) and name != "jobs"
+    ]
     words = [repr(robot.name), repr(Path(measurements.source).name)]
     words += [f"CalibrationSettings({', '.join(stated)})"] if stated else []
     return f"pisigma.calibrate({', '.join(words)})"

@@ -12,13 +12,13 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from pisigma.engines.engine import AbstractEngine
+from pisigma.engines.processes import ProcessEngine
 from pisigma.errors import OutputError
 from pisigma.files.conflicts import check_apart
 from pisigma.files.model_files import is_model, model_hash
 from pisigma.files.output_file import write_whole
-from pisigma.fleet.engine import AbstractEngine
 from pisigma.fleet.members import Member, read_fleet
-from pisigma.fleet.processes import ProcessEngine
 from pisigma.fleet.record import MARK, RobotRecord, read_record, read_records, record_path
 from pisigma.fleet.results_table import RESULTS, write_results
 from pisigma.judging.progress import Progress
@@ -133,7 +133,7 @@ def _engine(settings: FleetSettings, items: int) -> Iterator[AbstractEngine]:
     if settings.engine == "processes" or not items:
         yield ProcessEngine(max(1, min(jobs, items)))
         return
-    from pisigma.fleet.ray_cluster import RayEngine
+    from pisigma.engines.ray_cluster import RayEngine
 
     engine = RayEngine(settings.jobs, settings.address)
     try:

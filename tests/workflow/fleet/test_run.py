@@ -6,8 +6,8 @@ import resource
 import pytest
 from testing.aged import model_before, rows_later
 
+from pisigma.engines.processes import ProcessEngine
 from pisigma.errors import FleetError, OutputError
-from pisigma.fleet.processes import ProcessEngine
 from pisigma.fleet.record import read_records
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.workflow.fleet import run as workflow

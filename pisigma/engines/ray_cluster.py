@@ -4,7 +4,7 @@ import logging
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from pisigma.fleet.engine import ONE_THREAD, AbstractEngine, Item, Result, work_on
+from pisigma.engines.engine import ONE_THREAD, AbstractEngine, Item, Result, work_on
 
 
 class RayEngine(AbstractEngine):

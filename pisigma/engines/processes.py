@@ -11,7 +11,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
 
-from pisigma.fleet.engine import ONE_THREAD, AbstractEngine, Item, Result, work_on
+from pisigma.engines.engine import ONE_THREAD, AbstractEngine, Item, Result, work_on
 
 
 class ProcessEngine(AbstractEngine):

@@ -1,4 +1,4 @@
-"""Where the work for many robots is done: on this machine or on many, behind one interface."""
+"""Where the same work for many items is done: on this machine or on many, behind one interface."""
 
 import math
 from abc import ABC, abstractmethod

@@ -3,10 +3,10 @@
 import os
 
 import pytest
-from testing.fleet_work import environment, square
+from testing.engine_work import environment, square
 
-from pisigma.fleet.processes import ProcessEngine
-from pisigma.fleet.ray_cluster import RayEngine
+from pisigma.engines.processes import ProcessEngine
+from pisigma.engines.ray_cluster import RayEngine
 
 
 @pytest.fixture(scope="module")
