@@ -10,7 +10,7 @@ from testing.serving import running
 
 import pisigma
 
-COUNT, SEED = 60, 0
+COUNT, SEED = 40, 0
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS)

@@ -92,7 +92,7 @@ def test_the_programs_of_controllers_parse(name):
 
 
 @pytest.mark.parametrize("name", ["pisigma_client.src", "pisigma_client.mod", "pisigma_client.kl"])
-def test_the_lines_that_they_send_are_requests(name, repository):
+def test_the_lines_that_they_send_are_requests(name, served):
     """The texts of a request, with numbers in the places of the others."""
     text = (CLIENTS / name).read_text()
     for pattern in (r"SWRITE\(.*?\"(.*)\"", r"Str:=(.*);", r"WRITE link \((.*)\)"):
@@ -106,10 +106,10 @@ def test_the_lines_that_they_send_are_requests(name, repository):
         line = re.sub(r"(?<=[\[,:] )(?=[,\]])", "1", "".join(re.findall(quoted, words)))
         line = line.replace('""', '"').replace("\\0A", "").replace(": , ", ": 1, ").replace("[, ", "[1, ")
     request = json.loads(line)
-    with running(repository / "models" / "kiro4") as server, json_client(server) as lines:
+    with json_client(served) as lines:
         request.pop("id")
         request["pose"] = POSE if len(request["pose"]) == 6 else request["pose"]
-        assert set(lines.ask(**request)) == {"id", "q_deg", "status"}
+        assert set(lines.ask(**request, model="kiro4")) == {"id", "q_deg", "status"}
 
 
 def test_the_channel_of_ethernetkrl_is_that_of_its_program():
