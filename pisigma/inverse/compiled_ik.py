@@ -331,7 +331,7 @@ class CompiledIK:
             stop - start,
             address_of(T) + start * 128,
             *pairs,
-            address_of(axes),
+            address_of(axes) if len(axes) else 0,
             len(axes),
             branch,
             mark,

@@ -10,11 +10,12 @@ from pisigma.kernels.network import add_correction, choose_corrected, finish_cor
 from pisigma.kernels.newton import search
 from pisigma.kernels.recovery import (
     branch_of,
+    differ,
     distance_from,
-    distinct_solutions,
     is_redundant,
     nearest_starts,
     recover,
+    settle,
     solve_nominal,
     solve_redundant,
     within_reach,
@@ -23,6 +24,9 @@ from pisigma.kernels.rotations import pose_error, wrap
 from pisigma.kernels.rows import Array, Record, copy, fill, kernel
 from pisigma.kernels.task_axes import level_pose, write_residuals
 from pisigma.kinematics import tolerances
+
+_DISTINCT, _FAR = 0.05, 0.5
+"""[rad or m] Solutions are different where a joint differs by more, with joints to spare by far more."""
 
 
 @kernel
@@ -67,7 +71,7 @@ def solve_pose(description: Record, memory: Record, has_near: bool, branch: int,
 def solve_every(description: Record, memory: Record, out: Array) -> None:
     """Write different solutions of the pose in `memory.pose` of an arm without closed form, as `solve_pose` does."""
     reachable = level_pose(description, memory) and within_reach(description, memory, memory.pose)
-    count = distinct_solutions(description, memory, out.shape[0]) if reachable else 0
+    count = _distinct_solutions(description, memory, out.shape[0]) if reachable else 0
     for row in range(out.shape[0]):
         fill(memory.nominal, math.nan)
         if row < count:
@@ -77,6 +81,28 @@ def solve_every(description: Record, memory: Record, out: Array) -> None:
             fill(memory.checked, math.nan)
         reached, status = finish(description, memory, False, row < count, out[row])
         _write(description, memory, reached, status, 0, out[row])
+
+
+@kernel
+def _distinct_solutions(description: Record, memory: Record, most: int) -> int:
+    """Keep different joint values that reach the pose in `memory.candidates`, up to so many; their number."""
+    arms, count = description.arms, 0
+    least = _FAR if is_redundant(description, memory) else _DISTINCT
+    starts = nearest_starts(description, memory, memory.pose, tolerances.MORE_ATTEMPTS)
+    for attempt in range(starts):
+        if count == min(most, memory.rank.shape[0]):
+            break
+        copy(description.starts.q[memory.nearest[attempt]], memory.q)
+        if not settle(description, memory, False, memory.q):
+            continue
+        wrap_into_limits(arms, memory.q)
+        fresh = True
+        for index in range(count):
+            fresh = fresh and differ(arms, memory.q, memory.candidates[index]) > least
+        if fresh:
+            copy(memory.q, memory.candidates[count])
+            count += 1
+    return count
 
 
 @kernel

@@ -16,8 +16,10 @@ from pisigma.kinematics.tolerances import ATTEMPTS, BESIDE, REACH_ROUNDING
 
 _TURN = 0.2
 """[rad] By so much the elbow is turned at a time."""
-_DISTINCT, _FAR = 0.05, 0.5
-"""[rad or m] Solutions are different where a joint differs by more, with joints to spare by far more."""
+_AROUND, _ASIDE = 8, 0.2
+"""How many starts are tried for one branch, and how far the joints of all but the first are off [rad]."""
+_APART = 1e-4
+"""[rad or m] Two solutions near a singular pose are different where a joint differs by more."""
 _OUTSIDE = 1e6
 """What is taken from the worth of joint values outside their limits."""
 
@@ -82,8 +84,10 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
             beside[index, 0] = math.nan
     if not plausible:
         return -1
+    if not any_branch:
+        return branch if _recover_branch(description, memory, branch) else -1
     count = nearest_starts(description, memory, memory.pose, ATTEMPTS) if starts.count > 0 else 0
-    for attempt in range(1 + form.branches + count if any_branch else 1):
+    for attempt in range(1 + form.branches + count):
         place = branch if attempt == 0 else attempt - 1
         if attempt > form.branches:
             copy(starts.q[memory.nearest[attempt - 1 - form.branches]], memory.q)
@@ -95,8 +99,54 @@ def recover(description: Record, memory: Record, branch: int, any_branch: bool) 
             copy(memory.q, memory.solution)
             lies = branch_of(description, memory, memory.q)
             fill(memory.checked, math.nan)
-            return lies if any_branch or lies == branch else -1
+            return lies
     return -1
+
+
+@kernel
+def _recover_branch(description: Record, memory: Record, branch: int) -> bool:
+    """Look for joint values on one branch, from the nearest of the nominal arm in `memory.others`.
+
+    Near singular poses two branches may lead to one solution, beside which the other lies, or two solutions may be
+    nearest to one nominal branch; the one that this does not lead to is the other's.
+    """
+    if math.isnan(memory.others[branch, 0]):
+        return False
+    copy(memory.others[branch], memory.chosen)
+    for attempt in range(_AROUND):
+        for j in range(description.arms.dof):
+            side = 0.0 if attempt == 0 else -1.0 if 7 * attempt * (j + 3) % 8 < 4 else 1.0
+            memory.q[j] = memory.chosen[j] + side * (_ASIDE if description.arms.revolute[j] else 0.0)
+        if not search(description, memory, memory.pose, memory.q):
+            continue
+        copy(memory.q, memory.solution)
+        lies = branch_of(description, memory, memory.q)
+        another = lies == branch or _is_another(description, memory, lies)
+        fill(memory.checked, math.nan)
+        if another:
+            return True
+    return False
+
+
+@kernel
+def _is_another(description: Record, memory: Record, lies: int) -> bool:
+    """Whether `memory.solution` is another one than that to which a nominal branch leads."""
+    arms, form = description.arms, description.closed_form
+    all_branches(arms, form, memory.level, NEAREST, memory.rounding, memory.wanted, memory.others)
+    copy(memory.others[lies], memory.q)
+    if not search(description, memory, memory.pose, memory.q):
+        return False
+    return differ(arms, memory.q, memory.solution) > _APART
+
+
+@kernel
+def differ(arms: Record, q: Array, other: Array) -> float:
+    """Largest difference of a joint [rad or m], the short way round."""
+    far = 0.0
+    for j in range(arms.dof):
+        off = q[j] - other[j]
+        far = max(far, abs(wrap(off) if arms.revolute[j] else off))
+    return far
 
 
 @kernel
@@ -254,11 +304,7 @@ def settle(description: Record, memory: Record, has_near: bool, q: Array) -> boo
 
 @kernel
 def _approach_preferred(description: Record, memory: Record, q: Array) -> bool:
-    """Move joints as near to preferred values as the pose and the limits allow; whether they still reach the pose.
-
-    Every step solves the linearised problem: `min |dq - pull|` in units of `memory.scale` where `J dq = e` holds
-    (sequential quadratic programming). A joint that comes to a limit is held there.
-    """
+    """Move joints to preferred values as `inverse.spare_joints` does; whether they still reach the pose."""
     arms, arm = description.arms, CORRECTED if description.arms.corrected else IDENTIFIED
     reach, share, before = arms.reach[IDENTIFIED], 1.0, math.inf
     for _ in range(tolerances.ROUNDS):
@@ -351,29 +397,3 @@ def _keep_candidate(description: Record, memory: Record, has_near: bool, q: Arra
     memory.rank[place] = rank
     copy(q, memory.candidates[place])
     return min(count + 1, most)
-
-
-@kernel
-def distinct_solutions(description: Record, memory: Record, most: int) -> int:
-    """Keep different joint values that reach the pose in `memory.candidates`, up to so many; their number."""
-    arms, count = description.arms, 0
-    least = _FAR if is_redundant(description, memory) else _DISTINCT
-    starts = nearest_starts(description, memory, memory.pose, tolerances.MORE_ATTEMPTS)
-    for attempt in range(starts):
-        if count == min(most, memory.rank.shape[0]):
-            break
-        copy(description.starts.q[memory.nearest[attempt]], memory.q)
-        if not settle(description, memory, False, memory.q):
-            continue
-        wrap_into_limits(arms, memory.q)
-        fresh = True
-        for index in range(count):
-            far = 0.0
-            for j in range(arms.dof):
-                off = memory.q[j] - memory.candidates[index, j]
-                far = max(far, abs(wrap(off) if arms.revolute[j] else off))
-            fresh = fresh and far > least
-        if fresh:
-            copy(memory.q, memory.candidates[count])
-            count += 1
-    return count

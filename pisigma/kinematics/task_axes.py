@@ -41,7 +41,7 @@ class TaskAxes:
     tolerance: tuple[float, ...] = (0.0,) * 6
     elbow_angle: float | None = None
 
-    @property
+    @cached_property
     def ignored(self) -> tuple[str, ...]:
         """Names of the axes that do not count."""
         return tuple(name for name, free in zip(AXES, self.free, strict=True) if free)
@@ -51,7 +51,7 @@ class TaskAxes:
         """Which of `AXES` have no part in least squares and residuals."""
         return tuple(value < 0 or value == math.inf for value in self.tolerance)
 
-    @property
+    @cached_property
     def whole(self) -> bool:
         """Whether all axes count exactly."""
         return not any(self.tolerance)
