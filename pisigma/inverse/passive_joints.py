@@ -8,12 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from pisigma.kinematics import tolerances
+from pisigma.kinematics.task_axes import LEAN
 
 STARTS = 4
 """Stored joint values, those whose poses are nearest, that are tried one after the other."""
 IGNORED = 1e-6
 """Weight of the rotations about the tool's x and y axes where there are fewer than six axes: too few to choose them, so
-that they only decide between joint values that reach all else."""
+that they only decide between joint values that reach all else. The tool may lean by `LEAN` then, and no more."""
 
 Values = Float64[np.ndarray, "rows axes"]
 Motion = Callable[[Values], tuple[Any, Any]]
@@ -64,6 +65,7 @@ def solve(motion: Motion, T: Float64[np.ndarray, "rows 4 4"], start: Values) -> 
         if np.abs(step).max(initial=0.0) < 1e-13:
             break
     reached = np.abs(error * (weight == 1.0)).max(-1) < tolerances.ACCEPTED
+    reached &= np.abs(error[:, 3:5]).max(-1) <= LEAN
     return Reached(q, reached, np.linalg.norm(error[:, :3], axis=-1), np.linalg.norm(error[:, 3:], axis=-1))
 
 

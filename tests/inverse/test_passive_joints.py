@@ -59,3 +59,10 @@ def test_what_no_axis_can_do_is_said(ik, robot, q):
     solution = ik(T)
     assert (solution.status == Status.UNREACHABLE).all()
     assert np.isnan(solution.q).all()
+
+
+def test_a_tool_that_leans_far_is_not_reached(ik, robot, q):
+    T = pisigma.forward_kinematics(robot, q[:3])
+    c, s = np.cos(0.5), np.sin(0.5)
+    T[:, :3, :3] = T[:, :3, :3] @ np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+    assert (ik(T).status == Status.UNREACHABLE).all()
