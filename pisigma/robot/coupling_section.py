@@ -70,40 +70,48 @@ def coupled(
     if not sections:
         return tuple(rows), None
     joints = [row for row in rows if row.type != "fixed"]
-    names, by_name = [joint.name for joint in joints], {section.joint: section for section in sections}
+    _check_names(sections, [joint.name for joint in joints])
+    by_name = {section.joint: section for section in sections}
     used = {name for section in sections for name, factor in section.factors.items() if factor}
-    for name in (name for section in sections for name in (section.joint, *section.factors)):
-        if name not in names:
-            raise RobotError(f"coupling: there is no joint '{name}'; {nearest_choice(name, names)}")
-    if len(by_name) < len(sections):
-        raise RobotError("coupling: a joint has two entries; join them, one per joint.")
     axes = [joint for joint in joints if joint.name in used or joint.name not in by_name]
-    matrix, offset = np.zeros((len(joints), len(axes))), np.zeros(len(joints))
-    driven = np.zeros(matrix.shape, dtype=bool)
-    four_bars: list[tuple[int, FourBar]] = []
-    stops: list[tuple[int, tuple[float, float]]] = []
-    for index, joint in enumerate(joints):
-        section = by_name.get(joint.name, CoupledJointSection(joint=joint.name, factors={joint.name: 1.0}))
-        matrix[index] = [
-            section.factors.get(axis.name, 0.0) * axis.in_file_unit(1.0) / joint.in_file_unit(1.0)
-            if axis.type != joint.type
-            else section.factors.get(axis.name, 0.0)
-            for axis in axes
-        ]
-        offset[index] = _offset(joint, section)
-        driven[index] = [joint.name in by_name and axis.name in section.factors for axis in axes]
+    for joint in joints:
         if joint not in axes and np.isfinite([joint.lower, joint.upper]).any():
             raise RobotError(
                 f"coupling: the joint '{joint.name}' is passive, so the controller has no limits for it; remove them."
             )
-        if section.four_bar is not None:
-            four_bars.append((index, section.four_bar.to_si()))
-        if limits := section.limits_deg or section.limits_mm:
-            stops.append((index, (joint.from_file_unit(limits[0]), joint.from_file_unit(limits[1]))))
-    turning = tuple(joint.type == "revolute" for joint in joints)
-    coupling = Coupling(tuple(axes), turning, matrix, offset, driven, tuple(four_bars), tuple(stops))
+    plain = [CoupledJointSection(joint=joint.name, factors={joint.name: 1.0}) for joint in joints]
+    stated = [by_name.get(section.joint, section) for section in plain]
+    pairs = list(zip(joints, stated, strict=True))
+    coupling = Coupling(
+        axes=tuple(axes),
+        turning=tuple(joint.type == "revolute" for joint in joints),
+        matrix=np.array([[_factor(section, joint, axis) for axis in axes] for joint, section in pairs]),
+        offset=np.array([_offset(joint, section) for joint, section in pairs]),
+        driven=np.array([[s.joint in by_name and axis.name in s.factors for axis in axes] for s in stated]),
+        four_bars=tuple((i, s.four_bar.to_si()) for i, s in enumerate(stated) if s.four_bar is not None),
+        stops=tuple(
+            (index, (joint.from_file_unit(limits[0]), joint.from_file_unit(limits[1])))
+            for index, (joint, section) in enumerate(pairs)
+            if (limits := section.limits_deg or section.limits_mm)
+        ),
+    )
     limits = iter(hull(coupling).tolist())
     return tuple(row if row.type == "fixed" else _within(row, *next(limits)) for row in rows), coupling
+
+
+def _check_names(sections: Sequence[CoupledJointSection], names: Sequence[str]) -> None:
+    """Refuse entries of joints that there are not, or twice."""
+    for name in (name for section in sections for name in (section.joint, *section.factors)):
+        if name not in names:
+            raise RobotError(f"coupling: there is no joint '{name}'; {nearest_choice(name, names)}")
+    if len({section.joint for section in sections}) < len(sections):
+        raise RobotError("coupling: a joint has two entries; join them, one per joint.")
+
+
+def _factor(section: CoupledJointSection, joint: Row, axis: Row) -> float:
+    """By how many [rad or m] a joint moves per [rad or m] of an axis."""
+    factor = section.factors.get(axis.name, 0.0)
+    return factor if axis.type == joint.type else factor * axis.in_file_unit(1.0) / joint.in_file_unit(1.0)
 
 
 def _within(row: Row, lower: float, upper: float) -> Row:

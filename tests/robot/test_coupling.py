@@ -127,3 +127,21 @@ def test_a_coupling_that_cannot_be_is_refused(old, new, complaint):
     assert old in COUPLED
     with pytest.raises(RobotError, match=complaint):
         coupled_robot(COUPLED.replace(old, new))
+
+
+def test_a_screw_moves_by_millimetres_per_degree():
+    text = """\
+name: screw
+maker: nobody
+source: made up
+rows:
+  - {name: turn, type: revolute, limits_deg: [-180, 180]}
+  - {name: stroke, type: prismatic, limits_mm: [0, 200]}
+coupling:
+  - {joint: stroke, factors: {stroke: 1, turn: 0.05}, offset_mm: 3}
+"""
+    robot = coupled_robot(text)
+    assert_close(robot.to_dh(np.array([np.pi / 2, 0.1])), [np.pi / 2, 0.1 + 0.0045 + 0.003], atol=1e-15)
+    assert_close(robot.limits[1], [0.003 - 0.009, 0.203 + 0.009], atol=1e-15)
+    again = coupled_robot(robot_to_yaml(robot))
+    assert_close(again.to_dh(np.array([1.0, 0.1])), robot.to_dh(np.array([1.0, 0.1])), atol=1e-15)
