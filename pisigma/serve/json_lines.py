@@ -267,7 +267,7 @@ def _model_record(model: ServedModel) -> dict[str, Any]:
         "sha256": model.sha256,
         "joints": model.ik.joints,
         "units": ["deg" if turns else "mm" for turns in model.ik.revolute],
-        "limits": per_unit.tolist(),
+        "limits": per_unit.round(9).tolist(),
         "branches": model.ik.branches,
     }
 

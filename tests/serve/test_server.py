@@ -6,11 +6,18 @@ import socket
 import threading
 import time
 
+import numpy as np
 import pytest
+import torch
+from testing.closeness import assert_close
+from testing.coupled import coupled_robot
 from testing.models import no_type_checker
 from testing.serving import frame_client, json_client, running
 
+import pisigma
 from pisigma.errors import ModelError, OutputError
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.folder.model_folder import save_model
 from pisigma.serve import json_lines
 from pisigma.serve.models import ServedModels, model_folders
 from pisigma.serve.server import Server, ServeSettings
@@ -148,3 +155,26 @@ def test_a_defect_is_told_and_ends_nothing(served, monkeypatch):
         with pytest.raises(RuntimeError, match="a defect of pisigma"):
             client.ask(pose=POSE, model=0)
         assert client.ask(ask="health")["connections"] > 0
+
+
+def test_coupled_joints_are_answered_in_the_values_of_the_controller(tmp_path):
+    robot = coupled_robot()
+    model = CalibratedModel(
+        name="coupled",
+        kind="geometric",
+        robot=robot,
+        calibrated=robot,
+        network=None,
+        domain=None,
+        branches=(),
+        starts=torch.full((1, 6), 0.3, dtype=torch.float64),
+    )
+    save_model(model, tmp_path)
+    q = [10.0, -20.0, 30.0, 10.0, 35.0, -15.0]
+    with running(tmp_path) as server, json_client(server) as lines, frame_client(server) as frames:
+        pose = lines.ask(q_deg=q)["pose"]
+        assert_close(lines.ask(pose=pose, near_deg=q)["q_deg"], q, atol=1e-7)
+        T = pisigma.load(tmp_path).forward(np.radians(q))
+        assert_close(np.degrees(frames.solve(T.ravel(), np.radians(q))[1]), q, atol=1e-9)
+        (record,) = lines.ask(ask="models")["models"]
+        assert record["limits"][1] == [-60.0, 76.0]
