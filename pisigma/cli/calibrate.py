@@ -142,22 +142,16 @@ def calibrate(
     from pisigma.workflow import calibrate as workflow
 
     check_folder(out, overwrite, inputs=(robot_file(robot), data, prior))
+    nominal = Robot.load(robot, base, tip)
     if prior is not None:
-        drawn = Robot.load(robot, base, tip)
-        recalibrate_into(context, prior, data, out, accept_implausible, overwrite, as_json, drawn=drawn)
-        return
+        return recalibrate_into(
+            context, prior, data, out, accept_implausible, overwrite, as_json, drawn=nominal
+        )
     stated: dict[str, Any] = {"model": model, "folds": folds, "hold_out": hold_out, "split": split}
     stated |= {"repeats": repeats, "jobs": jobs, "seed": seed, "train_rows": train_rows, "robust": robust}
-    settings = workflow.CalibrationSettings(
-        free=_free(free),
-        prior_length=prior_mm / 1e3,
-        prior_angle=prior_mrad / 1e3,
-        gravity=_gravity(gravity),
-        new_frame_at=tuple(new_frame_at or ()),
-        socket_distances=_socket_distances(socket_distance),
-        **stated,
-    )
-    nominal = Robot.load(robot, base, tip)
+    stated |= {"free": _free(free), "gravity": _gravity(gravity), "new_frame_at": tuple(new_frame_at or ())}
+    stated |= {"prior_length": prior_mm / 1e3, "prior_angle": prior_mrad / 1e3}
+    settings = workflow.CalibrationSettings(socket_distances=_socket_distances(socket_distance), **stated)
     with progress_of("calibrate") as progress:
         calibration = workflow.calibrate(nominal, data, settings, progress)
     with saved(calibration, out, accept_implausible, overwrite, command=command_line(context)) as folder:

@@ -147,26 +147,13 @@ def recalibrate(
     rows = posterior.renamed(measurements.split_sets()[0])
     progress("what has moved")
     elsewhere = _elsewhere(parent, posterior, rows, settings)
-    adaptation = adapt(recalibration_problem(parent, posterior, rows, elsewhere), posterior.noise)
-    outliers: tuple[WrongRowFigures, ...] = ()
-    if wrong := adaptation.wrong_rows:
-        every = rows
-        rows = every.select(torch.tensor([row for row in range(every.rows) if row not in wrong]))
-        adaptation = adapt(recalibration_problem(parent, posterior, rows, elsewhere), posterior.noise)
-        outliers = _outliers(adaptation, every, wrong)
-    problem = adaptation.problem
+    rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere)
     calibrator = HybridCalibrator(drawn)
     judged = gate(parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation"))
     likeness = _likeness(parent, rows)
     if likeness is not None and likeness.odd:
         judged = judged.with_least_error
-    if judged.kept == "scratch":
-        result = fit(calibrator, rows, stage(progress, "from scratch"))
-        assert isinstance(result, HybridResult)
-        kept = replace(model_of_hybrid(parent.name, drawn, result, rows), kind=KIND)
-    else:
-        chosen = adapt(problem.without_arm(), adaptation.noise) if judged.kept == "old" else adaptation
-        kept = recalibrated_model(parent, chosen, rows)
+    kept = _kept_model(judged, parent, adaptation, rows, calibrator, stage(progress, "from scratch"))
     believable = likeness is None and _believable(judged, drawn)
     moved = moved_by(adaptation) if believable else None
     summary = _summary(parent, rows, adaptation, judged, moved).having(
@@ -180,6 +167,37 @@ def recalibrate(
     return Recalibration(
         kept, parent, adaptation, judged, moved or (), summary, seconds=time.perf_counter() - started
     )
+
+
+def _adapted(
+    parent: CalibratedModel, posterior: ModelPosterior, rows: Measurements, elsewhere: frozenset[Owner]
+) -> tuple[Measurements, Adaptation, tuple[WrongRowFigures, ...]]:
+    """The rows that are not wrong, the model adapted to them, and the wrong ones."""
+    adaptation = adapt(recalibration_problem(parent, posterior, rows, elsewhere), posterior.noise)
+    wrong = adaptation.wrong_rows
+    if not wrong:
+        return rows, adaptation, ()
+    right = rows.select(torch.tensor([row for row in range(rows.rows) if row not in wrong]))
+    adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere), posterior.noise)
+    return right, adaptation, _outliers(adaptation, rows, wrong)
+
+
+def _kept_model(
+    judged: Gate,
+    parent: CalibratedModel,
+    adaptation: Adaptation,
+    rows: Measurements,
+    calibrator: HybridCalibrator,
+    progress: Progress,
+) -> CalibratedModel:
+    """The model of the candidate that is kept."""
+    if judged.kept == "scratch":
+        result = fit(calibrator, rows, progress)
+        assert isinstance(result, HybridResult)
+        return replace(model_of_hybrid(parent.name, calibrator.geometric.robot, result, rows), kind=KIND)
+    if judged.kept == "old":
+        adaptation = adapt(adaptation.problem.without_arm(), adaptation.noise)
+    return recalibrated_model(parent, adaptation, rows)
 
 
 def _outliers(
