@@ -21,6 +21,7 @@ from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.monitoring.session import Session
+from pisigma.robot.row import Row
 from pisigma.verification.cause import length_text
 from pisigma.verification.motion import judged_motion, motion_sentence, motion_warnings
 from pisigma.verification.setup_fault import SetupFault
@@ -147,8 +148,14 @@ def read_for_verification(path: str | os.PathLike[str], model: CalibratedModel) 
     Raises:
         MeasurementError: the file cannot be used, or its column `set` leaves no row for tests.
     """
-    rows = tuple(replace(row, lower=-np.inf, upper=np.inf) for row in model.robot.rows)
-    return test_rows(Measurements.read_csv(path, replace(model.robot, rows=rows)))
+    rows, coupling = _without_limits(model.robot.rows), model.robot.coupling
+    if coupling is not None:
+        coupling = replace(coupling, axes=_without_limits(coupling.axes))
+    return test_rows(Measurements.read_csv(path, replace(model.robot, rows=rows, coupling=coupling)))
+
+
+def _without_limits(rows: Sequence[Row]) -> tuple[Row, ...]:
+    return tuple(replace(row, lower=-np.inf, upper=np.inf) for row in rows)
 
 
 def verify(
