@@ -6,18 +6,21 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from click.testing import CliRunner, Result
 from testing.models import hand_made_model, no_type_checker, small_recipe_text
-from typer.testing import CliRunner, Result
+from typer.main import get_command
 
 from pisigma.cli.main import app
 from pisigma.model.folder.model_folder import save_model
 
 Run = Callable[..., Result]
+COMMAND = get_command(app)
+"""Made once, which takes as long as many a command."""
 
 
 def _run(*arguments: object) -> Result:
     with no_type_checker():
-        result = CliRunner().invoke(app, [str(argument) for argument in arguments])
+        result = CliRunner().invoke(COMMAND, [str(argument) for argument in arguments])
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     return result

@@ -15,11 +15,11 @@ from types import FrameType
 from unittest.mock import patch
 
 import torch
+from click.testing import CliRunner
 from hostile.case import Case
 from hostile.clean import CleanRows
 from testing.models import no_type_checker
 from typer.main import get_command
-from typer.testing import CliRunner
 
 from pisigma.cli.main import app
 from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
@@ -28,6 +28,7 @@ from pisigma.robot import Robot
 from pisigma.workflow.calibrate import Calibration
 
 COMMAND = get_command(app)
+"""Made once, which takes as long as most of the cases."""
 LONGEST = 10.0
 """[s] of computing that a command may take."""
 WAITS = 4
@@ -94,11 +95,8 @@ def attempt(case: Case, folder: Path) -> Outcome:
             _at_most(LONGEST),
             no_type_checker(),
             patch.object(Calibration, "_describe", keep),
-            patch(
-                "typer.testing._get_command", lambda app: COMMAND
-            ),  # which takes as long as most of the cases
         ):
-            result = CliRunner().invoke(app, list(case.arguments))
+            result = CliRunner().invoke(COMMAND, list(case.arguments))
     except _TooLong:
         return Outcome(Ending.HANG)
     problem = result.exception
