@@ -91,7 +91,9 @@ def test_offsets_of_coupled_joints_are_those_of_the_axes():
     """The controller's zero of joint 2 moves joint 3 too."""
     nominal, matrix = Robot.load("ur10"), np.eye(6)
     matrix[2, 1], matrix[4, 4] = -1.0, 0.5
-    coupled = dataclasses.replace(nominal, coupling=Coupling(nominal.joints, matrix, np.full(6, 0.1)))
+    driven = (matrix != 0) & np.array([[False, False, True, False, True, False]]).T
+    coupling = Coupling(nominal.joints, (True,) * 6, matrix, np.full(6, 0.1), driven)
+    coupled = dataclasses.replace(nominal, coupling=coupling)
     moved = with_offsets(coupled, [0.0, 0.02, -0.01, 0.03, 0.01, 0.0])
     q = joints_around("ur10", 20)
     there = forward_kinematics(coupled, coupled.to_dh(q + torch.from_numpy(offsets_between(coupled, moved))))
