@@ -32,6 +32,7 @@ LINEARISATIONS = 2
 EM_STEPS = 60
 CLASS_ROBOTS = 0.2
 """The class of the robot counts like so many robots in the variances of the fleet."""
+CONCENTRATIONS = 10
 ODD = 1e-3
 """Probability that any robot of a fleet without odd ones is called odd."""
 
@@ -123,13 +124,13 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
     everything = torch.arange(len(knowledge.uncertainty.root))
     chosen = torch.cat([everything[: space.arm_size], everything[len(space.parameters) :]])
     usual = knowledge.uncertainty.root[chosen].square().sum(1)
-    population = Population(torch.zeros_like(usual), usual.diag(), space.arm_size)
+    first = population = Population(torch.zeros_like(usual), usual.diag(), space.arm_size)
     noise: Mapping[str, float] = {"position": Instrument().sigma}
     odd: tuple[int, ...] = ()
     for _ in range(LINEARISATIONS):
         model = _model(name, knowledge, population, fleet, noise)
         evidence = [_evidence(model, population.mean, rows) for rows in fleet]
-        population, odd = _without_odd(evidence, population, usual)
+        population, odd = without_odd(evidence, first, usual)
         noise = _medians([one.noise for one in evidence])
     model = _model(name, knowledge, population, fleet, noise)
     return FleetPrior(model, population, space.names[: space.arm_size], odd)
@@ -222,31 +223,50 @@ def _evidence(
     return RobotEvidence(normal, descent + normal @ mean, adaptation.noise)
 
 
-def _without_odd(
+def without_odd(
     evidence: Sequence[RobotEvidence], start: Population, usual: Float64[Tensor, " unknowns"]
 ) -> tuple[Population, tuple[int, ...]]:
-    """The population of the robots that are alike, and the numbers of the others."""
-    odd: tuple[int, ...] = ()
-    while True:
-        alike = [number for number in range(len(evidence)) if number not in odd]
+    """Estimate the population of the robots that are alike, and give the numbers of the others.
+
+    It begins with the half that is nearest to the median robot, which several odd ones that are alike do not stretch to
+    themselves, and takes in whatever is not odd beside those, until that no longer changes: concentration steps of
+    Rousseeuw and Van Driessen 1999 (Technometrics 41(3), 212-223). Half of the robots scatter less than all, so
+    distances count in units of the median robot's where that is farther than expected.
+
+    Args:
+        evidence: of the robots.
+        start: a population of usual robots.
+        usual: variances of the class of the robots.
+    """
+    alike = _nearest_to_median(evidence, start)
+    population = start
+    for _ in range(CONCENTRATIONS):
         population = expectation_maximisation([evidence[number] for number in alike], start, usual)
-        now = {number for number in alike if _is_odd(number, alike, evidence, population, usual)}
-        if not now or len(alike) - len(now) < FEWEST_ROBOTS:
-            return population, odd
-        odd = tuple(sorted({*odd, *now}))
+        surprises = [population.surprise(one) for one in evidence]
+        ratios = sorted(square / max(count, 1) for square, count in surprises)
+        unit = max(ratios[len(ratios) // 2], 1.0)
+        now = [
+            number
+            for number, (square, count) in enumerate(surprises)
+            if chi2.sf(square / unit, max(count, 1)) >= ODD / len(evidence)
+        ]
+        if now == alike or len(now) < FEWEST_ROBOTS:
+            break
+        alike = now
+    return population, tuple(number for number in range(len(evidence)) if number not in alike)
 
 
-def _is_odd(
-    number: int,
-    alike: Sequence[int],
-    evidence: Sequence[RobotEvidence],
-    population: Population,
-    usual: Float64[Tensor, " unknowns"],
-) -> bool:
-    """Whether a robot is too far from a population of the others, which it would stretch to itself."""
-    others = [evidence[one] for one in alike if one != number]
-    square, count = _maximised(others, population, usual).surprise(evidence[number])
-    return bool(chi2.sf(square, count) < ODD / len(evidence))
+def _nearest_to_median(evidence: Sequence[RobotEvidence], start: Population) -> list[int]:
+    """Numbers of the half of the robots that are nearest to the median one, in the directions that are measured."""
+    precision = torch.linalg.inv(start.covariance)
+    inverses = torch.linalg.inv(torch.stack([one.normal for one in evidence]) + precision)
+    x = torch.einsum("rij,rj->ri", inverses, torch.stack([one.descent for one in evidence]))
+    median = x.median(0).values
+    scatter = (x - median).abs().median(0).values.square() + inverses.diagonal(dim1=1, dim2=2).mean(0)
+    population = Population(median, scatter.diag(), start.geometric)
+    distances = [square / max(count, 1) for square, count in map(population.surprise, evidence)]
+    order = sorted(range(len(evidence)), key=lambda number: distances[number])
+    return sorted(order[: max(FEWEST_ROBOTS, len(evidence) // 2 + 1)])
 
 
 def expectation_maximisation(

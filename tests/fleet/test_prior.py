@@ -6,7 +6,14 @@ from testing.fleet_robots import DRAWN, common_errors, rows_of
 from testing.models import no_type_checker
 
 from pisigma.errors import FleetError
-from pisigma.fleet.prior import Likeness, Population, RobotEvidence, expectation_maximisation, fleet_prior
+from pisigma.fleet.prior import (
+    Likeness,
+    Population,
+    RobotEvidence,
+    expectation_maximisation,
+    fleet_prior,
+    without_odd,
+)
 from pisigma.fleet.prior_summary import summarise_prior
 from pisigma.workflow.calibrate import CalibrationSettings, calibrate
 from pisigma.workflow.recalibrate import recalibrate
@@ -81,6 +88,18 @@ def test_a_robot_without_information_does_not_count():
     )
     assert (few.mean - many.mean).abs().max() < 1e-4
     assert (few.covariance - many.covariance).abs().max() < 0.02
+
+
+@pytest.mark.parametrize("odd", [0, 1, 6])
+def test_odd_robots_that_are_alike_do_not_hide_each_other(odd):
+    g = torch.Generator().manual_seed(odd)
+    x = torch.tensor([1.0, -2.0, 0.5]).double() + 0.2 * torch.randn(20, 3, generator=g, dtype=torch.float64)
+    x[20 - odd :] += 3.0
+    evidence = [RobotEvidence(1e4 * torch.eye(3).double(), 1e4 * one, {}) for one in x]
+    start = Population(torch.zeros(3).double(), 9 * torch.eye(3).double(), 2)
+    population, found = without_odd(evidence, start, 9 * torch.ones(3).double())
+    assert found == tuple(range(20 - odd, 20))
+    assert (population.covariance.diagonal().sqrt() < 0.5).all()
 
 
 def test_few_robots_are_refused():
