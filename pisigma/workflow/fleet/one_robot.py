@@ -1,5 +1,6 @@
 """What is done with one robot of a fleet: settings, its sessions one after the other, and its record."""
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from pisigma.errors import FleetError, OutputError, PisigmaError, nearest_choice
 from pisigma.fleet.members import Member, SessionFile
 from pisigma.fleet.record import REFUSED, ParameterValue, RobotRecord, SessionRecord, write_record
 from pisigma.judging.validation_figures import AbstractValidationFigures
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
 from pisigma.workflow.calibrate import Calibration, CalibrationSettings, calibrate
 from pisigma.workflow.monitor import MonitorSettings, monitor
@@ -197,8 +199,24 @@ def _recalibrated(recalibration: Recalibration, session: SessionFile) -> Session
         verdict=summary.kept,
         sentence=f"{summary.changed} {summary.verdict}",
         rms_mm=summary.cross_validation[summary.kept].rms_mm,
+        parameters=_parameters_of(recalibration.model),
         warnings=recalibration.warnings,
     )
+
+
+def _parameters_of(model: CalibratedModel) -> tuple[ParameterValue, ...]:
+    """The geometric parameters of which a model has a posterior."""
+    known = model.uncertainty
+    if known is None:
+        return ()
+    space, values = known.space, known.geometry.robot.dh.ravel()
+    changes, deviations = values - space.robot.dh.ravel(), known.root[: space.arm_size].norm(dim=1)
+    parameters = []
+    for number in deviations.nonzero()[:, 0].tolist():
+        unit, scale = ("mm", 1e3) if space.parameters[number].unit == "m" else ("deg", math.degrees(1.0))
+        figures = (float(those[number]) * scale for those in (values, changes, deviations))
+        parameters.append(ParameterValue(space.names[number], unit, *figures))
+    return tuple(parameters)
 
 
 def _monitored(model: Path, sessions: tuple[SessionFile, ...]) -> Iterator[SessionRecord]:

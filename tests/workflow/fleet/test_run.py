@@ -99,6 +99,9 @@ def test_sessions_recalibrate_or_are_monitored(plant):
     assert [one.model for one in robot.sessions] == ["models/a/2026-11-01", "models/a/2026-12-01"]
     assert robot.sessions[1].verdict == "recalibrated"
     assert "Joint 3 moved" in robot.sessions[1].sentence
+    theta = {one.name: one for one in robot.sessions[1].parameters}["theta_3"]
+    assert theta.unit == "deg"
+    assert 0 < theta.standard_error < 0.1
     last = load_model(plant / "renewed" / robot.sessions[1].model)
     assert last.metrics["parent"]["name"] == "2026-11-01"
 
