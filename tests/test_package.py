@@ -41,6 +41,7 @@ LAYERS = (
     "training",
     "sensors",
     "identification",
+    "camera",
     "hybrid",
     "model",
     "inverse",

@@ -1,5 +1,7 @@
 """`pisigma calibrate`: geometric or hybrid calibration of measured data."""
 
+import math
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,7 +21,9 @@ from pisigma.cli.output import (
 from pisigma.errors import IdentificationError
 
 if TYPE_CHECKING:
+    from pisigma.camera.image_rows import CameraFiles
     from pisigma.judging.calibration_summary import CalibrationSummary
+    from pisigma.workflow.calibrate import CalibrationSettings
 
 RobotName = Annotated[
     str,
@@ -88,6 +92,29 @@ SocketDistance = Annotated[
     str | None,
     typer.Option(help="Known distance of two sockets as A,B,MM; */0,*/1,50 states that of every placement."),
 ]
+CameraFile = Annotated[
+    Path | None,
+    typer.Option(
+        "--camera",
+        help="Camera (YAML of pisigma, ROS or OpenCV) whose corners DATA holds: columns image, corner, u_px, v_px and "
+        "joints; with --board.",
+    ),
+]
+BoardFile = Annotated[
+    Path | None, typer.Option("--board", help="Board that the camera sees (YAML: rows, columns, square_mm).")
+]
+FixedCamera = Annotated[
+    bool,
+    typer.Option(
+        "--fixed-camera", help="The camera is fixed and the board on the flange, not the other way round."
+    ),
+]
+RepeatabilityMm = Annotated[
+    float, typer.Option(help="Of images: standard deviation with which a position repeats, per axis [mm].")
+]
+RepeatabilityDeg = Annotated[
+    float, typer.Option(help="Of images: standard deviation with which a direction repeats, per axis [deg].")
+]
 Base = Annotated[str | None, typer.Option(help="Of a URDF file: link that is the base. [default: its root]")]
 Tip = Annotated[
     str | None, typer.Option(help="Of a URDF file: link that is the tool. [default: its only leaf]")
@@ -123,6 +150,11 @@ def calibrate(
     gravity: Gravity = None,
     new_frame_at: NewFrameAt = None,
     socket_distance: SocketDistance = None,
+    camera: CameraFile = None,
+    board: BoardFile = None,
+    fixed_camera: FixedCamera = False,
+    repeatability_mm: RepeatabilityMm = 0.02,
+    repeatability_deg: RepeatabilityDeg = 0.01,
     base: Base = None,
     tip: Tip = None,
     prior: Prior = None,
@@ -141,17 +173,12 @@ def calibrate(
     from pisigma.robot.robot_file import robot_file
     from pisigma.workflow import calibrate as workflow
 
-    check_folder(out, overwrite, inputs=(robot_file(robot), data, prior))
-    nominal = Robot.load(robot, base, tip)
+    check_folder(out, overwrite, inputs=(robot_file(robot), data, prior, camera, board))
+    settings, nominal = _settings(context.params), Robot.load(robot, base, tip)
     if prior is not None:
         return recalibrate_into(
             context, prior, data, out, accept_implausible, overwrite, as_json, drawn=nominal
         )
-    stated: dict[str, Any] = {"model": model, "folds": folds, "hold_out": hold_out, "split": split}
-    stated |= {"repeats": repeats, "jobs": jobs, "seed": seed, "train_rows": train_rows, "robust": robust}
-    stated |= {"free": _free(free), "gravity": _gravity(gravity), "new_frame_at": tuple(new_frame_at or ())}
-    stated |= {"prior_length": prior_mm / 1e3, "prior_angle": prior_mrad / 1e3}
-    settings = workflow.CalibrationSettings(socket_distances=_socket_distances(socket_distance), **stated)
     with progress_of("calibrate") as progress:
         calibration = workflow.calibrate(nominal, data, settings, progress)
     with saved(calibration, out, accept_implausible, overwrite, command=command_line(context)) as folder:
@@ -221,6 +248,23 @@ def _print_parameters(summary: "CalibrationSummary", verbose: bool) -> None:
     print_table(title, *parameter_table(estimated))
 
 
+def _settings(options: Mapping[str, Any]) -> "CalibrationSettings":
+    """Settings by the options of the command."""
+    from pisigma.workflow.calibrate import CalibrationSettings
+
+    same = ("model", "folds", "hold_out", "split", "repeats", "jobs", "seed", "train_rows", "robust")
+    return CalibrationSettings(
+        free=_free(options["free"]),
+        prior_length=options["prior_mm"] / 1e3,
+        prior_angle=options["prior_mrad"] / 1e3,
+        gravity=_gravity(options["gravity"]),
+        new_frame_at=tuple(options["new_frame_at"] or ()),
+        socket_distances=_socket_distances(options["socket_distance"]),
+        camera=_camera(options),
+        **{name: options[name] for name in same},
+    )
+
+
 def _free(stated: str) -> Any:
     """Free parameters as the settings have them."""
     if stated in ("identifiable", "joint_offsets"):
@@ -239,6 +283,23 @@ def _gravity(stated: str | None) -> Any:
             f"the direction of gravity as X,Y,Z was wanted, such as 0,0,-1, got '{stated}'."
         )
     return direction
+
+
+def _camera(options: Mapping[str, Any]) -> "CameraFiles | None":
+    """What the pixels of a file of corners mean; None where neither camera nor board is stated."""
+    from pisigma.camera.image_rows import CameraFiles, Repeatability
+
+    camera, board = options["camera"], options["board"]
+    if camera is None and board is None:
+        return None
+    if camera is None or board is None:
+        raise IdentificationError("--camera and --board belong together; give both.")
+    if options["prior"] is not None:
+        raise IdentificationError("--prior does not read corners of images; leave --camera or --prior out.")
+    repeatability = Repeatability(
+        options["repeatability_mm"] / 1e3, math.radians(options["repeatability_deg"])
+    )
+    return CameraFiles(str(camera), str(board), options["fixed_camera"], repeatability)
 
 
 def _socket_distances(stated: str | None) -> dict[tuple[str, str], float]:

@@ -14,6 +14,7 @@ from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.readings import READINGS
 from pisigma.sensors.anchor import AnchorSensor
+from pisigma.sensors.corner import CornerSensor, as_poses
 from pisigma.sensors.pair import PairSensor
 from pisigma.sensors.pose import PositionSensor, RotationSensor
 from pisigma.sensors.sensor import AbstractSensor, SensorRows, UnknownGroup, names_of, numbers_of
@@ -56,7 +57,15 @@ def register_sensor(sensor: type[AbstractSensor]) -> type[AbstractSensor]:
     return sensor
 
 
-for _sensor in (PositionSensor, RotationSensor, TouchSensor, SocketSensor, AnchorSensor, PairSensor):
+for _sensor in (
+    PositionSensor,
+    RotationSensor,
+    TouchSensor,
+    SocketSensor,
+    AnchorSensor,
+    PairSensor,
+    CornerSensor,
+):
     register_sensor(_sensor)
 
 
@@ -98,14 +107,14 @@ def measured_errors(
             here.
 
     Returns:
-        By sensor [m or rad], NaN in rows without a value; the error of a pair stands in both of its rows. Sensors
+        By sensor [m or rad], images as positions and rotations of their poses, NaN in rows without a value; the error of a pair stands in both of its rows. Sensors
         that no row has are left out.
 
     Raises:
         IdentificationError: the rows of an owner that was not calibrated do not determine its unknowns.
     """
     rows = pairs_first(measurements, torch.arange(measurements.rows, device=T.device))
-    data = replace(measurements, sigma_position=None, sigma_rotation=None).select(rows)
+    data = replace(as_poses(measurements), sigma_position=None, sigma_rotation=None).select(rows)
     T = T[rows]
     still = torch.zeros(0, 6, len(T), dtype=T.dtype, device=T.device)
     motion = ToolMotion(T[:, :3, 3].t(), T[:, :3, :3].permute(1, 2, 0), still)

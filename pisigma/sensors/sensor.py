@@ -101,6 +101,11 @@ class SensorRows:
             )
         return sigma
 
+    @property
+    def by_corners(self) -> Bool[Tensor, " rows"]:
+        """Which rows hold a pose that the corners of a board in an image give, with its covariance."""
+        return self.measurements.measured("corner")
+
     def readings(self, name: str) -> Float64[Tensor, " rows"]:
         """Return the numbers in a column of a registered sensor [SI], NaN where a row has none."""
         values = self.measurements.readings.get(name)

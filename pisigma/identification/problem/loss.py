@@ -8,12 +8,12 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-MEDIAN_DISTANCE = {1: 0.674490, 2: 1.177410, 3: 1.538172}
+MEDIAN_DISTANCE = {1: 0.674490, 2: 1.177410, 3: 1.538172, 6: 2.312600}
 """Median of the length of a standard normal vector with so many components."""
-DISTANCE_99 = {1: 2.575829, 2: 3.034854, 3: 3.368214}
+DISTANCE_99 = {1: 2.575829, 2: 3.034854, 3: 3.368214, 6: 4.100231}
 """Its 99 % quantile."""
 
-HAMPEL_VARIANCE = {1: 0.990933, 2: 0.995409, 3: 0.996914}
+HAMPEL_VARIANCE = {1: 0.990933, 2: 0.995409, 3: 0.996914, 6: 0.998435}
 """Weighted variance of standard normal noise under Hampel's weights: `E[w d²] / (components · E[w])`."""
 
 

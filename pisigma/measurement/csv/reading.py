@@ -180,8 +180,7 @@ def read_joints(path: str | os.PathLike[str], robot: Robot) -> Float64[Tensor, "
         )
     values = np.empty((len(table.lines), axes))
     for number, column in enumerate(columns):
-        place = table.header.index(column.name)
-        values[:, number] = to_si(_numbers(table, place), column.unit)
+        values[:, number] = to_si(number_column(table, column.name), column.unit)
     return torch.from_numpy(robot.to_dh(values))
 
 
@@ -202,18 +201,36 @@ def _joint_column(table: Table, number: int, robot: Robot) -> Column:
     return column
 
 
-def _numbers(table: Table, place: int) -> Float64[np.ndarray, " rows"]:
-    """The cells of a column as numbers."""
+def number_column(table: Table, name: str) -> Float64[np.ndarray, " rows"]:
+    """Read a column of a table as numbers, every cell of which has to hold one.
+
+    Raises:
+        MeasurementError: there is no such column, or a cell holds no number; the message names line and column.
+    """
     numbers = []
-    for line, fields in zip(table.lines, table.records, strict=True):
-        cell = fields[place].strip() if place < len(fields) else ""
+    for line, cell in zip(table.lines, text_column(table, name), strict=True):
         try:
             numbers.append(float(cell))
         except ValueError:
             numbers.append(math.nan)
         if not math.isfinite(numbers[-1]):
             raise MeasurementError(
-                f"{table.source}, line {line}, column '{table.header[place]}': a number was wanted, got '{cell}'; "
-                "give a joint value or remove the row."
+                f"{table.source}, line {line}, column '{name}': a number was wanted, got '{cell}'; give one or remove "
+                "the row."
             )
     return np.array(numbers)
+
+
+def text_column(table: Table, name: str) -> list[str]:
+    """Read a column of a table as texts without surrounding blanks.
+
+    Raises:
+        MeasurementError: there is no such column.
+    """
+    if name not in table.header:
+        raise MeasurementError(
+            f"{table.source}, line {table.header_line}: there is no column '{name}'; "
+            f"{nearest_choice(name, table.header)}"
+        )
+    place = table.header.index(name)
+    return [fields[place].strip() if place < len(fields) else "" for fields in table.records]

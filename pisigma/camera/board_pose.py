@@ -1,0 +1,105 @@
+"""The pose of a board in one image, and its covariance."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from pisigma.camera.camera import Camera
+from pisigma.identification.initial_guess.base_and_tool_closed_form import nearest_rotation
+from pisigma.identification.problem.loss import AbstractLoss
+from pisigma.se3 import rotation_from_vector, skew
+
+FEWEST_CORNERS = 6
+"""Of an image: four determine the pose, two more show whether one is wrong."""
+STEPS = 20
+SMALLEST_STEP = 1e-10
+"""[m or rad] Steps are not continued below."""
+SMALLEST_NOISE = 1e-6
+"""[px] Floor of the noise of corners, for exact ones."""
+POSE = 6
+
+
+@dataclass(frozen=True, eq=False)
+class BoardPose:
+    """Where a board was in front of a camera.
+
+    Attributes:
+        R: R_camera_board.
+        t: origin of the board in the camera's frame [m].
+        cofactor: covariance of an error (shift of t [m], turn of R as a rotation vector in the camera's frame [rad])
+            for a noise of the corners of 1 px.
+        distance: by how much every corner misses its prediction [px].
+    """
+
+    R: Float64[np.ndarray, "3 3"]
+    t: Float64[np.ndarray, " 3"]
+    cofactor: Float64[np.ndarray, "6 6"]
+    distance: Float64[np.ndarray, " corners"]
+
+
+def solve_board_pose(
+    camera: Camera,
+    corners: Float64[np.ndarray, "corners 3"],
+    pixels: Float64[np.ndarray, "corners 2"],
+    loss: AbstractLoss,
+) -> BoardPose:
+    """Find the pose of a flat board by Gauss-Newton steps, from the homography of its corners (Zhang 2000).
+
+    With the point `P = R X + t` of a corner X, a shift δ and a turn ω move P by `δ + ω × R X`.
+
+    Args:
+        camera: its intrinsics are taken as they are.
+        corners: in the frame of the board [m], all with z = 0 and not on one line.
+        pixels: where the image shows them [px].
+        loss: how corners count that are far from their prediction.
+    """
+    R, t = _by_homography(corners, camera.undistort(pixels))
+    for _ in range(STEPS):
+        residual, J = _linearised(camera, corners, pixels, R, t)
+        weight = _weights(residual, loss)
+        normal = np.einsum("nki,n,nkj->ij", J, weight, J)
+        step = np.linalg.solve(normal, np.einsum("nki,n,nk->i", J, weight, residual))
+        t, R = t + step[:3], rotation_from_vector(torch.from_numpy(step[3:])).numpy() @ R
+        if np.abs(step).max() < SMALLEST_STEP:
+            break
+    residual, J = _linearised(camera, corners, pixels, R, t)
+    cofactor = np.linalg.inv(np.einsum("nki,n,nkj->ij", J, _weights(residual, loss), J))
+    return BoardPose(R, t, cofactor, np.linalg.norm(residual, axis=1))
+
+
+def _linearised(
+    camera: Camera, corners: np.ndarray, pixels: np.ndarray, R: np.ndarray, t: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Measured minus predicted pixels, and the derivative of the predicted ones by shift and turn."""
+    turned = corners @ R.T
+    predicted, by_point = camera.project(turned + t)
+    by_turn = -by_point @ skew(torch.from_numpy(turned)).numpy()
+    return pixels - predicted, np.concatenate([by_point, by_turn], -1)
+
+
+def _weights(residual: np.ndarray, loss: AbstractLoss) -> np.ndarray:
+    distance = torch.from_numpy(np.linalg.norm(residual, axis=1))
+    scale = max(loss.scale(distance, 2, POSE), SMALLEST_NOISE)
+    weights: np.ndarray = loss.weight(distance / scale, 2).numpy()
+    return weights
+
+
+def _by_homography(corners: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of a flat board from `ray ~ [r1 r2 t] (x, y, 1)`, linear in its nine numbers up to their scale."""
+    middle, size = corners[:, :2].mean(0), np.ptp(corners[:, :2], axis=0).max()
+    plane = np.concatenate([(corners[:, :2] - middle) / size, np.ones((len(corners), 1))], 1)
+    zero = np.zeros_like(plane)
+    A = np.concatenate(
+        [
+            np.concatenate([plane, zero, -rays[:, :1] * plane], 1),
+            np.concatenate([zero, plane, -rays[:, 1:] * plane], 1),
+        ]
+    )
+    H = np.linalg.svd(A)[2][-1].reshape(3, 3)
+    H *= np.sign(H[2, 2]) * 2 * size / (np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))
+    axes = H[:, :2] / size
+    R = np.column_stack([axes, np.cross(axes[:, 0], axes[:, 1])])
+    R = nearest_rotation(torch.from_numpy(R)).numpy()
+    return R, H[:, 2] - R[:, :2] @ middle

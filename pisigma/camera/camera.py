@@ -1,0 +1,154 @@
+"""A camera: its intrinsics, how it projects points, and the files that hold them."""
+
+import os
+import re
+from dataclasses import dataclass
+from typing import Annotated, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ConfigDict, Field
+
+from pisigma.errors import MeasurementError
+from pisigma.files.input_file import read_text
+from pisigma.yaml_file import MOST_BYTES, Section, parse_yaml
+
+Positive = Annotated[float, Field(gt=0)]
+UNDISTORT_STEPS = 20
+"""Newton steps from a distorted to the undistorted point; ordinary lenses take four."""
+
+
+class CameraDocument(Section):
+    """A camera as pisigma's own files state it; see `Camera`."""
+
+    name: str = "camera"
+    width: int = Field(gt=0)
+    height: int = Field(gt=0)
+    fx: Positive
+    fy: Positive
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+
+class MatrixSection(BaseModel):
+    """A matrix of a ROS or OpenCV file, row by row; its other keys are not looked at."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+    data: tuple[float, ...]
+
+
+class MatrixDocument(BaseModel):
+    """A camera as `camera_info` of ROS and the calibration sample of OpenCV write it."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
+    camera_name: str = "camera"
+    image_width: int = Field(gt=0)
+    image_height: int = Field(gt=0)
+    distortion_model: Literal["plumb_bob"] = "plumb_bob"
+    camera_matrix: MatrixSection
+    distortion_coefficients: MatrixSection
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera with radial and tangential distortion (Brown 1971, as in OpenCV and ROS's plumb_bob).
+
+    z looks out of the camera, x to the right and y down in the image.
+
+    Attributes:
+        name: of the camera.
+        width: of its images [px].
+        height: of its images [px].
+        fx: focal length along u [px].
+        fy: focal length along v [px].
+        cx: principal point, u [px].
+        cy: principal point, v [px].
+        k1: radial distortion, as k2 and k3 without a unit.
+        k2: see k1.
+        p1: tangential distortion, as p2 without a unit.
+        p2: see p1.
+        k3: see k1.
+    """
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    @staticmethod
+    def load(path: str | os.PathLike[str]) -> "Camera":
+        """Read a camera from pisigma's own YAML, a ROS `camera_info` or an OpenCV file.
+
+        Raises:
+            MeasurementError: the file cannot be read or describes no such camera; the message names file and key.
+        """
+        source = os.fspath(path)
+        text = read_text(path, MeasurementError, "YAML", MOST_BYTES)
+        if not re.search(r"^\s*camera_matrix\s*:", text, re.MULTILINE):
+            return Camera(**parse_yaml(text, CameraDocument, MeasurementError, source).model_dump())
+        # OpenCV writes a directive and a tag that YAML does not know; commented out, they keep the lines' numbers
+        plain = re.sub(r"^%YAML.*$|^---\s*$", "#", text, flags=re.MULTILINE).replace("!!opencv-matrix", "")
+        document = parse_yaml(plain, MatrixDocument, MeasurementError, source)
+        matrix, bent = document.camera_matrix.data, document.distortion_coefficients.data
+        if len(matrix) != 9 or matrix[0] <= 0 or matrix[4] <= 0 or any(matrix[k] for k in (1, 3, 6, 7)):
+            raise MeasurementError(
+                f"{source}: camera_matrix.data as fx, 0, cx, 0, fy, cy, 0, 0, 1 was wanted, got {matrix}."
+            )
+        if len(bent) < 4 or any(bent[5:]):
+            raise MeasurementError(
+                f"{source}: distortion_coefficients.data as k1, k2, p1, p2 and k3 was wanted, got {bent}; calibrate the "
+                "camera with that model."
+            )
+        size = (document.camera_name, document.image_width, document.image_height)
+        return Camera(*size, matrix[0], matrix[4], matrix[2], matrix[5], *bent[:5])
+
+    def project(
+        self, points: Float64[np.ndarray, "*batch 3"]
+    ) -> tuple[Float64[np.ndarray, "*batch 2"], Float64[np.ndarray, "*batch 2 3"]]:
+        """Return the pixels of points in the camera's frame [m] and their derivative by the points [px/m]."""
+        xy = points[..., :2] / points[..., 2:]
+        bent, derivative = self._distorted(xy)
+        scale = np.array([self.fx, self.fy])
+        by_point = np.zeros((*xy.shape, 3))
+        by_point[..., 0, 0] = by_point[..., 1, 1] = 1.0
+        by_point[..., 2] = -xy
+        by_point /= points[..., 2, None, None]
+        return bent * scale + (self.cx, self.cy), scale[:, None] * (derivative @ by_point)
+
+    def undistort(self, pixels: Float64[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch 2"]:
+        """Return x / z and y / z of the rays of pixels, by Newton's method."""
+        bent = (pixels - (self.cx, self.cy)) / (self.fx, self.fy)
+        xy = bent.copy()
+        for _ in range(UNDISTORT_STEPS):
+            now, derivative = self._distorted(xy)
+            xy += np.linalg.solve(derivative, (bent - now)[..., None])[..., 0]
+        return xy
+
+    def _distorted(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distorted x / z and y / z, and their derivative by the undistorted ones."""
+        x, y = xy[..., 0], xy[..., 1]
+        square = x * x + y * y
+        radial = 1 + square * (self.k1 + square * (self.k2 + square * self.k3))
+        slope = self.k1 + square * (2 * self.k2 + 3 * self.k3 * square)
+        bent = xy * radial[..., None]
+        bent[..., 0] += 2 * self.p1 * x * y + self.p2 * (square + 2 * x * x)
+        bent[..., 1] += self.p1 * (square + 2 * y * y) + 2 * self.p2 * x * y
+        derivative = np.empty((*xy.shape, 2))
+        derivative[..., 0, 0] = radial + 2 * x * x * slope + 2 * self.p1 * y + 6 * self.p2 * x
+        derivative[..., 1, 1] = radial + 2 * y * y * slope + 6 * self.p1 * y + 2 * self.p2 * x
+        mixed = 2 * (x * y * slope + self.p1 * x + self.p2 * y)
+        derivative[..., 0, 1] = derivative[..., 1, 0] = mixed
+        return bent, derivative

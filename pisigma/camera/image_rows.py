@@ -1,0 +1,234 @@
+"""Files of corners as measurements: one row an image, with the pose that its corners give and its covariance."""
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+
+from pisigma.camera.board import Board
+from pisigma.camera.board_pose import FEWEST_CORNERS, POSE, BoardPose, solve_board_pose
+from pisigma.camera.camera import Camera
+from pisigma.errors import IdentificationError, MeasurementError
+from pisigma.identification.problem.loss import HampelLoss
+from pisigma.measurement.csv.reading import number_column, read_joints, text_column
+from pisigma.measurement.csv.table import Table, read_table
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+from pisigma.se3 import skew
+from pisigma.sensors.corner import WEIGHT_COLUMNS
+
+LARGEST_MISS = 10.0
+"""[px] Where half of the corners of an image miss their prediction by more, they are not of this board."""
+SAME_JOINTS = 1e-9
+"""[rad or m] Joint values of one image differ by no more."""
+
+
+@dataclass(frozen=True)
+class Repeatability:
+    """By how much the robot misses, anew in every image, the pose that its joint values mean.
+
+    Attributes:
+        length: standard deviation of each coordinate of the target's position [m].
+        angle: standard deviation of its turn about each axis [rad].
+    """
+
+    length: float = 2e-5
+    angle: float = 1.75e-4
+
+    def __post_init__(self) -> None:
+        """Refuse what is no standard deviation."""
+        if not (0 <= self.length < np.inf and 0 <= self.angle < np.inf):
+            raise IdentificationError(
+                f"repeatability: standard deviations of 0 or more were wanted, got {self.length * 1e3:g} mm and "
+                f"{np.rad2deg(self.angle):g} deg."
+            )
+
+
+@dataclass(frozen=True)
+class CameraFiles:
+    """What the pixels of a file of corners mean.
+
+    Attributes:
+        camera: file of the camera, see `Camera.load`.
+        board: file of the board, see `Board.load`.
+        is_fixed: whether the camera stands beside the robot and the board is on the flange; else the other way round.
+        repeatability: of the robot.
+    """
+
+    camera: str
+    board: str
+    is_fixed: bool = False
+    repeatability: Repeatability = Repeatability()
+
+    def read(self, path: str | os.PathLike[str], robot: Robot) -> Measurements:
+        """Read a file of corners as measurements; see `read_images`.
+
+        Raises:
+            MeasurementError: a file cannot be used; the message says which and where.
+        """
+        camera, board = Camera.load(self.camera), Board.load(self.board)
+        return read_images(path, robot, camera, board, self.is_fixed, self.repeatability)
+
+
+@dataclass(frozen=True, eq=False)
+class Images:
+    """The corners of a file, image by image.
+
+    Attributes:
+        source: the file.
+        names: of the images, in the order in which they come.
+        q: joint values of every image [rad or m].
+        lines: where the first corner of every image stands.
+        corners: numbers of the corners that every image shows.
+        pixels: where it shows them [px].
+    """
+
+    source: str
+    names: tuple[str, ...]
+    q: Float64[torch.Tensor, "images dof"]
+    lines: tuple[int, ...]
+    corners: tuple[np.ndarray, ...]
+    pixels: tuple[Float64[np.ndarray, "_corners 2"], ...]
+
+
+def read_images(
+    path: str | os.PathLike[str],
+    robot: Robot,
+    camera: Camera,
+    board: Board,
+    is_fixed: bool = False,
+    repeatability: Repeatability = Repeatability(),
+) -> Measurements:
+    """Read a CSV file of corners: `image`, `corner`, `u_px`, `v_px` and the joints (`q1_deg` and so on) in every row.
+
+    Args:
+        path: the file; rows of one image have one name and the same joint values.
+        robot: whose joints they are.
+        camera: that took the images.
+        board: that they show; corners are numbered as there.
+        is_fixed: whether the camera is fixed and the board on the flange.
+        repeatability: of the robot.
+
+    Returns:
+        One row an image, in the frame of the board with the camera as target (of a fixed camera the other way
+        round), with the weights of `CornerSensor`.
+
+    Raises:
+        MeasurementError: the file cannot be used, or the corners of an image are not of this board.
+    """
+    images = _split_images(path, robot, len(board.corners))
+    return image_measurements(images, camera, board, is_fixed, repeatability)
+
+
+def image_measurements(
+    images: Images, camera: Camera, board: Board, is_fixed: bool, repeatability: Repeatability
+) -> Measurements:
+    """Solve the pose of the board in every image; see `read_images`.
+
+    Raises:
+        MeasurementError: the corners of an image are not of this board.
+    """
+    loss, corners = HampelLoss(), board.corners
+    poses = [
+        solve_board_pose(camera, corners[number], pixels, loss)
+        for number, pixels in zip(images.corners, images.pixels, strict=True)
+    ]
+    for name, line, pose in zip(images.names, images.lines, poses, strict=True):
+        miss = float(np.median(pose.distance))
+        if not miss < LARGEST_MISS:
+            raise MeasurementError(
+                f"{images.source}, line {line}: half of the corners of image '{name}' are {miss:.3g} px or more from "
+                f"where a board of {board.rows} x {board.columns} corners has them; check the numbers of the corners, "
+                "the board and the camera, or remove the image."
+            )
+    values = 2 * sum(map(len, images.corners))
+    distance = torch.from_numpy(np.concatenate([pose.distance for pose in poses]))
+    noise = loss.scale(distance, 2, POSE * len(poses))
+    noise = loss.deviation(distance, 2, min(POSE * len(poses), values - 1), max(noise, 1e-9))
+    at_board = noise / camera.fx * float(np.median([pose.t[2] for pose in poses]))
+    seen = [_seen_by_robot(pose, is_fixed) for pose in poses]
+    own = np.diag([repeatability.length**2] * 3 + [repeatability.angle**2] * 3)
+    roots = [at_board * _inverse_root(noise**2 * cofactor + own) for _, _, cofactor in seen]
+    weights = torch.from_numpy(np.stack(roots))[:, *np.tril_indices(POSE)]
+    count, names = len(poses), (board.name, camera.name)
+    frame, target = reversed(names) if is_fixed else names
+    return Measurements(
+        q=images.q,
+        position=torch.from_numpy(np.stack([t for _, t, _ in seen])),
+        rotation=torch.from_numpy(np.stack([R for R, _, _ in seen])),
+        frame=(frame,) * count,
+        target=(target,) * count,
+        readings=dict(zip(WEIGHT_COLUMNS, weights.t(), strict=True)),
+        line=images.lines,
+        source=images.source,
+    )
+
+
+def _seen_by_robot(pose: BoardPose, is_fixed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pose of the target in its frame, and the cofactor of its errors in the axes of the frame.
+
+    Of the inverse pose, position `-R^T t` moves by `-R^T (shift + t × turn)`, and the rotation turns by `-R^T turn`.
+    """
+    if is_fixed:
+        return pose.R, pose.t, pose.cofactor
+    back = pose.R.T
+    change = np.zeros((POSE, POSE))
+    change[:3, :3] = change[3:, 3:] = back
+    change[:3, 3:] = back @ skew(torch.from_numpy(pose.t)).numpy()
+    return back, -back @ pose.t, change @ pose.cofactor @ change.T
+
+
+def _inverse_root(covariance: np.ndarray) -> np.ndarray:
+    """Lower triangular W with `W^T W` = inverse of a covariance, scaled first, as metres and radians differ."""
+    scale = np.sqrt(covariance.diagonal())
+    root: np.ndarray = np.linalg.inv(np.linalg.cholesky(covariance / scale / scale[:, None])) / scale
+    return root
+
+
+def _split_images(path: str | os.PathLike[str], robot: Robot, corners: int) -> Images:
+    """Read the rows and put those of one image together."""
+    table, q = read_table(path), read_joints(path, robot)
+    number, u, v = (number_column(table, name) for name in ("corner", "u_px", "v_px"))
+    for row, corner in enumerate(number):
+        if corner != round(corner) or not 0 <= corner < corners:
+            raise MeasurementError(
+                f"{table.source}, line {table.lines[row]}, column 'corner': a whole number from 0 to {corners - 1} was "
+                f"wanted, as the board has {corners} corners, got {corner:g}; check the board's rows and columns."
+            )
+    rows: dict[str, list[int]] = {}
+    for row, name in enumerate(text_column(table, "image")):
+        rows.setdefault(name, []).append(row)
+    for name, of_image in rows.items():
+        _check_image(table, name, of_image, q, number)
+    return Images(
+        source=table.source,
+        names=tuple(rows),
+        q=torch.stack([q[of_image[0]] for of_image in rows.values()]),
+        lines=tuple(table.lines[of_image[0]] for of_image in rows.values()),
+        corners=tuple(number[of_image].astype(int) for of_image in rows.values()),
+        pixels=tuple(np.stack([u, v], -1)[of_image] for of_image in rows.values()),
+    )
+
+
+def _check_image(
+    table: Table, name: str, rows: list[int], q: Float64[torch.Tensor, "rows dof"], number: np.ndarray
+) -> None:
+    """Refuse an image that cannot be one.
+
+    Raises:
+        MeasurementError: it has too few corners, one twice, or two vectors of joint values.
+    """
+    where = f"{table.source}, line {table.lines[rows[0]]}: image '{name}'"
+    if len(rows) < FEWEST_CORNERS:
+        raise MeasurementError(
+            f"{where} has {len(rows)} corners, but {FEWEST_CORNERS} or more were wanted; remove the image."
+        )
+    if len(set(number[rows])) < len(rows):
+        raise MeasurementError(f"{where} has a corner twice; give every image a name of its own.")
+    if float((q[rows] - q[rows[0]]).abs().max()) > SAME_JOINTS:
+        raise MeasurementError(
+            f"{where} has rows of different joint values; give every image a name of its own, and all of its rows the "
+            "joint values at which it was taken."
+        )
