@@ -109,8 +109,8 @@ class Camera:
             )
         if len(bent) < 4 or any(bent[5:]):
             raise MeasurementError(
-                f"{source}: distortion_coefficients.data as k1, k2, p1, p2 and k3 was wanted, got {bent}; calibrate the "
-                "camera with that model."
+                f"{source}: distortion_coefficients.data as k1, k2, p1, p2 and k3 was wanted, got {bent}; calibrate "
+                "the camera with that model."
             )
         size = (document.camera_name, document.image_width, document.image_height)
         return Camera(*size, matrix[0], matrix[4], matrix[2], matrix[5], *bent[:5])

@@ -1,14 +1,14 @@
 """Files of corners as measurements: one row an image, with the pose that its corners give and its covariance."""
 
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 
 from pisigma.camera.board import Board
-from pisigma.camera.board_pose import FEWEST_CORNERS, POSE, BoardPose, solve_board_pose
+from pisigma.camera.board_pose import FEWEST_CORNERS, POSE, SMALLEST_NOISE, BoardPose, solve_board_pose
 from pisigma.camera.camera import Camera
 from pisigma.errors import IdentificationError, MeasurementError
 from pisigma.identification.problem.loss import HampelLoss
@@ -60,7 +60,7 @@ class CameraFiles:
     camera: str
     board: str
     is_fixed: bool = False
-    repeatability: Repeatability = Repeatability()
+    repeatability: Repeatability = field(default_factory=Repeatability)
 
     def read(self, path: str | os.PathLike[str], robot: Robot) -> Measurements:
         """Read a file of corners as measurements; see `read_images`.
@@ -143,15 +143,16 @@ def image_measurements(
                 f"where a board of {board.rows} x {board.columns} corners has them; check the numbers of the corners, "
                 "the board and the camera, or remove the image."
             )
-    values = 2 * sum(map(len, images.corners))
     distance = torch.from_numpy(np.concatenate([pose.distance for pose in poses]))
-    noise = loss.scale(distance, 2, POSE * len(poses))
-    noise = loss.deviation(distance, 2, min(POSE * len(poses), values - 1), max(noise, 1e-9))
+    used = float(POSE * len(poses))
+    scale = max(loss.scale(distance, 2, used), SMALLEST_NOISE)
+    noise = max(loss.deviation(distance, 2, used, scale), SMALLEST_NOISE)
     at_board = noise / camera.fx * float(np.median([pose.t[2] for pose in poses]))
     seen = [_seen_by_robot(pose, is_fixed) for pose in poses]
     own = np.diag([repeatability.length**2] * 3 + [repeatability.angle**2] * 3)
     roots = [at_board * _inverse_root(noise**2 * cofactor + own) for _, _, cofactor in seen]
-    weights = torch.from_numpy(np.stack(roots))[:, *np.tril_indices(POSE)]
+    row, column = np.tril_indices(POSE)
+    weights = torch.from_numpy(np.stack(roots)[:, row, column])
     count, names = len(poses), (board.name, camera.name)
     frame, target = reversed(names) if is_fixed else names
     return Measurements(

@@ -1,6 +1,6 @@
 """Simulated images of a board: where its corners appear to the camera of a true robot."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -25,7 +25,7 @@ class ImageNoise:
     """
 
     corner: float = 0.3
-    repeatability: Repeatability = Repeatability()
+    repeatability: Repeatability = field(default_factory=Repeatability)
 
 
 def simulate_images(

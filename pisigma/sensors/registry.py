@@ -107,8 +107,8 @@ def measured_errors(
             here.
 
     Returns:
-        By sensor [m or rad], images as positions and rotations of their poses, NaN in rows without a value; the error of a pair stands in both of its rows. Sensors
-        that no row has are left out.
+        By sensor [m or rad], NaN in rows without a value; the error of a pair stands in both of its rows, and that of
+        an image is that of its pose. Sensors that no row has are left out.
 
     Raises:
         IdentificationError: the rows of an owner that was not calibrated do not determine its unknowns.

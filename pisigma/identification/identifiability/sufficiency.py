@@ -26,6 +26,10 @@ SOCKETS_WITHOUT_SCALE = (
     "sockets alone are met by a robot of any size, so the scale stays as drawn; give the distance between two sockets "
     "(socket_distances), or measure one length otherwise."
 )
+SCALE_OF_BOARD = (
+    "every length rests on the board that the camera sees: if its squares are 0.1 % too large, so is the robot, and no "
+    "residual shows it; measure the board with a calliper, or one known distance with another sensor."
+)
 
 
 def free_parameters(redundancy: Redundancy, explicit: bool, unknowns: int) -> int:
@@ -163,6 +167,8 @@ def determines_scale(setup: CalibrationSetup) -> bool:
 
 
 def _scale(setup: CalibrationSetup) -> list[str]:
+    if {sensor.name for sensor in setup.problem.sensors if sensor.unit == "m"} == {"corner"}:
+        return [SCALE_OF_BOARD]
     if determines_scale(setup):
         return []
     return [TOUCHES_WITHOUT_SCALE if "touch" in setup.measurements.kinds else SOCKETS_WITHOUT_SCALE]

@@ -1,0 +1,104 @@
+"""Files of corners as rows of images, and what a calibration makes of them."""
+
+from pathlib import Path
+
+import pytest
+import torch
+from testing.camera_cell import BOARD, CAMERA, aligned_error, camera_cell, corner_lines
+from testing.closeness import assert_close
+
+from pisigma.camera.image_rows import Repeatability, image_measurements, read_images
+from pisigma.camera.simulated_images import ImageNoise
+from pisigma.errors import IdentificationError, MeasurementError
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.problem.parameters import Prior
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.dataset import Measurements
+
+EXACT = ImageNoise(0.0, Repeatability(0.0, 0.0))
+PRIOR = Prior(theta=5e-3, d=1e-3, a=1e-3, alpha=5e-3, beta=5e-3)
+
+
+@pytest.mark.parametrize("is_fixed", [False, True], ids=["flange", "fixed"])
+def test_exact_corners_give_the_poses_of_the_target(tmp_path: Path, is_fixed: bool) -> None:
+    cell = camera_cell(8, 0, EXACT, is_fixed)
+    path = tmp_path / "corners.csv"
+    path.write_text("\n".join(corner_lines(cell.images)) + "\n")
+    rows = read_images(path, cell.nominal, CAMERA, BOARD, is_fixed)
+    assert (rows.frame[0], rows.target[0]) == (("wrist", "board") if is_fixed else ("board", "wrist"))
+    assert_close(rows.T, forward_kinematics(cell.true, cell.images.q), atol=1e-7)
+    assert rows.place(1) == f"{path}, line {2 + len(cell.images.corners[0])}"
+    rows.write_csv(tmp_path / "rows.csv", cell.nominal)
+    again = Measurements.read_csv(tmp_path / "rows.csv", cell.nominal)
+    assert again.kinds == {"pose", "corner"}
+
+
+@pytest.mark.parametrize("is_fixed", [False, True], ids=["flange", "fixed"])
+def test_a_calibration_by_images_is_right_beyond_them(is_fixed: bool) -> None:
+    cell = camera_cell(50, 1, is_fixed=is_fixed)
+    data = image_measurements(cell.images, CAMERA, BOARD, is_fixed, Repeatability())
+    result = GeometricCalibrator(cell.nominal, prior=PRIOR).fit(data)
+    q = camera_cell(50, 2, is_fixed=is_fixed).images.q
+    true, estimated = (forward_kinematics(robot, q)[:, :3, 3] for robot in (cell.true, result.robot))
+    assert aligned_error(true, estimated) < 1e-4
+    (noise,) = result.noise
+    assert_close(noise.sigma, 0.3 / 1400 * 0.5, rtol=0.15)  # 0.3 px at 0.5 m
+
+
+def test_the_result_says_that_scale_rests_on_the_board() -> None:
+    cell = camera_cell(50, 1)
+    data = image_measurements(cell.images, CAMERA, BOARD, False, Repeatability())
+    result = GeometricCalibrator(cell.nominal).fit(data)
+    assert any("rests on the board" in sentence for sentence in result.recommendations)
+    assert {"theta_6", "tool_roll"} <= {name for group in result.redundant_sets for name in group}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            lambda lines: [lines[0].replace("u_px", "u"), *lines[1:]],
+            "there is no column 'u_px'; did you mean 'v_px'",
+        ),
+        (lambda lines: lines[:5], "line 2: image '0000' has 4 corners, but 6 or more were wanted"),
+        (lambda lines: [*lines, lines[1]], "image '0000' has a corner twice"),
+        (
+            lambda lines: [*lines, lines[1].replace("0000,0", "0000,54", 1)],
+            "number from 0 to 53 was wanted.*got 54",
+        ),
+        (lambda lines: [*lines[:54], lines[54][:-3] + "999"], "image '0000' has rows of different joint values"),
+        (
+            lambda lines: [*lines[:9], lines[9].replace(",", ",x", 2), *lines[10:]],
+            "line 10, column 'corner'.*'x8'",
+        ),
+    ],
+)
+def test_faulty_files_are_named(tmp_path: Path, change, message: str) -> None:
+    path = tmp_path / "corners.csv"
+    path.write_text("\n".join(change(corner_lines(camera_cell(8, 0, EXACT).images))) + "\n")
+    with pytest.raises(MeasurementError, match=message):
+        read_images(path, camera_cell(8, 0, EXACT).nominal, CAMERA, BOARD)
+
+
+def test_corners_of_another_board_are_refused() -> None:
+    images = camera_cell(8, 0, EXACT).images
+    shuffled = [
+        torch.randperm(len(one), generator=torch.Generator().manual_seed(0)) for one in images.corners
+    ]
+    mixed = type(images)(
+        images.source,
+        images.names,
+        images.q,
+        images.lines,
+        tuple(one[order.numpy()] for one, order in zip(images.corners, shuffled, strict=True)),
+        images.pixels,
+    )
+    with pytest.raises(MeasurementError, match=r"half of the corners of image '0000' are .* px or more from"):
+        image_measurements(mixed, CAMERA, BOARD, False, Repeatability())
+
+
+def test_repeatability_is_no_negative_number() -> None:
+    with pytest.raises(
+        IdentificationError, match=r"standard deviations of 0 or more were wanted, got -0\.01 mm"
+    ):
+        Repeatability(-1e-5, 0.0)
