@@ -1,0 +1,53 @@
+"""`pisigma calibrate` with the corners of a board in a camera's images."""
+
+import json
+from pathlib import Path
+
+import pytest
+from testing.camera_cell import BOARD, CAMERA, aligned_error, camera_cell, corner_lines
+from testing.closeness import assert_close
+
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.model.folder.model_folder import load_model
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with corners.csv, camera.yaml and board.yaml."""
+    folder = tmp_path_factory.mktemp("camera")
+    (folder / "corners.csv").write_text("\n".join(corner_lines(camera_cell(50, 1).images)) + "\n")
+    numbers = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "width", "height", "name")
+    (folder / "camera.yaml").write_text("".join(f"{name}: {getattr(CAMERA, name)}\n" for name in numbers))
+    (folder / "board.yaml").write_text(f"rows: 6\ncolumns: 9\nsquare_mm: {BOARD.square * 1e3}\n")
+    return folder
+
+
+def options(files: Path) -> tuple[object, ...]:
+    camera, board = files / "camera.yaml", files / "board.yaml"
+    return (files / "corners.csv", "--camera", camera, "--board", board, "--prior-mrad", 5)
+
+
+def test_from_pixels_of_corners_to_a_model(run, files, tmp_path):
+    command = ("calibrate", "ur5", *options(files), "--model", "geometric", "--folds", 2, "--repeats", 1)
+    result = run(*command, "--out", tmp_path / "arm", "--json")
+    assert result.exit_code == 0, result.output
+    printed = json.loads(result.stdout)
+    (noise,) = printed["noise"]
+    assert noise["sensor"] == "corner"
+    figures = printed["cross_validation"]
+    assert (figures["rows"], figures["folds"]) == (50, 2)  # a row an image
+    assert figures["geometric"]["rms_mm"] < 1.0 < 2.0 < figures["nominal"]["rms_mm"]  # of one image: 0.5 mm
+    assert any("rests on the board" in warning for warning in printed["warnings"])
+    model, q = load_model(tmp_path / "arm"), camera_cell(50, 2).images.q
+    true, estimated = (
+        forward_kinematics(robot, q)[:, :3, 3] for robot in (camera_cell(50, 1).true, model.calibrated)
+    )
+    assert_close(aligned_error(true, estimated), 0.0, atol=1e-4)
+
+
+def test_camera_and_board_belong_together(run, files, tmp_path):
+    command = ("calibrate", "ur5", files / "corners.csv", "--camera", files / "camera.yaml")
+    result = run(*command, "--out", tmp_path / "arm")
+    assert result.exit_code == 2
+    assert "--camera and --board belong together" in " ".join(result.stderr.split())
+    assert not (tmp_path / "arm").exists()
