@@ -17,7 +17,7 @@ from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.se3 import skew
-from pisigma.sensors.corner import WEIGHT_COLUMNS
+from pisigma.sensors.corner import NOISE_COLUMN, WEIGHT_COLUMN, weight_text
 
 LARGEST_MISS = 10.0
 """[px] Where half of the corners of an image miss their prediction by more, they are not of this board."""
@@ -150,9 +150,7 @@ def image_measurements(
     at_board = noise / camera.fx * float(np.median([pose.t[2] for pose in poses]))
     seen = [_seen_by_robot(pose, is_fixed) for pose in poses]
     own = np.diag([repeatability.length**2] * 3 + [repeatability.angle**2] * 3)
-    roots = [at_board * _inverse_root(noise**2 * cofactor + own) for _, _, cofactor in seen]
-    row, column = np.tril_indices(POSE)
-    weights = torch.from_numpy(np.stack(roots)[:, row, column])
+    weights = tuple(weight_text(_inverse_root(noise**2 * cofactor + own)) for _, _, cofactor in seen)
     count, names = len(poses), (board.name, camera.name)
     frame, target = reversed(names) if is_fixed else names
     return Measurements(
@@ -161,7 +159,7 @@ def image_measurements(
         rotation=torch.from_numpy(np.stack([R for R, _, _ in seen])),
         frame=(frame,) * count,
         target=(target,) * count,
-        readings=dict(zip(WEIGHT_COLUMNS, weights.t(), strict=True)),
+        readings={NOISE_COLUMN: torch.full_like(images.q[:, 0], at_board), WEIGHT_COLUMN: weights},
         line=images.lines,
         source=images.source,
     )

@@ -1,19 +1,49 @@
 """Cameras: the pose that the corners of a board in one image give, weighted by its whole covariance."""
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from pisigma.kinematics.parameter_jacobian import ToolMotion
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.readings import ReadingColumn, SensorReadings
+from pisigma.measurement.readings import ReadingColumn, Readings, RowFault, SensorReadings
 from pisigma.sensors.pose import rotation_difference
 from pisigma.sensors.sensor import AbstractSensor, Derivative, SensorRows, Unknowns, Values
 
-WEIGHT_COLUMNS = tuple(f"corner_weight_{row}{column}" for row in range(1, 7) for column in range(1, row + 1))
-"""Of a lower triangular matrix, row by row."""
+NOISE_COLUMN, WEIGHT_COLUMN = "corner_noise", "corner_weight"
+WEIGHTS = 21
+"""Numbers of a lower triangular matrix of six rows."""
+
+
+def weight_text(weight: Float64[np.ndarray, "6 6"]) -> str:
+    """Return what a cell of the weights' column holds: the lower triangle, row by row, with blanks between."""
+    return " ".join(f"{value:.17g}" for value in weight[np.tril_indices(6)])
+
+
+def _weights(text: str) -> list[float]:
+    """The numbers in a cell of the weights' column; none where it is empty or at fault."""
+    try:
+        numbers = [float(word) for word in text.split()]
+    except ValueError:
+        return []
+    return numbers if len(numbers) == WEIGHTS and all(map(math.isfinite, numbers)) else []
+
+
+def _row_faults(readings: Readings) -> Iterator[RowFault]:
+    """Find rows with noise or weights alone, and noise or weights that are none."""
+    noise = np.asarray(readings[NOISE_COLUMN])
+    texts = readings[WEIGHT_COLUMN]
+    weighted = np.array([bool(_weights(str(text))) for text in texts])
+    yield (
+        np.isfinite(noise) != weighted,
+        lambda row: f"a noise and {WEIGHTS} weights with blanks between were wanted, got '{texts[row]}'",
+    )
+    yield noise <= 0, lambda row: f"a positive noise was wanted, got {noise[row] * 1e3:.6g} mm"
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,15 +51,15 @@ class CornerSensor(AbstractSensor):
     """A camera that sees a board: `W · (position; rotation vector)` of measured against predicted poses.
 
     An image determines some directions of its pose much better than others, and shift and turn together. So the row
-    of an image states, beside the pose, a lower triangular W with `W^T W` proportional to the inverse covariance of
-    (position [m], turn [rad]) in the axes of the row's frame. The covariance is the sum of what the corners
-    leave open and of the robot's repeatability: the pose error that all corners of an image share is thereby
-    eliminated in closed form. W is scaled such that the noise is that of one corner as a length at the board.
+    of an image states, beside the pose, a lower triangular W with `W^T W` the inverse covariance of (position [m],
+    turn [rad]) in the axes of the row's frame. The covariance is the sum of what the corners leave open and of the
+    robot's repeatability: the pose error that all corners of an image share is thereby eliminated in closed form.
+    Values are the noise of one corner, as a length at the board, times W times the errors.
 
     Attributes:
         position: measured positions [m].
         rotation: measured rotations, the row index last.
-        weight: W for errors seen from the base's anchor [1, and m/rad].
+        weight: noise times W for errors seen from the base's anchor [1, and m/rad].
         present: whether a row has one.
         sigma: None; the noise is estimated.
     """
@@ -39,7 +69,10 @@ class CornerSensor(AbstractSensor):
     components = 6
     turning = True
     readings = SensorReadings(
-        "corner", tuple(ReadingColumn(name) for name in WEIGHT_COLUMNS), is_length=False
+        "corner",
+        (ReadingColumn(NOISE_COLUMN, ("mm",)), ReadingColumn(WEIGHT_COLUMN, is_text=True)),
+        is_length=False,
+        row_faults=_row_faults,
     )
     position: Float64[Tensor, "3 rows"]
     rotation: Float64[Tensor, "3 3 rows"]
@@ -59,7 +92,9 @@ class CornerSensor(AbstractSensor):
         position = torch.where(present, ((data.position - p)[:, None] @ R)[:, 0].t(), 0.0)
         weight = R.new_zeros(data.rows, 6, 6)
         row, column = torch.tril_indices(6, 6).to(R.device)
-        weight[:, row, column] = torch.stack([rows.readings(name) for name in WEIGHT_COLUMNS], -1)
+        texts = [str(text) for text in data.readings[WEIGHT_COLUMN]]
+        weight[:, row, column] = R.new_tensor([_weights(text) or [0.0] * WEIGHTS for text in texts])
+        weight = weight * rows.readings(NOISE_COLUMN)[:, None, None]
         turned = (weight.view(-1, 6, 2, 3) @ R[:, None]).view(-1, 6, 6)
         turned = torch.where(present[:, None, None], turned, 0.0)
         return cls(position, rotation.permute(1, 2, 0).contiguous(), turned.permute(1, 2, 0), present)
@@ -90,5 +125,9 @@ class CornerSensor(AbstractSensor):
 
 def as_poses(measurements: Measurements) -> Measurements:
     """Return rows of images as plain poses, without the weights of their corners."""
-    others = {name: values for name, values in measurements.readings.items() if name not in WEIGHT_COLUMNS}
+    others = {
+        name: values
+        for name, values in measurements.readings.items()
+        if name not in (NOISE_COLUMN, WEIGHT_COLUMN)
+    }
     return replace(measurements, readings=others)
