@@ -87,8 +87,10 @@ def written(rng: Rng, path: Path) -> tuple[str, bytes]:
         index = int(rng.integers(len(BOMBS)))
         text = BOMBS[index]
         return f"bomb {index}", (text if rng.random() < 0.5 else content.decode() + text).encode()
-    what, document = mutated(rng, yaml.safe_load(content), one_of(rng, (1, 1, 2)))
-    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=bool(rng.random() < 0.5))
+    what, document = mutated(rng, yaml.load(content, Loader=yaml.CSafeLoader), one_of(rng, (1, 1, 2)))
+    text = yaml.dump(
+        document, Dumper=yaml.CSafeDumper, sort_keys=False, allow_unicode=bool(rng.random() < 0.5)
+    )
     return what, text.encode("utf-8", errors="replace")
 
 

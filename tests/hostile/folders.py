@@ -72,13 +72,13 @@ def _another_document(rng: Rng, file: Path, other: Path) -> None:
 def _signed_again(rng: Rng, file: Path, other: Path) -> None:
     """Other weights under a hash that fits them, and another description."""
     weights, description = file.parent / "model.safetensors", file.parent / "model.yaml"
-    document = yaml.safe_load(description.read_bytes())
+    document = yaml.load(description.read_bytes(), Loader=yaml.CSafeLoader)
     if rng.random() < 0.5:
         weights.write_bytes(damaged(rng, weights.read_bytes())[1])
     if rng.random() < 0.7:
         _, document = mutated(rng, document)
     document["weights_sha256"] = hashlib.sha256(weights.read_bytes()).hexdigest()
-    description.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
+    description.write_text(yaml.dump(document, Dumper=yaml.CSafeDumper, sort_keys=False), encoding="utf-8")
 
 
 def _with_more_files(rng: Rng, file: Path, other: Path) -> None:

@@ -42,9 +42,9 @@ def folder(tmp_path) -> Path:
 def edit(folder: Path, change) -> None:
     """Change the description and sign it again, as a foreign program might."""
     text = (folder / "model.yaml").read_text()
-    document = yaml.safe_load(text[: text.index("\nsha256: ") + 1])
+    document = yaml.load(text[: text.index("\nsha256: ") + 1], Loader=yaml.CSafeLoader)
     change(document)
-    body = yaml.safe_dump(document, sort_keys=False)
+    body = yaml.dump(document, Dumper=yaml.CSafeDumper, sort_keys=False)
     (folder / "model.yaml").write_text(f"{body}sha256: {hashlib.sha256(body.encode()).hexdigest()}\n")
 
 
@@ -175,8 +175,8 @@ def test_a_newer_format_asks_for_an_upgrade(folder):
 
 def test_an_earlier_format_names_the_command_that_upgrades(folder):
     path = folder / "model.yaml"
-    document = yaml.safe_load(path.read_text().rsplit("sha256: ", 1)[0])
-    text = yaml.safe_dump(document | {"format": 2}, sort_keys=False)
+    document = yaml.load(path.read_text().rsplit("sha256: ", 1)[0], Loader=yaml.CSafeLoader)
+    text = yaml.dump(document | {"format": 2}, Dumper=yaml.CSafeDumper, sort_keys=False)
     path.write_text(f"{text}sha256: {hashlib.sha256(text.encode()).hexdigest()}\n")
     said = refused(folder)
     assert (

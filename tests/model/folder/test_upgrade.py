@@ -46,7 +46,7 @@ def write_old(model: CalibratedModel, folder: Path, turns: Sequence[int] = ()) -
     folder.mkdir()
     save_model(model, folder)
     path = folder / "model.yaml"
-    document = yaml.safe_load(path.read_text().rsplit("sha256: ", 1)[0])
+    document = yaml.load(path.read_text().rsplit("sha256: ", 1)[0], Loader=yaml.CSafeLoader)
     document["metrics"] = old(document["metrics"])
     if "uncertainty" in document:
         document["uncertainty"] = old(document["uncertainty"], {"prior_scale": "widening"})
@@ -58,7 +58,9 @@ def write_old(model: CalibratedModel, folder: Path, turns: Sequence[int] = ()) -
         for feature in document["learned"]["features"]:
             feature.pop("measured", None)
         document["metrics"]["hybrid"]["learned"]["fades_over_deg"] = 10.0
-    text = yaml.safe_dump(document | {"format": 2 if "uncertainty" in document else 1}, sort_keys=False)
+    text = yaml.dump(
+        document | {"format": 2 if "uncertainty" in document else 1}, Dumper=yaml.CSafeDumper, sort_keys=False
+    )
     path.write_text(f"{text}sha256: {hashlib.sha256(text.encode()).hexdigest()}\n")
     (folder / "compiled.npz").write_bytes(b"of the earlier version")
     (folder / "README.md").write_text(CARD.format("the correction fades to nothing over 10 deg"))
