@@ -328,9 +328,14 @@ def allowed_texts(document: type[BaseModel], path: _Path) -> list[str]:
     return sorted(texts)
 
 
+@functools.cache
+def _schema_of(document: type[BaseModel]) -> _Schema:
+    return document.model_json_schema()
+
+
 def _follow(document: type[BaseModel], path: _Path) -> list[_Schema]:
     """Plain schemas at the end of a validation path, which holds keys, indices and tags of unions."""
-    schema = document.model_json_schema()
+    schema = _schema_of(document)
     definitions = schema.get("$defs", {})
     nodes = _alternatives([schema], definitions)
     for part in path:
