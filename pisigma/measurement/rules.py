@@ -315,7 +315,7 @@ def group_faults(
 def _groups(names: Sequence[str]) -> dict[str, list[int]]:
     """The rows of every name, in their order."""
     rows: dict[str, list[int]] = {}
-    for row, name in enumerate(names):
+    for row, name in enumerate(names) if any(names) else ():
         if name:
             rows.setdefault(name, []).append(row)
     return rows

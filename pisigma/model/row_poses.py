@@ -68,8 +68,8 @@ def known_names(
         MeasurementError: the model does not know a name.
     """
     if not set(known) - {""}:
-        other = next((row for row, name in enumerate(names) if name != names[0]), None)
-        if other is not None:
+        if len(set(names)) > 1:
+            other = next(row for row, name in enumerate(names) if name != names[0])
             raise MeasurementError(
                 f"{measurements.place(other)}: {what} '{names[other]}' stands there, but "
                 f"{measurements.place(0)} has '{names[0]}', and the model knows one {what} only; give a file for each."
