@@ -27,6 +27,7 @@ from pisigma.monitoring.session import judge_session
 from pisigma.monitoring.trends import Forecast, Trend, charts_of, forecast_of, trends_of
 from pisigma.recalibration.model_posterior import ModelPosterior
 from pisigma.recalibration.recalibration_problem import owners_in
+from pisigma.verification.explanations import PLAUSIBLE_SHARE
 from pisigma.workflow.recalibrate import RecalibrationSettings
 
 FEWEST_ROWS = 5
@@ -176,7 +177,8 @@ def monitor(
     Raises:
         ModelError: the folder holds no model, or the model holds no posterior.
         MeasurementError: the rows cannot be read, or there are more or fewer dates than sessions.
-        IdentificationError: the rows do not determine where something stands.
+        IdentificationError: the rows do not determine where something stands, or nothing that can have moved explains
+            errors of more than 1 % of the reach.
         PoseError: the joint values do not fit the robot.
         OutputError: the history cannot be used.
     """
@@ -256,6 +258,13 @@ def _record(
     rows = posterior.renamed(rows)
     stated = None if moved is None else owners_in(rows, moved)
     session, zeros = judge_session(model, posterior, rows, stated)
+    limit = PLAUSIBLE_SHARE * model.robot.reach
+    if session.rms_after > limit > 0:
+        raise IdentificationError(
+            f"{rows.source}: whatever has moved, errors of {session.rms_after * 1e3:.4g} mm are left, and more than "
+            f"{limit * 1e3:.3g} mm are none of model '{model.name}': another robot was measured, or a column or a unit "
+            "is wrong. `pisigma verify` names what; correct the file."
+        )
     temperature = None if rows.temperature is None else float(rows.temperature.nanmean())
     return Record(Path(rows.source).name, date, rows.content_hash(), temperature, session, zeros)
 

@@ -7,6 +7,7 @@ from testing.aged import model_before, rows_later
 from testing.closeness import assert_close
 
 from pisigma.errors import IdentificationError, MeasurementError
+from pisigma.model.folder.model_folder import save_model
 from pisigma.workflow.monitor import MonitorSettings, monitor
 
 COLLISION = (0.0, 0.0, 0.00436, 0.0, 0.0, 0.0)
@@ -52,3 +53,15 @@ def test_settings_that_make_no_sense_are_refused(settings, fault):
 def test_every_file_has_a_date_or_none():
     with pytest.raises(MeasurementError, match="2 were wanted"):
         monitor(model_before(), [rows_later(6, 1)] * 2, MonitorSettings(dates=("2026-01-01",)))
+
+
+def test_rows_that_no_motion_explains_are_refused_and_not_remembered(tmp_path):
+    rows = rows_later(10, 30)
+    metres = replace(rows, position=rows.position * 1e-3)
+    (folder := tmp_path / "model").mkdir()
+    save_model(model_before(), folder)
+    with pytest.raises(
+        IdentificationError, match="another robot was measured, or a column or a unit is wrong"
+    ):
+        monitor(folder, [rows, metres])
+    assert [one.name for one in tmp_path.iterdir()] == ["model"]
