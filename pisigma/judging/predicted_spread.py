@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pisigma.hybrid.result import HybridResult
 from pisigma.measurement.dataset import Measurements
+from pisigma.sensors.corner import position_deviations
 
 WITHIN = 1.96
 """95 % of a normal value lie within so many standard deviations."""
@@ -86,16 +87,21 @@ def predicted_spread(result: HybridResult, measurements: Measurements) -> Predic
     judged = measurements.select(chosen)
     noise = _noise(result, judged)
     spread.error[chosen] = errors[chosen].detach().cpu()
-    spread.sigma[chosen] = (result.deviation(judged).square() + noise.square()[:, None]).sqrt()
+    spread.sigma[chosen] = (result.deviation(judged).square() + noise.square()).sqrt()
     return spread
 
 
-def _noise(result: HybridResult, measurements: Measurements) -> Float64[Tensor, " rows"]:
-    """Standard deviation of a measured coordinate of every row [m]."""
-    first = next(noise for noise in result.geometric.noise if noise.sensor == "position")
-    sigma = first.sigma if result.learned is None else result.learned.noise["position"]
-    none = torch.zeros(measurements.rows, dtype=torch.float64)
-    if first.unit != "stated":
-        return none + sigma
-    stated = measurements.sigma_position
-    return none if stated is None else sigma * torch.nan_to_num(stated)
+def _noise(result: HybridResult, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
+    """Standard deviations of the measured coordinates of every row [m]."""
+    deviation = torch.zeros(measurements.rows, 3, dtype=torch.float64)
+    for one in result.geometric.noise:
+        sigma = one.sigma if result.learned is None else result.learned.noise[one.sensor]
+        stated = measurements.sigma_position
+        if one.sensor == "corner":
+            by_image = position_deviations(measurements).cpu()
+            deviation = torch.where(by_image.isnan(), deviation, sigma * by_image)
+        elif one.sensor == "position" and one.unit != "stated":
+            deviation += sigma
+        elif one.sensor == "position" and stated is not None:
+            deviation += sigma * torch.nan_to_num(stated)[:, None]
+    return deviation

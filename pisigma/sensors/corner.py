@@ -90,11 +90,7 @@ class CornerSensor(AbstractSensor):
         eye = torch.eye(3).to(R)
         rotation = torch.where(present[:, None, None], R.mT @ data.rotation @ rows.tools.mT, eye)
         position = torch.where(present, ((data.position - p)[:, None] @ R)[:, 0].t(), 0.0)
-        weight = R.new_zeros(data.rows, 6, 6)
-        row, column = torch.tril_indices(6, 6).to(R.device)
-        texts = [str(text) for text in data.readings[WEIGHT_COLUMN]]
-        weight[:, row, column] = R.new_tensor([_weights(text) or [0.0] * WEIGHTS for text in texts])
-        weight = weight * rows.readings(NOISE_COLUMN)[:, None, None]
+        weight = _scaled_weights(data)
         turned = (weight.view(-1, 6, 2, 3) @ R[:, None]).view(-1, 6, 6)
         turned = torch.where(present[:, None, None], turned, 0.0)
         return cls(position, rotation.permute(1, 2, 0).contiguous(), turned.permute(1, 2, 0), present)
@@ -121,6 +117,26 @@ class CornerSensor(AbstractSensor):
 
     def _turned(self, motion: ToolMotion, rows: slice) -> Float[Tensor, "3 poses"]:
         return rotation_difference(self.rotation[..., rows], motion.rotation)
+
+
+def position_deviations(measurements: Measurements) -> Float64[Tensor, "rows 3"]:
+    """Return standard deviations of positions [1: per noise of a corner], NaN in rows that no image gave."""
+    weight = _scaled_weights(measurements)
+    by_image = measurements.measured("corner")
+    eye = torch.eye(6).to(weight)
+    spread = torch.linalg.inv(torch.where(by_image[:, None, None], weight, eye))
+    return torch.where(by_image[:, None], spread[:, :3].norm(dim=-1), torch.nan)
+
+
+def _scaled_weights(measurements: Measurements) -> Float64[Tensor, "rows 6 6"]:
+    """Noise times W of every row, 0 in rows that no image gave."""
+    scaled = measurements.q.new_zeros(measurements.rows, 6, 6)
+    noise, texts = (measurements.readings.get(name) for name in (NOISE_COLUMN, WEIGHT_COLUMN))
+    if isinstance(noise, Tensor) and isinstance(texts, tuple):
+        row, column = torch.tril_indices(6, 6).to(scaled.device)
+        triangles = scaled.new_tensor([_weights(text) or [0.0] * WEIGHTS for text in texts])
+        scaled[:, row, column] = torch.nan_to_num(noise)[:, None] * triangles
+    return scaled
 
 
 def as_poses(measurements: Measurements) -> Measurements:

@@ -1,7 +1,9 @@
 """Files of corners as rows of images, and what a calibration makes of them."""
 
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from testing.camera_cell import BOARD, CAMERA, aligned_error, camera_cell, corner_lines
@@ -13,10 +15,17 @@ from pisigma.errors import IdentificationError, MeasurementError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.parameters import Prior
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.dataset import Measurements, join
+from pisigma.robot import Robot
 
 EXACT = ImageNoise(0.0, Repeatability(0.0, 0.0))
 PRIOR = Prior(theta=5e-3, d=1e-3, a=1e-3, alpha=5e-3, beta=5e-3)
+
+
+def beyond(true: Robot, estimated: Robot) -> float:
+    """Root mean square error of positions at other views of the board [m]."""
+    q = camera_cell(50, 2).images.q
+    return aligned_error(*(forward_kinematics(robot, q)[:, :3, 3] for robot in (true, estimated)))
 
 
 @pytest.mark.parametrize("is_fixed", [False, True], ids=["flange", "fixed"])
@@ -38,11 +47,58 @@ def test_a_calibration_by_images_is_right_beyond_them(is_fixed: bool) -> None:
     cell = camera_cell(50, 1, is_fixed=is_fixed)
     data = image_measurements(cell.images, CAMERA, BOARD, is_fixed, Repeatability())
     result = GeometricCalibrator(cell.nominal, prior=PRIOR).fit(data)
-    q = camera_cell(50, 2, is_fixed=is_fixed).images.q
-    true, estimated = (forward_kinematics(robot, q)[:, :3, 3] for robot in (cell.true, result.robot))
-    assert aligned_error(true, estimated) < 1e-4
+    assert beyond(cell.true, result.robot) < 1e-4
     (noise,) = result.noise
     assert_close(noise.sigma, 0.3 / 1400 * 0.5, rtol=0.15)  # 0.3 px at 0.5 m
+
+
+def test_wrong_corners_and_swapped_joints_are_found() -> None:
+    cell = camera_cell(50, 1)
+    pixels, q = [one.copy() for one in cell.images.pixels], cell.images.q.clone()
+    for one in pixels:
+        one[::20, 0] += 5.0
+    wrong = [3, 17, 30]
+    q[wrong] = q[wrong][:, [0, 2, 1, 3, 4, 5]]
+    errors = []
+    for images in (cell.images, replace(cell.images, pixels=tuple(pixels), q=q)):
+        data = image_measurements(images, CAMERA, BOARD, False, Repeatability())
+        result = GeometricCalibrator(cell.nominal, prior=PRIOR).fit(data)
+        errors.append(beyond(cell.true, result.robot))
+    assert {outlier.row for outlier in result.outliers} == set(wrong)
+    assert errors[1] < 1.3 * errors[0]
+
+
+def test_a_tracker_beside_the_camera_adds_to_it() -> None:
+    cell = camera_cell(20, 1)
+    data = image_measurements(cell.images, CAMERA, BOARD, False, Repeatability())
+    q = camera_cell(50, 3).images.q[:15]
+    true = cell.true.with_geometry(base=np.array([0.1, 0.2, 0.3, 0.5, 0.0, 0.0]))
+    position = forward_kinematics(true, q)[:, :3, 3]
+    tracker = Measurements(q=q, position=position, frame=("tracker",) * 15, target=("wrist",) * 15)
+    alone, both = (
+        beyond(cell.true, GeometricCalibrator(cell.nominal, prior=PRIOR).fit(rows).robot)
+        for rows in (data, join([data, tracker]))
+    )
+    assert both < 0.7 * alone
+
+
+def test_two_cameras_calibrate_one_arm() -> None:
+    wrist, fixed = camera_cell(30, 1), camera_cell(30, 1, is_fixed=True)
+    both = join(
+        [
+            image_measurements(wrist.images, CAMERA, BOARD, False, Repeatability()),
+            image_measurements(
+                fixed.images,
+                replace(CAMERA, name="beside"),
+                replace(BOARD, name="hand"),
+                True,
+                Repeatability(),
+            ),
+        ]
+    )
+    result = GeometricCalibrator(wrist.nominal, prior=PRIOR).fit(both)
+    assert (set(result.bases), set(result.tools)) == ({"board", "beside"}, {"wrist", "hand"})
+    assert beyond(wrist.true, result.robot) < 1e-4
 
 
 def test_the_result_says_that_scale_rests_on_the_board() -> None:

@@ -28,7 +28,7 @@ def options(files: Path) -> tuple[object, ...]:
 
 
 def test_from_pixels_of_corners_to_a_model(run, files, tmp_path):
-    command = ("calibrate", "ur5", *options(files), "--model", "geometric", "--folds", 2, "--repeats", 1)
+    command = ("calibrate", "ur5", *options(files), "--folds", 2, "--repeats", 1)
     result = run(*command, "--out", tmp_path / "arm", "--json")
     assert result.exit_code == 0, result.output
     printed = json.loads(result.stdout)
@@ -38,6 +38,7 @@ def test_from_pixels_of_corners_to_a_model(run, files, tmp_path):
     assert (figures["rows"], figures["folds"]) == (50, 2)  # a row an image
     assert figures["geometric"]["rms_mm"] < 1.0 < 2.0 < figures["nominal"]["rms_mm"]  # of one image: 0.5 mm
     assert any("rests on the board" in warning for warning in printed["warnings"])
+    assert 0.85 < figures["coverage"] <= 1.0
     model, q = load_model(tmp_path / "arm"), camera_cell(50, 2).images.q
     true, estimated = (
         forward_kinematics(robot, q)[:, :3, 3] for robot in (camera_cell(50, 1).true, model.calibrated)

@@ -12,6 +12,7 @@ from pisigma.camera.image_rows import Repeatability, image_measurements
 from pisigma.errors import MeasurementError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
+from pisigma.sensors.corner import position_deviations
 
 
 def test_derivatives_are_those_of_the_weighted_errors() -> None:
@@ -33,6 +34,20 @@ def test_derivatives_are_those_of_the_weighted_errors() -> None:
         step[i] = 1e-6
         change = (residual(setup.start - step) - residual(setup.start + step)) / 2e-6
         assert_close(J[i], change, atol=1e-6, rtol=1e-6)
+
+
+def test_deviations_of_positions_are_those_of_their_covariance() -> None:
+    data = image_measurements(camera_cell(8).images, CAMERA, BOARD, False, Repeatability())
+    row, column = torch.tril_indices(6, 6)
+    noise, texts = data.readings["corner_noise"], data.readings["corner_weight"]
+    weight = torch.zeros(8, 6, 6, dtype=torch.float64)
+    weight[:, row, column] = torch.tensor([[float(word) for word in text.split()] for text in texts]).double()
+    covariance = torch.linalg.inv(weight.mT @ weight)[:, :3, :3].diagonal(dim1=1, dim2=2)
+    deviation = position_deviations(data) * torch.as_tensor(noise)[:, None]
+    assert_close(deviation, covariance.sqrt(), rtol=1e-4)
+    assert float(deviation.min()) > 2e-5  # the repeatability
+    tracker = Measurements(q=data.q, position=data.position)
+    assert bool(position_deviations(tracker).isnan().all())
 
 
 @pytest.mark.parametrize(
