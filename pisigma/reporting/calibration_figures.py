@@ -27,6 +27,8 @@ JOINT_UNITS = {
 }
 """Unit of a joint's values and of its correction, each with the factor from [rad] or [m]."""
 _REDUNDANT = 1 - 1e-6
+_LETTER = 0.07
+"""[inch] Width of a letter of the names along tables."""
 STYLES = {"nominal": (":", "s"), "geometric": ("--", "o"), "hybrid": ("-", "^")}
 """Line and mark of every model, so that they differ without colour too."""
 POINTS = 1_000
@@ -110,8 +112,11 @@ def draw_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:
     """
     largest = max(len(table.names) for table in tables)
     side = float(np.clip(0.27 * largest + 1.2, 4.0, 12.0))
-    figure = Figure(figsize=(side * len(tables) + 0.9, side + 0.3), layout="constrained")
+    width = side * len(tables) + 0.9
+    figure = Figure(figsize=(width, side + 0.3))
     grid = figure.subplots(1, len(tables), squeeze=False)[0]
+    room = 0.15 + _LETTER * max(len(name) for table in tables for name in table.names)
+    set_margins(figure, left=room, right=1.15, bottom=room + 0.35, top=0.35, across=room + 0.1)
     for axes, table, title in zip(grid, tables, ("lengths", "angles"), strict=True):
         shown = show_correlations(axes, table.names, table.values)
         axes.set_title(title, fontsize=11)
@@ -119,7 +124,7 @@ def draw_correlations(tables: Sequence[CorrelationTable], path: Path) -> None:
         for sign, mark in ((1, "$+$"), (-1, "$-$")):
             row, column = np.nonzero((sign * np.nan_to_num(table.values) > _REDUNDANT) & apart)
             axes.scatter(column, row, marker=mark, color="white", s=60)
-    bar = figure.colorbar(shown, ax=list(grid), shrink=0.8)
+    bar = figure.colorbar(shown, cax=figure.add_axes((1 - 1.0 / width, 0.2, 0.2 / width, 0.65)))
     bar.set_label("Pearson correlation")
     figure.supxlabel(
         "white + or -: redundant (|r| = 1);  grey: without effect on what was measured", fontsize=10
