@@ -35,7 +35,8 @@ def judged_motion(
 
     Returns:
         What it says, without what is fitted; None where the model holds no posterior, where the rows do not determine
-        what is fitted, and where no motion explains the rows: errors of more than 1 % of the reach are left.
+        what is fitted, and where no motion explains the rows: errors of more than 1 % of the reach are left, or a link
+        would have changed by so much.
     """
     with suppress(IdentificationError, ModelError):
         posterior = ModelPosterior.of(model)
@@ -44,7 +45,7 @@ def judged_motion(
         with torch.no_grad():
             session, _ = judge_session(model, posterior, some, owners_in(some, fitted) if fitted else None)
         moved = tuple(one for one in session.moved if one.moved.what.split()[0] not in fitted)
-        if session.rms_after <= PLAUSIBLE_SHARE * model.robot.reach:
+        if session.explains_within(PLAUSIBLE_SHARE * model.robot.reach):
             return replace(session, moved=moved)
     return None
 

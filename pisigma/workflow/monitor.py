@@ -177,8 +177,8 @@ def monitor(
     Raises:
         ModelError: the folder holds no model, or the model holds no posterior.
         MeasurementError: the rows cannot be read, or there are more or fewer dates than sessions.
-        IdentificationError: the rows do not determine where something stands, or nothing that can have moved explains
-            errors of more than 1 % of the reach.
+        IdentificationError: the rows do not determine where something stands, or no motion explains errors of more
+            than 1 % of the reach.
         PoseError: the joint values do not fit the robot.
         OutputError: the history cannot be used.
     """
@@ -259,11 +259,11 @@ def _record(
     stated = None if moved is None else owners_in(rows, moved)
     session, zeros = judge_session(model, posterior, rows, stated)
     limit = PLAUSIBLE_SHARE * model.robot.reach
-    if session.rms_after > limit > 0:
+    if not session.explains_within(limit):
         raise IdentificationError(
-            f"{rows.source}: whatever has moved, errors of {session.rms_after * 1e3:.4g} mm are left, and more than "
-            f"{limit * 1e3:.3g} mm are none of model '{model.name}': another robot was measured, or a column or a unit "
-            "is wrong. `pisigma verify` names what; correct the file."
+            f"{rows.source}: the errors are {session.rms * 1e3:.4g} mm, and no motion explains them that leaves less "
+            f"than {limit * 1e3:.3g} mm and changes no link of model '{model.name}' by more: another robot was "
+            "measured, or a column or a unit is wrong. `pisigma verify` names what; correct the file."
         )
     temperature = None if rows.temperature is None else float(rows.temperature.nanmean())
     return Record(Path(rows.source).name, date, rows.content_hash(), temperature, session, zeros)
