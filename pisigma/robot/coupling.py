@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 
-from pisigma.errors import RobotError
+from pisigma.errors import PoseError, RobotError
 from pisigma.robot.row import Row
 
 SLACK = 1e-9
@@ -116,7 +116,11 @@ class Coupling:
         return np.array([[axis.lower, axis.upper] for axis in self.axes])
 
     def to_dh(self, q: Any) -> Any:
-        """DH values `(*batch, dof)` at the controller's values `(*batch, axes)`, both [rad or m]; arrays or tensors."""
+        """DH values `(*batch, dof)` at the controller's values `(*batch, axes)`, both [rad or m]; arrays or tensors.
+
+        Raises:
+            PoseError: there are more or fewer values than axes.
+        """
         return self._by_four_bars(_times(q, self.matrix) + _like(q, self.offset), FourBar.follow)
 
     def to_controller(self, q: Any) -> Any:
@@ -234,7 +238,17 @@ def _like(values: Any, constants: np.ndarray) -> Any:
 
 
 def _times(values: Any, matrix: np.ndarray) -> Any:
-    """`matrix · values` along the last axis; what stands alone stays exactly what it is, NaN included."""
+    """`matrix · values` along the last axis; what stands alone stays exactly what it is, NaN included.
+
+    Raises:
+        PoseError: there are more or fewer values than the matrix takes.
+    """
+    shape, wanted = tuple(values.shape), matrix.shape[1]
+    if shape[-1:] != (wanted,):
+        raise PoseError(
+            f"coupled joints: {wanted} values were wanted along the last axis, got the shape {shape}; the controller "
+            "counts its axes, and the rows of the description their joints."
+        )
     columns: Sequence[Any] = [
         sum(
             (

@@ -6,7 +6,8 @@ import torch
 from testing.closeness import assert_close
 from testing.coupled import COUPLED, PALLETISER, coupled_robot
 
-from pisigma.errors import RobotError
+from pisigma.errors import PoseError, RobotError
+from pisigma.kernels.array_kinematics import forward_kinematics
 from pisigma.robot import Robot
 from pisigma.robot.coupling import FourBar
 from pisigma.robot.writing import robot_to_yaml
@@ -49,6 +50,15 @@ def test_a_coupled_robot_survives_its_file(tmp_path, text):
     assert_close(again.to_dh(q), robot.to_dh(q), atol=1e-14)
     assert_close(again.limits, robot.limits, atol=1e-14)
     assert_close(again.axis_limits, robot.axis_limits, atol=1e-14)
+
+
+def test_values_of_joints_are_not_taken_for_those_of_axes():
+    robot = coupled_robot(PALLETISER)
+    q = np.zeros(robot.dof)
+    with pytest.raises(PoseError, match=f"{robot.dof - 1} values were wanted"):
+        robot.to_dh(q)
+    with pytest.raises(PoseError, match=f"{robot.dof - 1} values were wanted"):
+        forward_kinematics(robot, q)
 
 
 def test_without_coupling_the_joints_are_the_axes():
