@@ -328,14 +328,9 @@ def allowed_texts(document: type[BaseModel], path: _Path) -> list[str]:
     return sorted(texts)
 
 
-@functools.cache
-def _schema_of(document: type[BaseModel]) -> _Schema:
-    return document.model_json_schema()
-
-
 def _follow(document: type[BaseModel], path: _Path) -> list[_Schema]:
     """Plain schemas at the end of a validation path, which holds keys, indices and tags of unions."""
-    schema = _schema_of(document)
+    schema = document.model_json_schema()
     definitions = schema.get("$defs", {})
     nodes = _alternatives([schema], definitions)
     for part in path:
