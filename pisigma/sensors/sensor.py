@@ -103,8 +103,8 @@ class SensorRows:
 
     @property
     def by_corners(self) -> Bool[Tensor, " rows"]:
-        """Which rows hold a pose that the corners of a board in an image give, with its covariance."""
-        return self.measurements.measured("corner")
+        """Which rows hold a pose that the corners of a board in an image give, whole and with its covariance."""
+        return self.measurements.measured("corner") & self.measurements.measured("pose")
 
     def readings(self, name: str) -> Float64[Tensor, " rows"]:
         """Return the numbers in a column of a registered sensor [SI], NaN where a row has none."""

@@ -1,5 +1,6 @@
 """Derivatives of the poses that images give."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -48,6 +49,13 @@ def test_deviations_of_positions_are_those_of_their_covariance() -> None:
     assert float(deviation.min()) > 2e-5  # the repeatability
     tracker = Measurements(q=data.q, position=data.position)
     assert bool(position_deviations(tracker).isnan().all())
+
+
+def test_positions_of_images_without_their_rotations_are_plain_positions() -> None:
+    cell = camera_cell(20)
+    data = image_measurements(cell.images, CAMERA, BOARD, False, Repeatability())
+    problem = GeometricCalibrator(cell.nominal).build(replace(data, rotation=None)).problem
+    assert [sensor.name for sensor in problem.sensors] == ["position"]
 
 
 @pytest.mark.parametrize(
