@@ -22,6 +22,7 @@ from pisigma.camera.camera import Camera
 from pisigma.camera.image_rows import Images, Repeatability, image_measurements
 from pisigma.camera.simulated_images import ImageNoise, simulate_images
 from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.identification.problem.parameters import Prior
 from pisigma.identification.problem.problem import MotionMemory
 from pisigma.kinematics.closed_form.registry import closed_form_solver
@@ -121,6 +122,7 @@ def main(draws: int, count: int) -> None:
     }
     base = xyzrpy_from_transform(invert(transform_from_xyzrpy(IN_BASE))).numpy()
     squares, seconds = {(name, what): 0.0 for name in judged for what in ("plain", "fit", "bound")}, 0.0
+    hand_eye_ratios = []
     for draw in range(draws):
         errors = np.random.default_rng(draw).standard_normal(nominal.dh.shape)
         errors *= [ANGLE, LENGTH, LENGTH, ANGLE, ANGLE]
@@ -131,6 +133,12 @@ def main(draws: int, count: int) -> None:
         seconds += time.perf_counter() - started
         alone = image_measurements(images, CAMERA, BOARD, False, Repeatability(0.0, 0.0))
         plain = GeometricCalibrator(nominal, prior=PRIOR).fit(alone).robot
+        hand_eye = fit_base_and_tool(nominal, rows).robot
+        points, *estimated = (
+            forward_kinematics(one, judged["workspace"])[:, :3, 3] for one in (true, robot, hand_eye)
+        )
+        of_fit, of_hand_eye = (aligned_error(points, one) for one in estimated)
+        hand_eye_ratios.append(of_fit / of_hand_eye)
         for name, at in judged.items():
             points = forward_kinematics(true, at)[:, :3, 3]
             for what, one in (("fit", robot), ("plain", plain)):
@@ -142,6 +150,7 @@ def main(draws: int, count: int) -> None:
             f"{name}: {fit:.4f} mm, Cramér-Rao bound {least:.4f} mm (ratio {fit / least:.2f}); "
             f"without the repeatability of the robot {plain:.4f} mm"
         )
+    print(f"against hand-eye alone (drawn arm, workspace), worst draw: 1/{1 / max(hand_eye_ratios):.0f}")
     print(f"{count} images: {seconds / draws:.2f} s a calibration")
 
 
