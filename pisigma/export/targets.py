@@ -66,7 +66,9 @@ def targets_csv(targets: Targets) -> str:
 
 
 def _check(request: ExportRequest) -> None:
-    if (request.poses is None) == (request.program is None):
+    if request.poses is not None and request.program is not None:
+        raise OutputError("--poses and --program both name poses to make targets for; give one of them.")
+    if request.poses is None and request.program is None:
         raise OutputError(
             "--format targets needs the poses to make them for; give them with --poses, or a --program that has them."
         )

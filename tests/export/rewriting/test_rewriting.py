@@ -353,7 +353,7 @@ def test_a_pose_of_several_tools_stays(arm, tmp_path):
         ({"out": Path("new.src")}, "--out ends as the program does"),
         ({"targets": "joints"}, "--targets goes with --poses"),
         ({"tolerance_mm": 0.0}, "--tolerance-mm 0: a length above 0 was wanted"),
-        ({"poses": Path("poses.csv")}, "needs the poses to make them for"),
+        ({"poses": Path("poses.csv")}, "both name poses"),
         ({"program": None}, "needs the poses to make them for"),
         ({"program": None, "poses": Path("x.csv")}, "--frames and --tolerance-mm go with --program"),
         ({"program": Path("none.script")}, "none.script: cannot be read"),
