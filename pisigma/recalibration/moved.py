@@ -48,7 +48,8 @@ class Moved:
         """The shift with half its 95 % interval and the unit."""
         half = NORMAL_95 * self.deviation
         digits = min(max(1 - math.floor(math.log10(max(half, 1e-6))), 0), 4)
-        return f"{self.shift:.{digits}f} ± {half:.{digits}f} {self.unit}"
+        shown = max(half, 10.0**-digits)  # never an uncertainty of 0
+        return f"{self.shift:.{digits}f} ± {shown:.{digits}f} {self.unit}"
 
     @property
     def sentence(self) -> str:
