@@ -42,7 +42,7 @@ CHROMIUM = (
 
 
 def pytest_collection_finish() -> None:
-    """Leave the modules of torch and of the tests out of garbage collections, which take 7 % of the time else."""
+    """Leave torch and the tests out of garbage collections, which take some per cent of the time."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000, 20, 20)
