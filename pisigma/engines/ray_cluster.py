@@ -1,6 +1,8 @@
 """The engine of a Ray cluster, or of Ray's workers on this machine."""
 
 import logging
+import os
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -24,8 +26,9 @@ class RayEngine(AbstractEngine):
 
         self._ray: Any = ray  # most of it has no types
         stated = {"address": address} if address else {"num_cpus": workers}
+        variables = ONE_THREAD if address else {**ONE_THREAD, "PYTHONPATH": os.pathsep.join(sys.path)}
         self._ray.init(
-            log_to_driver=False, logging_level=logging.ERROR, runtime_env={"env_vars": ONE_THREAD}, **stated
+            log_to_driver=False, logging_level=logging.ERROR, runtime_env={"env_vars": variables}, **stated
         )
         self._workers = max(1, int(self._ray.cluster_resources().get("CPU", 1)))
 

@@ -1,5 +1,7 @@
 """What came of the robots of a fleet, one small file each, which a later call goes on from."""
 
+import json
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +12,7 @@ from pisigma.files.output_file import write_whole
 
 REFUSED = "refused"
 MARK = "fleet.json"
-"""In the folder of a fleet, so that no other folder is written into."""
+"""In the folder of a fleet, with the ids of its robots, so that no other folder is written into."""
 
 
 @dataclass(frozen=True)
@@ -119,13 +121,36 @@ def read_record(path: Path) -> RobotRecord | None:
         return None
 
 
+def expect_robots(out: Path, robots: Collection[str]) -> None:
+    """Note in the folder of a fleet which robots it has, beside those that earlier calls noted.
+
+    Raises:
+        OutputError: it cannot be written.
+    """
+    before = expected_robots(out) if (out / MARK).is_file() else ()
+    everyone = sorted({*before, *robots})
+    write_whole(out / MARK, json.dumps({"format": 1, "robots": everyone}, indent=1) + "\n")
+
+
+def expected_robots(out: Path) -> tuple[str, ...]:
+    """Read which robots a fleet has, by their ids.
+
+    Raises:
+        FleetError: the folder is not that of a fleet.
+    """
+    try:
+        content = json.loads((out / MARK).read_text(encoding="utf-8"))
+        return tuple(str(robot) for robot in content["robots"])
+    except (OSError, ValueError, KeyError, TypeError):
+        raise FleetError(f"{out}: is not the folder of a fleet; make one with `pisigma fleet run`.") from None
+
+
 def read_records(out: Path) -> tuple[RobotRecord, ...]:
     """Read the records of all robots that have one, by their ids.
 
     Raises:
         FleetError: the folder is not that of a fleet.
     """
-    if not (out / MARK).is_file():
-        raise FleetError(f"{out}: is not the folder of a fleet; make one with `pisigma fleet run`.")
+    expected_robots(out)
     found = (read_record(path) for path in sorted((out / "records").glob("*.json")))
     return tuple(one for one in found if one is not None)

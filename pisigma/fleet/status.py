@@ -1,4 +1,4 @@
-"""How a fleet stands: which robots err most, which drift, which were not measured for long, which were refused."""
+"""How a fleet stands: which robots err most, drift, were not measured for long, were refused or are missing."""
 
 import datetime
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ class RobotStatus:
 
     Attributes:
         robot: its id.
-        last: its last session that was not refused; None where all were.
+        last: its last session that was not refused; None where there is none.
         refused: its session that was refused; None where none was.
         days: since its last session [days]; None where that has no date.
         overdue: whether that is too long.
@@ -33,9 +33,11 @@ class RobotStatus:
 
     @property
     def state(self) -> str:
-        """The first that holds of: refused, drifting, overdue, fine."""
+        """The first that holds of: refused, missing (not worked out yet), drifting, overdue, fine."""
         if self.refused is not None:
             return "refused"
+        if self.last is None:
+            return "missing"
         return "drifting" if self.drifting else "overdue" if self.overdue else "fine"
 
 
@@ -54,15 +56,20 @@ class FleetStatus:
     overdue_days: int
 
     @staticmethod
-    def of(records: Sequence[RobotRecord], today: datetime.date, overdue_days: int) -> "FleetStatus":
+    def of(
+        records: Sequence[RobotRecord], today: datetime.date, overdue_days: int, expected: Sequence[str] = ()
+    ) -> "FleetStatus":
         """See a fleet from a day.
 
         Args:
             records: of its robots.
             today: the day.
             overdue_days: days without a session after which a robot is overdue.
+            expected: ids of its robots; those without a record are missing.
         """
-        robots = (_status(one, today, overdue_days) for one in records)
+        robots = [_status(one, today, overdue_days) for one in records]
+        missing = set(expected) - {one.robot for one in records}
+        robots += [RobotStatus(robot, None, None, None, False) for robot in missing]
         return FleetStatus(tuple(sorted(robots, key=lambda one: one.robot)), today, overdue_days)
 
     @property
@@ -73,8 +80,8 @@ class FleetStatus:
 
     @property
     def action(self) -> bool:
-        """Whether a robot was refused or drifts."""
-        return any(one.state in ("refused", "drifting") for one in self.robots)
+        """Whether a robot was refused, is missing or drifts."""
+        return any(one.state in ("refused", "missing", "drifting") for one in self.robots)
 
     def in_state(self, state: str) -> tuple[RobotStatus, ...]:
         """The robots of a state."""
@@ -88,6 +95,7 @@ class FleetStatus:
             "worst": [{"robot": one.robot, "rms_mm": _rms(one)} for one in self.worst_first],
             "drifting": [one.robot for one in self.robots if one.drifting],
             "overdue": [{"robot": one.robot, "days": one.days} for one in self.robots if one.overdue],
+            "missing": [one.robot for one in self.in_state("missing")],
             "refused": [
                 {"robot": one.robot, "reason": one.refused.sentence}
                 for one in self.robots

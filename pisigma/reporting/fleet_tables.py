@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pisigma.fleet.status import FleetStatus, RobotStatus
 from pisigma.reporting.tables import Table
 
-STATES = ("refused", "drifting", "overdue", "fine")
+STATES = ("refused", "missing", "drifting", "overdue", "fine")
 
 
 def state_table(status: FleetStatus) -> Table:

@@ -28,6 +28,7 @@ STATUS = FleetStatus.of(
     ],
     TODAY,
     180,
+    ["fine", "killed"],
 )
 
 
@@ -36,6 +37,7 @@ def test_every_robot_has_its_state():
     assert states == {
         "bad": "refused",
         "fine": "fine",
+        "killed": "missing",
         "moved": "drifting",
         "old": "overdue",
         "pays": "drifting",
@@ -55,7 +57,8 @@ def test_json_names_what_is_to_be_done():
 
 
 def test_tables_have_all_robots():
-    assert dict(state_table(STATUS).rows) == {"refused": "1", "drifting": "2", "overdue": "1", "fine": "1"}
+    counts = {"refused": "1", "missing": "1", "drifting": "2", "overdue": "1", "fine": "1"}
+    assert dict(state_table(STATUS).rows) == counts
     rows = {row[0]: row[1:] for row in robot_table(STATUS.robots).rows}
     assert rows["moved"] == ("2026-11-01", "10", "moved", "0.900", "21", "drifting")
     assert rows["bad"] == ("2026-01-01", "", "", "", "", "refused")

@@ -142,15 +142,15 @@ def status(
 ) -> None:
     """Say how a fleet stands: the worst robots, those that drift, that were not measured for long, or were refused.
 
-    Exit status 3 where a robot drifts or was refused.
+    Exit status 3 where a robot drifts, was refused, or has not been worked out yet.
     """
     from pisigma.files.output_file import check_output, write_whole
-    from pisigma.fleet.record import read_records
+    from pisigma.fleet.record import expected_robots, read_records
     from pisigma.fleet.status import FleetStatus
 
     if page is not None:
         check_output(page, (".html", ".htm"), "a page", (folder / "records",))
-    seen = FleetStatus.of(read_records(folder), _day(today), overdue_days)
+    seen = FleetStatus.of(read_records(folder), _day(today), overdue_days, expected_robots(folder))
     if page is not None:
         from pisigma.reporting.page.fleet import fleet_page
 
@@ -193,5 +193,7 @@ def _print_status(seen: "FleetStatus", page: Path | None) -> None:
             assert said is not None
             words = f"{one.days} days since its last session." if state == "overdue" else said.sentence
             print_lines([f"{title}: {one.robot}, {said.session}: {words}"], indent="  ")
+    if missing := [one.robot for one in seen.in_state("missing")]:
+        print_lines([f"Missing: {', '.join(missing)}; give the same `pisigma fleet run` again."], indent="  ")
     if page is not None:
         print_lines([f"Page written to {page}."])

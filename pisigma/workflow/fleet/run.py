@@ -17,9 +17,8 @@ from pisigma.engines.processes import ProcessEngine
 from pisigma.errors import OutputError
 from pisigma.files.conflicts import check_apart
 from pisigma.files.model_files import is_model, model_hash
-from pisigma.files.output_file import write_whole
 from pisigma.fleet.members import Member, read_fleet
-from pisigma.fleet.record import MARK, RobotRecord, read_record, read_records, record_path
+from pisigma.fleet.record import MARK, RobotRecord, expect_robots, read_record, read_records, record_path
 from pisigma.fleet.results_table import RESULTS, write_results
 from pisigma.judging.progress import Progress
 from pisigma.workflow.calibrate import CalibrationSettings
@@ -164,8 +163,7 @@ def _prepare(folder: Path, source: Path, members: tuple[Member, ...]) -> None:
         raise OutputError(
             f"{folder}: cannot be written ({problem.strerror}); choose another --out."
         ) from None
-    if not mark.is_file():
-        write_whole(mark, json.dumps({"format": 1, "made_by": "pisigma fleet run"}) + "\n")
+    expect_robots(folder, [member.id for member in members])
 
 
 def _finished(out: Path, member: Member, key: str) -> RobotRecord | None:
