@@ -49,5 +49,7 @@ def test_a_description_is_checked_at_the_pendant(run, refuses, tmp_path):
     assert_close([second[f"{axis}_mm"] / 1e3 for axis in "xyz"], T[:3, 3], atol=1e-12)
     shown = run("robots", "--check", "ur5").stdout
     assert "theta_3" in shown
-    assert "-817.250" in shown
+    assert "-817.25" in shown
+    assert "inside" in shown
+    assert all(len(line) <= 80 for line in run("robots", "--check", "ur10").stdout.splitlines())
     assert "no robot of the catalogue" in refuses("robots", "--check", "nothing")
