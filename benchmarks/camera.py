@@ -20,7 +20,6 @@ from torch import Tensor
 from pisigma.camera.board import Board
 from pisigma.camera.camera import Camera
 from pisigma.camera.image_rows import Images, Repeatability, image_measurements
-from pisigma.camera.simulated_images import ImageNoise, simulate_images
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.identification.problem.parameters import Prior
@@ -37,6 +36,7 @@ from pisigma.se3 import (
     transform_from_xyzrpy,
     xyzrpy_from_transform,
 )
+from pisigma.simulation.camera.images import ImageNoise, simulate_images
 
 LENGTH, ANGLE = 1e-3, np.deg2rad(0.3)
 CAMERA = Camera("wrist", 1920, 1200, 1400.0, 1400.0, 960.0, 600.0)

@@ -10,13 +10,13 @@ from testing.camera_cell import BOARD, CAMERA, aligned_error, camera_cell, corne
 from testing.closeness import assert_close
 
 from pisigma.camera.image_rows import Repeatability, image_measurements, read_images
-from pisigma.camera.simulated_images import ImageNoise
 from pisigma.errors import IdentificationError, MeasurementError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.parameters import Prior
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot import Robot
+from pisigma.simulation.camera.images import ImageNoise
 
 EXACT = ImageNoise(0.0, Repeatability(0.0, 0.0))
 PRIOR = Prior(theta=5e-3, d=1e-3, a=1e-3, alpha=5e-3, beta=5e-3)

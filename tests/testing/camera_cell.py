@@ -11,7 +11,6 @@ from torch import Tensor
 from pisigma.camera.board import Board
 from pisigma.camera.camera import Camera
 from pisigma.camera.image_rows import Images
-from pisigma.camera.simulated_images import ImageNoise, simulate_images
 from pisigma.kinematics.closed_form.registry import closed_form_solver
 from pisigma.robot import Robot
 from pisigma.se3 import (
@@ -21,6 +20,7 @@ from pisigma.se3 import (
     transform_from_xyzrpy,
     xyzrpy_from_transform,
 )
+from pisigma.simulation.camera.images import ImageNoise, simulate_images
 
 CAMERA = Camera("wrist", 1920, 1200, 1400.0, 1400.0, 960.0, 600.0, -0.1, 0.05, 1e-4, -2e-4, 0.01)
 BOARD = Board("board", 6, 9, 0.03)

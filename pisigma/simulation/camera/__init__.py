@@ -1,0 +1,1 @@
+"""Cameras as error-prone sensors: which images they take of a board."""
