@@ -114,13 +114,17 @@ EXTRAS = {
     "pyarrow": "fleet",
     "ray": "ray",
     "pyzmq": "serve",
+    "opencv-python-headless": "camera",
 }
 """By the package that is imported on use, the extra that it comes with."""
+_PACKAGES = {"cv2": "opencv-python-headless"}
+"""Packages that are imported by another name."""
 
 
 def missing_extra(problem: ImportError) -> MissingExtraError | None:
     """Say which extra brings the package that could not be imported; None where none does."""
-    package = (problem.name or "").split(".")[0]
+    module = (problem.name or "").split(".")[0]
+    package = _PACKAGES.get(module, module)
     if package not in EXTRAS:
         return None
     return MissingExtraError(
