@@ -54,7 +54,10 @@ Repeats = Annotated[
 ]
 Jobs = Annotated[
     int | None,
-    typer.Option(help="Processes that judge folds side by side, with one thread each. [default: threads]"),
+    typer.Option(
+        help="Processes that calibrate with all rows and with those of each fold side by side, with one thread each. "
+        "[default: threads]"
+    ),
 ]
 Seed = Annotated[int, typer.Option(help="Seed of the split, and of drawing training rows.")]
 TrainRows = Annotated[

@@ -1,6 +1,6 @@
 """Calibrations judged on held-out rows: nominal, geometric and hybrid side by side."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Protocol, runtime_checkable
@@ -14,8 +14,8 @@ from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.judging.pose_statistics import PoseErrors, error_statistics
 from pisigma.judging.predicted_spread import PredictedSpread, predicted_spread
-from pisigma.judging.progress import Progress, silent, stage
-from pisigma.judging.side_by_side import in_processes, side_by_side
+from pisigma.judging.progress import Progress, stage
+from pisigma.judging.side_by_side import side_by_side
 from pisigma.judging.trained_calibrations import (
     Calibrator,
     Result,
@@ -120,7 +120,7 @@ class CalibrationValidation:
 
 
 @dataclass(frozen=True, eq=False)
-class _JudgedFold:
+class JudgedFold:
     """What is kept of one fold: errors of its held-out rows under all models.
 
     Attributes:
@@ -142,7 +142,7 @@ class _JudgedFold:
     left_out: int = 0
 
 
-def _joined(measurements: Measurements, judged: Sequence[_JudgedFold], folds: int) -> CalibrationValidation:
+def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int) -> CalibrationValidation:
     """Everything together, in the order of the rows."""
     units = {SENSORS[kind].unit for kind in measurements.kinds if kind in SENSORS}
     turned = measurements.rotation is not None or "rad" in units
@@ -180,47 +180,57 @@ def validate(
         IdentificationError: the training rows of a split do not determine what is asked for, or no test row has a
             target or anchor that its training rows have too.
     """
-    return validate_repeatedly(calibrator, measurements, [splits], progress)
+    judged = judged_folds(calibrator, measurements, [splits], progress)
+    return joined_repeats(measurements, [splits], judged)
 
 
-def validate_repeatedly(
+def judged_folds(
     calibrator: Calibrator,
     measurements: Measurements,
     repeats: Sequence[Sequence[TrainTest]],
     progress: Progress = lambda what: None,
-    jobs: int | None = None,
-) -> CalibrationValidation:
-    """Validate on several repeats of folds; see `validate` and `pisigma.measurement.splits.repeats`.
+) -> Iterator[JudgedFold]:
+    """Judge every fold of every repeat in turn, or in threads; see `fold_tasks`."""
+    return side_by_side(fold_tasks(calibrator, measurements, repeats, progress), measurements.rows > FEW_ROWS)
+
+
+def fold_tasks(
+    calibrator: Calibrator,
+    measurements: Measurements,
+    repeats: Sequence[Sequence[TrainTest]],
+    progress: Progress,
+) -> list[Callable[[], JudgedFold]]:
+    """Give what judges every fold of every repeat.
 
     Args:
         calibrator: see `validate`.
         measurements: the rows.
-        repeats: training and test rows of every fold, per repeat.
-        progress: called with the fold that is being judged, and what is being tried; not from other processes.
-        jobs: processes that judge folds side by side; None for threads of this one.
+        repeats: training and test rows of every fold, per repeat; see `pisigma.measurement.splits.repeats`.
+        progress: called with the fold that is being judged, and what is being tried.
     """
-    tasks = []
+    tasks: list[Callable[[], JudgedFold]] = []
     for number, splits in enumerate(repeats, 1):
         of_repeat = progress
         if len(repeats) > 1:
             of_repeat = stage(progress, f"repeat {number} of {len(repeats)}", ", ")
-        names = (f"fold {fold} of {len(splits)}" for fold in range(1, len(splits) + 1))
-        tasks += [(name, split, of_repeat) for name, split in zip(names, splits, strict=True)]
-    work = partial(_judged_fold, calibrator, measurements)
-    if jobs is None:
-        judged = side_by_side(work, tasks, measurements.rows > FEW_ROWS)
-    else:
-        progress(f"{len(tasks)} folds in {jobs} processes")
-        judged = in_processes(work, [(fold, split, silent) for fold, split, _ in tasks], jobs)
+        for fold, split in enumerate(splits, 1):
+            name = f"fold {fold} of {len(splits)}"
+            tasks.append(partial(_judged_fold, calibrator, measurements, name, split, of_repeat))
+    return tasks
+
+
+def joined_repeats(
+    measurements: Measurements, repeats: Sequence[Sequence[TrainTest]], judged: Iterator[JudgedFold]
+) -> CalibrationValidation:
+    """Put the judged folds of all repeats together, in the order of `fold_tasks`."""
     first, *again = [_joined(measurements, [next(judged) for _ in splits], len(splits)) for splits in repeats]
     return replace(first, again=tuple(again))
 
 
 def _judged_fold(
-    calibrator: Calibrator, measurements: Measurements, task: tuple[str, TrainTest, Progress]
-) -> _JudgedFold:
+    calibrator: Calibrator, measurements: Measurements, fold: str, split: TrainTest, progress: Progress
+) -> JudgedFold:
     """Calibrate on the training rows of one split and judge on its test rows."""
-    fold, split, progress = task
     progress(fold)
     train, test = split
     training = measurements.select(train)
@@ -308,7 +318,7 @@ def _judge(
     results: Mapping[str, Result],
     training: Measurements,
     held_out: Measurements,
-) -> _JudgedFold:
+) -> JudgedFold:
     """Judge all models on held-out rows, with frames that they lack fitted by a calibrator, if there is one."""
     stated = {} if calibrator is None else calibrator.socket_distances
     errors, distances, spread = {}, {}, None
@@ -318,7 +328,7 @@ def _judge(
         distances[name] = _distance_errors(stated, result, training, held_out)
         if isinstance(result, HybridResult):
             spread = predicted_spread(result, held_out)
-    return _JudgedFold(torch.arange(held_out.rows), errors, distances, spread)
+    return JudgedFold(torch.arange(held_out.rows), errors, distances, spread)
 
 
 @runtime_checkable

@@ -18,10 +18,10 @@ from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import HampelLoss, SquaredLoss
 from pisigma.identification.problem.parameters import Prior
 from pisigma.judging.calibration_summary import CalibrationSummary, summarise
-from pisigma.judging.calibration_validation import CalibrationValidation, judge, validate_repeatedly
-from pisigma.judging.few_rows import fit_where_it_helps
+from pisigma.judging.calibration_validation import CalibrationValidation, joined_repeats, judge
+from pisigma.judging.fit_beside_folds import fit_beside_folds
 from pisigma.judging.held_out_rows import HeldOutRows
-from pisigma.judging.progress import Progress, stage
+from pisigma.judging.progress import Progress
 from pisigma.judging.trained_calibrations import Calibrator, Result, geometric_of, trained
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.new_frames import with_new_frames
@@ -58,7 +58,8 @@ class CalibrationSettings:
         hold_out: share of the rows that are held out once, instead of folds.
         split: how rows are split: see `pisigma.measurement.splits.SplitBy`.
         repeats: of the cross-validation; None for 1 to 10, the more the fewer different joint values there are.
-        jobs: processes that judge folds side by side, with one thread each; None for threads of this one.
+        jobs: processes that calibrate with all rows and with those of folds side by side, with one thread each; None
+            for threads of this one.
         seed: of the split, and of drawing training rows.
         train_rows: number of rows, drawn at random, to calibrate with, in the cross-validation too; None for all.
         free: "identifiable", "joint_offsets", or names of parameters.
@@ -258,13 +259,10 @@ def calibrate(
     if faulty:
         calibrator, splits = geometric_of(calibrator), []
     try:
-        result = fit_where_it_helps(calibrator, rows, stage(progress, "calibration"))
+        result, judged = fit_beside_folds(calibrator, rows, training, splits, progress, settings.jobs)
     except IdentificationError as refusal:
         raise explained(refusal, nominal, rows) from refusal
-    validation = None
-    if splits:
-        validating = stage(progress, "cross-validation")
-        validation = validate_repeatedly(calibrator, training, splits, validating, settings.jobs)
+    validation = joined_repeats(training, splits, judged) if splits else None
     test = None if test_rows is None else judge(calibrator, result, rows, test_rows)
     summary = summarise(result)
     if faulty:

@@ -11,7 +11,7 @@ from testing.simulated_arm import simulate
 from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import SquaredLoss
-from pisigma.judging.calibration_validation import validate, validate_repeatedly
+from pisigma.judging.calibration_validation import validate
 from pisigma.judging.trained_calibrations import with_frames
 from pisigma.measurement import Measurements, k_folds
 from pisigma.measurement.dataset import join
@@ -142,13 +142,3 @@ def test_rows_without_a_socket_are_in_no_test() -> None:
     data = join([free, sockets])
     tested = torch.cat([test for _, test in k_folds(data, None, 0, "placement")])
     assert sorted(tested.tolist()) == list(range(4, data.rows))
-
-
-def test_folds_in_processes_give_the_same_to_the_bit() -> None:
-    arm = simulate("kiro4", rows=24, noise=5e-5)
-    calibrator = GeometricCalibrator(arm.nominal)
-    splits = [k_folds(arm.measurements, 3, 0)]
-    here = validate_repeatedly(calibrator, arm.measurements, splits)
-    there = validate_repeatedly(calibrator, arm.measurements, splits, jobs=1)
-    for name, errors in here.models.items():
-        assert torch.equal(errors.position, there.models[name].position), name
