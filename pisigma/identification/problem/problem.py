@@ -159,7 +159,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return point.index_add(0, self.active, step)
 
     def linearise(self, point: Tensor, like: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
-        """Sum up the normal equations; rows are weighted by the noise of `like`."""
+        """Sum up the normal equations; rows are weighted by the noise of `like`, where None by that which they show."""
         before = None if like is None else view_of(like)
         noise = (float("inf"),) * len(self.sensors) if before is None else before.noise
         unknowns = self.space.sensor_unknowns(point)
@@ -172,7 +172,19 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         view = (
             SensorView(tuple(sums), ones, ones, ones) if before is None else replace(before, sums=tuple(sums))
         )
-        return self.combined(point, view)
+        linearisation = self.combined(point, view)
+        if before is not None:
+            return linearisation
+        # gross errors would decide the first step, so the rows are weighted by what they show of the noise
+        weighted = self.renewed(linearisation)[0]
+        return self.linearise(point, weighted) if self._rejects(view_of(weighted)) else linearisation
+
+    def _rejects(self, view: SensorView) -> bool:
+        """Whether the loss rejects any row."""
+        return any(
+            not bool(self.loss.weight(sums.distance / view.scale(k), sensor.components).all())
+            for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True))
+        )
 
     def renewed(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], bool]:
         """Estimate the noise robustly, what repeats are worth, and how wide the prior has to be."""
