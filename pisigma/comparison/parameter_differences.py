@@ -4,7 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
-from typing import Literal
 
 import numpy as np
 import torch
@@ -15,11 +14,12 @@ from pisigma.comparison.parameter_effects import Difference, ParameterEffects
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.model.accuracy import parameter_posterior
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.recalibration.moved import UNITS, Moved
+from pisigma.recalibration.moved import Moved
+from pisigma.sensors.sensor import SHOWN_UNITS, ShownUnit
 
 LEVEL = 0.01
 """Probability with which anything at all is called different where two models differ by chance alone."""
-FACTORS = dict(UNITS.values())
+FACTORS = dict(SHOWN_UNITS.values())
 """By "mm" or "deg" what an SI value is multiplied by."""
 
 
@@ -29,7 +29,7 @@ class ParameterDifference:
 
     Attributes:
         name: such as "theta_3".
-        unit: "mm" or "deg", of all figures.
+        unit: "mm", "deg", "px" or "1", of all figures.
         first: its value in the first model.
         second: its value in the second.
         deviations: standard deviation of each by the posteriors; None where the model holds none.
@@ -41,7 +41,7 @@ class ParameterDifference:
     """
 
     name: str
-    unit: Literal["mm", "deg"]
+    unit: ShownUnit
     first: float
     second: float
     deviations: tuple[float | None, float | None]
@@ -150,7 +150,7 @@ def _side_by_side(pair: ModelPair) -> tuple[ParameterDifference, ...]:
     known = [_deviations(model, space.arm_size) for model in models]
     parameters = []
     for number, parameter in enumerate(space.parameters[: space.arm_size]):
-        unit, factor = UNITS[parameter.unit]
+        unit, factor = SHOWN_UNITS[parameter.unit]
         first, second = (float(those[number]) * factor for those in values)
         own, other = (None if those is None else float(those[number]) * factor for those in known)
         parameters.append(ParameterDifference(parameter.name, unit, first, second, (own, other)))

@@ -16,8 +16,9 @@ from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.hybrid_motion import corrected_joints
-from pisigma.recalibration.moved import UNITS, Moved, deviation_along
+from pisigma.recalibration.moved import Moved, deviation_along
 from pisigma.se3 import rotation_from_vector, rotation_vector, skew, xyzrpy_from_transform
+from pisigma.sensors.sensor import SHOWN_UNITS
 
 FLOOR = 2e-5
 """[m] Standard deviation of predicted coordinates that no posterior knows of, as a robot's repeatability."""
@@ -164,7 +165,7 @@ class ParameterEffects:
 
     def _difference(self, number: int, shift: float, deviation: float) -> Difference:
         """A shift of a parameter with its name and unit."""
-        unit, factor = UNITS[self._unit(number)]
+        unit, factor = SHOWN_UNITS[self._unit(number)]
         name = self._name(number)
         if self._is_zero(number):
             row = self._pair.first.identified.rows[number // 5]
@@ -207,8 +208,8 @@ class ParameterEffects:
             moved += [
                 Moved(what, float(vector.norm()) * factor, deviation_along(vector, block) * factor, unit)
                 for vector, block, (unit, factor) in (
-                    (length, C[:3, :3], UNITS["m"]),
-                    (angle, C[3:, 3:], UNITS["rad"]),
+                    (length, C[:3, :3], SHOWN_UNITS["m"]),
+                    (angle, C[3:, 3:], SHOWN_UNITS["rad"]),
                 )
             ]
         return tuple(moved)

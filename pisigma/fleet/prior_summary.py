@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pisigma.fleet.prior import FleetPrior
 from pisigma.judging.summary import AbstractSummary
 from pisigma.recalibration.model_posterior import FLEET_PRIOR
+from pisigma.sensors.sensor import SHOWN_UNITS
 from pisigma.yaml_file import Section
 
 
@@ -74,12 +75,9 @@ def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:
     deviation = population.covariance.diagonal().sqrt()
     parameters = []
     for number, name in enumerate(prior.names):
-        length = known.space.parameters[number].unit == "m"
-        scale = 1e3 if length else math.degrees(1.0)
+        unit, scale = SHOWN_UNITS[known.space.parameters[number].unit]
         mean, spread = float(population.mean[number]) * scale, float(deviation[number]) * scale
-        parameters.append(
-            CommonFigures(name=name, unit="mm" if length else "deg", mean=mean, deviation=spread)
-        )
+        parameters.append(CommonFigures(name=name, unit=unit, mean=mean, deviation=spread))
     weights, start, spectrum = deviation[population.geometric :], 0, []
     for feature in known.features:
         group = feature.group[feature.used]

@@ -19,9 +19,8 @@ from pisigma.judging.summary import AbstractSummary
 from pisigma.judging.trained_calibrations import Result, geometric_result
 from pisigma.judging.validation_figures import LearningPoint, ValidationFigures
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.sensors.sensor import SHOWN_UNITS
 from pisigma.yaml_file import Section
-
-_UNITS = {"m": ("mm", 1e3), "rad": ("deg", math.degrees(1.0))}
 
 
 class NoiseFigures(Section):
@@ -49,7 +48,7 @@ class ParameterFigures(Section):
 
     Attributes:
         name: such as "theta_1".
-        unit: "mm" or "deg"; the unit of the four figures.
+        unit: "mm", "deg", "px" or "1"; the unit of the four figures.
         nominal: as drawn.
         estimated: as identified.
         change: estimated minus nominal.
@@ -284,7 +283,7 @@ def summarise(result: Result) -> CalibrationSummary:
 def _parameters(result: CalibrationResult) -> tuple[ParameterFigures, ...]:
     rows = []
     for parameter in result.parameters:
-        unit, factor = _UNITS[parameter.unit]
+        unit, factor = SHOWN_UNITS[parameter.unit]
         names = ("nominal", "estimated", "change", "standard_error")
         figures = {name: _or_none(getattr(parameter, name) * factor) for name in names}
         texts = {"name": parameter.name, "remark": parameter.remark, "label": parameter.label}
@@ -295,16 +294,16 @@ def _parameters(result: CalibrationResult) -> tuple[ParameterFigures, ...]:
 def _outliers(outliers: Sequence[Outlier]) -> tuple[OutlierFigures, ...]:
     rows = []
     for outlier in outliers:
-        unit, factor = _UNITS[outlier.unit]
+        unit, factor = SHOWN_UNITS[outlier.unit]
         figures = {"deviations": outlier.deviations, f"residual_{unit}": outlier.residual * factor}
         rows.append(OutlierFigures(row=outlier.row, place=outlier.place, sensor=outlier.sensor, **figures))
     return tuple(rows)
 
 
 def _noise(sensor: str, sigma: float, unit: str, **counts: Any) -> NoiseFigures:
-    if unit not in _UNITS:
+    if unit not in SHOWN_UNITS:
         return NoiseFigures(sensor=sensor, factor_on_stated_sigma=sigma, **counts)
-    name, factor = _UNITS[unit]
+    name, factor = SHOWN_UNITS[unit]
     return NoiseFigures(sensor=sensor, **{f"sigma_{name}": sigma * factor}, **counts)
 
 
@@ -329,7 +328,9 @@ def _learned(result: HybridResult, learned: LearnedPart) -> LearnedFigures:
         unknowns=learned.unknowns,
         effective_parameters=learned.effective,
         linearisations=learned.rounds,
-        noise=tuple(_noise(sensor, sigma, units[sensor]) for sensor, sigma in learned.noise.items()),
+        noise=tuple(
+            _noise(sensor, sigma, units[sensor]) for sensor, sigma in learned.noise.items() if sensor in units
+        ),
         prior_scale=result.uncertainty.prior_scale,
     )
 

@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
+from pisigma.sensors.sensor import ShownUnit
+
 FALSE_ALARMS_PER_YEAR = 0.05
 """Of all charts of a robot together, where nothing changes."""
 SESSIONS_PER_YEAR = 12
@@ -51,7 +53,7 @@ class Chart:
     """
 
     what: str
-    unit: Literal["deg", "mm"]
+    unit: ShownUnit
     values: Float64[Tensor, " sessions"]
     deviations: Float64[Tensor, " sessions"]
     scores: Float64[Tensor, " sessions"]

@@ -13,7 +13,8 @@ from torch import Tensor
 from pisigma.monitoring.charts import Chart, innovations, limits_of
 from pisigma.monitoring.history import Record
 from pisigma.recalibration.drift import NOISE_SPREAD
-from pisigma.recalibration.moved import CLEAR, NORMAL_95, UNITS
+from pisigma.recalibration.moved import CLEAR, NORMAL_95
+from pisigma.sensors.sensor import SHOWN_UNITS, ShownUnit
 
 DAYS_PER_MONTH = 365.25 / 12
 FEWEST = 4
@@ -38,7 +39,7 @@ class Trend:
 
     what: str
     over: Literal["month", "kelvin"]
-    unit: Literal["deg", "mm"]
+    unit: ShownUnit
     slope: float
     deviation: float
 
@@ -99,7 +100,7 @@ def charts_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Char
     charts = []
     for joint in range(len(revolute)):
         values, covariance = _joint_values(records, joint)
-        unit, factor = UNITS["rad" if revolute[joint] else "m"]
+        unit, factor = SHOWN_UNITS["rad" if revolute[joint] else "m"]
         scores = innovations(values, covariance)
         deviations = covariance.diagonal().sqrt() * factor
         charts.append(
@@ -131,7 +132,7 @@ def trends_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Tren
         overs.append(("kelvin", temperature))
     trends = []
     for joint in range(len(revolute)):
-        unit, factor = UNITS["rad" if revolute[joint] else "m"]
+        unit, factor = SHOWN_UNITS["rad" if revolute[joint] else "m"]
         values, covariance = _joint_values(records, joint)
         there = torch.isfinite(values).nonzero()[:, 0]
         if len(there) < FEWEST + len(overs) - 1:

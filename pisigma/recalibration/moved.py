@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -14,11 +13,11 @@ from pisigma.recalibration.adaptation import Adaptation
 from pisigma.recalibration.drift import DriftGroup
 from pisigma.recalibration.recalibration_problem import RecalibrationProblem, frame_stretch
 from pisigma.se3 import rotation_vector, transform_from_xyzrpy
+from pisigma.sensors.sensor import SHOWN_UNITS, ShownUnit
 
 CLEAR = 3.3
 """[standard deviations] What moved by less is not told from chance: one in 1,000 of what did not move."""
 NORMAL_95 = 1.959964
-UNITS: dict[str, tuple[Literal["mm", "deg"], float]] = {"m": ("mm", 1e3), "rad": ("deg", math.degrees(1.0))}
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ class Moved:
     what: str
     shift: float
     deviation: float
-    unit: Literal["mm", "deg"]
+    unit: ShownUnit
 
     @property
     def interval(self) -> tuple[float, float]:
@@ -97,7 +96,7 @@ def moved_of_group(
     space, moved = problem.design.problem.space, []
     for index, by, variance in zip(group.index, shift, covariance.diagonal(), strict=True):
         parameter = space.parameters[int(index)]
-        unit, factor = UNITS[parameter.unit]
+        unit, factor = SHOWN_UNITS[parameter.unit]
         what, sign = parameter.name, 1
         if kind == "joint":
             what, sign = group.what, int(space.robot.directions[int(name) - 1])
@@ -143,8 +142,8 @@ def _of_frame(
     return [
         Moved(group.what, float(vector.norm()) * factor, deviation_along(vector, block) * factor, unit)
         for vector, block, (unit, factor) in (
-            (motion[:3], covariance[:3, :3], UNITS["m"]),
-            (motion[3:], covariance[3:, 3:], UNITS["rad"]),
+            (motion[:3], covariance[:3, :3], SHOWN_UNITS["m"]),
+            (motion[3:], covariance[3:, 3:], SHOWN_UNITS["rad"]),
         )
     ]
 

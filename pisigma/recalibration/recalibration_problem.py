@@ -143,9 +143,7 @@ def _joined_space(space: ParameterSpace, rows: Measurements) -> ParameterSpace:
         there = of_rows.get(name, UnknownGroup(name, own.columns, ()))
         stands = dict(zip(there.owners, there.frames, strict=True))
         stands |= {owner: frames[0] for owner in own.owners if owner not in stands}
-        groups.append(
-            UnknownGroup(name, own.columns, tuple(stands), tuple(stands.values()), there.angles or own.angles)
-        )
+        groups.append(replace(own, owners=tuple(stands), frames=tuple(stands.values())))
     targets = tuple(dict.fromkeys((*space.targets, *rows.target)))
     return ParameterSpace(space.robot, frames, targets, tuple(groups))
 

@@ -1,8 +1,9 @@
 """The interface of sensors: from rows of measurements to residual blocks with derivatives by the chain rule."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal
 
 import torch
@@ -14,6 +15,16 @@ from pisigma.kinematics.parameter_jacobian import ToolMotion
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.readings import SensorReadings
 
+OtherUnit = Literal["px", "1"]
+ParameterUnit = Literal["m", "rad", "px", "1"]
+ShownUnit = Literal["mm", "deg", "px", "1"]
+SHOWN_UNITS: Mapping[str, tuple[ShownUnit, float]] = {
+    "m": ("mm", 1e3),
+    "rad": ("deg", math.degrees(1.0)),
+    "px": ("px", 1.0),
+    "1": ("1", 1.0),
+}
+"""In which unit figures of a unit are shown, and how many of it make one."""
 SHORTEST = 1e-12
 """[m] Distances are not divided by less."""
 
@@ -39,6 +50,7 @@ class UnknownGroup:
         owners: names of those that have such unknowns, such as the anchors.
         frames: per owner, the frame that it stands in.
         angles: the columns that are angles [rad]; the others are lengths [m].
+        units: by column, the unit of those that are neither: "px", or "1" of plain numbers.
     """
 
     name: str
@@ -46,6 +58,11 @@ class UnknownGroup:
     owners: tuple[str, ...]
     frames: tuple[str, ...] = ()
     angles: frozenset[str] = frozenset()
+    units: Mapping[str, OtherUnit] = field(default_factory=dict)
+
+    def unit(self, column: str) -> ParameterUnit:
+        """Return the unit of a column."""
+        return self.units.get(column, "rad" if column in self.angles else "m")
 
     @property
     def has_point(self) -> bool:

@@ -16,7 +16,7 @@ from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.kinematics.parameter_jacobian import motion_order
 from pisigma.robot.description import Robot
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS
-from pisigma.sensors.sensor import UnknownGroup, Unknowns
+from pisigma.sensors.sensor import ParameterUnit, UnknownGroup, Unknowns
 
 LENGTHS = frozenset({"d", "a", "x", "y", "z"})
 EVERYWHERE, NOWHERE = -1, -2
@@ -25,6 +25,7 @@ USUAL_LENGTH = 1e-3
 """[m] Scale of length parameters where no prior gives one."""
 USUAL_ANGLE = 1e-3
 """[rad]"""
+USUAL_ERRORS: dict[ParameterUnit, float] = {"m": USUAL_LENGTH, "rad": USUAL_ANGLE, "px": 1.0, "1": 1e-3}
 SMALLEST_PRIOR = 1e-12
 """[m or rad] A parameter with less uncertainty is fixed: leave it out of `free`."""
 
@@ -70,19 +71,19 @@ class Parameter:
     Attributes:
         name: such as "theta_1", "d_EE", "base_x" or, with several targets, "tool_B_x".
         group: "theta", "d", "a", "alpha", "beta", "base", "tool", or that of a sensor's unknowns, such as "socket".
-        unit: "m" or "rad".
+        unit: "m", "rad", "px", or "1" of a plain number.
         owner: the row, frame or target it belongs to, or such as the socket.
     """
 
     name: str
     group: str
-    unit: Literal["m", "rad"]
+    unit: ParameterUnit
     owner: str
 
     @property
     def usual_error(self) -> float:
-        """A usual size of its error, for scaling: 1 mm or 1 mrad."""
-        return USUAL_LENGTH if self.unit == "m" else USUAL_ANGLE
+        """A usual size of its error, for scaling: 1 mm, 1 mrad, 1 px or 1e-3."""
+        return USUAL_ERRORS[self.unit]
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,7 +120,7 @@ class ParameterSpace:
                     Parameter(
                         f"{own.name}_{owner}_{column}",
                         own.name,
-                        "rad" if column in own.angles else "m",
+                        own.unit(column),
                         owner,
                     )
                     for column in own.columns

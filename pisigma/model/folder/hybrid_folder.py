@@ -272,6 +272,7 @@ def _unknowns_section(groups: Sequence[UnknownGroup]) -> dict[str, object]:
             "owners": list(group.owners),
             "angles": sorted(group.angles),
         }
+        | ({"units": dict(group.units)} if group.units else {})
         for group in groups
         if group.name not in ("socket", "anchor")
     }
@@ -283,7 +284,7 @@ def _unknowns(known: UncertaintySection) -> tuple[UnknownGroup, ...]:
         UnknownGroup("socket", SOCKET_COLUMNS, known.sockets),
         UnknownGroup("anchor", ANCHOR_COLUMNS, known.anchors),
         *(
-            UnknownGroup(name, other.columns, other.owners, angles=frozenset(other.angles))
+            UnknownGroup(name, other.columns, other.owners, angles=frozenset(other.angles), units=other.units)
             for name, other in known.others.items()
         ),
     )

@@ -12,6 +12,7 @@ from pisigma.files.model_files import read_model_file
 from pisigma.joint_correction.feature import FeatureSection
 from pisigma.joint_correction.registry import feature_section
 from pisigma.robot.robot_file import RobotDocument
+from pisigma.sensors.sensor import OtherUnit
 from pisigma.yaml_file import Section, parse_yaml, yaml_text
 
 FORMAT = 4
@@ -59,6 +60,7 @@ class UnknownsSection(Section):
     columns: tuple[str, ...] = Field(min_length=1)
     owners: tuple[str, ...] = Field(min_length=1)
     angles: tuple[str, ...] = ()
+    units: dict[str, OtherUnit] = Field(default_factory=dict)
 
 
 class UncertaintySection(Section):

@@ -1,6 +1,5 @@
 """What is done with one robot of a fleet: settings, its sessions one after the other, and its record."""
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from pisigma.fleet.record import REFUSED, ParameterValue, RobotRecord, SessionRe
 from pisigma.judging.validation_figures import AbstractValidationFigures
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.robot.description import Robot
+from pisigma.sensors.sensor import SHOWN_UNITS
 from pisigma.workflow.calibrate import Calibration, CalibrationSettings, calibrate
 from pisigma.workflow.monitor import MonitorSettings, monitor
 from pisigma.workflow.recalibrate import Recalibration, recalibrate
@@ -213,7 +213,7 @@ def _parameters_of(model: CalibratedModel) -> tuple[ParameterValue, ...]:
     changes, deviations = values - space.robot.dh.ravel(), known.root[: space.arm_size].norm(dim=1)
     parameters = []
     for number in deviations.nonzero()[:, 0].tolist():
-        unit, scale = ("mm", 1e3) if space.parameters[number].unit == "m" else ("deg", math.degrees(1.0))
+        unit, scale = SHOWN_UNITS[space.parameters[number].unit]
         figures = (float(those[number]) * scale for those in (values, changes, deviations))
         parameters.append(ParameterValue(space.names[number], unit, *figures))
     return tuple(parameters)
