@@ -36,11 +36,13 @@ class ReadingColumn:
         units: the units it may be in, each of which makes a column of its own, such as "tilt_roll_deg"; "" is a
             number without a unit, whose column is called as the quantity.
         is_text: whether its cells hold names instead of numbers; then `units` is ("",).
+        is_optional: whether a file may have the sensor's other columns without it.
     """
 
     name: str
     units: tuple[Unit, ...] = ("",)
     is_text: bool = False
+    is_optional: bool = False
 
 
 def no_faults(readings: Readings) -> Iterator[RowFault]:

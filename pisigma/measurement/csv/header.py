@@ -243,7 +243,9 @@ def _check_readings(place: str, columns: tuple[Column, ...]) -> None:
     present = {column.quantity: column for column in columns}
     for readings in READINGS.values():
         there = [column for column in readings.columns if column.name in present]
-        missing = [column for column in readings.columns if column.name not in present]
+        missing = [
+            column for column in readings.columns if column.name not in present and not column.is_optional
+        ]
         if there and missing:
             wanted = ", ".join(f"{column.name}_{column.units[0]}".rstrip("_") for column in missing)
             raise MeasurementError(
