@@ -34,6 +34,7 @@ class BoardDocument(Section):
     rows: int = Field(ge=2, le=100)
     columns: int = Field(ge=2, le=100)
     square_mm: Length | None = None
+    square_sigma_mm: float | None = Field(default=None, ge=0)
     marker_mm: Length | None = None
     dictionary: Dictionary = "5x5_1000"
     tag_mm: Length | None = None
@@ -72,6 +73,7 @@ class Board:
         kind: of the board.
         marker: side of the markers of a ChArUco board, or of AprilTags [m].
         dictionary: of its markers: a `Dictionary` or a `TagFamily`.
+        scale_deviation: standard deviation of all its lengths together, as a share of them; None where none is stated.
     """
 
     name: str
@@ -81,6 +83,7 @@ class Board:
     kind: BoardKind = "checkerboard"
     marker: float = 0.0
     dictionary: str = ""
+    scale_deviation: float | None = None
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "Board":
@@ -94,7 +97,8 @@ class Board:
         pitch = board.square_mm or marker + (board.spacing_mm or 0.0)
         names = {"checkerboard": "", "charuco": board.dictionary, "apriltag": board.family}
         lengths = pitch / 1e3, board.kind, marker / 1e3
-        return Board(board.name, board.rows, board.columns, *lengths, names[board.kind])
+        scale = None if board.square_sigma_mm is None else board.square_sigma_mm / pitch
+        return Board(board.name, board.rows, board.columns, *lengths, names[board.kind], scale)
 
     @property
     def corners(self) -> Float64[np.ndarray, "corners 3"]:

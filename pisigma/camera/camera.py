@@ -2,7 +2,7 @@
 
 import os
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -11,11 +11,31 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from pisigma.errors import MeasurementError
 from pisigma.files.input_file import read_text
+from pisigma.sensors.intrinsics import CAMERA_UNITS
 from pisigma.yaml_file import MOST_BYTES, Section, parse_yaml
 
+INTRINSICS = tuple(CAMERA_UNITS)
+USUAL_DEVIATIONS = (0.5, 0.5, 1.0, 1.0, 0.002, 0.01, 2e-4, 2e-4, 0.0)
+"""Standard deviations of the intrinsics that a usual calibration leaves, with 0 for k3, which it seldom frees."""
+
 Positive = Annotated[float, Field(gt=0)]
+Deviation = Annotated[float, Field(ge=0)]
 UNDISTORT_STEPS = 20
 """Newton steps from a distorted to the undistorted point; ordinary lenses take four."""
+
+
+class DeviationsSection(Section):
+    """Standard deviations of a camera's intrinsics; those that are not stated are 0."""
+
+    fx: Deviation = 0.0
+    fy: Deviation = 0.0
+    cx: Deviation = 0.0
+    cy: Deviation = 0.0
+    k1: Deviation = 0.0
+    k2: Deviation = 0.0
+    p1: Deviation = 0.0
+    p2: Deviation = 0.0
+    k3: Deviation = 0.0
 
 
 class CameraDocument(Section):
@@ -33,6 +53,7 @@ class CameraDocument(Section):
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+    sigma: DeviationsSection | None = None
 
 
 class MatrixSection(BaseModel):
@@ -73,6 +94,7 @@ class Camera:
         p1: tangential distortion, as p2 without a unit.
         p2: see p1.
         k3: see k1.
+        sigma: standard deviations of fx, fy, cx, cy [px], k1, k2, p1, p2, k3; None where none are stated.
     """
 
     name: str
@@ -87,6 +109,7 @@ class Camera:
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
+    sigma: tuple[float, ...] | None = None
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "Camera":
@@ -98,7 +121,9 @@ class Camera:
         source = os.fspath(path)
         text = read_text(path, MeasurementError, "YAML", MOST_BYTES)
         if not re.search(r"^\s*camera_matrix\s*:", text, re.MULTILINE):
-            return Camera(**parse_yaml(text, CameraDocument, MeasurementError, source).model_dump())
+            own = parse_yaml(text, CameraDocument, MeasurementError, source)
+            sigma = None if own.sigma is None else tuple(own.sigma.model_dump().values())
+            return Camera(**own.model_dump(exclude={"sigma"}), sigma=sigma)
         # OpenCV writes a directive and a tag that YAML does not know; commented out, they keep the lines' numbers
         plain = re.sub(r"^%YAML.*$|^---\s*$", "#", text, flags=re.MULTILINE).replace("!!opencv-matrix", "")
         document = parse_yaml(plain, MatrixDocument, MeasurementError, source)
@@ -113,7 +138,17 @@ class Camera:
                 "the camera with that model."
             )
         size = (document.camera_name, document.image_width, document.image_height)
-        return Camera(*size, matrix[0], matrix[4], matrix[2], matrix[5], *bent[:5])
+        k1, k2, p1, p2, k3 = (*bent, 0.0)[:5]
+        return Camera(*size, matrix[0], matrix[4], matrix[2], matrix[5], k1, k2, p1, p2, k3)
+
+    @property
+    def intrinsics(self) -> Float64[np.ndarray, " 9"]:
+        """All numbers of the model, in the order of `INTRINSICS` [px, and 1 from k1 on]."""
+        return np.array([getattr(self, name) for name in INTRINSICS])
+
+    def with_intrinsics(self, values: Float64[np.ndarray, " 9"]) -> "Camera":
+        """Return the camera with other numbers in the order of `INTRINSICS`."""
+        return replace(self, **dict(zip(INTRINSICS, values.tolist(), strict=True)))
 
     def project(
         self, points: Float64[np.ndarray, "*batch 3"]
@@ -127,6 +162,26 @@ class Camera:
         by_point[..., 2] = -xy
         by_point /= points[..., 2, None, None]
         return bent * scale + (self.cx, self.cy), scale[:, None] * (derivative @ by_point)
+
+    def by_intrinsics(self, points: Float64[np.ndarray, "*batch 3"]) -> Float64[np.ndarray, "*batch 2 9"]:
+        """Return the derivative of the pixels of points in the camera's frame [m] by the intrinsics.
+
+        The pixels are linear in the focal lengths times a polynomial that is linear in the distortion, so the columns
+        are these factors themselves.
+        """
+        xy = points[..., :2] / points[..., 2:]
+        x, y = xy[..., 0], xy[..., 1]
+        square = x * x + y * y
+        derivative = np.zeros((*xy.shape, len(INTRINSICS)))
+        bent = self._distorted(xy)[0]
+        for axis, focal in enumerate((self.fx, self.fy)):
+            derivative[..., axis, axis] = bent[..., axis]
+            derivative[..., axis, 2 + axis] = 1.0
+            for column, power in ((4, square), (5, square**2), (8, square**3)):
+                derivative[..., axis, column] = focal * xy[..., axis] * power
+        derivative[..., 0, 6], derivative[..., 0, 7] = self.fx * 2 * x * y, self.fx * (square + 2 * x * x)
+        derivative[..., 1, 6], derivative[..., 1, 7] = self.fy * (square + 2 * y * y), self.fy * 2 * x * y
+        return derivative
 
     def undistort(self, pixels: Float64[np.ndarray, "*batch 2"]) -> Float64[np.ndarray, "*batch 2"]:
         """Return x / z and y / z of the rays of pixels, by Newton's method."""

@@ -51,6 +51,16 @@ def test_the_derivative_is_that_of_the_pixels() -> None:
         assert_close(derivative[..., k], change, atol=1e-4, rtol=1e-7)
 
 
+def test_the_derivative_by_the_intrinsics_is_that_of_the_pixels() -> None:
+    at = points()
+    derivative = CAMERA.by_intrinsics(at)
+    assert derivative.shape == (5, 4, 2, 9)
+    for k, step in enumerate(1e-6 * np.eye(9)):
+        more, less = (CAMERA.with_intrinsics(CAMERA.intrinsics + change) for change in (step, -step))
+        change = (more.project(at)[0] - less.project(at)[0]) / 2e-6
+        assert_close(derivative[..., k], change, atol=1e-4, rtol=1e-7)
+
+
 def test_undistorted_pixels_are_the_rays_of_their_points() -> None:
     at = points()
     assert_close(CAMERA.undistort(CAMERA.project(at)[0]), at[..., :2] / at[..., 2:], atol=1e-12)
@@ -64,10 +74,17 @@ def test_one_camera_in_three_kinds_of_files(tmp_path: Path, text: str) -> None:
     assert Camera.load(path) == wanted
 
 
+def test_deviations_of_the_intrinsics_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "camera.yaml"
+    path.write_text(OWN + "sigma: {fx: 0.5, fy: 0.6, cx: 1, k1: 0.002}\n")
+    assert Camera.load(path).sigma == (0.5, 0.6, 1.0, 0.0, 0.002, 0.0, 0.0, 0.0, 0.0)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         (OWN.replace("fx", "f_x"), r"camera\.yaml, line 3: unknown key 'f_x'.*did you mean 'fx'"),
+        (OWN + "sigma: {fx: -1}\n", r"'sigma\.fx': input should be greater than or equal to 0"),
         (OWN.replace("fx: 1400", "fx: -1400"), r"line 3: 'fx': input should be greater than 0"),
         (ROS.replace("plumb_bob", "equidistant"), r"'distortion_model' cannot be 'equidistant'"),
         (ROS.replace("0.01]", "0.01, 3]"), r"k1, k2, p1, p2 and k3 was wanted, got .*3\.0"),
