@@ -97,11 +97,15 @@ def aligned_error(true: Tensor, estimated: Tensor) -> float:
 def bound(true: Robot, rows: Measurements, q: Tensor) -> float:
     """Cramér-Rao bound [m] of the same figure: no prior, the noise of corners and repeatability known."""
     setup = GeometricCalibrator(true, prior=None).build(rows)
-    problem, point, everything = setup.problem, setup.start, torch.arange(len(setup.start))
-    (sensor,), here = problem.sensors, slice(0, rows.rows)
-    J = problem.derivative(sensor, problem.motion(point, here, everything), {}, here, everything).flatten(1)
+    problem, point = setup.problem, setup.start
+    unknown = [*range(problem.space.of("tool").stop), *setup.free_unknowns]
+    everything = torch.tensor(unknown)
+    here, unknowns = slice(0, rows.rows), problem.space.sensor_unknowns(point)
+    motion = problem.motion(point, here, everything)
+    blocks = [problem.derivative(sensor, motion, unknowns, here, everything) for sensor in problem.sensors]
+    J = torch.cat([block.flatten(1) for block in blocks], 1)
     noise = float(torch.as_tensor(rows.readings["corner_noise"])[0])
-    scale = torch.from_numpy(problem.space.usual_errors)[:, None]
+    scale = torch.from_numpy(problem.space.usual_errors)[everything, None]
     covariance = torch.linalg.pinv(scale * J @ J.T * scale.T / noise**2, rtol=1e-9, hermitian=True)
     none = torch.zeros(len(q), dtype=torch.int64)
     elsewhere = replace(problem, q=q, frame=none, target=none, memory=MotionMemory())

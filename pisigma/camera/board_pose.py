@@ -31,12 +31,20 @@ class BoardPose:
         cofactor: covariance of an error (shift of t [m], turn of R as a rotation vector in the camera's frame [rad])
             for a noise of the corners of 1 px.
         distance: by how much every corner misses its prediction [px].
+        by_intrinsics: derivative of the pose (shift of t [m], turn of R as a rotation vector in the camera's frame
+            [rad]) by the intrinsics, which the corners are solved anew with.
+        root: with `rest` what the corners say of the intrinsics k whatever the pose is, for a noise of 1 px:
+            `root (k - present) = rest`.
+        rest: see root [px].
     """
 
     R: Float64[np.ndarray, "3 3"]
     t: Float64[np.ndarray, " 3"]
     cofactor: Float64[np.ndarray, "6 6"]
     distance: Float64[np.ndarray, " corners"]
+    by_intrinsics: Float64[np.ndarray, "6 9"]
+    root: Float64[np.ndarray, "9 9"]
+    rest: Float64[np.ndarray, " 9"]
 
 
 def solve_board_pose(
@@ -65,8 +73,30 @@ def solve_board_pose(
         if np.abs(step).max() < SMALLEST_STEP:
             break
     residual, J = _linearised(camera, corners, pixels, R, t)
-    cofactor = np.linalg.inv(np.einsum("nki,n,nkj->ij", J, _weights(residual, loss), J))
-    return BoardPose(R, t, cofactor, np.linalg.norm(residual, axis=1))
+    root = np.sqrt(_weights(residual, loss))[:, None, None]
+    columns = np.concatenate([J, camera.by_intrinsics(corners @ R.T + t), residual[..., None]], -1)
+    triangle = _triangle((root * columns).reshape(-1, columns.shape[-1]))
+    inverse = np.linalg.inv(triangle[:POSE, :POSE])
+    return BoardPose(
+        R,
+        t,
+        inverse @ inverse.T,
+        np.linalg.norm(residual, axis=1),
+        by_intrinsics=-inverse @ triangle[:POSE, POSE:-1],
+        root=triangle[POSE:-1, POSE:-1],
+        rest=triangle[POSE:-1, -1],
+    )
+
+
+def _triangle(columns: Float64[np.ndarray, "values columns"]) -> Float64[np.ndarray, "columns columns"]:
+    """Triangular factor of a matrix, square also where it has fewer rows than columns.
+
+    Its first rows belong to the pose, the next ones to what is left for the intrinsics once the pose is eliminated.
+    """
+    count = columns.shape[1]
+    padded = np.concatenate([columns, np.zeros((count, count))])
+    triangle: np.ndarray = np.linalg.qr(padded, mode="r")  # type: ignore[assignment]
+    return triangle
 
 
 def _linearised(

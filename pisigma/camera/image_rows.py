@@ -1,23 +1,27 @@
 """Files of corners as measurements: one row an image, with the pose that its corners give and its covariance."""
 
 import os
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import get_args
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 
 from pisigma.camera.board import Board
-from pisigma.camera.board_pose import FEWEST_CORNERS, POSE, SMALLEST_NOISE, BoardPose, solve_board_pose
+from pisigma.camera.board_pose import FEWEST_CORNERS, POSE, BoardPose, solve_board_pose
 from pisigma.camera.camera import Camera
-from pisigma.errors import IdentificationError, MeasurementError
+from pisigma.camera.solved_images import IntrinsicsChoice, prior_deviations, solve_images
+from pisigma.errors import IdentificationError, MeasurementError, nearest_choice
 from pisigma.identification.problem.loss import HampelLoss
 from pisigma.measurement.csv.reading import number_column, read_joints, text_column
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.se3 import skew
-from pisigma.sensors.corner import NOISE_COLUMN, WEIGHT_COLUMN, weight_text
+from pisigma.sensors.corner import WEIGHT_COLUMN, weight_text
+from pisigma.sensors.intrinsics import CAMERA_COLUMN, INTRINSICS_COLUMN, NOISE_COLUMN, SCALE_COLUMN
 
 LARGEST_MISS = 10.0
 """[px] Where half of the corners of an image miss their prediction by more, they are not of this board."""
@@ -55,12 +59,20 @@ class CameraFiles:
         board: file of the board, see `Board.load`.
         is_fixed: whether the camera stands beside the robot and the board is on the flange; else the other way round.
         repeatability: of the robot.
+        intrinsics: whether the camera's are held, under their prior, or free; see `prior_deviations`.
     """
 
     camera: str
     board: str
     is_fixed: bool = False
     repeatability: Repeatability = field(default_factory=Repeatability)
+    intrinsics: IntrinsicsChoice = "prior"
+
+    def __post_init__(self) -> None:
+        """Refuse what is no choice."""
+        if self.intrinsics not in get_args(IntrinsicsChoice):
+            choices = nearest_choice(self.intrinsics, get_args(IntrinsicsChoice))
+            raise IdentificationError(f"intrinsics '{self.intrinsics}' is no choice; {choices}")
 
     def read(self, path: str | os.PathLike[str], robot: Robot) -> Measurements:
         """Read a file of corners as measurements; see `read_images`.
@@ -69,7 +81,7 @@ class CameraFiles:
             MeasurementError: a file cannot be used; the message says which and where.
         """
         camera, board = Camera.load(self.camera), Board.load(self.board)
-        return read_images(path, robot, camera, board, self.is_fixed, self.repeatability)
+        return read_images(path, robot, camera, board, self.is_fixed, self.repeatability, self.intrinsics)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,6 +112,7 @@ def read_images(
     board: Board,
     is_fixed: bool = False,
     repeatability: Repeatability = Repeatability(),
+    intrinsics: IntrinsicsChoice = "prior",
 ) -> Measurements:
     """Read a CSV file of corners: `image`, `corner`, `u_px`, `v_px` and the joints (`q1_deg` and so on) in every row.
 
@@ -110,6 +123,7 @@ def read_images(
         board: that they show; corners are numbered as there.
         is_fixed: whether the camera is fixed and the board on the flange.
         repeatability: of the robot.
+        intrinsics: whether the camera's are held, under their prior, or free; see `prior_deviations`.
 
     Returns:
         One row an image, in the frame of the board with the camera as target (of a fixed camera the other way
@@ -119,11 +133,16 @@ def read_images(
         MeasurementError: the file cannot be used, or the corners of an image are not of this board.
     """
     images = _split_images(path, robot, len(board.corners))
-    return image_measurements(images, camera, board, is_fixed, repeatability)
+    return image_measurements(images, camera, board, is_fixed, repeatability, intrinsics)
 
 
 def image_measurements(
-    images: Images, camera: Camera, board: Board, is_fixed: bool, repeatability: Repeatability
+    images: Images,
+    camera: Camera,
+    board: Board,
+    is_fixed: bool,
+    repeatability: Repeatability,
+    intrinsics: IntrinsicsChoice = "prior",
 ) -> Measurements:
     """Solve the pose of the board in every image; see `read_images`.
 
@@ -131,10 +150,49 @@ def image_measurements(
         MeasurementError: the corners of an image are not of this board.
     """
     loss, corners = HampelLoss(), board.corners
-    poses = [
-        solve_board_pose(camera, corners[number], pixels, loss)
-        for number, pixels in zip(images.corners, images.pixels, strict=True)
+
+    def solve(present: Camera) -> list[BoardPose]:
+        poses = [
+            solve_board_pose(present, corners[number], pixels, loss)
+            for number, pixels in zip(images.corners, images.pixels, strict=True)
+        ]
+        _refuse_other_boards(images, board, poses)
+        return poses
+
+    solved = solve_images(camera, prior_deviations(camera, intrinsics), solve, loss, images.source)
+    at_board = solved.noise / camera.fx * float(np.median([pose.t[2] for pose in solved.poses]))
+    seen = [_seen_by_robot(pose, is_fixed) for pose in solved.poses]
+    own = np.diag([repeatability.length**2] * 3 + [repeatability.angle**2] * 3)
+    covariances = [
+        change @ pose.cofactor @ change.T for pose, (_, _, change) in zip(solved.poses, seen, strict=True)
     ]
+    weights = tuple(weight_text(_inverse_root(solved.noise**2 * one + own)) for one in covariances)
+    count, names = len(seen), (board.name, camera.name)
+    texts = {CAMERA_COLUMN: (camera.name,) * count}
+    if solved.sigma.any():
+        by = np.stack([change for _, _, change in seen]) @ solved.intrinsics.by
+        texts[INTRINSICS_COLUMN] = replace(solved.intrinsics, by=by).texts
+    if board.scale_deviation is not None:
+        texts[SCALE_COLUMN] = (f"{board.scale_deviation:.17g}",) * count
+    frame, target = reversed(names) if is_fixed else names
+    return Measurements(
+        q=images.q,
+        position=torch.from_numpy(np.stack([t for _, t, _ in seen])),
+        rotation=torch.from_numpy(np.stack([R for R, _, _ in seen])),
+        frame=(frame,) * count,
+        target=(target,) * count,
+        readings={NOISE_COLUMN: torch.full_like(images.q[:, 0], at_board), WEIGHT_COLUMN: weights, **texts},
+        line=images.lines,
+        source=images.source,
+    )
+
+
+def _refuse_other_boards(images: Images, board: Board, poses: Sequence[BoardPose]) -> None:
+    """Refuse images whose corners are not where a board of this kind has them.
+
+    Raises:
+        MeasurementError: see above.
+    """
     for name, line, pose in zip(images.names, images.lines, poses, strict=True):
         miss = float(np.median(pose.distance))
         if not miss < LARGEST_MISS:
@@ -143,40 +201,20 @@ def image_measurements(
                 f"where a board of {board.rows} x {board.columns} corners has them; check the numbers of the corners, "
                 "the board and the camera, or remove the image."
             )
-    distance = torch.from_numpy(np.concatenate([pose.distance for pose in poses]))
-    used = float(POSE * len(poses))
-    scale = max(loss.scale(distance, 2, used), SMALLEST_NOISE)
-    noise = max(loss.deviation(distance, 2, used, scale), SMALLEST_NOISE)
-    at_board = noise / camera.fx * float(np.median([pose.t[2] for pose in poses]))
-    seen = [_seen_by_robot(pose, is_fixed) for pose in poses]
-    own = np.diag([repeatability.length**2] * 3 + [repeatability.angle**2] * 3)
-    weights = tuple(weight_text(_inverse_root(noise**2 * cofactor + own)) for _, _, cofactor in seen)
-    count, names = len(poses), (board.name, camera.name)
-    frame, target = reversed(names) if is_fixed else names
-    return Measurements(
-        q=images.q,
-        position=torch.from_numpy(np.stack([t for _, t, _ in seen])),
-        rotation=torch.from_numpy(np.stack([R for R, _, _ in seen])),
-        frame=(frame,) * count,
-        target=(target,) * count,
-        readings={NOISE_COLUMN: torch.full_like(images.q[:, 0], at_board), WEIGHT_COLUMN: weights},
-        line=images.lines,
-        source=images.source,
-    )
 
 
 def _seen_by_robot(pose: BoardPose, is_fixed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Pose of the target in its frame, and the cofactor of its errors in the axes of the frame.
+    """Pose of the target in its frame, and its change in the axes of the frame by that of the board's pose.
 
     Of the inverse pose, position `-R^T t` moves by `-R^T (shift + t × turn)`, and the rotation turns by `-R^T turn`.
     """
     if is_fixed:
-        return pose.R, pose.t, pose.cofactor
+        return pose.R, pose.t, np.eye(POSE)
     back = pose.R.T
     change = np.zeros((POSE, POSE))
-    change[:3, :3] = change[3:, 3:] = back
-    change[:3, 3:] = back @ skew(torch.from_numpy(pose.t)).numpy()
-    return back, -back @ pose.t, change @ pose.cofactor @ change.T
+    change[:3, :3] = change[3:, 3:] = -back
+    change[:3, 3:] = -back @ skew(torch.from_numpy(pose.t)).numpy()
+    return back, -back @ pose.t, change
 
 
 def _inverse_root(covariance: np.ndarray) -> np.ndarray:

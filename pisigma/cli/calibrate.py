@@ -112,6 +112,13 @@ FixedCamera = Annotated[
         "--fixed-camera", help="The camera is fixed and the board on the flange, not the other way round."
     ),
 ]
+Intrinsics = Annotated[
+    str,
+    typer.Option(
+        help="Of the camera: fixed: as its file states them; prior: within the standard deviations in its file, or "
+        "those of a usual calibration where it states none; free: as the images show them."
+    ),
+]
 RepeatabilityMm = Annotated[
     float, typer.Option(help="Of images: standard deviation with which a position repeats, per axis [mm].")
 ]
@@ -156,6 +163,7 @@ def calibrate(
     camera: CameraFile = None,
     board: BoardFile = None,
     fixed_camera: FixedCamera = False,
+    intrinsics: Intrinsics = "prior",
     repeatability_mm: RepeatabilityMm = 0.02,
     repeatability_deg: RepeatabilityDeg = 0.01,
     base: Base = None,
@@ -302,7 +310,7 @@ def _camera(options: Mapping[str, Any]) -> "CameraFiles | None":
     repeatability = Repeatability(
         options["repeatability_mm"] / 1e3, math.radians(options["repeatability_deg"])
     )
-    return CameraFiles(str(camera), str(board), options["fixed_camera"], repeatability)
+    return CameraFiles(str(camera), str(board), options["fixed_camera"], repeatability, options["intrinsics"])
 
 
 def _socket_distances(stated: str | None) -> dict[tuple[str, str], float]:

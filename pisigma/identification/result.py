@@ -61,8 +61,7 @@ class SensorNoise:
     """Noise of one kind of sensor, as the residuals show it.
 
     Attributes:
-        sensor: "position", "rotation", "touch", "socket", "distance", "pair", "socket distance", or the name of a
-            registered sensor.
+        sensor: "position", "rotation", "touch", "socket", "distance", "pair", or the name of a registered sensor.
         sigma: standard deviation of one value [m or rad]; where the rows state their own, the factor on it.
         unit: "m" or "rad", or "stated" for a factor on what the rows state.
         values: number of measured values.
@@ -189,7 +188,7 @@ class CalibrationResult:
 
     @cached_property
     def noise(self) -> tuple[SensorNoise, ...]:
-        """Noise of every sensor."""
+        """Noise of every sensor whose values are measured rather than stated."""
         return _noise(self.solved)
 
     @property
@@ -366,6 +365,8 @@ def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
     view = view_of(here)
     used = values_used(view, covariance_of(here.normal))
     for k, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
+        if sensor.certain:
+            continue
         sigma = view.noise[k]
         unit = sensor.unit if sensor.sigma is None else "stated"
         noise.append(

@@ -1,21 +1,43 @@
 """Cameras: the pose that the corners of a board in one image give, weighted by its whole covariance."""
 
-import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Int64
 from torch import Tensor
 
 from pisigma.kinematics.parameter_jacobian import ToolMotion
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.readings import ReadingColumn, Readings, RowFault, SensorReadings
+from pisigma.se3 import rotation_from_vector
+from pisigma.sensors.intrinsics import (
+    CAMERA_COLUMN,
+    COLUMNS,
+    INTRINSICS_COLUMN,
+    NOISE_COLUMN,
+    NUMBERS,
+    SCALE_COLUMN,
+    SIZE,
+    ImageIntrinsics,
+    boards,
+    cameras,
+    numbers_in,
+    texts_of,
+)
 from pisigma.sensors.pose import rotation_difference
-from pisigma.sensors.sensor import AbstractSensor, Derivative, SensorRows, Unknowns, Values
+from pisigma.sensors.sensor import (
+    AbstractSensor,
+    Derivative,
+    SensorRows,
+    UnknownDerivative,
+    Unknowns,
+    Values,
+    names_of,
+)
 
-NOISE_COLUMN, WEIGHT_COLUMN = "corner_noise", "corner_weight"
+WEIGHT_COLUMN = "corner_weight"
 WEIGHTS = 21
 """Numbers of a lower triangular matrix of six rows."""
 
@@ -25,25 +47,25 @@ def weight_text(weight: Float64[np.ndarray, "6 6"]) -> str:
     return " ".join(f"{value:.17g}" for value in weight[np.tril_indices(6)])
 
 
-def _weights(text: str) -> list[float]:
-    """The numbers in a cell of the weights' column; none where it is empty or at fault."""
-    try:
-        numbers = [float(word) for word in text.split()]
-    except ValueError:
-        return []
-    return numbers if len(numbers) == WEIGHTS and all(map(math.isfinite, numbers)) else []
-
-
 def _row_faults(readings: Readings) -> Iterator[RowFault]:
     """Find rows with noise or weights alone, and noise or weights that are none."""
     noise = np.asarray(readings[NOISE_COLUMN])
     texts = readings[WEIGHT_COLUMN]
-    weighted = np.array([bool(_weights(str(text))) for text in texts])
+    weighted = np.array([bool(numbers_in(str(text), WEIGHTS)) for text in texts])
     yield (
         np.isfinite(noise) != weighted,
         lambda row: f"a noise and {WEIGHTS} weights with blanks between were wanted, got '{texts[row]}'",
     )
     yield noise <= 0, lambda row: f"a positive noise was wanted, got {noise[row] * 1e3:.6g} mm"
+    for name, count in ((INTRINSICS_COLUMN, SIZE), (SCALE_COLUMN, 1)):
+        stated = [str(text) for text in readings[name]]
+        wrong = np.array([bool(text) and not numbers_in(text, count) for text in stated])
+        yield (
+            wrong,
+            lambda row, name=name, count=count, stated=stated: (  # type: ignore[misc]
+                f"{name}: {count} numbers with blanks between were wanted, got '{stated[row][:40]}'"
+            ),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +83,11 @@ class CornerSensor(AbstractSensor):
         rotation: measured rotations, the row index last.
         weight: noise times W for errors seen from the base's anchor [1, and m/rad].
         present: whether a row has one.
+        camera: index of the camera among those whose intrinsics are identified, -1 where a row has none.
+        at: the intrinsics that the poses were solved with.
+        by_intrinsics: derivative of the weighted measured pose by the intrinsics.
+        board: index of the board, -1 where a row has none.
+        by_scale: derivative of the weighted measured pose by the scale of the board [m].
         sigma: None; the noise is estimated.
     """
 
@@ -70,7 +97,7 @@ class CornerSensor(AbstractSensor):
     turning = True
     readings = SensorReadings(
         "corner",
-        (ReadingColumn(NOISE_COLUMN, ("mm",)), ReadingColumn(WEIGHT_COLUMN, is_text=True)),
+        (ReadingColumn(NOISE_COLUMN, ("mm",)), ReadingColumn(WEIGHT_COLUMN, is_text=True), *COLUMNS),
         is_length=False,
         row_faults=_row_faults,
     )
@@ -78,6 +105,11 @@ class CornerSensor(AbstractSensor):
     rotation: Float64[Tensor, "3 3 rows"]
     weight: Float64[Tensor, "6 6 rows"]
     present: Bool[Tensor, " rows"]
+    camera: Int64[Tensor, " rows"]
+    at: Float64[Tensor, "9 rows"]
+    by_intrinsics: Float64[Tensor, "6 9 rows"]
+    board: Int64[Tensor, " rows"]
+    by_scale: Float64[Tensor, "6 rows"]
     sigma: Float64[Tensor, " rows"] | None = None
 
     @classmethod
@@ -93,12 +125,30 @@ class CornerSensor(AbstractSensor):
         weight = _scaled_weights(data)
         turned = (weight.view(-1, 6, 2, 3) @ R[:, None]).view(-1, 6, 6)
         turned = torch.where(present[:, None, None], turned, 0.0)
-        return cls(position, rotation.permute(1, 2, 0).contiguous(), turned.permute(1, 2, 0), present)
+        images = ImageIntrinsics.of(texts_of(data, INTRINSICS_COLUMN))
+        at, by = (torch.from_numpy(values).to(R) for values in (images.at, images.by))
+        by_scale = torch.where(present, torch.einsum("nij,nj->in", weight[..., :3], data.position), 0.0)
+        return cls(
+            position,
+            rotation.permute(1, 2, 0).contiguous(),
+            turned.permute(1, 2, 0),
+            present,
+            camera=rows.numbers(cameras(data), names_of(cameras(data))),
+            at=at.t(),
+            by_intrinsics=(weight @ by).permute(1, 2, 0),
+            board=rows.numbers(boards(data), names_of(boards(data))),
+            by_scale=by_scale,
+        )
 
     def residual(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Values:
         """Return the weighted errors of the poses [m]."""
         off = torch.cat([self.position[:, rows] - motion.position, self._turned(motion, rows)])
         residual: Tensor = torch.einsum("ijn,jn->in", self.weight[..., rows], off)
+        if "camera" in unknowns:
+            moved = unknowns["camera"][:, self.camera[rows]] - self.at[:, rows]
+            residual += torch.einsum("ijn,jn->in", self.by_intrinsics[..., rows], moved)
+        if "board" in unknowns:
+            residual += self.by_scale[:, rows] * unknowns["board"][:, self.board[rows]]
         return residual
 
     def derivative(self, motion: ToolMotion, unknowns: Unknowns, rows: slice) -> Derivative:
@@ -114,6 +164,16 @@ class CornerSensor(AbstractSensor):
         shift_and_turn = torch.cat([motion.derivative[:, :3], turn], 1)
         derivative: Tensor = torch.einsum("ijn,pjn->pin", self.weight[..., rows], shift_and_turn)
         return derivative
+
+    def unknown_derivatives(
+        self, motion: ToolMotion, unknowns: Unknowns, rows: slice
+    ) -> tuple[UnknownDerivative, ...]:
+        """Return minus the change of the measured pose with the intrinsics and the scale of the board."""
+        of_camera = UnknownDerivative(
+            "camera", self.camera[rows], -self.by_intrinsics[..., rows].transpose(0, 1)
+        )
+        of_board = UnknownDerivative("board", self.board[rows], -self.by_scale[None, :, rows])
+        return tuple(one for one in (of_camera, of_board) if one.group in unknowns)
 
     def _turned(self, motion: ToolMotion, rows: slice) -> Float[Tensor, "3 poses"]:
         return rotation_difference(self.rotation[..., rows], motion.rotation)
@@ -134,16 +194,37 @@ def _scaled_weights(measurements: Measurements) -> Float64[Tensor, "rows 6 6"]:
     noise, texts = (measurements.readings.get(name) for name in (NOISE_COLUMN, WEIGHT_COLUMN))
     if isinstance(noise, Tensor) and isinstance(texts, tuple):
         row, column = torch.tril_indices(6, 6).to(scaled.device)
-        triangles = scaled.new_tensor([_weights(text) or [0.0] * WEIGHTS for text in texts])
+        triangles = scaled.new_tensor([numbers_in(text, WEIGHTS) or [0.0] * WEIGHTS for text in texts])
         scaled[:, row, column] = torch.nan_to_num(noise)[:, None] * triangles
     return scaled
 
 
-def as_poses(measurements: Measurements) -> Measurements:
-    """Return rows of images as plain poses, without the weights of their corners."""
-    others = {
-        name: values
-        for name, values in measurements.readings.items()
-        if name not in (NOISE_COLUMN, WEIGHT_COLUMN)
-    }
-    return replace(measurements, readings=others)
+def as_poses(
+    measurements: Measurements, unknowns: Mapping[str, Mapping[str, Float64[np.ndarray, " columns"]]]
+) -> Measurements:
+    """Return rows of images as plain poses, without the weights of their corners.
+
+    Args:
+        measurements: with rows of images or without.
+        unknowns: by group and owner, what was identified; images of a camera or a board that is not here are as they
+            were read.
+    """
+    names = (NOISE_COLUMN, WEIGHT_COLUMN, CAMERA_COLUMN, INTRINSICS_COLUMN, SCALE_COLUMN)
+    others = {name: values for name, values in measurements.readings.items() if name not in names}
+    position, rotation = measurements.position, measurements.rotation
+    if position is None or rotation is None or CAMERA_COLUMN not in measurements.readings:
+        return replace(measurements, readings=others)
+    images = ImageIntrinsics.of(texts_of(measurements, INTRINSICS_COLUMN))
+    moved = np.zeros((measurements.rows, NUMBERS))
+    scale = np.ones(measurements.rows)
+    for row, camera in enumerate(cameras(measurements) or ()):
+        moved[row] = unknowns.get("camera", {}).get(camera, images.at[row]) - images.at[row]
+    for row, board in enumerate(boards(measurements) or ()):
+        scale[row] += float(unknowns.get("board", {}).get(board, np.zeros(1))[0])
+    change = torch.from_numpy(np.einsum("nij,nj->ni", images.by, moved)).to(position)
+    return replace(
+        measurements,
+        position=(position + change[:, :3]) * torch.from_numpy(scale).to(position)[:, None],
+        rotation=rotation_from_vector(change[:, 3:]) @ rotation,
+        readings=others,
+    )

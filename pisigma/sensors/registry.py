@@ -15,6 +15,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.readings import READINGS
 from pisigma.sensors.anchor import AnchorSensor
 from pisigma.sensors.corner import CornerSensor, as_poses
+from pisigma.sensors.intrinsics import BoardScaleSensor, IntrinsicsSensor
 from pisigma.sensors.pair import PairSensor
 from pisigma.sensors.pose import PositionSensor, RotationSensor
 from pisigma.sensors.sensor import AbstractSensor, SensorRows, UnknownGroup, names_of, numbers_of
@@ -65,6 +66,8 @@ for _sensor in (
     AnchorSensor,
     PairSensor,
     CornerSensor,
+    IntrinsicsSensor,
+    BoardScaleSensor,
 ):
     register_sensor(_sensor)
 
@@ -114,7 +117,7 @@ def measured_errors(
         IdentificationError: the rows of an owner that was not calibrated do not determine its unknowns.
     """
     rows = pairs_first(measurements, torch.arange(measurements.rows, device=T.device))
-    data = replace(as_poses(measurements), sigma_position=None, sigma_rotation=None).select(rows)
+    data = replace(as_poses(measurements, unknowns), sigma_position=None, sigma_rotation=None).select(rows)
     T = T[rows]
     still = torch.zeros(0, 6, len(T), dtype=T.dtype, device=T.device)
     motion = ToolMotion(T[:, :3, 3].t(), T[:, :3, :3].permute(1, 2, 0), still)

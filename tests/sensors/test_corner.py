@@ -18,23 +18,31 @@ from pisigma.sensors.corner import position_deviations
 
 def test_derivatives_are_those_of_the_weighted_errors() -> None:
     cell = camera_cell(8)
-    data = image_measurements(cell.images, CAMERA, BOARD, False, Repeatability())
+    board = replace(BOARD, scale_deviation=1e-3)
+    data = image_measurements(cell.images, CAMERA, board, False, Repeatability())
     setup = GeometricCalibrator(cell.nominal).build(data)
     problem, everything, rows = setup.problem, torch.arange(len(setup.start)), slice(0, 8)
-    (sensor,) = problem.sensors
+    assert [sensor.name for sensor in problem.sensors] == ["corner", "intrinsics", "board scale"]
+    unknowns = problem.space.sensor_unknowns
 
-    def residual(at: Tensor) -> Tensor:
-        return sensor.residual(problem.motion(at, rows, everything), {}, rows)
+    def residuals(at: Tensor) -> list[Tensor]:
+        motion = problem.motion(at, rows, everything)
+        return [sensor.residual(motion, unknowns(at), rows) for sensor in problem.sensors]
 
-    J = problem.derivative(sensor, problem.motion(setup.start, rows, everything), {}, rows, everything)
-    assert (
-        float(residual(setup.start).norm(dim=0).min()) > 1e-3
-    )  # the arm as drawn is far from what was measured
+    motion = problem.motion(setup.start, rows, everything)
+    J = [
+        problem.derivative(sensor, motion, unknowns(setup.start), rows, everything)
+        for sensor in problem.sensors
+    ]
+    off = residuals(setup.start)[0].norm(dim=0)
+    assert float(off.min()) > 1e-3  # the arm as drawn is far from what was measured
     for i in everything.tolist():
         step = torch.zeros_like(setup.start)
         step[i] = 1e-6
-        change = (residual(setup.start - step) - residual(setup.start + step)) / 2e-6
-        assert_close(J[i], change, atol=1e-6, rtol=1e-6)
+        for derivative, less, more in zip(
+            J, residuals(setup.start - step), residuals(setup.start + step), strict=True
+        ):
+            assert_close(derivative[i], (less - more) / 2e-6, atol=1e-6, rtol=1e-6)
 
 
 def test_deviations_of_positions_are_those_of_their_covariance() -> None:

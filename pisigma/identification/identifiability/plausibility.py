@@ -110,7 +110,7 @@ def residual_sizes(problem: CalibrationProblem, here: Linearisation[Tensor]) -> 
     """Length of every row's residual per component [m], NaN where no length was measured."""
     sizes = torch.full_like(problem.q[:, 0], torch.nan)
     for sensor, sums in zip(problem.sensors, view_of(here).sums, strict=True):
-        if sensor.unit == "m" and sensor.name != "socket distance":
+        if sensor.unit == "m" and not sensor.certain:
             size = sums.residual.norm(dim=0) / sensor.components**0.5
             sizes = torch.where(sensor.present, size, sizes)
     return sizes

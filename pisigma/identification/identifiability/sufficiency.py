@@ -9,6 +9,7 @@ from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.setup import CalibrationSetup
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot.description import Robot
+from pisigma.sensors.intrinsics import BoardScaleSensor, IntrinsicsSensor
 
 LITTLE_MOTION = 0.1
 """[rad or m] A joint that moves less hardly shows its errors."""
@@ -155,7 +156,7 @@ def determines_scale(setup: CalibrationSetup) -> bool:
     alone do not, but do not pretend to.
     """
     data = setup.measurements
-    lengths = {sensor.name for sensor in setup.problem.sensors if sensor.unit == "m"}
+    lengths = _lengths(setup)
     if not lengths or lengths - {"touch", "socket"}:
         return True
     faces: dict[tuple[str, str], list[float]] = {}
@@ -166,8 +167,16 @@ def determines_scale(setup: CalibrationSetup) -> bool:
     return any(max(values) - min(values) > SAME_FACE for values in faces.values())
 
 
+def _lengths(setup: CalibrationSetup) -> set[str]:
+    """Names of the sensors that measure lengths, or state them."""
+    stated = (IntrinsicsSensor.name, BoardScaleSensor.name)
+    return {
+        sensor.name for sensor in setup.problem.sensors if sensor.unit == "m" and sensor.name not in stated
+    }
+
+
 def _scale(setup: CalibrationSetup) -> list[str]:
-    if {sensor.name for sensor in setup.problem.sensors if sensor.unit == "m"} == {"corner"}:
+    if _lengths(setup) == {"corner"}:
         return [SCALE_OF_BOARD]
     if determines_scale(setup):
         return []
