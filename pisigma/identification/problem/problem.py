@@ -182,7 +182,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def _rejects(self, view: SensorView) -> bool:
         """Whether the loss rejects any row."""
         return any(
-            not bool(self.loss.weight(sums.distance / view.scale(k), sensor.components).all())
+            not bool(self.loss_of(sensor).weight(sums.distance / view.scale(k), sensor.components).all())
             for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True))
         )
 
