@@ -1,0 +1,1 @@
+"""Corners of printed boards in images, by OpenCV (the extra `camera`)."""

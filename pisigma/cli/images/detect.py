@@ -1,0 +1,52 @@
+"""`pisigma detect`: corners of a board in images, as a file for `pisigma calibrate`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pisigma.cli.arguments import AsJson
+from pisigma.cli.output import print_json, print_lines, progress_of
+
+Images = Annotated[list[Path], typer.Argument(help="Image files, or folders of them.")]
+BoardFile = Annotated[Path, typer.Option(help="Board (YAML) that the images show.")]
+CameraFile = Annotated[Path, typer.Option(help="Camera (YAML) that took the images.")]
+Joints = Annotated[
+    Path | None,
+    typer.Option(
+        help="Joint values (CSV) with a column 'image', or 'time' where images are named by their time."
+    ),
+]
+Within = Annotated[float, typer.Option(help="Largest difference of time stamps that are joined [s].")]
+MostBlur = Annotated[
+    float, typer.Option("--most-blur-px", help="Images whose edges are blurred more are left out [px].")
+]
+
+
+def detect(
+    images: Images,
+    board: BoardFile,
+    camera: CameraFile,
+    out: Annotated[Path, typer.Option(help="File of corners to write (.csv).")],
+    joints: Joints = None,
+    within: Within = 0.2,
+    most_blur: MostBlur = 3.0,
+    as_json: AsJson = False,
+) -> None:
+    """Find the corners of a board in images, to sub-pixel.
+
+    Images without a whole board and blurred ones are named and left out.
+    """
+    from pisigma.files.output_file import check_output
+    from pisigma.workflow.images import detect as workflow
+
+    inputs = [*images, board, camera, *([joints] if joints else [])]
+    check_output(out, (".csv",), "a file of corners", inputs)
+    settings = workflow.DetectionSettings(most_blur, within)
+    with progress_of("detect") as progress:
+        detected = workflow.detect(images, board, camera, joints, settings, progress)
+    detected.save(out)
+    if as_json:
+        print_json({"file": str(out)} | detected.to_json())
+    else:
+        print_lines([*detected.sentences, f"{len(detected.rows) - 1} corners written to {out}."])

@@ -1,0 +1,76 @@
+"""`pisigma detect`: from image files to a file of corners, and what it refuses."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from testing.board_images import CAMERA, cv2, draw_board, view
+from testing.closeness import assert_close
+
+from pisigma.camera.board import Board
+
+BOARD = Board("board", 4, 5, 0.03)
+VIEWS = [view(BOARD, 0.33, (roll, 0.4, -0.3)) for roll in (0.0, 2.0, 0.1, 5.0)]
+CAMERA_YAML = f"width: {CAMERA.width}\nheight: {CAMERA.height}\nfx: 500\nfy: 500\ncx: 320\ncy: 200\n"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with four images, the third a piece of a board and the fourth blurred, and the files beside them."""
+    folder = tmp_path_factory.mktemp("images")
+    (folder / "images").mkdir()
+    for number, (R, t) in enumerate(VIEWS):
+        image = draw_board(BOARD, R, t, blur=4.0 if number == 3 else 0.8)
+        if number == 2:
+            image[:, :280] = 120
+        cv2.imwrite(str(folder / "images" / f"{number:02d}.png"), image)
+    (folder / "board.yaml").write_text("rows: 4\ncolumns: 5\nsquare_mm: 30\n")
+    (folder / "camera.yaml").write_text(CAMERA_YAML)
+    (folder / "joints.csv").write_text("image,q1_deg,q2_deg\n00.png,10,20\n01.png,30,40\n02.png,1,2\n")
+    return folder
+
+
+def options(files: Path, **others: str) -> tuple[object, ...]:
+    named = {"board": "board.yaml", "camera": "camera.yaml"} | others
+    return (files / "images", *(word for name, file in named.items() for word in (f"--{name}", files / file)))
+
+
+def test_corners_with_joint_values_are_written(run, files, tmp_path):
+    command = ("detect", *options(files, joints="joints.csv"), "--out", tmp_path / "corners.csv")
+    result = run(*command, "--json")
+    assert result.exit_code == 0, result.output
+    printed = json.loads(result.stdout)
+    assert (printed["rows"], printed["rms_px"] < 0.05) == (40, True)
+    reasons = [image["left_out"] for image in printed["images"]]
+    assert reasons[:2] == [None, None]
+    assert "only a piece" in reasons[2]
+    assert "edges are blurred by 4" in reasons[3]
+    rows = list(csv.DictReader((tmp_path / "corners.csv").open()))
+    assert list(rows[0]) == ["image", "corner", "u_px", "v_px", "q1_deg", "q2_deg"]
+    assert [row["q2_deg"] for row in rows] == ["20"] * 20 + ["40"] * 20
+    pixels = np.array([[float(row["u_px"]), float(row["v_px"])] for row in rows]).reshape(2, 20, 2)
+    for (R, t), detected in zip(VIEWS, pixels, strict=False):
+        assert_close(detected, CAMERA.project(BOARD.corners @ R.T + t)[0], atol=0.08)
+
+
+def test_what_is_left_out_is_named(run, files, tmp_path):
+    result = run("detect", *options(files), "--out", tmp_path / "corners.csv")
+    text = " ".join(result.stdout.split())
+    assert "2 of 4 images show the board: 40 corners" in text
+    assert "02 is left out: only a piece of" in text
+    assert "03 is left out: its edges are blurred by" in text
+
+
+def test_what_is_refused(refuses, files, tmp_path):
+    out = ("--out", tmp_path / "corners.csv")
+    (files / "even.yaml").write_text("rows: 4\ncolumns: 6\nsquare_mm: 30\n")
+    (files / "other.yaml").write_text("rows: 6\ncolumns: 7\nsquare_mm: 30\n")
+    (files / "large.yaml").write_text(CAMERA_YAML.replace("640", "1280"))
+    assert "looks the same turned by 180 deg" in refuses("detect", *options(files, board="even.yaml"), *out)
+    assert "none of 4 images can be used" in refuses("detect", *options(files, board="other.yaml"), *out)
+    assert "1280 x 400 px was wanted" in refuses("detect", *options(files, camera="large.yaml"), *out)
+    no_image = ("detect", files / "board.yaml", *options(files)[1:])
+    assert "is no image that OpenCV reads" in refuses(*no_image, *out)
+    assert not (tmp_path / "corners.csv").exists()

@@ -1,0 +1,44 @@
+"""Images of boards, drawn by OpenCV as polygons that the camera projects."""
+
+import numpy as np
+import pytest
+import torch
+
+from pisigma.camera.board import Board
+from pisigma.camera.camera import Camera
+from pisigma.camera.pattern import board_pattern
+from pisigma.se3 import rotation_from_rpy
+
+cv2 = pytest.importorskip("cv2", reason="opencv-python-headless is not installed")
+
+CAMERA = Camera("small", 640, 400, 500.0, 500.0, 320.0, 200.0)
+FINER = 8
+"""Pixels of a pixel along each axis, while polygons are drawn."""
+
+
+def view(board: Board, distance: float, rpy: tuple[float, float, float]) -> tuple[np.ndarray, np.ndarray]:
+    """R_camera_board and t [m] where the middle of the board is on the camera's axis; 0, 0, 0 looks straight at it."""
+    R = rotation_from_rpy(torch.tensor(rpy, dtype=torch.float64)).numpy()
+    return R, np.array([0.0, 0.0, distance]) - R @ (board.corners.max(0) / 2)
+
+
+def draw_board(
+    board: Board,
+    R: np.ndarray,
+    t: np.ndarray,
+    camera: Camera = CAMERA,
+    blur: float = 0.8,
+    noise: float = 1.0,
+) -> np.ndarray:
+    """Gray image of a white sheet with a board on a gray ground."""
+    pattern = board_pattern(board)
+    image = np.full((FINER * camera.height, FINER * camera.width), 120, dtype=np.uint8)
+    for rectangle, gray in ((pattern.sheet, 210), *((black, 40) for black in pattern.black)):
+        left, top, right, bottom = rectangle
+        ends = np.array([[left, top, 0], [right, top, 0], [right, bottom, 0], [left, bottom, 0]])
+        pixels = (camera.project(ends @ R.T + t)[0] + 0.5) * FINER - 0.5
+        cv2.fillConvexPoly(image, np.rint(pixels * 1024).astype(np.int32), gray, shift=10)
+    small = cv2.resize(image.astype(np.float32), (camera.width, camera.height), interpolation=cv2.INTER_AREA)
+    small = cv2.GaussianBlur(small, (0, 0), blur)
+    small += noise * np.random.default_rng(0).standard_normal(small.shape)
+    return np.clip(np.rint(small), 0, 255).astype(np.uint8)
