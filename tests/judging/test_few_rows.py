@@ -1,5 +1,7 @@
 """Few rows have to show that a fitted arm is better than the drawn one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -43,3 +45,14 @@ def test_an_arm_without_errors_stays_as_drawn(hybrid):
     )
     robot = (result.geometric if hybrid else result).robot
     assert np.array_equal(robot.dh, arm.nominal.dh)
+
+
+def test_ten_positions_of_an_arm_with_clear_errors_are_fitted():
+    arm = simulate("ur10", rows=110, noise=5e-5, length=1e-3, angle=1e-3)
+    rows = replace(arm.measurements, rotation=None)
+    few, others = rows.select(torch.arange(10)), rows.select(torch.arange(10, 110))
+    calibrator = GeometricCalibrator(arm.nominal)
+    with no_type_checker():
+        results = (fit_where_it_helps(calibrator, few, nothing), base_and_tool(calibrator).fit(few))
+        fitted, nominal = (errors_under(result, others).figures.rms_mm for result in results)
+    assert fitted < 0.2 * nominal
