@@ -52,6 +52,8 @@ def kernel_forms(wanted: KernelForms = _NOTHING) -> KernelForms:
 def load_kernels(wanted: KernelForms = _NOTHING) -> Callable[..., int]:
     """The function `kernels.run`, on addresses and numbers; -1, or what `kernels.solve_poses` says.
 
+    Bytes and ctypes arrays count as their addresses.
+
     Machine code is made when it is first wanted on a machine, in some seconds, and read from a file afterwards.
 
     Args:
@@ -107,7 +109,7 @@ def library_object(wanted: KernelForms) -> bytes:
         return _code(kernel_forms(wanted), machine, "library")
 
 
-def _call(native: Any, *arguments: int) -> int:
+def _call(native: Any, *arguments: Any) -> int:
     """Call the compiled function, which writes its result, and what was raised: nothing ever is."""
     result = (ctypes.c_int64 * 2)()
     address = ctypes.addressof(result)
