@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -47,12 +48,12 @@ class ServedModel:
         """What requests call it: the name of its folder."""
         return self.folder.name
 
-    @property
+    @cached_property
     def joints_key(self) -> str:
         """What messages call its joint values: `q_deg` where all joints turn, else `q` [deg or mm]."""
         return "q_deg" if self.ik.revolute.all() else "q"
 
-    @property
+    @cached_property
     def quick(self) -> bool:
         """Whether the compiled kernels solve its poses, in microseconds; coupled joints are solved around them."""
         controller = self.ik.controller
