@@ -19,6 +19,7 @@ from pisigma.serve.connection import Connection
 from pisigma.serve.json_lines import JsonLines
 from pisigma.serve.metrics import Metrics
 from pisigma.serve.models import ServedModels
+from pisigma.serve.polling import DURATION, Polling
 from pisigma.serve.protocol import AbstractProtocol
 from pisigma.serve.zeromq import ZeroMq
 
@@ -42,6 +43,7 @@ class ServeSettings:
         zmq_port: for ZeroMQ; 0 for a free one, None for none.
         token: that every client has to send first; wanted where the host is not of the loopback.
         patience: see `PATIENCE`.
+        polling: how long after a request the server stays awake for the next one [s], see `Polling`; 0 for not at all.
     """
 
     host: str = "127.0.0.1"
@@ -50,6 +52,7 @@ class ServeSettings:
     zmq_port: int | None = None
     token: str | None = None
     patience: float = PATIENCE
+    polling: float = DURATION
 
 
 class Server:
@@ -86,6 +89,7 @@ class Server:
             raise
         self._ready: deque[tuple[Connection, bytes]] = deque()
         self._stopping = False
+        self._polling = Polling(self._selector, settings.polling)
         self._wake, self._woken = socket.socketpair()
         self._wake.setblocking(False)
         self._selector.register(self._woken, selectors.EVENT_READ, self._take_ready)
@@ -173,8 +177,9 @@ class Server:
 
     def _turn(self, timeout: float) -> None:
         """Wait for connections, and go on with those that can."""
-        for key, events in self._selector.select(timeout):
+        for key, events in self._polling.ready() or self._selector.select(timeout):
             key.data(events)
+        self._polling.went_on()
 
     def _submit(self, connection: Connection, job: Callable[[], bytes]) -> None:
         """Have an answer worked out beside the others."""

@@ -32,6 +32,15 @@ ZmqPort = Annotated[
 TokenFile = Annotated[
     Path | None, typer.Option(help="File with the token that every client has to send first.")
 ]
+PollMs = Annotated[
+    float,
+    typer.Option(
+        min=0,
+        max=100,
+        help="Milliseconds to stay awake for the next request, where requests come that often and no other program "
+        "wants the processor; 0 to sleep at once.",
+    ),
+]
 
 
 def serve(
@@ -42,6 +51,7 @@ def serve(
     binary_port: BinaryPort = 0,
     zmq_port: ZmqPort = None,
     token_file: TokenFile = None,
+    poll_ms: PollMs = 2.5,
 ) -> None:
     """Answer requests for corrected joint values, paths and poses, until SIGTERM or Ctrl-C.
 
@@ -54,7 +64,9 @@ def serve(
     token = (
         None if token_file is None else read_input(token_file, OutputError).decode(errors="replace").strip()
     )
-    server = Server(_load(model, models), ServeSettings(host, port, binary_port, zmq_port, token))
+    server = Server(
+        _load(model, models), ServeSettings(host, port, binary_port, zmq_port, token, polling=poll_ms / 1e3)
+    )
     for name in (signal.SIGTERM, signal.SIGINT):
         signal.signal(name, lambda *_: server.stop())
     if hasattr(signal, "SIGHUP"):
