@@ -1,71 +1,75 @@
 """When the server stays awake for the next request."""
 
-import time
-
 import pytest
 
+from pisigma.serve import polling
 from pisigma.serve.polling import TAKEN_AWAY, Polling
 
 DURATION = 0.02
 
 
-class _Selector:
-    """Finds a request at the stated look, of which each takes a while."""
+class _Sockets:
+    """A clock, and sockets where a request comes at the stated look; each look takes a while."""
 
-    def __init__(self, request_at=10**9, look=0.0):
-        self.looks, self.request_at, self.look = 0, request_at, look
+    def __init__(self):
+        self.now, self.look, self.looks, self.request_at = 100.0, TAKEN_AWAY / 5, 0, None
+
+    def monotonic(self):
+        return self.now
 
     def select(self, timeout):
         assert timeout == 0
         self.looks += 1
-        time.sleep(self.look)
+        self.now += self.look
         return ["request"] if self.looks == self.request_at else []
 
 
-def _busy(selector, duration=DURATION):
-    """After two requests at once."""
-    polling = Polling(selector, duration)
+@pytest.fixture
+def sockets(monkeypatch):
+    sockets = _Sockets()
+    monkeypatch.setattr(polling, "time", sockets)
+    return sockets
+
+
+def _after_two_requests(sockets, apart=0.0, duration=DURATION):
+    polling = Polling(sockets, duration)
     polling.went_on()
+    sockets.now += apart
     polling.went_on()
     return polling
 
 
-def test_the_next_of_frequent_requests_finds_the_server_awake():
-    selector = _Selector(request_at=3)
-    assert _busy(selector).ready() == ["request"]
-    assert selector.looks == 3
+def test_the_next_of_frequent_requests_finds_the_server_awake(sockets):
+    sockets.request_at = 3
+    assert _after_two_requests(sockets).ready() == ["request"]
+    assert sockets.looks == 3
 
 
-def test_the_server_sleeps_when_no_request_comes_in_time():
-    selector, begun = _Selector(), time.monotonic()
-    assert _busy(selector).ready() == []
-    assert selector.looks > 0
-    assert time.monotonic() - begun >= DURATION / 2
+def test_the_server_sleeps_when_no_request_comes_in_time(sockets):
+    begun = sockets.now
+    assert _after_two_requests(sockets).ready() == []
+    assert DURATION <= sockets.now - begun < 1.1 * DURATION
 
 
-@pytest.mark.parametrize("pause", [None, 1.5 * DURATION])
-def test_an_idle_server_never_polls(pause):
-    selector = _Selector()
-    polling = Polling(selector, DURATION)
-    polling.went_on()
-    if pause is not None:
-        time.sleep(pause)
-        polling.went_on()
-    assert polling.ready() == []
-    assert selector.looks == 0
+@pytest.mark.parametrize(("apart", "duration"), [(2 * DURATION, DURATION), (0.0, 0.0)])
+def test_after_rare_requests_or_without_a_duration_the_server_sleeps_at_once(sockets, apart, duration):
+    assert _after_two_requests(sockets, apart, duration).ready() == []
+    assert sockets.looks == 0
 
 
-def test_without_a_duration_nothing_is_polled():
-    selector = _Selector()
-    assert _busy(selector, 0.0).ready() == []
-    assert selector.looks == 0
-
-
-def test_the_server_rests_where_others_want_the_processor():
-    selector = _Selector(look=2 * TAKEN_AWAY)
-    polling = _busy(selector)
-    assert polling.ready() == []
-    assert selector.looks == 1
+def test_one_request_alone_keeps_nobody_awake(sockets):
+    polling = Polling(sockets, DURATION)
     polling.went_on()
     assert polling.ready() == []
-    assert selector.looks == 1
+    assert sockets.looks == 0
+
+
+def test_the_server_rests_where_others_want_the_processor(sockets):
+    sockets.look = 2 * TAKEN_AWAY
+    busy = _after_two_requests(sockets)
+    for looks, pause in ((1, 0.0), (1, 0.5), (2, 1.0)):
+        sockets.now += pause
+        busy.went_on()
+        busy.went_on()
+        assert busy.ready() == []
+        assert sockets.looks == looks
