@@ -30,7 +30,7 @@ class BoardPose:
         t: origin of the board in the camera's frame [m].
         cofactor: covariance of an error (shift of t [m], turn of R as a rotation vector in the camera's frame [rad])
             for a noise of the corners of 1 px.
-        distance: by how much every corner misses its prediction [px].
+        distance: by how much every corner misses its prediction [px: of corners of the usual deviation].
         by_intrinsics: derivative of the pose (shift of t [m], turn of R as a rotation vector in the camera's frame
             [rad]) by the intrinsics, which the corners are solved anew with.
         root: with `rest` what the corners say of the intrinsics k whatever the pose is, for a noise of 1 px:
@@ -52,6 +52,7 @@ def solve_board_pose(
     corners: Float64[np.ndarray, "corners 3"],
     pixels: Float64[np.ndarray, "corners 2"],
     loss: AbstractLoss,
+    sigma: Float64[np.ndarray, " corners"] | None = None,
 ) -> BoardPose:
     """Find the pose of a flat board by Gauss-Newton steps, from the homography of its corners (Zhang 2000).
 
@@ -62,19 +63,22 @@ def solve_board_pose(
         corners: in the frame of the board [m], all with z = 0 and not on one line.
         pixels: where the image shows them [px].
         loss: how corners count that are far from their prediction.
+        sigma: standard deviation of every corner over the usual one; None where all are alike.
     """
+    sigma = np.ones(len(pixels)) if sigma is None else sigma
     R, t = _by_homography(corners, camera.undistort(pixels))
     for _ in range(STEPS):
-        residual, J = _linearised(camera, corners, pixels, R, t)
+        residual, J = _linearised(camera, corners, pixels, sigma, R, t)
         weight = _weights(residual, loss)
         normal = np.einsum("nki,n,nkj->ij", J, weight, J)
         step = np.linalg.solve(normal, np.einsum("nki,n,nk->i", J, weight, residual))
         t, R = t + step[:3], rotation_from_vector(torch.from_numpy(step[3:])).numpy() @ R
         if np.abs(step).max() < SMALLEST_STEP:
             break
-    residual, J = _linearised(camera, corners, pixels, R, t)
+    residual, J = _linearised(camera, corners, pixels, sigma, R, t)
     root = np.sqrt(_weights(residual, loss))[:, None, None]
-    columns = np.concatenate([J, camera.by_intrinsics(corners @ R.T + t), residual[..., None]], -1)
+    by_intrinsics = camera.by_intrinsics(corners @ R.T + t) / sigma[:, None, None]
+    columns = np.concatenate([J, by_intrinsics, residual[..., None]], -1)
     triangle = _triangle((root * columns).reshape(-1, columns.shape[-1]))
     inverse = np.linalg.inv(triangle[:POSE, :POSE])
     return BoardPose(
@@ -100,13 +104,14 @@ def _triangle(columns: Float64[np.ndarray, "values columns"]) -> Float64[np.ndar
 
 
 def _linearised(
-    camera: Camera, corners: np.ndarray, pixels: np.ndarray, R: np.ndarray, t: np.ndarray
+    camera: Camera, corners: np.ndarray, pixels: np.ndarray, sigma: np.ndarray, R: np.ndarray, t: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Measured minus predicted pixels, and the derivative of the predicted ones by shift and turn."""
+    """Measured minus predicted pixels, and the derivative of the predicted ones by shift and turn, over sigma."""
     turned = corners @ R.T
     predicted, by_point = camera.project(turned + t)
     by_turn = -by_point @ skew(torch.from_numpy(turned)).numpy()
-    return pixels - predicted, np.concatenate([by_point, by_turn], -1)
+    J = np.concatenate([by_point, by_turn], -1)
+    return (pixels - predicted) / sigma[:, None], J / sigma[:, None, None]
 
 
 def _weights(residual: np.ndarray, loss: AbstractLoss) -> np.ndarray:

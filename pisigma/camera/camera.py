@@ -54,6 +54,7 @@ class CameraDocument(Section):
     p2: float = 0.0
     k3: float = 0.0
     sigma: DeviationsSection | None = None
+    is_fixed: bool = False
 
 
 class MatrixSection(BaseModel):
@@ -95,6 +96,7 @@ class Camera:
         p2: see p1.
         k3: see k1.
         sigma: standard deviations of fx, fy, cx, cy [px], k1, k2, p1, p2, k3; None where none are stated.
+        is_fixed: whether it stands beside the robot and the board is on the flange; else the other way round.
     """
 
     name: str
@@ -110,6 +112,7 @@ class Camera:
     p2: float = 0.0
     k3: float = 0.0
     sigma: tuple[float, ...] | None = None
+    is_fixed: bool = False
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "Camera":

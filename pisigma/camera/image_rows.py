@@ -1,32 +1,25 @@
-"""Files of corners as measurements: one row an image, with the pose that its corners give and its covariance."""
+"""Images of boards as measurements: one row an image, with the pose that its corners give and its covariance."""
 
-import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import get_args
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float64
 
 from pisigma.camera.board import Board
-from pisigma.camera.board_pose import FEWEST_CORNERS, POSE, BoardPose, solve_board_pose
+from pisigma.camera.board_pose import POSE, BoardPose, solve_board_pose
 from pisigma.camera.camera import Camera
 from pisigma.camera.solved_images import IntrinsicsChoice, prior_deviations, solve_images
-from pisigma.errors import IdentificationError, MeasurementError, nearest_choice
+from pisigma.errors import IdentificationError, MeasurementError
 from pisigma.identification.problem.loss import HampelLoss
-from pisigma.measurement.csv.reading import number_column, read_joints, text_column
-from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.dataset import Measurements
-from pisigma.robot.description import Robot
 from pisigma.se3 import skew
 from pisigma.sensors.corner import WEIGHT_COLUMN, weight_text
 from pisigma.sensors.intrinsics import CAMERA_COLUMN, INTRINSICS_COLUMN, NOISE_COLUMN, SCALE_COLUMN
 
 LARGEST_MISS = 10.0
 """[px] Where half of the corners of an image miss their prediction by more, they are not of this board."""
-SAME_JOINTS = 1e-9
-"""[rad or m] Joint values of one image differ by no more."""
 
 
 @dataclass(frozen=True)
@@ -50,43 +43,9 @@ class Repeatability:
             )
 
 
-@dataclass(frozen=True)
-class CameraFiles:
-    """What the pixels of a file of corners mean.
-
-    Attributes:
-        camera: file of the camera, see `Camera.load`.
-        board: file of the board, see `Board.load`.
-        is_fixed: whether the camera stands beside the robot and the board is on the flange; else the other way round.
-        repeatability: of the robot.
-        intrinsics: whether the camera's are held, under their prior, or free; see `prior_deviations`.
-    """
-
-    camera: str
-    board: str
-    is_fixed: bool = False
-    repeatability: Repeatability = field(default_factory=Repeatability)
-    intrinsics: IntrinsicsChoice = "prior"
-
-    def __post_init__(self) -> None:
-        """Refuse what is no choice."""
-        if self.intrinsics not in get_args(IntrinsicsChoice):
-            choices = nearest_choice(self.intrinsics, get_args(IntrinsicsChoice))
-            raise IdentificationError(f"intrinsics '{self.intrinsics}' is no choice; {choices}")
-
-    def read(self, path: str | os.PathLike[str], robot: Robot) -> Measurements:
-        """Read a file of corners as measurements; see `read_images`.
-
-        Raises:
-            MeasurementError: a file cannot be used; the message says which and where.
-        """
-        camera, board = Camera.load(self.camera), Board.load(self.board)
-        return read_images(path, robot, camera, board, self.is_fixed, self.repeatability, self.intrinsics)
-
-
 @dataclass(frozen=True, eq=False)
 class Images:
-    """The corners of a file, image by image.
+    """The corners of images that one camera took of one board.
 
     Attributes:
         source: the file.
@@ -95,6 +54,7 @@ class Images:
         lines: where the first corner of every image stands.
         corners: numbers of the corners that every image shows.
         pixels: where it shows them [px].
+        sigma: standard deviation of every corner, whose common factor is estimated; nothing where all are alike.
     """
 
     source: str
@@ -103,37 +63,15 @@ class Images:
     lines: tuple[int, ...]
     corners: tuple[np.ndarray, ...]
     pixels: tuple[Float64[np.ndarray, "_corners 2"], ...]
+    sigma: tuple[Float64[np.ndarray, " _corners"], ...] = ()
 
-
-def read_images(
-    path: str | os.PathLike[str],
-    robot: Robot,
-    camera: Camera,
-    board: Board,
-    is_fixed: bool = False,
-    repeatability: Repeatability = Repeatability(),
-    intrinsics: IntrinsicsChoice = "prior",
-) -> Measurements:
-    """Read a CSV file of corners: `image`, `corner`, `u_px`, `v_px` and the joints (`q1_deg` and so on) in every row.
-
-    Args:
-        path: the file; rows of one image have one name and the same joint values.
-        robot: whose joints they are.
-        camera: that took the images.
-        board: that they show; corners are numbered as there.
-        is_fixed: whether the camera is fixed and the board on the flange.
-        repeatability: of the robot.
-        intrinsics: whether the camera's are held, under their prior, or free; see `prior_deviations`.
-
-    Returns:
-        One row an image, in the frame of the board with the camera as target (of a fixed camera the other way
-        round), with the weights of `CornerSensor`.
-
-    Raises:
-        MeasurementError: the file cannot be used, or the corners of an image are not of this board.
-    """
-    images = _split_images(path, robot, len(board.corners))
-    return image_measurements(images, camera, board, is_fixed, repeatability, intrinsics)
+    @property
+    def relative_sigma(self) -> tuple[Float64[np.ndarray, " _corners"], ...]:
+        """Standard deviations over the usual one of all corners."""
+        if not self.sigma:
+            return tuple(np.ones(len(corners)) for corners in self.corners)
+        usual = np.median(np.concatenate(self.sigma))
+        return tuple(of_image / usual for of_image in self.sigma)
 
 
 def image_measurements(
@@ -144,7 +82,19 @@ def image_measurements(
     repeatability: Repeatability,
     intrinsics: IntrinsicsChoice = "prior",
 ) -> Measurements:
-    """Solve the pose of the board in every image; see `read_images`.
+    """Solve the pose of the board in every image.
+
+    Args:
+        images: of one camera and one board.
+        camera: that took them.
+        board: that they show; corners are numbered as there.
+        is_fixed: whether the camera is fixed and the board on the flange.
+        repeatability: of the robot.
+        intrinsics: whether the camera's are held, under their prior, or free; see `prior_deviations`.
+
+    Returns:
+        One row an image, in the frame of the board with the camera as target (of a fixed camera the other way
+        round), with the weights of `CornerSensor`.
 
     Raises:
         MeasurementError: the corners of an image are not of this board.
@@ -153,8 +103,10 @@ def image_measurements(
 
     def solve(present: Camera) -> list[BoardPose]:
         poses = [
-            solve_board_pose(present, corners[number], pixels, loss)
-            for number, pixels in zip(images.corners, images.pixels, strict=True)
+            solve_board_pose(present, corners[number], pixels, loss, sigma)
+            for number, pixels, sigma in zip(
+                images.corners, images.pixels, images.relative_sigma, strict=True
+            )
         ]
         _refuse_other_boards(images, board, poses)
         return poses
@@ -182,6 +134,7 @@ def image_measurements(
         frame=(frame,) * count,
         target=(target,) * count,
         readings={NOISE_COLUMN: torch.full_like(images.q[:, 0], at_board), WEIGHT_COLUMN: weights, **texts},
+        image=images.names,
         line=images.lines,
         source=images.source,
     )
@@ -222,50 +175,3 @@ def _inverse_root(covariance: np.ndarray) -> np.ndarray:
     scale = np.sqrt(covariance.diagonal())
     root: np.ndarray = np.linalg.inv(np.linalg.cholesky(covariance / scale / scale[:, None])) / scale
     return root
-
-
-def _split_images(path: str | os.PathLike[str], robot: Robot, corners: int) -> Images:
-    """Read the rows and put those of one image together."""
-    table, q = read_table(path), read_joints(path, robot)
-    number, u, v = (number_column(table, name) for name in ("corner", "u_px", "v_px"))
-    for row, corner in enumerate(number):
-        if corner != round(corner) or not 0 <= corner < corners:
-            raise MeasurementError(
-                f"{table.source}, line {table.lines[row]}, column 'corner': a whole number from 0 to {corners - 1} was "
-                f"wanted, as the board has {corners} corners, got {corner:g}; check the board's rows and columns."
-            )
-    rows: dict[str, list[int]] = {}
-    for row, name in enumerate(text_column(table, "image")):
-        rows.setdefault(name, []).append(row)
-    for name, of_image in rows.items():
-        _check_image(table, name, of_image, q, number)
-    return Images(
-        source=table.source,
-        names=tuple(rows),
-        q=torch.stack([q[of_image[0]] for of_image in rows.values()]),
-        lines=tuple(table.lines[of_image[0]] for of_image in rows.values()),
-        corners=tuple(number[of_image].astype(int) for of_image in rows.values()),
-        pixels=tuple(np.stack([u, v], -1)[of_image] for of_image in rows.values()),
-    )
-
-
-def _check_image(
-    table: Table, name: str, rows: list[int], q: Float64[torch.Tensor, "rows dof"], number: np.ndarray
-) -> None:
-    """Refuse an image that cannot be one.
-
-    Raises:
-        MeasurementError: it has too few corners, one twice, or two vectors of joint values.
-    """
-    where = f"{table.source}, line {table.lines[rows[0]]}: image '{name}'"
-    if len(rows) < FEWEST_CORNERS:
-        raise MeasurementError(
-            f"{where} has {len(rows)} corners, but {FEWEST_CORNERS} or more were wanted; remove the image."
-        )
-    if len(set(number[rows])) < len(rows):
-        raise MeasurementError(f"{where} has a corner twice; give every image a name of its own.")
-    if float((q[rows] - q[rows[0]]).abs().max()) > SAME_JOINTS:
-        raise MeasurementError(
-            f"{where} has rows of different joint values; give every image a name of its own, and all of its rows the "
-            "joint values at which it was taken."
-        )

@@ -1,6 +1,5 @@
 """`pisigma calibrate`: geometric or hybrid calibration of measured data."""
 
-import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -8,6 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pisigma.cli.arguments import AcceptImplausible, AsJson, Overwrite, complete_model, complete_robot
+from pisigma.cli.camera_options import (
+    Boards,
+    Cameras,
+    FixedCamera,
+    Intrinsics,
+    RepeatabilityDeg,
+    RepeatabilityMm,
+    stated_cameras,
+)
 from pisigma.cli.lifetime.recalibrate import recalibrate_into
 from pisigma.cli.output import (
     command_line,
@@ -21,7 +29,6 @@ from pisigma.cli.output import (
 from pisigma.errors import IdentificationError
 
 if TYPE_CHECKING:
-    from pisigma.camera.image_rows import CameraFiles
     from pisigma.judging.calibration_summary import CalibrationSummary
     from pisigma.workflow.calibrate import CalibrationSettings
 
@@ -31,7 +38,9 @@ RobotName = Annotated[
         metavar="ROBOT", help="Catalogue name or robot file (YAML or URDF).", autocompletion=complete_robot
     ),
 ]
-Data = Annotated[Path, typer.Argument(metavar="DATA", help="Measurements (CSV).")]
+Data = Annotated[
+    list[Path], typer.Argument(metavar="DATA...", help="Measurements (CSV), in one file or several.")
+]
 Out = Annotated[Path, typer.Option(help="Model folder to write.")]
 Model = Annotated[
     str,
@@ -95,36 +104,6 @@ SocketDistance = Annotated[
     str | None,
     typer.Option(help="Known distance of two sockets as A,B,MM; */0,*/1,50 states that of every placement."),
 ]
-CameraFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--camera",
-        help="Camera (YAML of pisigma, ROS or OpenCV) whose corners DATA holds: columns image, corner, u_px, v_px and "
-        "joints; with --board.",
-    ),
-]
-BoardFile = Annotated[
-    Path | None, typer.Option("--board", help="Board that the camera sees (YAML: rows, columns, square_mm).")
-]
-FixedCamera = Annotated[
-    bool,
-    typer.Option(
-        "--fixed-camera", help="The camera is fixed and the board on the flange, not the other way round."
-    ),
-]
-Intrinsics = Annotated[
-    str,
-    typer.Option(
-        help="Of the camera: fixed: as its file states them; prior: within the standard deviations in its file, or "
-        "those of a usual calibration where it states none; free: as the images show them."
-    ),
-]
-RepeatabilityMm = Annotated[
-    float, typer.Option(help="Of images: standard deviation with which a position repeats, per axis [mm].")
-]
-RepeatabilityDeg = Annotated[
-    float, typer.Option(help="Of images: standard deviation with which a direction repeats, per axis [deg].")
-]
 Base = Annotated[str | None, typer.Option(help="Of a URDF file: link that is the base. [default: its root]")]
 Tip = Annotated[
     str | None, typer.Option(help="Of a URDF file: link that is the tool. [default: its only leaf]")
@@ -133,7 +112,7 @@ Prior = Annotated[
     Path | None,
     typer.Option(
         help="Model folder of `pisigma fleet prior` to begin with; left-out rows decide whether it helps. Then only "
-        "--out, --overwrite, --accept-implausible and --json count.",
+        "--out, --overwrite, --accept-implausible, --json and cameras count.",
         autocompletion=complete_model,
     ),
 ]
@@ -160,8 +139,8 @@ def calibrate(
     gravity: Gravity = None,
     new_frame_at: NewFrameAt = None,
     socket_distance: SocketDistance = None,
-    camera: CameraFile = None,
-    board: BoardFile = None,
+    camera: Cameras = None,
+    board: Boards = None,
     fixed_camera: FixedCamera = False,
     intrinsics: Intrinsics = "prior",
     repeatability_mm: RepeatabilityMm = 0.02,
@@ -184,11 +163,12 @@ def calibrate(
     from pisigma.robot.robot_file import robot_file
     from pisigma.workflow import calibrate as workflow
 
-    check_folder(out, overwrite, inputs=(robot_file(robot), data, prior, camera, board))
+    files = (*data, *(camera or ()), *(board or ()))
+    check_folder(out, overwrite, inputs=(robot_file(robot), prior, *files))
     settings, nominal = _settings(context.params), Robot.load(robot, base, tip)
     if prior is not None:
         return recalibrate_into(
-            context, prior, data, out, accept_implausible, overwrite, as_json, drawn=nominal
+            context, prior, data, out, accept_implausible, overwrite, as_json, settings.cameras, drawn=nominal
         )
     with progress_of("calibrate") as progress:
         calibration = workflow.calibrate(nominal, data, settings, progress)
@@ -271,7 +251,7 @@ def _settings(options: Mapping[str, Any]) -> "CalibrationSettings":
         gravity=_gravity(options["gravity"]),
         new_frame_at=tuple(options["new_frame_at"] or ()),
         socket_distances=_socket_distances(options["socket_distance"]),
-        camera=_camera(options),
+        cameras=stated_cameras(options),
         **{name: options[name] for name in same},
     )
 
@@ -294,23 +274,6 @@ def _gravity(stated: str | None) -> Any:
             f"the direction of gravity as X,Y,Z was wanted, such as 0,0,-1, got '{stated}'."
         )
     return direction
-
-
-def _camera(options: Mapping[str, Any]) -> "CameraFiles | None":
-    """What the pixels of a file of corners mean; None where neither camera nor board is stated."""
-    from pisigma.camera.image_rows import CameraFiles, Repeatability
-
-    camera, board = options["camera"], options["board"]
-    if camera is None and board is None:
-        return None
-    if camera is None or board is None:
-        raise IdentificationError("--camera and --board belong together; give both.")
-    if options["prior"] is not None:
-        raise IdentificationError("--prior does not read corners of images; leave --camera or --prior out.")
-    repeatability = Repeatability(
-        options["repeatability_mm"] / 1e3, math.radians(options["repeatability_deg"])
-    )
-    return CameraFiles(str(camera), str(board), options["fixed_camera"], repeatability, options["intrinsics"])
 
 
 def _socket_distances(stated: str | None) -> dict[tuple[str, str], float]:

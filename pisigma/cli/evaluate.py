@@ -5,6 +5,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
+from pisigma.cli.camera_options import (
+    Boards,
+    Cameras,
+    FixedCamera,
+    Intrinsics,
+    RepeatabilityDeg,
+    RepeatabilityMm,
+    stated_cameras,
+)
 from pisigma.cli.output import print_json, print_lines
 from pisigma.cli.verify import FitFrame, FitTool, print_comparison
 from pisigma.errors import AcceptanceError
@@ -46,6 +55,7 @@ Seed = Annotated[int, typer.Option(help="Seed of the resamples.")]
 
 
 def evaluate(
+    context: typer.Context,
     paths: Paths,
     max_mean_mm: MaxMean = None,
     max_p95_mm: MaxP95 = None,
@@ -53,6 +63,12 @@ def evaluate(
     max_mean_deg: MaxMeanDeg = None,
     fit_frame: FitFrame = False,
     fit_tool: FitTool = False,
+    camera: Cameras = None,
+    board: Boards = None,
+    fixed_camera: FixedCamera = False,
+    intrinsics: Intrinsics = "prior",
+    repeatability_mm: RepeatabilityMm = 0.02,
+    repeatability_deg: RepeatabilityDeg = 0.01,
     resamples: Resamples = 2000,
     seed: Seed = 0,
     sha256: Hashes = None,
@@ -79,7 +95,8 @@ def evaluate(
     for folder, wanted in zip(folders, sha256 or (), strict=False):
         check_model_hash(folder, wanted)
     limits = workflow.Limits(max_mean_mm, max_p95_mm, max_mm, max_mean_deg)
-    settings = workflow.EvaluationSettings(limits, fit_frame, fit_tool, Bootstrap(resamples, seed))
+    bootstrap, cameras = Bootstrap(resamples, seed), stated_cameras(context.params)
+    settings = workflow.EvaluationSettings(limits, fit_frame, fit_tool, bootstrap, cameras)
     evaluation = workflow.evaluate(paths[:-1], paths[-1], settings)
     if as_json:
         print_json(evaluation.to_json())

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -56,11 +57,13 @@ class Measurements:
         approach: per row and joint, from which side the joint came to its value: +1 as it grew, -1 as it fell,
             NaN where that is not stated.
         date: per row, the day it was measured (ISO 8601, such as "2026-11-22"); "" where it is not stated.
+        image: per row, the name of the image that it comes from; "" where it comes from none.
         readings: what registered sensors measured (see `pisigma.sensors.register_sensor`), by column: one number
             [SI] or one name a row.
         line: per row, the line in the file it came from (0 where it came from none).
         source: the file, or what made the rows.
         left_out: rows of the file that are not here, and why.
+        origin: per row, the file it came from, where rows came from several; else nothing.
 
     Raises:
         MeasurementError: the fields do not fit together, or a value cannot be one; the message names the row.
@@ -85,10 +88,12 @@ class Measurements:
     pair: tuple[str, ...] | None = None
     approach: Float64[Tensor, "rows dof"] | None = None
     date: tuple[str, ...] | None = None
+    image: tuple[str, ...] | None = None
     readings: Mapping[str, Tensor | tuple[str, ...]] = field(default_factory=dict)
     line: tuple[int, ...] = ()
     source: str = "memory"
     left_out: tuple[LeftOut, ...] = ()
+    origin: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Fill in names that are missing and check that everything fits together."""
@@ -100,7 +105,7 @@ class Measurements:
             object.__setattr__(self, name, tuple(getattr(self, name)) or (default,) * self.rows)
         if self.split is not None:
             object.__setattr__(self, "split", tuple(self.split))
-        for name in ("socket", "touch_axis", "anchor", "pair", "date"):
+        for name in ("socket", "touch_axis", "anchor", "pair", "date", "image"):
             names = getattr(self, name) or ()
             object.__setattr__(self, name, tuple(names) if any(names) else None)
         check_fields(self.as_fields())
@@ -114,7 +119,7 @@ class Measurements:
         present = {
             item.name: value
             for item in fields(self)
-            if item.name not in ("line", "source", "left_out", "readings")
+            if item.name not in ("line", "source", "left_out", "origin", "readings")
             and (value := getattr(self, item.name)) is not None
         }
         present |= dict(sorted(self.readings.items()))
@@ -124,6 +129,7 @@ class Measurements:
             line=self.line,
             source=self.source,
             left_out=self.left_out,
+            origin=self.origin,
         )
 
     @staticmethod
@@ -141,7 +147,13 @@ class Measurements:
             line=data.line,
             source=data.source,
             left_out=data.left_out,
+            origin=data.origin,
         )
+
+    @property
+    def file_names(self) -> str:
+        """Names of the files, without their folders, with " + " between them; or the source in memory."""
+        return " + ".join(Path(name).name for name in dict.fromkeys(self.origin or (self.source,)))
 
     @property
     def rows(self) -> int:

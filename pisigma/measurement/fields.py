@@ -26,7 +26,7 @@ NUMBERS: dict[str, tuple[int, ...]] = {
     "approach": (-1,),
 }
 """Fields that are numbers, with the shape of a row; -1 stands for the number of joints."""
-TEXTS = ("target", "frame", "split", "socket", "touch_axis", "anchor", "pair", "date")
+TEXTS = ("target", "frame", "split", "socket", "touch_axis", "anchor", "pair", "date", "image")
 """Fields that are texts."""
 
 OnBadRow = Literal["error", "leave_out"]
@@ -62,6 +62,7 @@ class MeasuredFields:
         line: per row, the line of the file it came from (0 where it came from none).
         source: the file, or what made the rows.
         left_out: rows of the file that are not here, and why.
+        origin: per row, the file it came from, where rows came from several; else nothing.
     """
 
     numbers: Mapping[str, Tensor]
@@ -69,6 +70,7 @@ class MeasuredFields:
     line: tuple[int, ...]
     source: str
     left_out: tuple[LeftOut, ...] = field(default=())
+    origin: tuple[str, ...] = ()
 
     @property
     def rows(self) -> int:
@@ -88,9 +90,11 @@ class MeasuredFields:
         return array
 
     def label(self, row: int) -> str:
-        """Name a row as complaints do: by file and line, or by source and row counted from 0."""
+        """Name a row as complaints do: by file and line, or by source and row counted from 0, and by its image."""
         line = self.line[row] if row < len(self.line) else 0
-        return f"{self.source}, line {line}" if line else f"{self.source}, row {row}"
+        source, image = self.origin[row] if self.origin else self.source, self.text("image")[row]
+        where = f"{source}, line {line}" if line else f"{source}, row {row}"
+        return f"{where} (image '{image}')" if image else where
 
     def measured(self, kind: Kind) -> Bool[Tensor, " rows"]:
         """Say for every row whether it holds a measurement of a kind.
@@ -137,6 +141,7 @@ class MeasuredFields:
             numbers={name: values[rows] for name, values in self.numbers.items()},
             texts={name: tuple(texts[row] for row in chosen) for name, texts in self.texts.items()},
             line=tuple(self.line[row] for row in chosen),
+            origin=tuple(self.origin[row] for row in chosen) if self.origin else (),
         )
 
 
@@ -151,6 +156,7 @@ def joined_fields(data: Sequence[MeasuredFields]) -> MeasuredFields:
         values = one.numbers.get(name)
         return one.numbers["q"].new_full((one.rows, *row), torch.nan) if values is None else values
 
+    sources = dict.fromkeys(one.source for one in data)
     shapes = {name: values.shape[1:] for one in data for name, values in one.numbers.items()}
     return MeasuredFields(
         numbers={name: torch.cat([filled(one, name, row) for one in data]) for name, row in shapes.items()},
@@ -159,6 +165,9 @@ def joined_fields(data: Sequence[MeasuredFields]) -> MeasuredFields:
             for name in dict.fromkeys(name for one in data for name in one.texts)
         },
         line=tuple(line for one in data for line in one.line),
-        source=" + ".join(dict.fromkeys(one.source for one in data)),
+        source=" + ".join(sources),
         left_out=tuple(row for one in data for row in one.left_out),
+        origin=tuple(name for one in data for name in one.origin or (one.source,) * one.rows)
+        if len(sources) > 1
+        else (),
     )

@@ -22,6 +22,11 @@ def with_new_frames(measurements: Measurements, lines: Sequence[int]) -> Measure
     """
     if not lines:
         return measurements
+    if measurements.origin:
+        raise MeasurementError(
+            f"{measurements.source}: lines at which new frames begin are those of one file, but there are several; "
+            "name the frames in a column 'frame'."
+        )
     rows = sorted(measurements.line)
     for line in lines:
         if not rows[0] < line <= rows[-1]:

@@ -1,7 +1,6 @@
 """A geometric or hybrid calibration as a model that corrected inverse kinematics can be made from."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 from jaxtyping import Float64
@@ -54,7 +53,7 @@ def model_of_calibration(
         provenance=Provenance(
             recipe=recipe[0],
             recipe_sha256=recipe[1],
-            data_source=Path(measurements.source).name,
+            data_source=measurements.file_names,
             data_sha256=measurements.content_hash(),
             rows=measurements.rows,
             rows_left_out=len(measurements.left_out),

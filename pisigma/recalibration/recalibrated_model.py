@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -69,7 +68,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
         hybrid_tools=geometry.tools if hybrid else {},
         uncertainty=PositionUncertainty(space, geometry, known.features, root, known.prior_scale, noise),
         provenance=Provenance(
-            data_source=Path(rows.source).name,
+            data_source=rows.file_names,
             data_sha256=rows.content_hash(),
             rows=rows.rows,
             rows_left_out=len(rows.left_out),

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Literal, get_args
 
-from pisigma.camera.image_rows import CameraFiles
+from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.errors import IdentificationError, MeasurementError, nearest_choice
 from pisigma.files.model_files import HELD_OUT_CSV
 from pisigma.hybrid.calibrator import HybridCalibrator
@@ -71,7 +71,7 @@ class CalibrationSettings:
         new_frame_at: lines of the file of measurements at which new frames begin, because the instrument was moved.
         socket_distances: by the names of two sockets their known distance [m]. A * in both names stands for the same
             text, so that ("*/0", "*/1") means a/0 and a/1, b/0 and b/1 and so on.
-        camera: what the pixels mean where the file of measurements holds corners of boards in images.
+        cameras: what the pixels mean where files of measurements hold corners of boards in images.
 
     Raises:
         IdentificationError: the model is no choice, has no use for gravity, or only one of the two prior standard
@@ -94,7 +94,7 @@ class CalibrationSettings:
     gravity: tuple[float, float, float] | None = None
     new_frame_at: tuple[int, ...] = ()
     socket_distances: Mapping[tuple[str, str], float] = field(default_factory=dict)
-    camera: CameraFiles | None = None
+    cameras: CameraFiles | None = None
 
     def __post_init__(self) -> None:
         """Refuse settings that are no choice or exclude each other."""
@@ -130,16 +130,6 @@ class CalibrationSettings:
                 f"the prior's standard deviations were wanted above 0, or both 0 for none, got {prior[0] * 1e3:g} mm "
                 f"and {prior[1] * 1e3:g} mrad."
             )
-
-    def read(self, path: str | os.PathLike[str], robot: Robot) -> Measurements:
-        """Read a file of measurements, or of corners where a camera is stated.
-
-        Raises:
-            MeasurementError: the file cannot be used.
-        """
-        if self.camera is not None:
-            return self.camera.read(path, robot)
-        return Measurements.read_csv(path, robot)
 
     def calibrator(self, robot: Robot, sockets: Iterable[str] = ()) -> Calibrator:
         """Give the calibrator of a robot.
@@ -228,7 +218,7 @@ class Calibration(AbstractModelResult):
 
 def calibrate(
     robot: Robot | str | os.PathLike[str],
-    data: Measurements | str | os.PathLike[str],
+    data: Measurements | MeasurementFiles,
     settings: CalibrationSettings = CalibrationSettings(),
     progress: Progress = lambda what: None,
 ) -> Calibration:
@@ -236,7 +226,7 @@ def calibrate(
 
     Args:
         robot: as drawn: a robot, a name of the catalogue, or a robot file (YAML or URDF).
-        data: measurements, or a CSV file of them; rows of the set "test" are kept apart and judged in the end.
+        data: measurements, or CSV files of them; rows of the set "test" are kept apart and judged in the end.
         settings: see `CalibrationSettings`.
         progress: called with what is being done.
 
@@ -247,7 +237,7 @@ def calibrate(
     """
     started = time.perf_counter()
     nominal = robot if isinstance(robot, Robot) else Robot.load(os.fspath(robot))
-    measurements = data if isinstance(data, Measurements) else settings.read(data, nominal)
+    measurements = read_rows(data, nominal, settings.cameras)
     measurements = with_new_frames(measurements, settings.new_frame_at)
     training, test_rows = measurements.split_sets()
     splits = settings.splits(training)
@@ -360,7 +350,7 @@ def _call(robot: Robot, measurements: Measurements, settings: CalibrationSetting
         for name, value in named.items()
         if value != getattr(usual, name) and name != "jobs"
     ]
-    words = [repr(robot.name), repr(Path(measurements.source).name)]
+    words = [repr(robot.name), repr(measurements.file_names)]
     words += [f"CalibrationSettings({', '.join(stated)})"] if stated else []
     return f"pisigma.calibrate({', '.join(words)})"
 

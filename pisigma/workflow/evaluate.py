@@ -9,6 +9,7 @@ from pathlib import Path
 
 import torch
 
+from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.errors import MeasurementError, ModelError
 from pisigma.judging.bootstrap import Bootstrap
 from pisigma.judging.diagnostic import Diagnostic
@@ -100,12 +101,14 @@ class EvaluationSettings:
         fit_frame: fit the frames of the rows to them, as after the sensor was moved.
         fit_tool: fit the targets of the rows to them, as after another reflector was mounted.
         bootstrap: how confidence intervals are computed.
+        cameras: what the pixels mean where files of measurements hold corners of boards in images.
     """
 
     limits: Limits = field(default_factory=Limits)
     fit_frame: bool = False
     fit_tool: bool = False
     bootstrap: Bootstrap = field(default_factory=Bootstrap)
+    cameras: CameraFiles | None = None
 
     @property
     def fitted(self) -> tuple[FrameKind, ...]:
@@ -200,7 +203,7 @@ class Evaluation:
 
 def evaluate(
     models: ModelSource | HoldsModel | Sequence[ModelSource | HoldsModel],
-    data: str | os.PathLike[str] | Measurements,
+    data: Measurements | MeasurementFiles,
     settings: EvaluationSettings | None = None,
 ) -> Evaluation:
     """Compare models on measurements, with confidence intervals, and hold them against limits.
@@ -209,7 +212,7 @@ def evaluate(
         models: one or several folders or models, and the words "nominal" (the robot as drawn, base and tool fitted)
             and "geometric" (what a hybrid builds upon) of the first that has it. A single model is compared with
             nominal.
-        data: measurements, or their file, in the frames that the models were fitted in. Where rows are marked, only
+        data: measurements, or their files, in the frames that the models were fitted in. Where rows are marked, only
             those of the set "test" are judged.
         settings: how. None: no limits, 2000 resamples.
 
@@ -223,9 +226,7 @@ def evaluate(
         models = [models]
     sources = labelled(models)
     loaded = load_models(sources)
-    everything = data
-    if not isinstance(everything, Measurements):
-        everything = Measurements.read_csv(everything, next(iter(loaded.values())).robot)
+    everything = read_rows(data, next(iter(loaded.values())).robot, settings.cameras)
     rows = test_rows(everything)
     compared = with_references(list(sources), loaded, rows.rotation is not None)
     comparison = compare_models(compared, rows, settings.bootstrap, settings.fitted)

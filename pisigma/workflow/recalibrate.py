@@ -2,7 +2,6 @@
 
 import datetime
 import math
-import os
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.errors import IdentificationError, ModelError, nearest_choice
 from pisigma.files.model_files import model_hash
 from pisigma.hybrid.calibrator import HybridCalibrator
@@ -62,12 +62,14 @@ class RecalibrationSettings:
 
     Attributes:
         moved: which of "base" and "tool" stand elsewhere than when the model was made; None to find it by evidence.
+        cameras: what the pixels mean where files of rows hold corners of boards in images.
 
     Raises:
         IdentificationError: something else is named.
     """
 
     moved: tuple[str, ...] | None = None
+    cameras: CameraFiles | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot stand elsewhere."""
@@ -111,7 +113,7 @@ class Recalibration(AbstractModelResult):
 
 def recalibrate(
     model: ModelSource | HoldsModel,
-    data: Measurements | str | os.PathLike[str],
+    data: Measurements | MeasurementFiles,
     settings: RecalibrationSettings = RecalibrationSettings(),
     progress: Progress = lambda what: None,
     drawn: Robot | None = None,
@@ -121,7 +123,7 @@ def recalibrate(
     Args:
         model: of `pisigma calibrate`, `pisigma recalibrate` or `pisigma fleet prior`, or what holds it (a
             `CorrectedIK`, a `Calibration`), or its folder.
-        data: new rows of any sensors, or a CSV file of them; those of the set "test" are left out.
+        data: new rows of any sensors, or CSV files of them; those of the set "test" are left out.
         settings: see `RecalibrationSettings`.
         progress: called with what is being done.
         drawn: the robot that the model has to be of; None for any.
@@ -143,7 +145,7 @@ def recalibrate(
             "model of this robot."
         )
     drawn = posterior.space.robot
-    measurements = data if isinstance(data, Measurements) else Measurements.read_csv(data, drawn)
+    measurements = read_rows(data, drawn, settings.cameras)
     rows = posterior.renamed(measurements.split_sets()[0])
     progress("what has moved")
     elsewhere = _elsewhere(parent, posterior, rows, settings)
@@ -234,7 +236,7 @@ def _summary(
 ) -> RecalibrationSummary:
     """All figures; `moved` is None where nothing can be said of it."""
     return RecalibrationSummary(
-        command=f"pisigma.recalibrate({parent.name!r}, {Path(rows.source).name!r})",
+        command=f"pisigma.recalibrate({parent.name!r}, {rows.file_names!r})",
         diagnostics=_diagnostics(adaptation.problem.design.problem.space.robot, judged, rows),
         parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=""),
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),

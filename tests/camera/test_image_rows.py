@@ -1,15 +1,14 @@
-"""Files of corners as rows of images, and what a calibration makes of them."""
+"""Images as rows, and what a calibration makes of them."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from testing.camera_cell import BOARD, CAMERA, aligned_error, camera_cell, corner_lines
+from testing.camera_cell import BOARD, CAMERA, aligned_error, camera_cell
 from testing.closeness import assert_close
 
-from pisigma.camera.image_rows import Repeatability, image_measurements, read_images
+from pisigma.camera.image_rows import Repeatability, image_measurements
 from pisigma.errors import IdentificationError, MeasurementError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.parameters import Prior
@@ -26,20 +25,6 @@ def beyond(true: Robot, estimated: Robot) -> float:
     """Root mean square error of positions at other views of the board [m]."""
     q = camera_cell(50, 2).images.q
     return aligned_error(*(forward_kinematics(robot, q)[:, :3, 3] for robot in (true, estimated)))
-
-
-@pytest.mark.parametrize("is_fixed", [False, True], ids=["flange", "fixed"])
-def test_exact_corners_give_the_poses_of_the_target(tmp_path: Path, is_fixed: bool) -> None:
-    cell = camera_cell(8, 0, EXACT, is_fixed)
-    path = tmp_path / "corners.csv"
-    path.write_text("\n".join(corner_lines(cell.images)) + "\n")
-    rows = read_images(path, cell.nominal, CAMERA, BOARD, is_fixed)
-    assert (rows.frame[0], rows.target[0]) == (("wrist", "board") if is_fixed else ("board", "wrist"))
-    assert_close(rows.T, forward_kinematics(cell.true, cell.images.q), atol=1e-7)
-    assert rows.place(1) == f"{path}, line {2 + len(cell.images.corners[0])}"
-    rows.write_csv(tmp_path / "rows.csv", cell.nominal)
-    again = Measurements.read_csv(tmp_path / "rows.csv", cell.nominal)
-    assert again.kinds == {"pose", "corner"}
 
 
 @pytest.mark.parametrize("is_fixed", [False, True], ids=["flange", "fixed"])
@@ -108,36 +93,6 @@ def test_the_result_says_that_scale_rests_on_the_board() -> None:
     result = GeometricCalibrator(cell.nominal).fit(data)
     assert any("rests on the board" in sentence for sentence in result.warnings)
     assert {"theta_6", "d_6", "a_6", "alpha_6"} <= set(result.redundancy.removed)  # they go with the tool
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            lambda lines: [lines[0].replace("u_px", "u"), *lines[1:]],
-            "there is no column 'u_px'; did you mean 'v_px'",
-        ),
-        (lambda lines: lines[:5], "line 2: image '0000' has 4 corners, but 6 or more were wanted"),
-        (lambda lines: [*lines, lines[1]], "image '0000' has a corner twice"),
-        (
-            lambda lines: [*lines, lines[1].replace("0000,0", "0000,54", 1)],
-            "number from 0 to 53 was wanted.*got 54",
-        ),
-        (
-            lambda lines: [*lines[:54], lines[54].rpartition(",")[0] + ",1.5"],
-            "image '0000' has rows of different joint values",
-        ),
-        (
-            lambda lines: [*lines[:9], lines[9].replace(",", ",x", 2), *lines[10:]],
-            "line 10, column 'corner'.*'x8'",
-        ),
-    ],
-)
-def test_faulty_files_are_named(tmp_path: Path, change, message: str) -> None:
-    path = tmp_path / "corners.csv"
-    path.write_text("\n".join(change(corner_lines(camera_cell(8, 0, EXACT).images))) + "\n")
-    with pytest.raises(MeasurementError, match=message):
-        read_images(path, camera_cell(8, 0, EXACT).nominal, CAMERA, BOARD)
 
 
 def test_corners_of_another_board_are_refused() -> None:

@@ -1,19 +1,31 @@
 """`pisigma recalibrate`: a model brought up to date with few new rows."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelFolder, Overwrite
+from pisigma.cli.camera_options import (
+    Boards,
+    Cameras,
+    FixedCamera,
+    Intrinsics,
+    RepeatabilityDeg,
+    RepeatabilityMm,
+    stated_cameras,
+)
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of, saved
 
 if TYPE_CHECKING:
+    from pisigma.camera.corner_file import CameraFiles
     from pisigma.robot.description import Robot
     from pisigma.workflow.recalibrate import Recalibration
 
 Data = Annotated[
-    Path, typer.Argument(metavar="ROWS", help="New measurements (CSV), ten poses or more, of any sensors.")
+    list[Path],
+    typer.Argument(metavar="ROWS...", help="New measurements (CSV), ten poses or more, of any sensors."),
 ]
 Out = Annotated[Path | None, typer.Option(help="Model folder to write; needed without --dry-run.")]
 Moved = Annotated[
@@ -33,6 +45,12 @@ def recalibrate(
     out: Out = None,
     moved: Moved = None,
     dry_run: DryRun = False,
+    camera: Cameras = None,
+    board: Boards = None,
+    fixed_camera: FixedCamera = False,
+    intrinsics: Intrinsics = "prior",
+    repeatability_mm: RepeatabilityMm = 0.02,
+    repeatability_deg: RepeatabilityDeg = 0.01,
     accept_implausible: AcceptImplausible = False,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
@@ -47,20 +65,20 @@ def recalibrate(
     if (out is None) is not dry_run:
         raise typer.BadParameter("either --out DIR or --dry-run was wanted.", param_hint="'--out'")
     if out is not None:
-        check_folder(out, overwrite, inputs=(model, data))
-    recalibrate_into(
-        context, model, data, out, accept_implausible, overwrite, as_json, moved=stated_to_move(moved)
-    )
+        check_folder(out, overwrite, inputs=(model, *data, *(camera or ()), *(board or ())))
+    cameras, elsewhere = stated_cameras(context.params), stated_to_move(moved)
+    recalibrate_into(context, model, data, out, accept_implausible, overwrite, as_json, cameras, elsewhere)
 
 
 def recalibrate_into(
     context: typer.Context,
     model: Path,
-    data: Path,
+    data: Sequence[Path],
     out: Path | None,
     accept_implausible: bool,
     overwrite: bool,
     as_json: bool,
+    cameras: "CameraFiles | None",
     moved: tuple[str, ...] | None = None,
     drawn: "Robot | None" = None,
 ) -> None:
@@ -69,11 +87,12 @@ def recalibrate_into(
     Args:
         context: of the command, for the card.
         model: folder of the model.
-        data: file of the rows.
+        data: files of the rows.
         out: folder to write; None for none.
         accept_implausible: write also what must not be trusted.
         overwrite: replace the model that the folder holds.
         as_json: print one JSON object.
+        cameras: what the pixels mean where files of rows hold corners.
         moved: what is stated to stand elsewhere.
         drawn: the robot that the model has to be of; None for any.
 
@@ -82,7 +101,7 @@ def recalibrate_into(
     """
     from pisigma.workflow import recalibrate as workflow
 
-    settings = workflow.RecalibrationSettings(moved)
+    settings = workflow.RecalibrationSettings(moved, cameras)
     with progress_of("recalibration") as progress:
         recalibration = workflow.recalibrate(model, data, settings, progress, drawn)
     if out is None:

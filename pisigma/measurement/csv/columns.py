@@ -16,6 +16,9 @@ ANCHOR_PLACE = ("anchor_x", "anchor_y", "anchor_z")
 REVOLUTE_UNITS: tuple[Unit, ...] = ("deg", "rad")
 PRISMATIC_UNITS: tuple[Unit, ...] = ("mm", "m")
 
+CORNERS = ("corner", "u_px", "v_px")
+"""Columns of files of corners, which `pisigma.camera` reads."""
+
 PLAN_COLUMNS = ("order", "candidate")
 """What a plan says of its poses; measurements may keep it, and nothing reads it there."""
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pisigma.errors import MeasurementError
 from pisigma.measurement.csv.columns import (
     ANCHOR_PLACE,
+    CORNERS,
     POSITION,
     PRISMATIC_UNITS,
     QUATERNION,
@@ -76,6 +77,11 @@ def read_header(table: Table, robot: Robot | None) -> Layout:
         MeasurementError: a column is unknown, missing or there twice, or units do not fit together.
     """
     place = f"{table.source}, line {table.header_line}"
+    if set(CORNERS) <= set(table.header):
+        raise MeasurementError(
+            f"{place}: these are corners of a board in images; state what they mean with --camera camera.yaml --board "
+            "board.yaml, which pisigma calibrate, recalibrate and evaluate read."
+        )
     columns = tuple(_find(place, name, number) for number, name in enumerate(table.header, start=1))
     index: dict[str, int] = {}
     for number, column in enumerate(columns):

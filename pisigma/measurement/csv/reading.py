@@ -69,13 +69,13 @@ def read_fields(
     return _complete(_sound_rows(table, layout, robot), on_bad_row)
 
 
-def fields_of(table: Table) -> MeasuredFields:
+def fields_of(table: Table, robot: Robot | None = None) -> MeasuredFields:
     """Read the table of a measurement file; see `read_fields`.
 
     Raises:
         MeasurementError: its header or a row cannot be used.
     """
-    return _complete(sound_rows(table, None), "error")
+    return _complete(sound_rows(table, robot), "error")
 
 
 def sound_rows(table: Table, robot: Robot | None) -> MeasuredFields:

@@ -4,7 +4,6 @@ import functools
 from collections.abc import Hashable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float64
@@ -152,7 +151,7 @@ def _judged(
 ) -> JudgedRows:
     return JudgedRows(
         origin=origins[0],
-        measurements=replace(rows, source=Path(rows.source).name),
+        measurements=replace(rows, source=rows.file_names),
         place=place_of(model, rows.q),
         models=models,
         residual=residual,
