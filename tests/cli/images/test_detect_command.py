@@ -46,8 +46,8 @@ def test_corners_with_joint_values_are_written(run, files, tmp_path):
     reasons = [image["left_out"] for image in printed["images"]]
     assert reasons[:2] == [None, None]
     assert "only a piece" in reasons[2]
-    assert "edges are blurred by 4" in reasons[3]
-    rows = list(csv.DictReader((tmp_path / "corners.csv").open()))
+    assert "edges are blurred by 3.9" in reasons[3]
+    rows = list(csv.DictReader((tmp_path / "corners.csv").read_text().splitlines()))
     assert list(rows[0]) == ["image", "corner", "u_px", "v_px", "q1_deg", "q2_deg"]
     assert [row["q2_deg"] for row in rows] == ["20"] * 20 + ["40"] * 20
     pixels = np.array([[float(row["u_px"]), float(row["v_px"])] for row in rows]).reshape(2, 20, 2)
