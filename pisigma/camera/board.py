@@ -18,6 +18,8 @@ Dictionary = Literal[
 ]  # fmt: skip
 """Of the markers in the white squares of a ChArUco board, as OpenCV numbers them."""
 TagFamily = Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11"]
+TAG_CELLS = {"tag16h5": 6, "tag25h9": 7, "tag36h10": 8, "tag36h11": 8}
+"""Cells along the side of a tag, with those of its border."""
 Length = Annotated[float, Field(gt=0)]
 _LENGTHS: dict[BoardKind, tuple[str, ...]] = {
     "checkerboard": ("square_mm",),
@@ -120,6 +122,13 @@ class Board:
         along = np.stack([number[:, :-1], number[:, 1:]], -1).reshape(-1, 2)
         across = np.stack([number[:-1], number[1:]], -1).reshape(-1, 2)
         return np.concatenate([along, across])
+
+    @property
+    def clearance(self) -> float:
+        """Share of the length of an edge, to both of its sides, that is all black or white."""
+        if self.kind == "apriltag":
+            return 1.0 / TAG_CELLS[self.dictionary]
+        return 0.4 if self.kind == "checkerboard" else (1 - self.marker / self.square) / 2
 
     @property
     def is_symmetric(self) -> bool:

@@ -7,8 +7,6 @@ from jaxtyping import Float64
 from pisigma.camera.board import Board
 from pisigma.camera.detection.detected_board import DetectedBoard, Image, NoBoard, refined
 
-WINDOW = 0.3
-"""Half of the window around a corner, as share of the distance to the nearest one: it holds no other edges."""
 SMALLEST_PIECE = 3
 """Rows and columns of corners of a piece of a board that is recognised as one."""
 
@@ -26,10 +24,8 @@ def detect_checkerboard(image: Image, board: Board) -> DetectedBoard | NoBoard:
     if not there:
         return NoBoard(_reason(image, board))
     grid = np.asarray(corners, dtype=np.float64).reshape(board.rows, board.columns, 2)
-    steps = np.linalg.norm((grid.reshape(-1, 2)[board.edges] * [[[1.0], [-1.0]]]).sum(1), axis=1)
     grid = _numbered(image, grid, board.is_symmetric)
-    pixels = refined(image, grid.reshape(-1, 2), WINDOW * float(steps.min()))
-    return DetectedBoard(np.arange(len(pixels)), pixels)
+    return refined(image, DetectedBoard(np.arange(len(board.corners)), grid.reshape(-1, 2)), board)
 
 
 def _numbered(

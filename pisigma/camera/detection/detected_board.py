@@ -7,14 +7,20 @@ import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 from scipy.ndimage import map_coordinates
 
+from pisigma.camera.board import Board
+
 Image = UInt8[np.ndarray, "height width"]
 """Grey values; the centre of the first pixel is at u = v = 0."""
-ALONG = np.array([0.3, 0.4, 0.5, 0.6, 0.7])
+ALONG = np.linspace(0.2, 0.8, 9)
 """Where edges are crossed, as shares of their lengths: away from other edges."""
 ACROSS = np.linspace(-1.0, 1.0, 41)
-"""Where they are sampled on both sides, as shares of `REACH`."""
-REACH = 0.3
-"""Share of the length of an edge, to both of its sides."""
+"""Where they are sampled on both sides, as shares of how far they are followed."""
+FOLLOWED = 0.7
+"""Share of the clearance of an edge in which it is followed: what is printed beyond is blurred, too."""
+ENDS = 0.7
+"""From here on, an edge is as black or as white as it gets."""
+WINDOW = 0.8
+"""Half of the side of the window around a corner, as share of the clearance."""
 _STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-4)
 
 
@@ -42,42 +48,83 @@ class NoBoard:
     reason: str
 
 
-def refined(image: Image, pixels: np.ndarray, radius: float) -> Float64[np.ndarray, "corners 2"]:
-    """Move corners to where the gradients around them point past (Förstner & Gülch 1987).
+def shown_edges(detected: DetectedBoard, board: Board) -> Float64[np.ndarray, "edges 2 2"]:
+    """Pixels of both ends of the edges of a board between corners that were detected [px]."""
+    pixels = np.full((len(board.corners), 2), np.nan)
+    pixels[detected.corners] = detected.pixels
+    ends = pixels[board.edges]
+    shown: np.ndarray = ends[np.isfinite(ends).all((1, 2))]
+    return shown
+
+
+def refined(image: Image, detected: DetectedBoard, board: Board) -> DetectedBoard:
+    """Move the corners of squares to where the gradients around them point past (Förstner & Gülch 1987).
+
+    The window around each is as large as it can be without other edges in it.
 
     Args:
         image: that shows them.
-        pixels: about where they are [px].
-        radius: half of the side of the square around each that is looked at [px].
+        detected: about where they are.
+        board: whose corners they are.
     """
-    half = max(round(radius), 2)
-    start = np.ascontiguousarray(pixels, dtype=np.float32).reshape(-1, 1, 2)
+    ends = shown_edges(detected, board)
+    shortest = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1).min(initial=np.inf)
+    half = max(round(WINDOW * board.clearance * shortest), 2) if len(ends) else 2
+    start = np.ascontiguousarray(detected.pixels, dtype=np.float32).reshape(-1, 1, 2)
     moved = cv2.cornerSubPix(image, start, (half, half), (-1, -1), _STOP)
-    return np.asarray(moved, dtype=np.float64).reshape(-1, 2)
+    return DetectedBoard(detected.corners, np.asarray(moved, dtype=np.float64).reshape(-1, 2))
 
 
-def edge_blur(image: Image, ends: Float64[np.ndarray, "edges 2 2"]) -> float:
-    """Standard deviation of the blur across the edges of a board [px].
+@dataclass(frozen=True, eq=False)
+class EdgeProfiles:
+    """How black turns to white across the edges of a board.
 
-    Of a step from a to b that is blurred with the standard deviation σ, the areas between profile and step sum up to
-    `(b - a) σ sqrt(2/π)`. A motion blurs edges across it only, so that the third quartile of all edges is given.
-
-    Args:
-        image: that shows the board.
-        ends: pixels of both ends of every edge [px].
+    Attributes:
+        at: where every edge is crossed [px].
+        across: normals of the edges as long as they are followed to each side [px].
+        profile: gray level along the crossings, from 0 at their begin to 1 at their end; NaN without contrast.
     """
-    along = ends[:, 1] - ends[:, 0]
-    length = np.linalg.norm(along, axis=1)
-    normal = np.stack([-along[:, 1], along[:, 0]], -1) / length[:, None]
-    reach = REACH * length
-    at = ends[:, :1] + ALONG[:, None] * along[:, None]
-    at = at[:, :, None] + (reach[:, None] * ACROSS)[:, None, :, None] * normal[:, None, None]
-    profile = map_coordinates(
-        image.astype(np.float64), [at[..., 1], at[..., 0]], order=1, mode="nearest"
-    ).mean(1)
-    first, last = (profile[:, side].mean(1) for side in (ACROSS < -0.7, ACROSS > 0.7))
-    missing = np.where(ACROSS < 0, profile - first[:, None], last[:, None] - profile)
-    contrast = last - first
-    contrast[np.abs(contrast) < 1.0] = np.nan
-    area = missing.mean(1) * 2 * reach / contrast
-    return float(np.nanquantile(area, 0.75) / np.sqrt(2 / np.pi))
+
+    at: Float64[np.ndarray, "edges crossings 2"]
+    across: Float64[np.ndarray, "edges 2"]
+    profile: Float64[np.ndarray, "edges crossings samples"]
+
+    @staticmethod
+    def of(image: Image, ends: Float64[np.ndarray, "edges 2 2"], clearance: float) -> "EdgeProfiles":
+        """Sample an image across edges.
+
+        Args:
+            image: that shows the board.
+            ends: pixels of both ends of every edge [px].
+            clearance: share of the length of an edge to whose sides nothing else is printed, see `Board.clearance`.
+        """
+        along = ends[:, 1] - ends[:, 0]
+        across = FOLLOWED * clearance * np.stack([-along[:, 1], along[:, 0]], -1)
+        at = ends[:, :1] + ALONG[:, None] * along[:, None]
+        sampled = at[:, :, None] + ACROSS[:, None] * across[:, None, None]
+        gray = map_coordinates(
+            image.astype(np.float64), [sampled[..., 1], sampled[..., 0]], order=1, mode="nearest"
+        )
+        first, last = (
+            gray[..., side].mean((1, 2))[:, None, None] for side in (ACROSS < -ENDS, ACROSS > ENDS)
+        )
+        contrast = np.where(np.abs(last - first) < 1.0, np.nan, last - first)
+        return EdgeProfiles(at, across, (gray - first) / contrast)
+
+    @property
+    def blur(self) -> float:
+        """Standard deviation of the blur [px]; NaN without edges.
+
+        The areas between a step from 0 to 1 that is blurred with the standard deviation σ and the step sum up to
+        `σ sqrt(2/π)`. A motion blurs edges across it only, so that the third quartile of all edges is given.
+        """
+        missing = np.where(ACROSS < 0, self.profile, 1 - self.profile).mean((1, 2))
+        blur = 2 * np.linalg.norm(self.across, axis=1) * missing / np.sqrt(2 / np.pi)
+        return float(np.nanquantile(blur, 0.75)) if np.isfinite(blur).any() else np.nan
+
+    @property
+    def points(self) -> Float64[np.ndarray, "edges crossings 2"]:
+        """Where the middle between black and white is on every crossing [px]: half of its area is on either side."""
+        offset = 1 - 2 * self.profile.mean(2)
+        points: np.ndarray = self.at + offset[..., None] * self.across[:, None]
+        return points

@@ -1,7 +1,7 @@
 """Detection of boards of all kinds in image files."""
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,11 +9,12 @@ import cv2
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.camera.board import Board
+from pisigma.camera.board import Board, BoardKind
 from pisigma.camera.board_pose import FEWEST_CORNERS, solve_board_pose
 from pisigma.camera.camera import Camera
 from pisigma.camera.detection.checkerboard import detect_checkerboard
-from pisigma.camera.detection.detected_board import DetectedBoard, Image, NoBoard, edge_blur
+from pisigma.camera.detection.detected_board import DetectedBoard, EdgeProfiles, Image, NoBoard, shown_edges
+from pisigma.camera.detection.markers import detect_apriltags, detect_charuco
 from pisigma.camera.image_rows import LARGEST_MISS
 from pisigma.errors import MeasurementError
 from pisigma.files.input_file import read_input
@@ -21,6 +22,11 @@ from pisigma.identification.problem.loss import HampelLoss
 
 MOST_BLUR = 3.0
 """[px] Images whose edges are blurred more are left out unless another limit is stated."""
+DETECTORS: dict[BoardKind, Callable[[Image, Board], DetectedBoard | NoBoard]] = {
+    "checkerboard": detect_checkerboard,
+    "charuco": detect_charuco,
+    "apriltag": detect_apriltags,
+}
 ENDINGS = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".webp")
 """Of the images of a folder."""
 
@@ -114,13 +120,10 @@ def detect_board(path: Path, board: Board, most_blur: float = MOST_BLUR) -> Boar
         MeasurementError: the file cannot be read or is no image.
     """
     image = read_image(path)
-    size, detected = (image.shape[1], image.shape[0]), detect_checkerboard(image, board)
+    size, detected = (image.shape[1], image.shape[0]), DETECTORS[board.kind](image, board)
     if isinstance(detected, NoBoard):
         return BoardImage(path, size, detected, np.nan)
-    pixels = np.full((len(board.corners), 2), np.nan)
-    pixels[detected.corners] = detected.pixels
-    ends = pixels[board.edges]
-    blur = edge_blur(image, ends[np.isfinite(ends).all((1, 2))])
+    blur = EdgeProfiles.of(image, shown_edges(detected, board), board.clearance).blur
     if len(detected.corners) < FEWEST_CORNERS:
         reason = f"it shows {len(detected.corners)} corners, but {FEWEST_CORNERS} or more were wanted"
     elif blur > most_blur:

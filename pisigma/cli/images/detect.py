@@ -6,11 +6,17 @@ from typing import Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
+from pisigma.cli.endings import fail
 from pisigma.cli.output import print_json, print_lines, progress_of
 
-Images = Annotated[list[Path], typer.Argument(help="Image files, or folders of them.")]
+Images = Annotated[list[Path] | None, typer.Argument(help="Image files, or folders of them.")]
 BoardFile = Annotated[Path, typer.Option(help="Board (YAML) that the images show.")]
-CameraFile = Annotated[Path, typer.Option(help="Camera (YAML) that took the images.")]
+CameraFile = Annotated[Path | None, typer.Option(help="Camera (YAML) that took the images.")]
+Out = Annotated[Path | None, typer.Option(help="File of corners to write (.csv).")]
+Print = Annotated[
+    Path | None,
+    typer.Option("--print", help="Draw the board at its true size instead, to be printed (.pdf)."),
+]
 Joints = Annotated[
     Path | None,
     typer.Option(
@@ -24,13 +30,14 @@ MostBlur = Annotated[
 
 
 def detect(
-    images: Images,
     board: BoardFile,
-    camera: CameraFile,
-    out: Annotated[Path, typer.Option(help="File of corners to write (.csv).")],
+    images: Images = None,
+    camera: CameraFile = None,
+    out: Out = None,
     joints: Joints = None,
     within: Within = 0.2,
     most_blur: MostBlur = 3.0,
+    sheet: Print = None,
     as_json: AsJson = False,
 ) -> None:
     """Find the corners of a board in images, to sub-pixel.
@@ -40,6 +47,11 @@ def detect(
     from pisigma.files.output_file import check_output
     from pisigma.workflow.images import detect as workflow
 
+    if sheet is not None:
+        _print_board(board, sheet, as_json)
+        return
+    if not images or camera is None or out is None:
+        fail("IMAGES, --camera, and --out were wanted; state them, or --print to draw the board.")
     inputs = [*images, board, camera, *([joints] if joints else [])]
     check_output(out, (".csv",), "a file of corners", inputs)
     settings = workflow.DetectionSettings(most_blur, within)
@@ -50,3 +62,18 @@ def detect(
         print_json({"file": str(out)} | detected.to_json())
     else:
         print_lines([*detected.sentences, f"{len(detected.rows) - 1} corners written to {out}."])
+
+
+def _print_board(board: Path, sheet: Path, as_json: bool) -> None:
+    """Write a board as a PDF."""
+    from pisigma.camera.board import Board
+    from pisigma.files.output_file import check_output, write_whole
+    from pisigma.reporting.board_sheet import board_pdf
+
+    check_output(sheet, (".pdf",), "a board to print", [board])
+    paper, content = board_pdf(Board.load(board))
+    write_whole(sheet, content)
+    if as_json:
+        print_json({"file": str(sheet), "paper": paper})
+    else:
+        print_lines([f"Board written to {sheet}; print it on {paper} at 100 % and check the ruler."])

@@ -7,7 +7,7 @@ from testing.closeness import assert_close
 
 from pisigma.camera.board import Board
 from pisigma.camera.detection.checkerboard import detect_checkerboard
-from pisigma.camera.detection.detected_board import DetectedBoard, NoBoard, edge_blur
+from pisigma.camera.detection.detected_board import DetectedBoard, EdgeProfiles, NoBoard
 
 BOARD = Board("board", 4, 5, 0.03)
 
@@ -46,4 +46,5 @@ def test_why_there_is_no_board() -> None:
 def test_the_blur_of_edges(blur: float) -> None:
     R, t = view(BOARD, 0.3, (0.4, 0.3, 0.0))
     ends = CAMERA.project(BOARD.corners @ R.T + t)[0][BOARD.edges]
-    assert_close(edge_blur(draw_board(BOARD, R, t, blur=blur), ends), np.hypot(blur, 0.5), rtol=0.05)
+    profiles = EdgeProfiles.of(draw_board(BOARD, R, t, blur=blur), ends, BOARD.clearance)
+    assert_close(profiles.blur, np.hypot(blur, 0.5), rtol=0.05)

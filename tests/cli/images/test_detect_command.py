@@ -46,7 +46,7 @@ def test_corners_with_joint_values_are_written(run, files, tmp_path):
     reasons = [image["left_out"] for image in printed["images"]]
     assert reasons[:2] == [None, None]
     assert "only a piece" in reasons[2]
-    assert "edges are blurred by 3.9" in reasons[3]
+    assert "edges are blurred by 3.8" in reasons[3]
     rows = list(csv.DictReader((tmp_path / "corners.csv").read_text().splitlines()))
     assert list(rows[0]) == ["image", "corner", "u_px", "v_px", "q1_deg", "q2_deg"]
     assert [row["q2_deg"] for row in rows] == ["20"] * 20 + ["40"] * 20
@@ -74,3 +74,13 @@ def test_what_is_refused(refuses, files, tmp_path):
     no_image = ("detect", files / "board.yaml", *options(files)[1:])
     assert "is no image that OpenCV reads" in refuses(*no_image, *out)
     assert not (tmp_path / "corners.csv").exists()
+
+
+def test_a_board_is_drawn_to_be_printed(run, refuses, files, tmp_path):
+    command = ("detect", "--board", files / "board.yaml", "--print")
+    result = run(*command, tmp_path / "board.pdf")
+    assert result.exit_code == 0, result.output
+    assert "print it on A4 at 100 %" in result.stdout
+    assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
+    assert "goes into a .pdf file" in refuses(*command, tmp_path / "board.png")
+    assert "--print to draw the board" in refuses(*command[:-1])

@@ -1,0 +1,106 @@
+"""A board as a page to print at its true size."""
+
+import io
+
+import numpy as np
+from matplotlib.backends.backend_pdf import FigureCanvasPdf
+from matplotlib.figure import Figure
+from matplotlib.patches import PathPatch
+from matplotlib.path import Path as Outline
+
+from pisigma.camera.board import Board
+from pisigma.camera.pattern import Pattern, board_pattern
+from pisigma.errors import OutputError
+
+PAPERS = {
+    "A4": (210.0, 297.0),
+    "A3": (297.0, 420.0),
+    "A2": (420.0, 594.0),
+    "A1": (594.0, 841.0),
+    "A0": (841.0, 1189.0),
+}
+"""Width and height of paper [mm]."""
+MARGIN = 8.0
+"""[mm] What printers leave white along the edges of a sheet."""
+FOOT = 22.0
+"""[mm] Below the board, for its text and the ruler."""
+RULER = 100.0
+"""[mm] Length of the line by which the scale of a printer is checked."""
+MM = 1 / 25.4
+"""Inches."""
+
+
+def board_pdf(board: Board) -> tuple[str, bytes]:
+    """Draw a board as a PDF; see `draw_board_sheet`.
+
+    Returns:
+        The paper that it is for, such as "A4" or "A3 landscape"; and the PDF.
+    """
+    paper, figure = draw_board_sheet(board)
+    stream = io.BytesIO()
+    metadata = {"Title": board.name, "CreationDate": None}
+    FigureCanvasPdf(figure).print_pdf(stream, metadata=metadata)  # type: ignore[no-untyped-call]
+    return paper, stream.getvalue()
+
+
+def draw_board_sheet(board: Board) -> tuple[str, Figure]:
+    """Draw a board in its true size, with what it is and a ruler below, on the smallest paper that it fits on.
+
+    Raises:
+        OutputError: it fits on no paper.
+        MeasurementError: there are not so many markers in its dictionary.
+        ImportError: the markers need OpenCV, which is not installed.
+    """
+    pattern = board_pattern(board)
+    across, down = 1e3 * (pattern.sheet[2:] - pattern.sheet[:2])
+    paper, (width, height) = _paper(board, float(across), float(down))
+    figure = Figure(figsize=(width * MM, height * MM))
+    axes = figure.add_axes((0.0, 0.0, 1.0, 1.0), xlim=(0, width), ylim=(height, 0))
+    axes.set_axis_off()
+    corner = np.array([(width - across) / 2, MARGIN]) - 1e3 * pattern.sheet[:2]
+    axes.add_patch(PathPatch(_outline(pattern, corner), facecolor="black", edgecolor="none"))
+    top = MARGIN + down + 4
+    begin, end = (width - RULER) / 2, (width + RULER) / 2
+    axes.plot(
+        [begin, begin, begin, end, end, end], [top, top + 4, top + 2, top + 2, top, top + 4], "k", lw=0.5
+    )
+    texts = (
+        f"This line is {RULER:g} mm long; if not, print again at 100 %, or state the lengths that are measured.",
+        f"{board.name}: {_description(board)}. Paper: {paper}. x leads right, y down; corner 0 is upper left.",
+    )
+    for number, text in enumerate(texts):
+        axes.text(width / 2, top + 8 + 4 * number, text, ha="center", va="center", fontsize=6.5)
+    return paper, figure
+
+
+def _paper(board: Board, across: float, down: float) -> tuple[str, tuple[float, float]]:
+    """Give the smallest paper for a board of some width and height [mm], upright where both ways fit."""
+    needs = max(across, RULER) + 2 * MARGIN, down + FOOT + 2 * MARGIN
+    for name, (width, height) in PAPERS.items():
+        for title, size in ((name, (width, height)), (f"{name} landscape", (height, width))):
+            if needs[0] <= size[0] and needs[1] <= size[1]:
+                return title, size
+    raise OutputError(
+        f"board '{board.name}': needs a sheet of {needs[0]:.0f} x {needs[1]:.0f} mm, more than A0 has; take fewer or "
+        "smaller squares."
+    )
+
+
+def _outline(pattern: Pattern, corner: np.ndarray) -> Outline:
+    """All black rectangles as one outline [mm], so that no light shines through where two of them meet."""
+    left, top, right, bottom = (1e3 * pattern.black + np.tile(corner, 2)).T
+    ends = np.stack([[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]).transpose(
+        2, 0, 1
+    )
+    codes = [Outline.MOVETO, Outline.LINETO, Outline.LINETO, Outline.LINETO, Outline.CLOSEPOLY] * len(ends)
+    return Outline(ends.reshape(-1, 2), codes)
+
+
+def _description(board: Board) -> str:
+    size = f"{board.rows} x {board.columns}"
+    marker, square = f"{1e3 * board.marker:g} mm", f"{1e3 * board.square:g} mm"
+    return {
+        "checkerboard": f"checkerboard of {size} corners, squares of {square}",
+        "charuco": f"ChArUco board of {size} corners, squares of {square}, markers {board.dictionary} of {marker}",
+        "apriltag": f"{size} AprilTags {board.dictionary} of {marker}, {square} from tag to tag",
+    }[board.kind]
