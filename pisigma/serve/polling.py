@@ -8,8 +8,8 @@ DURATION = 2.5e-3
 """[s] After a request, so that clients that ask every 2 ms find the server awake."""
 TAKEN_AWAY = 5e-4
 """[s] Between two looks, if other programs or threads had the processor meanwhile."""
-REST = 1.0
-"""[s] Without polling after that."""
+REST = 100.0
+"""Times as long nothing is polled after that, so that no more than one request in a hundred waits for it."""
 
 
 class Polling:
@@ -31,7 +31,7 @@ class Polling:
                 return ready
             before, now = now, time.monotonic()
             if now - before > TAKEN_AWAY:
-                self._resting_until = now + REST
+                self._resting_until = now + REST * (now - before)
         return []
 
     def went_on(self) -> None:

@@ -3,7 +3,7 @@
 import pytest
 
 from pisigma.serve import polling
-from pisigma.serve.polling import TAKEN_AWAY, Polling
+from pisigma.serve.polling import REST, TAKEN_AWAY, Polling
 
 DURATION = 0.02
 
@@ -67,8 +67,8 @@ def test_one_request_alone_keeps_nobody_awake(sockets):
 def test_the_server_rests_where_others_want_the_processor(sockets):
     sockets.look = 2 * TAKEN_AWAY
     busy = _after_two_requests(sockets)
-    for looks, pause in ((1, 0.0), (1, 0.5), (2, 1.0)):
-        sockets.now += pause
+    for looks, pause in ((1, 0.0), (1, 0.6), (2, 0.6)):
+        sockets.now += pause * REST * sockets.look
         busy.went_on()
         busy.went_on()
         assert busy.ready() == []
