@@ -1,4 +1,4 @@
-"""Corrected targets in place of a program's, and way points where a straight move would leave its line."""
+"""Corrected targets in place of a program's, and way points where a move would leave its line or its arc."""
 
 import difflib
 import re
@@ -10,7 +10,8 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.export.programs.targets import WITH_TARGET
-from pisigma.export.rewriting.scan import Edit, Frame, LinearMove, ScannedProgram, Target
+from pisigma.export.rewriting.arcs import Arcs, is_straight
+from pisigma.export.rewriting.scan import Edit, Frame, PathMove, Pose, ScannedProgram, Target
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.status import Status
@@ -86,7 +87,7 @@ class ProgramCorrection:
     Attributes:
         solver: the model.
         branch: to take instead of the trained one.
-        tolerance: how far the tool may leave a straight line between way points [m].
+        tolerance: how far the tool may leave a straight line or an arc between way points [m].
     """
 
     solver: CorrectedIK
@@ -98,38 +99,30 @@ class ProgramCorrection:
 
         A target is the pose that the real tool shall take. Its place takes the pose at which the robot as drawn stands
         at the corrected joint values. A straight move is cut where the line between two of these leaves the corrected
-        line by more than the tolerance.
+        line by more than the tolerance; an arc likewise, into arcs.
         """
-        targets, moves = program.targets, [move for move in program.moves if move.start is not None]
-        unknown = "where the straight move begins is not stated, so only its end is corrected"
-        left = {move.line: unknown for move in program.moves if move.start is None} | dict(program.left)
-        paths = [_path(move) for move in moves]
+        targets, ways = program.targets, {move: self.path(move) for move in program.moves}
+        paths = {move: way for move, way in ways.items() if isinstance(way, Tensor)}
         answers = self.commanded(
-            [*targets, *(move.end for move in moves)], [*(target.pose.T[None] for target in targets), *paths]
+            [*targets, *(move.end for move in paths)],
+            [*(target.pose.T[None] for target in targets), *paths.values()],
         )
-        edits, count, shift = [], 0, 0.0
-        for target, there in zip(targets, answers, strict=False):
-            if there.reached:
-                edits.append(Edit(target.pose.span, target.pose.write(there.T[0])))
-                shift = max(shift, float((there.T[0] - target.pose.T)[:3, 3].norm()))
-        for move, there in zip(moves, answers[len(targets) :], strict=True):
-            points = self.way_points(there)
-            if isinstance(points, str):
-                left.setdefault(move.line, points)
-            elif points:
-                edits += move.way_points(points)
-                count += len(points)
-        text = program.finish(_edited(program.text, edits))
-        statuses = ((target.line, there.status[0]) for target, there in zip(targets, answers, strict=False))
-        branches = sorted(
-            {index for there in answers[: len(targets)] if there.reached for index in there.branches}
-        )
+        points = {
+            move: self.way_points(move, there)
+            for move, there in zip(paths, answers[len(targets) :], strict=True)
+        }
+        reasons = {move.line: why for move, why in (ways | points).items() if isinstance(why, str)}
+        cuts = [(move, way) for move, way in points.items() if way and not isinstance(way, str)]
+        answered = list(zip(targets, answers, strict=False))
+        reached = [(target.pose, there) for target, there in answered if there.reached]
+        text = program.finish(_edited(program.text, _edits(reached, cuts)))
+        branches = sorted({index for _, there in reached for index in there.branches})
         return CorrectedProgram(
             text,
-            tuple(statuses),
-            count,
-            tuple(sorted(left.items())),
-            shift,
+            tuple((target.line, there.status[0]) for target, there in answered),
+            sum(len(way) for _, way in cuts),
+            tuple(sorted((reasons | dict(program.left)).items())),
+            max((float((there.T[0] - pose.T)[:3, 3].norm()) for pose, there in reached), default=0.0),
             tuple(self.solver.branches[index] for index in branches),
         )
 
@@ -153,42 +146,98 @@ class ProgramCorrection:
             for T, status, branch in zip(*split, strict=True)
         ]
 
-    def way_points(self, there: Commanded) -> list[Frame] | str:
-        """The way points of a straight move; or why it is not cut."""
+    def path(self, move: PathMove) -> Float64[Tensor, "points 4 4"] | str:
+        """The way that the program means, of the end's tool in the end's frame; or why that is not known."""
+        if move.start is None or (move.circular and move.via is None):
+            where = "begins or what it passes" if move.circular else "begins"
+            return f"where the {_kind(move)} {where} is not stated, so only its end is corrected"
+        start, end = _seen_from(move.end, move.start), move.end.pose.T[None]
+        if move.via is None:
+            return _between(start, end, _steps(start, end, _distance(start, end)))[0]
+        via = _seen_from(move.end, move.via)
+        if is_straight(*(T[:, :3, 3] for T in (start, via, end))):
+            return "the points of the arc lie on a line or in one place, so it has no way points"
+        arc = Arcs.through(*(T[:, :3, 3] for T in (start, via, end)))
+        between = start[:, :3, :3] @ rotation_from_vector(arc.passing / arc.angle * _turn(start, end))
+        if LEVER * float(rotation_vector(between.mT @ via[:, :3, :3]).norm()) > self.tolerance:
+            return "the tool turns along the arc otherwise than from its begin to its end, so it has no way points"
+        length = float(arc.angle * arc.radius.norm())
+        return _round(start, via, end, _steps(start, end, length))[0]
+
+    def way_points(self, move: PathMove, there: Commanded) -> list[Frame] | str:
+        """The way points of a move, see `PathMove.way_points`; or why it is not cut."""
         if not there.reached:
-            return "the straight move cannot be followed everywhere, so it has no way points"
+            return f"the {_kind(move)} cannot be followed everywhere, so it has no way points"
         if len(there.branches) > 1:
-            return "the straight move passes from one branch to another, so it has no way points"
-        stride = len(there.T) - 1
-        while stride > 1 and _off_chords(there.T, stride) > self.tolerance:
+            return f"the {_kind(move)} passes from one branch to another, so it has no way points"
+        whole = stride = len(there.T) - 1
+        least = 2 if move.circular else 1
+        while stride > least and _off(there.T, stride, move.circular) > self.tolerance:
             stride //= 2
-        return list(there.T[stride:-1:stride])
+        between = stride // least
+        return list(there.T[between:-1:between]) if stride < whole else []
 
 
-def _path(move: LinearMove) -> Float64[Tensor, "points 4 4"]:
-    """The straight way that the program means, of the end's tool in the end's frame."""
-    start, end = move.start, move.end
-    assert start is not None
-    T_flange = start.T_root_frame @ start.pose.T @ invert(start.T_flange_tool)
-    T_start = invert(end.T_root_frame) @ T_flange @ end.T_flange_tool
-    return _between(T_start[None], end.pose.T[None], _steps(T_start, end.pose.T))[0]
+def _kind(move: PathMove) -> str:
+    return "arc" if move.circular else "straight move"
 
 
-def _off_chords(T: Float64[Tensor, "points 4 4"], stride: int) -> float:
-    """How far poses are at most off the straight lines between every so many of them [m]."""
-    chord = _between(T[:-1:stride], T[stride::stride], stride)[:, :-1].flatten(0, 1)
-    turn = rotation_vector(chord[:, :3, :3].mT @ T[:-1, :3, :3]).norm(dim=-1)
-    return float(((chord - T[:-1])[:, :3, 3].norm(dim=-1) + LEVER * turn).max())
+def _edits(
+    reached: Sequence[tuple[Pose, Commanded]], cuts: Sequence[tuple[PathMove, list[Frame]]]
+) -> list[Edit]:
+    """The new poses of targets and the way points of moves, where an arc's replaces what it passed before."""
+    added = [edit for move, way in cuts for edit in move.way_points(way)]
+    replaced = [edit.span for edit in added if edit.span[0] < edit.span[1]]
+    corrected = [Edit(pose.span, pose.write(there.T[0])) for pose, there in reached]
+    return added + [
+        edit
+        for edit in corrected
+        if not any(begin <= edit.span[0] and edit.span[1] <= end for begin, end in replaced)
+    ]
 
 
-def _steps(start: Frame, end: Frame) -> int:
-    """A power of two: steps that are short enough to see the correction change."""
-    length = float((end - start)[:3, 3].norm())
-    angle = float(rotation_vector(start[:3, :3].mT @ end[:3, :3]).norm())
+def _seen_from(end: Target, target: Target) -> Float64[Tensor, "1 4 4"]:
+    """The pose of the end's tool in the end's frame when the robot stands at a target."""
+    T_flange = target.T_root_frame @ target.pose.T @ invert(target.T_flange_tool)
+    return (invert(end.T_root_frame) @ T_flange @ end.T_flange_tool)[None]
+
+
+def _off(T: Float64[Tensor, "points 4 4"], stride: int, circular: bool) -> float:
+    """How far poses are at most off the straight lines, or arcs, between every so many of them [m]."""
+    start, end = T[:-1:stride], T[stride::stride]
+    drawn = _round(start, T[stride // 2 :: stride], end, stride) if circular else _between(start, end, stride)
+    drawn = drawn[:, :-1].flatten(0, 1)
+    turn = rotation_vector(drawn[:, :3, :3].mT @ T[:-1, :3, :3]).norm(dim=-1)
+    return float(((drawn - T[:-1])[:, :3, 3].norm(dim=-1) + LEVER * turn).max())
+
+
+def _steps(start: Float64[Tensor, "1 4 4"], end: Float64[Tensor, "1 4 4"], length: float) -> int:
+    """A power of two: steps of a way of a length [m] that are short enough to see the correction change."""
+    angle = float(_turn(start, end).norm())
     steps = 8
     while steps < MOST_STEPS and steps < max(length / SPACING, angle / STEP_ANGLE):
         steps *= 2
     return steps
+
+
+def _distance(start: Float64[Tensor, "1 4 4"], end: Float64[Tensor, "1 4 4"]) -> float:
+    return float((end - start)[:, :3, 3].norm())
+
+
+def _turn(start: Float64[Tensor, "ways 4 4"], end: Float64[Tensor, "ways 4 4"]) -> Float64[Tensor, "ways 3"]:
+    """Rotation vectors from poses to others [rad], in the frames of the former."""
+    return rotation_vector(start[:, :3, :3].mT @ end[:, :3, :3])
+
+
+def _round(
+    start: Float64[Tensor, "ways 4 4"],
+    via: Float64[Tensor, "ways 4 4"],
+    end: Float64[Tensor, "ways 4 4"],
+    steps: int,
+) -> Float64[Tensor, "ways points 4 4"]:
+    """Poses from ones by others to third ones: an arc, and a turn about one axis from begin to end."""
+    arcs = Arcs.through(*(T[:, :3, 3] for T in (start, via, end)))
+    return transform(_between(start, end, steps)[..., :3, :3], arcs.points(steps))
 
 
 def _between(
@@ -196,8 +245,7 @@ def _between(
 ) -> Float64[Tensor, "ways points 4 4"]:
     """Poses from ones to others: a straight line, and a turn about one axis."""
     share = torch.linspace(0, 1, steps + 1, dtype=torch.float64)[:, None]
-    turn = rotation_vector(start[:, :3, :3].mT @ end[:, :3, :3])
-    R = start[:, None, :3, :3] @ rotation_from_vector(share * turn[:, None])
+    R = start[:, None, :3, :3] @ rotation_from_vector(share * _turn(start, end)[:, None])
     return transform(R, start[:, None, :3, 3] + share * (end - start)[:, None, :3, 3])
 
 

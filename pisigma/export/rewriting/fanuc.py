@@ -19,6 +19,7 @@ from pisigma.export.rewriting.scan import (
     Pose,
     Scan,
     ScannedProgram,
+    groups_of,
 )
 from pisigma.se3 import transform_from_xyzrpy
 
@@ -77,7 +78,7 @@ class _Reader:
 
     def _move(self, line: re.Match[str], move: re.Match[str]) -> None:
         names = [move["target"], *re.findall(r":\s*(P\[[^\]]*\])", move["rest"])]
-        for name in names:
+        for order, name in enumerate(names):
             index = re.match(r"P\[(\d+)", name)
             match = self.positions.get(index[1]) if index else None
             if match is not None and re.search(r"\bJ1\s*=", match["body"]):
@@ -94,9 +95,10 @@ class _Reader:
                     if isinstance(pose, Pose):
                         self.scan.blur(pose)
                     pose = f"{modified[0]} moves the target"
-            linear = move["kind"] == "L" and isinstance(pose, Pose)
-            cut = partial(self._way_points, line, move, match) if linear and match else None
-            self.scan.move(line.start(), pose, frame, tool, cut)
+            circular = move["kind"] == "C" and order == 1
+            cuttable = isinstance(pose, Pose) and (circular or move["kind"] == "L")
+            cut = partial(self._way_points, line, move, match, len(names)) if cuttable and match else None
+            self.scan.move(line.start(), pose, frame, tool, cut, circular)
 
     def _pose(self, name: str) -> Pose | str:
         match = self.positions[name]
@@ -109,20 +111,30 @@ class _Reader:
         return Pose(values.span("six"), T, partial(_written, values["six"]))
 
     def _way_points(
-        self, line: re.Match[str], move: re.Match[str], match: re.Match[str], poses: Sequence[Frame]
+        self,
+        line: re.Match[str],
+        move: re.Match[str],
+        match: re.Match[str],
+        count: int,
+        poses: Sequence[Frame],
     ) -> list[Edit]:
         """Lines and positions of way points, with the speed of the move and continuous termination."""
-        speed = re.match(r"\s*(\S+)", move["rest"])
-        lines, positions = [], []
+        speed = re.match(r"(?:\s*:\s*P\[[^\]]*\])?\s*(\S+)", move["rest"])
         span = _VALUES.match(self.text, match.start("body"))
         assert span is not None
+        names, positions = [], []
         for T in poses:
-            name = next(self.numbers)
-            lines.append(f"   1:L P[{name}] {speed[1] if speed else ''} CNT100 ;{self.scan.line_end}")
-            head = re.sub(r"^P\[[^\]]*\]", f"P[{name}]", self.text[match.start() : span.start("six")])
+            names.append(f"P[{next(self.numbers)}]")
+            head = re.sub(r"^P\[[^\]]*\]", names[-1], self.text[match.start() : span.start("six")])
             positions.append(f"{head}{_written(span['six'], T)}{self.text[span.end('six') : match.end()]}")
-        end = self.text.rindex("/END")
-        return [Edit((line.start(),) * 2, "".join(lines)), Edit((end, end), "".join(positions))]
+        letter, between = ("L", "") if count == 1 else ("C", f"{self.scan.line_end}    :  ")
+        lines = (
+            f"   1:{letter} {between.join(group)} {speed[1] if speed else ''} CNT100 ;{self.scan.line_end}"
+            for group in groups_of(names, count)
+        )
+        end, target = self.text.rindex("/END"), line.start("body") + move.start("target")
+        passed = [Edit((target, target + len(move["target"])), names[-1])] if count == 2 else []
+        return [Edit((line.start(),) * 2, "".join(lines)), Edit((end, end), "".join(positions)), *passed]
 
 
 def _written(text: str, T: Frame) -> str:

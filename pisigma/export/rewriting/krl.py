@@ -20,6 +20,7 @@ from pisigma.export.rewriting.scan import (
     Scan,
     ScannedProgram,
     arguments,
+    groups_of,
     masked,
     numbers_in,
 )
@@ -43,6 +44,7 @@ _STATEMENT = re.compile(
     r"|S?(?P<move>PTP|LIN|CIRC)(?P<relative>_REL)?\s+(?P<target>[^\n]*?)[ \t\r]*$)",
     re.MULTILINE | re.IGNORECASE,
 )
+_TURNING = re.compile(r"\$(?:CIRC_TYPE|ORI_TYPE)\b", re.IGNORECASE)
 _OPENS = re.compile(r"(?:GLOBAL\s+)?DEF|IF|FOR|WHILE|LOOP|REPEAT|SWITCH", re.IGNORECASE)
 _CLOSES = re.compile(r"END\w*|UNTIL", re.IGNORECASE)
 
@@ -129,15 +131,21 @@ class _Reader:
 
     def _move(self, match: re.Match[str]) -> None:
         start, kind = match.start("target"), match["move"].upper()
-        for begin, _ in [*arguments(match["target"] + ";", 0)][: 2 if kind == "CIRC" else 1]:
-            if _AXES.match(self.text, start + begin):
+        spans = [(start + begin, start + end) for begin, end in arguments(match["target"] + ";", 0)]
+        operands = []
+        for begin, _ in spans[: 2 if kind == "CIRC" else 1]:
+            if _AXES.match(self.text, begin):
                 self.scan.joints(match.start())
                 continue
-            pose = self._target(start + begin) if not match["relative"] else COMPUTED
-            cut = None
-            if kind == "LIN" and isinstance(pose, Pose):
-                cut = partial(self._way_points, match, start + begin)
-            self.scan.move(match.start(), pose, self.state["BASE"], self.state["TOOL"], cut)
+            pose = self._target(begin) if not match["relative"] else COMPUTED
+            operands.append(begin)
+            circular, cut = len(operands) == 2, None
+            if isinstance(pose, Pose) and (circular or kind == "LIN"):
+                if circular and (len(spans) > 2 or _TURNING.search(self.text)):
+                    self.scan.leave(match.start(), "the angle of the arc, or how the tool turns, is stated")
+                else:
+                    cut = partial(self._way_points, match, operands)
+            self.scan.move(match.start(), pose, self.state["BASE"], self.state["TOOL"], cut, circular)
 
     def _target(self, start: int) -> Pose | str:
         if literal := _AGGREGATE.match(self.text, start):
@@ -145,13 +153,21 @@ class _Reader:
         name = _NAME.match(self.text, start)
         return (self.names.get(name[0]) if name else None) or COMPUTED
 
-    def _way_points(self, move: re.Match[str], operand: int, poses: Sequence[Frame]) -> list[Edit]:
-        """Straight moves to all way points, which are passed by distance."""
+    def _way_points(self, move: re.Match[str], operands: Sequence[int], poses: Sequence[Frame]) -> list[Edit]:
+        """Straight moves or arcs to all way points, which are passed by distance."""
         start = self.scan.line_start(move.start())
-        word = self.text[start:operand]
-        smooth = "" if "SLIN" in word.upper() else " C_DIS"
-        lines = (f"{word}{{{_six(T)}}}{smooth}{self.scan.line_end}" for T in poses)
-        return [Edit((start, start), "".join(lines))]
+        word = self.text[start : operands[0]]
+        smooth = "" if re.match(r"\s*S(LIN|CIRC)", word, re.IGNORECASE) else " C_DIS"
+        lines = (
+            f"{word}{', '.join(f'{{{_six(T)}}}' for T in group)}{smooth}{self.scan.line_end}"
+            for group in groups_of(poses, len(operands))
+        )
+        edits = [Edit((start, start), "".join(lines))]
+        if len(operands) == 2:
+            passed = _AGGREGATE.match(self.text, operands[0]) or _NAME.match(self.text, operands[0])
+            assert passed is not None
+            edits.append(Edit(passed.span(), f"{{{_six(poses[-1])}}}"))
+        return edits
 
 
 def _pose(literal: re.Match[str]) -> Pose:

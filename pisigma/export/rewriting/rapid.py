@@ -20,6 +20,7 @@ from pisigma.export.rewriting.scan import (
     Scan,
     ScannedProgram,
     arguments,
+    groups_of,
     masked,
     numbers_in,
 )
@@ -42,6 +43,7 @@ _WOBJ = re.compile(
 _DATA = re.compile(
     r"(?im)^[ \t]*(?:LOCAL\s+|TASK\s+)?(?:CONST|PERS|VAR)\s+(robtarget|tooldata|wobjdata)\s+(\w+)\s*:=\s*"
 )
+_TURNING = re.compile(r"(?i)\bCirPathMode\b")
 _SET = re.compile(r"\b(\w+)(?:\.\w+)*\s*:=")
 _FLOW = (
     "PROC|ENDPROC|FUNC|ENDFUNC|TRAP|ENDTRAP|IF|ELSEIF|ELSE|ENDIF|FOR|ENDFOR|WHILE|ENDWHILE|TEST|CASE|DEFAULT|ENDTEST|"
@@ -107,15 +109,17 @@ class _Reader:
             return
         frame, tool = self._frames(self.text[slice(*spans[count + 2])])
         timed = re.search(r"(?i)\\T\s*:=", self.text[slice(*spans[count])])
-        for span in spans[:count]:
+        for index, span in enumerate(spans[:count]):
             pose = self._target(re.split(r"\s*\\", self.text[slice(*span)])[0], span)
-            cut = None
-            if kind[1].upper() == "L" and isinstance(pose, Pose):
+            circular, cut = index == 1, None
+            if isinstance(pose, Pose) and (circular or kind[1].upper() == "L"):
                 if timed:
                     self.scan.leave(match.start(), "the move has a time, so no way points are put in")
+                elif circular and _TURNING.search(self.text):
+                    self.scan.leave(match.start(), "the module states how the tool turns along arcs")
                 else:
-                    cut = partial(self._way_points, match, spans, pose)
-            self.scan.move(match.start(), pose, frame, tool, cut)
+                    cut = partial(self._way_points, match, spans, count, pose)
+            self.scan.move(match.start(), pose, frame, tool, cut, circular)
 
     def _target(self, expression: str, span: tuple[int, int]) -> Pose | str:
         if literal := _TARGET.match(self.text, span[0]):
@@ -135,7 +139,12 @@ class _Reader:
         )
 
     def _way_points(
-        self, move: re.Match[str], spans: Sequence[tuple[int, int]], pose: Pose, poses: Sequence[Frame]
+        self,
+        move: re.Match[str],
+        spans: Sequence[tuple[int, int]],
+        count: int,
+        pose: Pose,
+        poses: Sequence[Frame],
     ) -> list[Edit]:
         """The move again before itself, once a way point, past which the tool flies."""
         start = self.scan.line_start(move.start())
@@ -143,13 +152,15 @@ class _Reader:
         literal = _TARGET.search(text, text.rfind("[", 0, begin))
         assert literal is not None
         rest = text[end : literal.end()]
-        speed, last = text[slice(*spans[1])], text[slice(*spans[3])]
+        speed, last = text[slice(*spans[count])], text[slice(*spans[count + 2])]
         indent = re.match(r"[ \t]*", text[start:])
+        word = f"{indent[0] if indent else ''}Move{'L' if count == 1 else 'C'}"
         lines = (
-            f"{indent[0] if indent else ''}MoveL [{pose.write(T)}{rest}, {speed}, z1, {last};{self.scan.line_end}"
-            for T in poses
+            f"{word} {', '.join(f'[{pose.write(T)}{rest}' for T in group)}, {speed}, z1, {last};{self.scan.line_end}"
+            for group in groups_of(poses, count)
         )
-        return [Edit((start, start), "".join(lines))]
+        passed = [Edit(spans[0], f"[{pose.write(poses[-1])}{rest}")] if count == 2 else []
+        return [Edit((start, start), "".join(lines)), *passed]
 
 
 def _frame(text: str) -> Frame:

@@ -3,14 +3,16 @@
 import bisect
 import re
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
 Frame = Float64[Tensor, "4 4"]
+_Item = TypeVar("_Item")
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 COMPUTED = "the target is computed or not stated in this file"
@@ -58,19 +60,25 @@ class Target:
 
 
 @dataclass(frozen=True, eq=False)
-class LinearMove:
-    """A straight move to a target.
+class PathMove:
+    """A straight move to a target, or an arc through another one.
 
     Attributes:
         line: of the move.
         start: the target before; None where the program does not say where the move begins.
+        via: the target that an arc passes; None for a straight move, or where the program does not state it.
         end: where it leads.
-        way_points: gives the edits that make it go by poses of the end's tool in the end's frame.
+        circular: whether it is an arc.
+        way_points: gives the edits that make it go by poses of the end's tool in the end's frame. Those of an arc
+            become arcs too: by turns a pose that one passes and the pose where it ends, and at last the one that the
+            move itself passes then.
     """
 
     line: int
     start: Target | None
+    via: Target | None
     end: Target
+    circular: bool
     way_points: Callable[[Sequence[Frame]], list[Edit]]
 
 
@@ -81,7 +89,7 @@ class ScannedProgram:
     Attributes:
         text: of the program.
         targets: those whose frame and tool are known, in the order of the text.
-        moves: the straight ones among the moves to them.
+        moves: the straight ones and the arcs among the moves to them.
         left: line and reason of whatever is left alone.
         joint_lines: lines of moves to joint values, which stay.
         finish: what is done to the text after the edits, such as numbering its lines.
@@ -89,7 +97,7 @@ class ScannedProgram:
 
     text: str
     targets: tuple[Target, ...]
-    moves: tuple[LinearMove, ...]
+    moves: tuple[PathMove, ...]
     left: tuple[tuple[int, str], ...]
     joint_lines: tuple[int, ...]
     finish: Callable[[str], str] = lambda text: text
@@ -141,10 +149,10 @@ class Scan:
         self._breaks = [match.start() for match in re.finditer("\n", text)]
         self._targets: dict[tuple[int, int], Target] = {}
         self._unclear: set[tuple[int, int]] = set()
-        self._moves: list[LinearMove] = []
+        self._moves: list[PathMove] = []
         self._left: dict[int, str] = {}
         self._joint_lines: list[int] = []
-        self._previous: Target | None = None
+        self._last_two: tuple[Target | None, Target | None] = (None, None)
 
     def line(self, position: int) -> int:
         """The line of a place in the text, from 1."""
@@ -159,13 +167,13 @@ class Scan:
         self._left.setdefault(self.line(position), reason)
 
     def interrupt(self) -> None:
-        """What follows may be reached from elsewhere: the next straight move begins nobody knows where."""
-        self._previous = None
+        """What follows may be reached from elsewhere: the next move begins nobody knows where."""
+        self._last_two = (None, None)
 
     def joints(self, position: int) -> None:
         """A move to joint values, which stays."""
         self._joint_lines.append(self.line(position))
-        self._previous = None
+        self._last_two = (None, None)
 
     def blur(self, pose: Pose) -> None:
         """A pose is used in ways that are not understood, so it stays."""
@@ -178,6 +186,7 @@ class Scan:
         frame: Frame | str,
         tool: Frame | str,
         way_points: Callable[[Sequence[Frame]], list[Edit]] | None = None,
+        circular: bool = False,
     ) -> None:
         """A move to a pose.
 
@@ -186,9 +195,11 @@ class Scan:
             pose: the pose, or why it is not understood; likewise `frame` and `tool`.
             frame: that the pose is given in, seen from the origin of the robot description.
             tool: that is brought there, seen from the last row of the robot description.
-            way_points: of a straight move, see `LinearMove`.
+            way_points: of a straight move or an arc, see `PathMove`.
+            circular: whether it is the end of an arc, whose other target came before.
         """
-        self._previous, before = None, self._previous
+        start, via = self._last_two if circular else (self._last_two[1], None)
+        self._last_two = (self._last_two[1], None)
         for part in (pose, frame, tool):
             if isinstance(part, str):
                 self.leave(position, part)
@@ -205,8 +216,8 @@ class Scan:
             self.blur(pose)
             return
         if way_points is not None:
-            self._moves.append(LinearMove(self.line(position), before, target, way_points))
-        self._previous = target
+            self._moves.append(PathMove(self.line(position), start, via, target, circular, way_points))
+        self._last_two = (self._last_two[0], target)
 
     def program(
         self, names: NamedPoses | None = None, finish: Callable[[str], str] = lambda text: text
@@ -219,18 +230,17 @@ class Scan:
                 self._left.setdefault(target.line, "the pose is also used in a way that is not understood")
         kept = {span: target for span, target in self._targets.items() if span not in self._unclear}
         moves = [
-            LinearMove(
-                move.line,
-                move.start if move.start and move.start.pose.span in kept else None,
-                move.end,
-                move.way_points,
-            )
+            replace(move, start=_among(kept, move.start), via=_among(kept, move.via))
             for move in self._moves
-            if move.end.pose.span in kept
+            if _among(kept, move.end)
         ]
         targets = tuple(kept[span] for span in sorted(kept))
         left = tuple(sorted(self._left.items()))
         return ScannedProgram(self.text, targets, tuple(moves), left, tuple(self._joint_lines), finish)
+
+
+def _among(kept: Mapping[tuple[int, int], Target], target: Target | None) -> Target | None:
+    return None if target is None else kept.get(target.pose.span)
 
 
 def masked(text: str, hidden: re.Pattern[str]) -> str:
@@ -263,6 +273,11 @@ def arguments(text: str, start: int) -> Iterator[tuple[int, int]]:
 def _stripped(text: str, start: int, end: int) -> tuple[int, int]:
     inside = text[start:end]
     return start + len(inside) - len(inside.lstrip()), end - len(inside) + len(inside.rstrip())
+
+
+def groups_of(poses: Sequence[_Item], count: int) -> list[Sequence[_Item]]:
+    """The way points, or their names, of every move that is put in: one each, or two for arcs; see `PathMove`."""
+    return [poses[first : first + count] for first in range(0, len(poses) - count + 1, count)]
 
 
 def numbers_in(text: str) -> list[float]:

@@ -1,7 +1,7 @@
 """Poses of URScript programs: `p[x, y, z, rx, ry, rz]` in metres and rotation vectors."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -20,6 +20,7 @@ from pisigma.export.rewriting.scan import (
     Scan,
     ScannedProgram,
     arguments,
+    groups_of,
     masked,
     numbers_in,
 )
@@ -33,6 +34,9 @@ _STATEMENT = re.compile(
     r"|(?P<call>\b(?P<name>move[jlpc]|servo[jc]|set_tcp)\s*\()",
     re.MULTILINE,
 )
+_TURNING = re.compile(r"mode\s*=\s*(?!0$)")
+_Span = tuple[int, int]
+
 BLEND = 1e-3
 """[m] Radius at way points, smaller where the way is short."""
 
@@ -81,20 +85,37 @@ class _Reader:
 
     def _move(self, call: re.Match[str]) -> None:
         spans = list(arguments(self.text, call.end()))
-        for span in spans[: 2 if call["name"] in ("movec", "servoc") else 1]:
+        circular = call["name"] in ("movec", "servoc")
+        operands = []
+        for span in spans[: 2 if circular else 1]:
             if self.text[span[0]] == "[":
                 self.scan.joints(call.start())
                 continue
             pose, frame, operand = self._target(span)
+            operands.append(operand)
             cut = None
-            if call["name"] == "movel" and isinstance(pose, Pose):
-                if any(re.match(r"t\s*=", self.text[slice(*other)]) for other in spans):
-                    self.scan.leave(call.start(), "the move has a time, so no way points are put in")
-                else:
-                    cut = partial(self._way_points, call, spans, operand, pose)
-            self.scan.move(call.start(), pose, frame, self.tool, cut)
+            if call["name"] == "movel" or len(operands) == 2:
+                cut = self._cut(call, spans, operands, pose)
+            self.scan.move(call.start(), pose, frame, self.tool, cut, circular=len(operands) == 2)
 
-    def _target(self, span: tuple[int, int]) -> tuple[Pose | str, Frame | str, tuple[int, int]]:
+    def _cut(
+        self, call: re.Match[str], spans: Sequence[_Span], operands: Sequence[_Span], pose: Pose | str
+    ) -> Callable[[Sequence[Frame]], list[Edit]] | None:
+        """What puts way points in, if that can be."""
+        rest = [self.text[slice(*span)] for span in spans[len(operands) :]]
+        if isinstance(pose, str) or call["name"] == "servoc":
+            return None
+        if any(re.match(r"t\s*=", argument) for argument in rest):
+            self.scan.leave(call.start(), "the move has a time, so no way points are put in")
+            return None
+        if sum("=" not in argument for argument in rest) > 2 or any(map(_TURNING.match, rest)):
+            self.scan.leave(
+                call.start(), "a radius without its name or a mode is stated, so no way points are put in"
+            )
+            return None
+        return partial(self._way_points, call, spans, operands, rest, pose)
+
+    def _target(self, span: _Span) -> tuple[Pose | str, Frame | str, _Span]:
         """The pose that an argument is, the frame it is given in, and where it stands."""
         expression = self.text[slice(*span)]
         if function := re.match(r"(get_inverse_kin|pose_trans)\s*\(", expression):
@@ -108,7 +129,7 @@ class _Reader:
             return pose, frame.T if frame else "the frame is computed", operand
         return self._constant(span, target=True) or COMPUTED, IDENTITY, span
 
-    def _constant(self, span: tuple[int, int], target: bool) -> Pose | None:
+    def _constant(self, span: _Span, target: bool) -> Pose | None:
         expression = self.text[slice(*span)]
         if _LITERAL.fullmatch(expression):
             return _pose(self.text, span)
@@ -117,27 +138,32 @@ class _Reader:
     def _way_points(
         self,
         call: re.Match[str],
-        spans: Sequence[tuple[int, int]],
-        operand: tuple[int, int],
+        spans: Sequence[_Span],
+        operands: Sequence[_Span],
+        rest: Sequence[str],
         pose: Pose,
         poses: Sequence[Frame],
     ) -> list[Edit]:
         """The move again before itself, once a way point, with a small blend radius."""
-        start, (before, after) = self.scan.line_start(call.start()), operand
-        line_end = self.scan.line_end
-        ends = torch.stack([*poses, pose.T])[:, :3, 3]
+        start, count = self.scan.line_start(call.start()), len(operands)
+        ends = torch.stack([*poses[count - 1 :: count], pose.T])[:, :3, 3]
         nearest = float((ends[1:] - ends[:-1]).norm(dim=-1).min())
         radius = f"r={number(min(BLEND, nearest / 4), 6)}"
-        rest = [self.text[slice(*span)] for span in spans[1:]]
         named = [index for index, argument in enumerate(rest) if re.match(r"r\s*=", argument)]
         rest = [radius if index in named else argument for index, argument in enumerate(rest)]
         rest += [] if named else [radius]
-        head, tail = self.text[start:before], self.text[after : spans[0][1]]
-        lines = (f"{head}{', '.join([pose.write(T) + tail, *rest])}){line_end}" for T in poses)
-        return [Edit((start, start), "".join(lines))]
+        head, lines = self.text[start : spans[0][0]], []
+        for group in groups_of(poses, count):
+            targets = [
+                self.text[span[0] : operand[0]] + pose.write(T) + self.text[operand[1] : span[1]]
+                for span, operand, T in zip(spans, operands, group, strict=False)
+            ]
+            lines.append(f"{head}{', '.join([*targets, *rest])}){self.scan.line_end}")
+        passed = [Edit(operands[0], pose.write(poses[-1]))] if count == 2 else []
+        return [Edit((start, start), "".join(lines)), *passed]
 
 
-def _pose(text: str, span: tuple[int, int]) -> Pose:
+def _pose(text: str, span: _Span) -> Pose:
     values = torch.tensor(numbers_in(text[slice(*span)]), dtype=torch.float64)
     return Pose(span, transform(rotation_from_vector(values[3:]), values[:3]), _written)
 

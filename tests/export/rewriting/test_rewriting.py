@@ -5,11 +5,9 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
-from testing.identified import geometric_model, off_by
 from testing.rewritten_programs import (
     FRAME,
     LANGUAGES,
@@ -24,23 +22,9 @@ from testing.rewritten_programs import (
 
 from pisigma.errors import OutputError
 from pisigma.export.export_format import Exported, ExportRequest
-from pisigma.export.programs.text import (
-    millimetres_and_euler,
-)
+from pisigma.export.programs.text import millimetres_and_euler
 from pisigma.export.registry import export_model
-from pisigma.model.folder.model_folder import load_model, save_model
-from pisigma.robot import Robot
-
-
-@pytest.fixture(scope="module")
-def arm(tmp_path_factory) -> Path:
-    """A geometric model of a UR10 with a base and a tool of its own."""
-    nominal = Robot.load("ur10").with_geometry(base=np.full(6, 0.3), tool=np.full(6, 0.1))
-    model = geometric_model("ur10")
-    folder = tmp_path_factory.mktemp("models") / "arm"
-    folder.mkdir()
-    save_model(replace(model, robot=nominal, calibrated=off_by(nominal)), folder)
-    return folder
+from pisigma.model.folder.model_folder import load_model
 
 
 @pytest.mark.parametrize("language", LANGUAGES, ids=lambda language: language.suffix)
