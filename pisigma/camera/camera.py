@@ -20,6 +20,8 @@ USUAL_DEVIATIONS = (0.5, 0.5, 1.0, 1.0, 0.002, 0.01, 2e-4, 2e-4, 0.0)
 
 Positive = Annotated[float, Field(gt=0)]
 Deviation = Annotated[float, Field(ge=0)]
+UNDISTORTED = 1e-14
+"""A shorter Newton step to the undistorted point is rounding."""
 UNDISTORT_STEPS = 20
 """Newton steps from a distorted to the undistorted point; ordinary lenses take four."""
 
@@ -192,7 +194,10 @@ class Camera:
         xy = bent.copy()
         for _ in range(UNDISTORT_STEPS):
             now, derivative = self._distorted(xy)
-            xy += np.linalg.solve(derivative, (bent - now)[..., None])[..., 0]
+            step = np.linalg.solve(derivative, (bent - now)[..., None])[..., 0]
+            xy += step
+            if not np.abs(step).max(initial=0.0) > UNDISTORTED:
+                break
         return xy
 
     def _distorted(self, xy: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
