@@ -1,6 +1,7 @@
 """All checks; a new one is a file and a line here."""
 
 from pisigma.judging.diagnostic import Diagnostic
+from pisigma.verification.checks.camera import CameraCheck
 from pisigma.verification.checks.check import AbstractCheck, CheckedCalibration
 from pisigma.verification.checks.few_rows import FewRowsCheck
 from pisigma.verification.checks.other_robot import OtherRobotCheck
@@ -26,6 +27,7 @@ CHECKS: tuple[AbstractCheck, ...] = (
     TwoPopulationsCheck(),
     FewRowsCheck(),
     TemperatureCheck(),
+    CameraCheck(),
 )
 """In the order in which their diagnostics are printed."""
 
