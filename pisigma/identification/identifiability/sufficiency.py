@@ -9,7 +9,7 @@ from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.setup import CalibrationSetup
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot.description import Robot
-from pisigma.sensors.intrinsics import BoardScaleSensor, IntrinsicsSensor
+from pisigma.sensors.intrinsics import SCALE_COLUMN, BoardScaleSensor, IntrinsicsSensor, texts_of
 
 LITTLE_MOTION = 0.1
 """[rad or m] A joint that moves less hardly shows its errors."""
@@ -26,10 +26,6 @@ TOUCHES_WITHOUT_SCALE = (
 SOCKETS_WITHOUT_SCALE = (
     "sockets alone are met by a robot of any size, so the scale stays as drawn; give the distance between two sockets "
     "(socket_distances), or measure one length otherwise."
-)
-SCALE_OF_BOARD = (
-    "every length rests on the board that the camera sees: if its squares are 0.1 % too large, so is the robot, and no "
-    "residual shows it; measure the board with a calliper, or one known distance with another sensor."
 )
 
 
@@ -167,6 +163,22 @@ def determines_scale(setup: CalibrationSetup) -> bool:
     return any(max(values) - min(values) > SAME_FACE for values in faces.values())
 
 
+def _scale_of_boards(setup: CalibrationSetup) -> str:
+    """Say that nothing but boards gives the scale, and how sure it is."""
+    stated = [float(text) for text in texts_of(setup.measurements, SCALE_COLUMN) if text]
+    how_sure = (
+        f"its squares are stated to {max(stated):.2g} of their length, which is "
+        f"{max(stated) * setup.problem.space.robot.reach * 1e3:.2g} mm at the reach of the robot"
+        if stated
+        else "how sure its squares are is not stated (square_sigma_mm), so no predicted error contains it"
+    )
+    return (
+        "every length rests on the board that the camera sees: if its squares are 0.1 % too large, so is the robot, "
+        f"and no residual shows it; {how_sure}. Measure the board with a calliper, or one known distance with another "
+        "sensor."
+    )
+
+
 def _lengths(setup: CalibrationSetup) -> set[str]:
     """Names of the sensors that measure lengths, or state them."""
     stated = (IntrinsicsSensor.name, BoardScaleSensor.name)
@@ -177,7 +189,7 @@ def _lengths(setup: CalibrationSetup) -> set[str]:
 
 def _scale(setup: CalibrationSetup) -> list[str]:
     if _lengths(setup) == {"corner"}:
-        return [SCALE_OF_BOARD]
+        return [_scale_of_boards(setup)]
     if determines_scale(setup):
         return []
     return [TOUCHES_WITHOUT_SCALE if "touch" in setup.measurements.kinds else SOCKETS_WITHOUT_SCALE]
