@@ -97,7 +97,8 @@ def intrinsics_information(
     free = np.flatnonzero(sigma > 0)
     scaled = images.root[:, :, free] * sigma[free]
     information = np.eye(len(free)) + np.einsum("nij,nik->jk", scaled, scaled)
-    pull = np.einsum("nij,ni->j", scaled, images.residual) + (images.stated[0] - at)[free] / sigma[free]
+    residual = images.residual + np.einsum("nij,nj->ni", images.root, images.at - at)
+    pull = np.einsum("nij,ni->j", scaled, residual) + (images.stated[0] - at)[free] / sigma[free]
     U, mean = np.zeros((NUMBERS, NUMBERS)), at.copy()
     U[np.ix_(free, free)] = np.linalg.cholesky(information).T / sigma[free]
     mean[free] += sigma[free] * np.linalg.solve(information, pull)
