@@ -1,0 +1,223 @@
+"""Cameras in other set-ups than one camera on the flange, with wrong corners and images, and with gears.
+
+    OMP_NUM_THREADS=1 python benchmarks/camera_setups.py [mixed] [wrong] [gears] [--draws 10]
+
+The arms, cameras, boards and noise of `camera.py`, with intrinsics taken as they are. mixed: a fixed camera with the
+board on the flange, two cameras, and a camera with 10 positions of a tracker (0.02 mm), each beside its parts alone.
+wrong: 5 % of the corners off by 5 px and three images with two joint values swapped. gears: joints that wobble by two
+harmonics of 0.015 deg, 150 images, the hybrid against the geometry alone. Errors are those of the target's position
+over 400 postures of the whole joint space after the best rigid alignment, pooled over draws.
+"""
+
+import argparse
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import torch
+from camera import (
+    ANGLE,
+    BOARD,
+    CAMERA,
+    CANDIDATES,
+    IN_BASE,
+    LENGTH,
+    NOISE,
+    ON_FLANGE,
+    POSTURES,
+    PRIOR,
+    aligned_error,
+    far_apart,
+    views,
+)
+from torch import Tensor
+
+from pisigma.camera.image_rows import Images, image_measurements
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.kinematics.closed_form.registry import closed_form_solver
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.dataset import Measurements, join
+from pisigma.robot import Robot
+from pisigma.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.simulation.camera.images import simulate_images
+
+BESIDE = replace(CAMERA, name="beside", is_fixed=True)
+HAND = replace(BOARD, name="hand")
+CAMERA_IN_BASE = torch.tensor([0.45, -0.1, 0.9, 0.0, 0.0, np.pi], dtype=torch.float64)
+REFLECTOR = np.array([0.05, -0.04, 0.1, 0.0, 0.0, 0.0])
+TRACKER_NOISE = 2e-5
+WRONG_SHARE, WRONG_BY, SWAPPED = 0.05, 5.0, 3
+GEAR = np.deg2rad(0.015)
+HARMONICS = (1, 2)
+GEAR_IMAGES = 150
+
+
+class Arm:
+    """A true arm of a draw, and what instruments measure of it."""
+
+    def __init__(self, nominal: Robot, draw: int):
+        errors = np.random.default_rng(draw).standard_normal(nominal.dh.shape)
+        self.nominal, self.draw = nominal, draw
+        self.dh = nominal.dh + errors * [ANGLE, LENGTH, LENGTH, ANGLE, ANGLE]
+        self.rng = np.random.default_rng(1000 + draw)
+
+    def with_frames(self, in_base: Tensor | None, on_flange: np.ndarray) -> Robot:
+        """The true arm as measured from something in its base, with something on its flange."""
+        base = None if in_base is None else xyzrpy_from_transform(invert(transform_from_xyzrpy(in_base)))
+        return self.nominal.with_geometry(
+            self.dh, base=None if base is None else base.numpy(), tool=on_flange
+        )
+
+    def images(self, q: Tensor, is_fixed: bool = False, wobble: Tensor | float = 0.0) -> Images:
+        """Corners in the images of the camera on the flange, or of that beside it."""
+        true = self.with_frames(CAMERA_IN_BASE if is_fixed else IN_BASE, ON_FLANGE.numpy())
+        generator = torch.Generator().manual_seed(self.draw)
+        images = simulate_images(true, q + wobble, CAMERA, BOARD, NOISE, generator, is_fixed)
+        return replace(images, q=q)
+
+    def rows(self, q: Tensor, is_fixed: bool = False) -> Measurements:
+        """What these images measure."""
+        camera, board = (BESIDE, HAND) if is_fixed else (CAMERA, BOARD)
+        return solved(self.images(q, is_fixed), camera, board)
+
+    def tracked(self, q: Tensor) -> Measurements:
+        """Positions of a reflector on the flange."""
+        position = forward_kinematics(self.with_frames(None, REFLECTOR), q)[:, :3, 3]
+        noise = TRACKER_NOISE * torch.from_numpy(self.rng.standard_normal((len(q), 3)))
+        names = {"frame": ("tracker",) * len(q), "target": ("reflector",) * len(q)}
+        return Measurements(q, position + noise, **names)
+
+    def error(self, estimated: Robot, postures: Tensor, on_flange: np.ndarray) -> float:
+        """Error of the position of something on the flange [m]; an arm's tool is measured from its estimate."""
+        true = self.with_frames(None, on_flange)
+        return aligned_error(*(forward_kinematics(one, postures)[:, :3, 3] for one in (true, estimated)))
+
+
+def solved(images: Images, camera=CAMERA, board=BOARD) -> Measurements:
+    """Rows of images, the intrinsics taken as they are."""
+    return image_measurements(images, camera, board, camera.is_fixed, NOISE.repeatability, "fixed")
+
+
+def fixed_views(robot: Robot, count: int, rng: np.random.Generator) -> Tensor:
+    """Joint values [rad] at which the camera beside the robot sees the board on its flange."""
+    solver, chosen = closed_form_solver(robot), list[Tensor]()
+    T_base_board = transform_from_xyzrpy(IN_BASE)
+    for q in views(robot, 3 * count, rng):
+        T_board_camera = invert(T_base_board) @ forward_kinematics(
+            robot.with_geometry(tool=ON_FLANGE.numpy()), q
+        )
+        T = transform_from_xyzrpy(CAMERA_IN_BASE) @ invert(T_board_camera)
+        branches = solver.solve(T @ invert(transform_from_xyzrpy(ON_FLANGE))).q
+        reached = branches[torch.isfinite(branches).all(-1)]
+        if len(reached):
+            chosen.append(reached[rng.integers(len(reached))])
+    return torch.stack(chosen)
+
+
+def fitted(arm: Arm, rows: Measurements, target: str) -> Robot:
+    """The calibrated arm with the tool of a target."""
+    result = GeometricCalibrator(arm.nominal, prior=PRIOR).fit(rows)
+    return result.robot.with_geometry(base=np.zeros(6), tool=result.tools[target])
+
+
+def mixed(arm: Arm, q: Tensor, q_fixed: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
+    """Errors of set-ups with several instruments, and of each of them alone."""
+    wrist, beside, tracker = arm.rows(q), arm.rows(q_fixed, True), arm.tracked(postures[-10:])
+    few, few_beside = arm.rows(q[:25]), arm.rows(q_fixed[:25], True)
+    on_flange = ON_FLANGE.numpy()
+    for name, rows, target, point in (
+        ("camera on the flange, 50 images", [wrist], "wrist", on_flange),
+        ("fixed camera, board on the flange, 50 images", [beside], "hand", on_flange),
+        ("camera on the flange, 25 images", [few], "wrist", on_flange),
+        ("fixed camera, 25 images", [few_beside], "hand", on_flange),
+        ("both cameras, 25 images each", [few, few_beside], "wrist", on_flange),
+        ("tracker, 10 positions", [tracker], "reflector", REFLECTOR),
+        ("camera, 50 images, and tracker, 10 positions", [wrist, tracker], "wrist", on_flange),
+    ):
+        yield name, arm.error(fitted(arm, join(rows), target), postures[:-10], point)
+
+
+def wrong(arm: Arm, q: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
+    """Errors with good and with wrong corners and images, and whether other images are named than the wrong ones."""
+    clean, rng = arm.images(q), arm.rng
+    faulty = rng.choice(len(q), SWAPPED, replace=False)
+    swapped, pixels = q.clone(), []
+    for image in faulty:
+        joints = rng.choice(q.shape[1], 2, replace=False)
+        swapped[image, joints] = swapped[image, joints[::-1].copy()]
+    for of_image in clean.pixels:
+        direction = rng.uniform(0, 2 * np.pi, len(of_image))
+        off = WRONG_BY * np.stack([np.cos(direction), np.sin(direction)], -1)
+        pixels.append(of_image + off * (rng.random(len(of_image)) < WRONG_SHARE)[:, None])
+    good = np.setdiff1d(np.arange(len(q)), faulty)
+    both = solved(replace(clean, q=swapped, pixels=tuple(pixels)))
+    for name, rows in (
+        ("clean", solved(clean)),
+        ("without the three images", solved(clean).select(torch.from_numpy(good))),
+        ("5 % wrong corners, three swapped images", both),
+    ):
+        yield name, arm.error(fitted(arm, rows, "wrist"), postures, ON_FLANGE.numpy())
+    outliers = GeometricCalibrator(arm.nominal, prior=PRIOR).fit(both).outliers
+    yield (
+        "share of the draws in which other images are named",
+        float({one.row for one in outliers} != set(faulty)),
+    )
+
+
+def gears(arm: Arm, q: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
+    """Errors of the geometry alone and of the hybrid where gears wobble."""
+    phase = torch.from_numpy(arm.rng.uniform(0, 2 * np.pi, (len(HARMONICS), q.shape[1])))
+
+    def wobble(q: Tensor) -> Tensor:
+        return sum((GEAR * (m * q + phase[k]).sin() for k, m in enumerate(HARMONICS)), torch.zeros_like(q))
+
+    rows = solved(arm.images(q, wobble=wobble(q)))
+    true = arm.with_frames(None, ON_FLANGE.numpy())
+    points = forward_kinematics(true, postures + wobble(postures))[:, :3, 3]
+    geometry = GeometricCalibrator(arm.nominal, prior=PRIOR)
+    alone = forward_kinematics(geometry.fit(rows).robot, postures)[:, :3, 3]
+    yield "geometry", aligned_error(points, alone)
+    hybrid = HybridCalibrator(geometry).fit(rows)
+    yield "hybrid", aligned_error(points, hybrid.predicted_poses(at(rows, postures))[:, :3, 3])
+
+
+def at(rows: Measurements, q: Tensor) -> Measurements:
+    """Other joint values in the frame of some rows."""
+    return Measurements(
+        q, torch.zeros(len(q), 3).to(q), frame=rows.frame[:1] * len(q), target=rows.target[:1] * len(q)
+    )
+
+
+def main(chosen: list[str], draws: int) -> None:
+    """Print root mean squares over all draws."""
+    nominal, rng = Robot.load("ur5"), np.random.default_rng(0)
+    q = far_apart(views(nominal, CANDIDATES * 50, rng), 50)
+    q_fixed = far_apart(fixed_views(nominal, CANDIDATES * 50, rng), 50)
+    q_gears = far_apart(views(nominal, CANDIDATES * GEAR_IMAGES, rng), GEAR_IMAGES)
+    postures = torch.from_numpy(rng.uniform(-np.pi, np.pi, (POSTURES + 10, nominal.dof)))
+    parts = {
+        "mixed": lambda arm: mixed(arm, q, q_fixed, postures),
+        "wrong": lambda arm: wrong(arm, q, postures),
+        "gears": lambda arm: gears(arm, q_gears, postures),
+    }
+    for part in chosen or parts:
+        errors = defaultdict[str, list[float]](list)
+        for draw in range(draws):
+            for name, error in parts[part](Arm(nominal, draw)):
+                errors[name].append(error)
+        print(f"{part}:")
+        for name, values in errors.items():
+            if name.startswith("share"):
+                print(f"  {name}: {np.mean(values):.2f}")
+            else:
+                print(f"  {name}: {1e3 * np.sqrt(np.mean(np.square(values))):.4f} mm")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("parts", nargs="*", help="mixed, wrong, gears; all where none is named")
+    parser.add_argument("--draws", type=int, default=10)
+    arguments = parser.parse_args()
+    main(arguments.parts, arguments.draws)
