@@ -154,6 +154,14 @@ def _refuse_other_boards(images: Images, board: Board, poses: Sequence[BoardPose
                 f"where a board of {board.rows} x {board.columns} corners has them; check the numbers of the corners, "
                 "the board and the camera, or remove the image."
             )
+    from_front = np.array([pose.R[:, 2] @ pose.t > 0 for pose in poses])
+    if from_front.any() and not from_front.all():
+        fewer = np.flatnonzero(from_front == (2 * from_front.sum() < len(from_front)))
+        raise MeasurementError(
+            f"{images.source}, line {images.lines[fewer[0]]}: image '{images.names[fewer[0]]}' shows the board "
+            f"mirrored against {len(poses) - len(fewer)} of the {len(poses)} images; check whether it is mirrored, "
+            "and whether its corners are numbered as in the others."
+        )
 
 
 def _seen_by_robot(pose: BoardPose, is_fixed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

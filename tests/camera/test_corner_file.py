@@ -151,7 +151,9 @@ def test_what_is_stated_of_cameras_has_to_fit_the_files(tmp_path: Path) -> None:
     two = camera_files(tmp_path, (CAMERA, BESIDE))
     with pytest.raises(MeasurementError, match="there is no column 'camera'"):
         read_rows(path, cell.nominal, two)
-    with pytest.raises(MeasurementError, match=r"these are corners .*state what they mean with --camera"):
+    with pytest.raises(
+        MeasurementError, match=r"these are corners .*state what they mean with --camera .* read\.$"
+    ):
         read_rows(path, cell.nominal)
     with pytest.raises(MeasurementError, match="another camera is called 'wrist', too"):
         read_rows(path, cell.nominal, replace(two, cameras=two.cameras[:1] * 2))

@@ -112,6 +112,17 @@ def test_corners_of_another_board_are_refused() -> None:
         image_measurements(mixed, CAMERA, BOARD, False, Repeatability())
 
 
+def test_mirrored_images_are_named() -> None:
+    images = camera_cell(8, 0, EXACT).images
+    pixels = list(images.pixels)
+    for number in (3, 6):
+        pixels[number] = np.array([CAMERA.width, 0.0]) + pixels[number] * [-1.0, 1.0]
+    with pytest.raises(
+        MeasurementError, match="image '0003' shows the board mirrored against 6 of the 8 images"
+    ):
+        image_measurements(replace(images, pixels=tuple(pixels)), CAMERA, BOARD, False, Repeatability())
+
+
 def test_repeatability_is_no_negative_number() -> None:
     with pytest.raises(
         IdentificationError, match=r"standard deviations of 0 or more were wanted, got -0\.01 mm"

@@ -4,7 +4,7 @@ import os
 import shlex
 
 from pisigma.errors import MeasurementError
-from pisigma.measurement.csv.columns import find_column
+from pisigma.measurement.csv.columns import CORNERS, find_column
 from pisigma.measurement.csv.table import read_table
 from pisigma.measurement.foreign.export_file import read_export
 from pisigma.measurement.foreign.mapping import FileMapping, map_columns
@@ -33,9 +33,9 @@ def import_hint(path: str | os.PathLike[str]) -> str:
 
 
 def _has_columns(path: str | os.PathLike[str]) -> bool:
-    """Whether the header of a file has the columns of measurement files, so that something else is wrong with it."""
+    """Whether the header of a file has the columns of measurement files or of corners; something else is wrong then."""
     try:
-        return all(find_column(name) is not None for name in read_table(path).header)
+        return all(find_column(name) or name in CORNERS for name in read_table(path).header)
     except MeasurementError:
         return False
 
