@@ -142,7 +142,6 @@ class HybridCalibrator:
             return _geometric_alone(solved, choice, verdict)
         falling = gravity_sentence(self.geometric.robot, choice.best.design.features)
         verdict, trials = " ".join(filter(None, (_kept_sentence(choice), falling, trained))), choice.trials
-        del choice  # its regression is not needed any more, and large
         learned = self._learned(solved, refined)
         progress("looking at left-out rows")
         uncertainty = position_uncertainty(

@@ -1,7 +1,7 @@
 """Regression by normal equations: for many values and fewer unknowns."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -60,7 +60,8 @@ class NormalEquations(AbstractRegression):
         columns = self.design.indices(design.features)
         normal = self.normal.new_empty((len(self.normal), len(columns), len(columns)))
         for whole, part in zip(self.normal, normal, strict=True):
-            torch.index_select(whole[columns], 1, columns, out=part)
+            for rows in chunks(len(columns)):  # no second matrix beside the large ones
+                torch.index_select(whole[columns[rows]], 1, columns, out=part[rows])
         return replace(self, design=design, normal=normal, descent=self.descent[:, columns])
 
     def without(self, groups: Int64[Tensor, " groups"]) -> "NormalEquations":
@@ -148,19 +149,25 @@ class NormalEquations(AbstractRegression):
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
         """See `AbstractRegression.covariance_root`; with `N = L L^T` it is `L^-T`."""
         scale, factor, _ = self._solved(posterior.prior, posterior.noise)
-        root = torch.zeros_like(factor)
-        _invert_triangle(factor, root)
-        return CovarianceRoot(root.t().mul_(scale[:, None]))
+        _invert_triangle(factor)
+        return CovarianceRoot(factor.t().mul_(scale[:, None]))
 
     def _solved(self, prior: GaussianPrior, noise: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
         """Column scale and Cholesky factor of the matrix, and the most probable values."""
-        normal, descent = torch.zeros_like(self.normal[0]), torch.zeros_like(self.descent[0])
-        for N, b, sigma in zip(self.normal, self.descent, noise, strict=True):
-            normal.add_(N, alpha=sigma**-2)
+
+        def normal() -> Tensor:
+            total = torch.zeros_like(self.normal[0])
+            for N, sigma in zip(self.normal, noise, strict=True):
+                total.add_(N, alpha=sigma**-2)
+            total.diagonal().add_(prior.precision)
+            return total
+
+        descent = torch.zeros_like(self.descent[0])
+        for b, sigma in zip(self.descent, noise, strict=True):
             descent.add_(b, alpha=sigma**-2)
-        normal.diagonal().add_(prior.precision)
         scale, factor = factored(normal)
-        return scale, factor, scale * torch.cholesky_solve((scale * descent)[:, None], factor)[:, 0]
+        inner = torch.linalg.solve_triangular(factor, (scale * descent)[:, None], upper=False)
+        return scale, factor, scale * torch.linalg.solve_triangular(factor.mT, inner, upper=True)[:, 0]
 
     def _misfits(self, x: Float64[Tensor, " unknowns"]) -> tuple[float, ...]:
         """`Σ (y - X x)²` per sensor."""
@@ -177,21 +184,26 @@ def log_noise(sensors: Sequence[SensorCount], noise: Sequence[float]) -> float:
     return sum(2 * sensor.values * math.log(sigma) for sensor, sigma in pairs)
 
 
-def factored(normal: Float64[Tensor, "unknowns unknowns"]) -> tuple[Tensor, Tensor]:
-    """Column scale, and Cholesky factor of the scaled matrix; the matrix is changed in place.
+def factored(matrix: Callable[[], Float64[Tensor, "unknowns unknowns"]]) -> tuple[Tensor, Tensor]:
+    """Column scale, and Cholesky factor of a scaled symmetric matrix.
+
+    Args:
+        matrix: makes it, stored row by row; its upper triangle is read. As the factor takes its memory, it is made
+            again where that fails.
 
     Raises:
         IdentificationError: the matrix is not finite.
     """
-    scale = normal.diagonal().clamp(min=1e-300).rsqrt()
-    scaled = normal.mul_(scale).mul_(scale[:, None])
     jitter = 1e-14
     while True:
-        scaled.diagonal().fill_(1 + jitter)
-        factor, failed = torch.linalg.cholesky_ex(scaled)
+        scaled = matrix()
+        scale = scaled.diagonal().clamp(min=1e-300).rsqrt()
+        scaled.mul_(scale).mul_(scale[:, None]).diagonal().fill_(1 + jitter)
+        by_column, status = scaled.mT, torch.empty((), dtype=torch.int32, device=scaled.device)
+        factor, failed = torch.linalg.cholesky_ex(by_column, out=(by_column, status))
         if not failed:
             return scale, factor
-        if not bool(torch.isfinite(scaled).all()):
+        if not bool(torch.isfinite(matrix()).all()):
             raise IdentificationError(
                 "the normal equations are not finite; look for values without limit in the measurements."
             )
@@ -209,17 +221,17 @@ def inverted(scale: Tensor, factor: Tensor) -> Float64[Tensor, "unknowns unknown
     return inverse.mul_(scale).mul_(scale[:, None])
 
 
-def _invert_triangle(factor: Tensor, inverse: Tensor) -> None:
-    """Fill in the inverse of a lower triangular matrix: block by block, so that most of it are products."""
+def _invert_triangle(factor: Tensor) -> None:
+    """Put its inverse in the place of a lower triangular matrix: block by block, so that most of it are products."""
     size = len(factor)
     if size <= SMALL_BLOCK:
         identity = torch.eye(size, dtype=factor.dtype, device=factor.device)
-        inverse.copy_(torch.linalg.solve_triangular(factor, identity, upper=False))
+        factor.copy_(torch.linalg.solve_triangular(factor, identity, upper=False))
         return
     first, last = slice(0, size // 2), slice(size // 2, size)
     for block in (first, last):
-        _invert_triangle(factor[block, block], inverse[block, block])
-    inverse[last, first] = -(inverse[last, last] @ factor[last, first]) @ inverse[first, first]
+        _invert_triangle(factor[block, block])
+    factor[last, first] = -(factor[last, last] @ factor[last, first]) @ factor[first, first]
 
 
 def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> float:

@@ -61,17 +61,17 @@ def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: C
         choice: of the features, as fitted to some of the rows or all.
     """
     design, posterior = Design(problem, choice.best.design.features), choice.best.posterior
-    rows, fit = choice.rows, choice.regression
-    rounds = 1
+    rows, fit, rounds = choice.rows, None, 1
     while rounds < MOST_ROUNDS:
         there = linearised(design, posterior.x, posterior.effective, group)
         differs = there.difference(rows, posterior.x, design, posterior.noise)
         if differs < SETTLED * posterior.effective:
             break
-        rows, fit = there, regression(design, there)
+        rows, fit = there, None  # one system of equations at a time: they are large
+        fit = regression(design, there)
         posterior = fit.maximise_evidence(posterior.prior, posterior.noise)
         rounds += 1
-    return _refined(rows, design, posterior, fit, rounds)
+    return _refined(rows, design, posterior, fit or regression(design, rows), rounds)
 
 
 def refined_at(design: Design, posterior: Posterior, group: Int64[Tensor, " rows"], rounds: int) -> Refined:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pisigma.hybrid.design import FOLDS, Design, Rows
-from pisigma.hybrid.evidence import AbstractRegression, Posterior
+from pisigma.hybrid.evidence import Posterior
 from pisigma.hybrid.regression import regression
 from pisigma.joint_correction.feature import AbstractFeature
 
@@ -94,14 +94,12 @@ class Choice:
         rows: on which features were chosen.
         geometry: without features.
         best: with the features that were kept.
-        regression: of the rows on its unknowns.
         trials: what was tried, in order.
     """
 
     rows: Rows
     geometry: Fitted
     best: Fitted
-    regression: AbstractRegression
     trials: tuple[Trial, ...]
 
 
@@ -130,6 +128,7 @@ class Search:
         self.progress = progress
         self.rows = rows
         self._regression = regression(Design(rows.problem, tuple(largest)), rows)
+        self._order = [one.name for one in largest]
         self._folds = rows.folds(FOLDS if rows.groups > FEW_GROUPS else FOLDS_OF_FEW, MOST_GROUPS)
         began = time.monotonic()
         self.geometry, self._unit = self.fitted(())
@@ -188,7 +187,7 @@ class Search:
                 break
         for chosen in others if grown else ():
             if chosen not in before:
-                best = self._tried([chosen, *best.design.features], best)
+                best = self._tried([*best.design.features, chosen], best)
         together = [*others, *growing[:FIRST_MODEL_SIZES][-1:]]
         if len(together) > 1 and self.rows.groups <= FEW_TOGETHER:
             usual = tuple(max(scale, LEAST_USUAL_SCALE) for scale in self.prior_scale)
@@ -198,14 +197,14 @@ class Search:
             gain, sizes = self._regression.first_sizes(best.posterior, best.design, chosen)
             if gain > CLEARLY / 2:
                 best = self._tried([*best.design.features, chosen], best, sizes)
-        return Choice(
-            self.rows, self.geometry, best, self._regression.select(best.design), tuple(self.trials)
-        )
+        return Choice(self.rows, self.geometry, best, tuple(self.trials))
 
     def _tried(
         self, features: Sequence[AbstractFeature], best: Fitted, sizes: Tensor | None = None
     ) -> Fitted:
         """The better of new features and the best so far, by evidence and by left-out rows."""
+        # in the order of the largest design, whose equations then need no copy for all of its features
+        features = sorted(features, key=lambda one: self._order.index(one.name))
         self.progress(" + ".join(chosen.label for chosen in features))
         began = time.monotonic()
         tried, left_out = self.fitted(features, best, sizes)

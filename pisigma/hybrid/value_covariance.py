@@ -161,7 +161,7 @@ class ValueCovariance(AbstractRegression):
         inner = torch.linalg.solve_triangular(factor, G, upper=False)
         normal = inner.t() @ inner
         normal.diagonal().add_(precision[:active])
-        scale, lower = factored(normal)
+        scale, lower = factored(normal.clone)
         root = torch.linalg.solve_triangular(lower, torch.diag(scale), upper=False).t()
         follow = torch.linalg.solve_triangular(factor.t(), inner @ root, upper=True)
         directions = torch.cat([root, -size[:, None] * (Z.t() @ follow)])
@@ -189,7 +189,7 @@ class ValueCovariance(AbstractRegression):
         return trace > LARGEST_RATIO * min(noise) ** 2
 
     def _covariance(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Tensor:
-        """The lower triangle of V."""
+        """The upper triangle of V."""
         V = self.y.new_zeros((len(self.y), len(self.y)))
         V.view(-1)[self._pairs] = prior.sizes[prior.classes :].square() @ self.K
         V.diagonal().add_(self.y.new_tensor(noise).square()[self.sensor])
@@ -198,7 +198,7 @@ class ValueCovariance(AbstractRegression):
     @cached_property
     def _pairs(self) -> Int64[Tensor, " pairs"]:
         """Where the values' pairs stand in a matrix that is stored row by row."""
-        return _lower_triangle(len(self.y))
+        return _upper_triangle(len(self.y))
 
     @cached_property
     def _counts(self) -> Float64[Tensor, " pairs"]:
@@ -218,13 +218,13 @@ class ValueCovariance(AbstractRegression):
     ) -> tuple[Tensor, Tensor, Tensor, float]:
         """P, the parameters and their covariance, and `log |V| + log |G^T V^-1 G + Λ|`."""
         active = self.design.active
-        factor = factored(self._covariance(prior, noise))
+        factor = factored(lambda: self._covariance(prior, noise))
         log_det = log_determinant(*factor)
         inverse, G = inverted(*factor), self.X[:, :active]
         along = inverse @ G
         normal = G.t() @ along
         normal.diagonal().add_(prior.precision[:active])
-        factor = factored(normal)
+        factor = factored(normal.clone)
         log_det += log_determinant(*factor)
         covariance = inverted(*factor)
         parameters = covariance @ (along.t() @ self.y)
@@ -241,14 +241,14 @@ def _gram(X: Tensor, prior: GaussianPrior, group: int, active: int) -> Tensor:
     columns = (prior.group == group).nonzero()[:, 0]
     columns = columns[columns >= active]
     Z = X[:, columns] * prior.base[columns].rsqrt()
-    return (Z @ Z.t()).flatten()[_lower_triangle(len(X))]
+    return (Z @ Z.t()).flatten()[_upper_triangle(len(X))]
 
 
 @lru_cache(maxsize=4)
-def _lower_triangle(size: int) -> Int64[Tensor, " pairs"]:
-    """Where the lower triangle stands in a matrix that is stored row by row."""
+def _upper_triangle(size: int) -> Int64[Tensor, " pairs"]:
+    """Where the pairs of values stand in the upper triangle of a matrix that is stored row by row."""
     pairs: Tensor = torch.tril_indices(size, size)
-    return pairs[0] * size + pairs[1]
+    return pairs[1] * size + pairs[0]
 
 
 def _places_of_pairs(values: Int64[Tensor, " values"]) -> Int64[Tensor, " pairs"]:

@@ -15,10 +15,11 @@ from pisigma.errors import PoseError, nearest_choice
 from pisigma.inverse.joint_input import FAULTS
 from pisigma.inverse.solution import Solution
 from pisigma.kernels import arrays
+from pisigma.kernels.array_kinematics import address_of
 from pisigma.kernels.description_file import read_description
 from pisigma.kernels.forms import KernelForms
 from pisigma.kernels.layout import make_memory, pack
-from pisigma.kernels.machine_code import address_of, kernel_forms, load_kernels
+from pisigma.kernels.machine_code import kernel_forms, load_kernels
 from pisigma.kinematics.task_axes import WHOLE, TaskAxes, default_axes
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
@@ -32,9 +33,7 @@ SOLUTIONS = 8
 
 _PATIENCE = 2.0
 """[s] Kernels that are on disk are loaded in far less."""
-_COMPILING = (
-    "pisigma: preparing the inverse kinematics for this processor, once; that takes some seconds ...\n"
-)
+_COMPILING = "pisigma: preparing the inverse kinematics for this processor, once, in some seconds ...\n"
 
 
 def _kernels(forms: KernelForms) -> Callable[..., int]:

@@ -15,7 +15,6 @@ import numpy as np
 from pisigma.errors import ModelError
 from pisigma.kernels.arrays import FIXED, FORWARD, PRISMATIC, REVOLUTE
 from pisigma.kernels.layout import DESCRIPTION, DOF, ROWS, make_memory
-from pisigma.kernels.machine_code import address_of, load_kernels
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
     import pisigma.robot.description
@@ -103,6 +102,8 @@ class _Chain:
         Raises:
             ModelError: the robot is larger than the kernels allow, or there are no kernels for this machine.
         """
+        from pisigma.kernels.machine_code import load_kernels  # here: LLVM takes 40 MB from the fits
+
         if len(robot.rows) > ROWS or robot.dof > DOF:
             raise ModelError(
                 f"robot '{robot.name}' is larger than the kernels allow ({DOF} joints, {ROWS} rows)."
@@ -217,3 +218,8 @@ def _cosine_sine(angle: float) -> tuple[float, float]:
     if abs(quarter - round(quarter)) < 1e-15 * max(1.0, abs(quarter)):
         return ((1.0, 0.0), (0.0, 1.0), (-1.0, 0.0), (0.0, -1.0))[round(quarter) % 4]
     return math.cos(angle), math.sin(angle)
+
+
+def address_of(array: Any) -> int:
+    """Where the numbers of a contiguous array lie in memory."""
+    return array.__array_interface__["data"][0]

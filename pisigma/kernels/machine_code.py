@@ -239,8 +239,3 @@ def _trusted(status: os.stat_result) -> bool:
     if not hasattr(os, "geteuid"):  # Windows, where the folders of a user are closed to others
         return True
     return status.st_uid in (0, os.geteuid()) and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-
-
-def address_of(array: Any) -> int:
-    """Where the numbers of a contiguous array lie in memory."""
-    return array.__array_interface__["data"][0]

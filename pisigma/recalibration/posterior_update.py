@@ -71,5 +71,5 @@ class PosteriorUpdate:
             root = R.addmm_((R @ self._along) * shrink, self._along.t())
         if root.shape[1] <= MOST_DIRECTIONS * len(root):
             return root
-        scale, factor = factored(root @ root.t())
+        scale, factor = factored(lambda: root @ root.t())
         return torch.where(root.any(1)[:, None], factor / scale[:, None], 0.0)

@@ -12,9 +12,7 @@ from pisigma.judging.trained_calibrations import Result, geometric_result
 from pisigma.judging.training_summary import TrainingRun, TrainingSummary
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.reporting import calibration_figures as figures
 from pisigma.reporting import calibration_tables as tables
-from pisigma.reporting import figures as training_figures
 from pisigma.reporting.rendering import write_card
 
 
@@ -69,6 +67,8 @@ def _draw_calibration(
     folder: Path,
 ) -> None:
     """Draw the figures of `write_calibration_card`."""
+    from pisigma.reporting import calibration_figures as figures  # here: matplotlib takes 30 MB from the fits
+
     geometric = geometric_result(result)
     correlations = (geometric.pairwise.lengths, geometric.pairwise.angles)
     figures.draw_correlations(correlations, folder / model_files.CORRELATION_PNG)
@@ -101,6 +101,8 @@ def write_training_card(
         summary: all figures.
         folder: where to write.
     """
+    from pisigma.reporting import figures as training_figures
+
     joints, energies = run.history.joints, run.history.energies
     training_figures.write_energy_csv(joints, energies, folder / model_files.ENERGY_CSV)
     training_figures.draw_energy(joints, energies, folder / model_files.ENERGY_PNG)

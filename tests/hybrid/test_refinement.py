@@ -68,14 +68,13 @@ def test_the_network_predicts_what_the_design_does(refined: Refined) -> None:
 def chosen_as(refined: Refined, rows: Rows) -> Choice:
     """A choice that came to a solution on some rows."""
     fitted = Fitted(refined.design, refined.posterior)
-    return Choice(rows, fitted, fitted, refined.regression, ())
+    return Choice(rows, fitted, fitted, ())
 
 
 def test_a_solution_that_has_settled_is_not_linearised_again(refined: Refined) -> None:
     again = refine(refined.rows.problem, refined.rows.group, chosen_as(refined, refined.rows))
     assert again.rounds == 1
     assert again.rows is refined.rows
-    assert again.regression is refined.regression
     assert_close(again.point, refined.point)
 
 

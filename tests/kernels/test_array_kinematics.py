@@ -12,7 +12,7 @@ from testing.closeness import assert_close
 import pisigma
 from pisigma.errors import ModelError, PoseError
 from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.kernels import array_kinematics
+from pisigma.kernels import array_kinematics, machine_code
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.jacobian import joint_jacobian
 from pisigma.robot import Robot, catalogue
@@ -79,7 +79,7 @@ def test_without_kernels_arrays_go_through_torch(monkeypatch):
     def missing() -> None:
         raise ModelError("there are none.")
 
-    monkeypatch.setattr(array_kinematics, "load_kernels", missing)
+    monkeypatch.setattr(machine_code, "load_kernels", missing)
     robot = Robot.load("ur5")
     q = joints_of(robot, 4).numpy()
     T, J = joint_jacobian(robot, torch.from_numpy(q))
