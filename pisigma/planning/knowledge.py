@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
@@ -25,13 +26,14 @@ from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.planning.board_sight import BoardSight
 from pisigma.planning.robot_class import RobotClass
 from pisigma.robot.description import Robot
-from pisigma.se3 import rotation_vector
+from pisigma.se3 import rotation_vector, skew
 
-SensorKind = Literal["position", "pose", "distance"]
-WIDE_LENGTH, WIDE_TOOL, WIDE_ANGLE = 1.0, 0.1, 1.0
-"""[m, m, rad] Where base and tool may be before anything is measured: so wide that it does not matter."""
+SensorKind = Literal["position", "pose", "distance", "camera"]
+WIDE = (*(1.0,) * 6, *(0.1,) * 3, *(1.0,) * 3)
+"""[m, rad, m, rad] Where base and tool may be before anything is measured: so wide that it does not matter."""
 
 
 @dataclass(frozen=True)
@@ -39,17 +41,19 @@ class Instrument:
     """What measures, and how well; repeatability of the robot counts as noise of the instrument.
 
     Attributes:
-        kind: "position" of a target, its "pose", or its "distance" from an anchor.
+        kind: "position" of a target, its "pose", its "distance" from an anchor, or a "camera" that sees a board.
         sigma: standard deviation of a coordinate or a distance [m]. The default lies between what hybrid calibrations
             of the measured UR5 and UR10 leave of a laser tracker's coordinates, 0.028 and 0.043 mm.
         sigma_rotation: standard deviation of an angle about an axis [rad], of the UR10's target.
         anchor: where distances are from, in the measuring frame [m].
+        sight: camera and board; one is the measuring frame, the other one the target. None of other kinds.
     """
 
     kind: SensorKind = "position"
     sigma: float = 3.5e-5
     sigma_rotation: float = 1.1e-4
     anchor: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    sight: BoardSight | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,9 +169,16 @@ class Knowledge:
         """Derivative D of the target's position by independent standard normal numbers: its covariance is `D D^T`.
 
         The position is that in the measuring frame, or where distances are measured in the robot's base frame, as these
-        do not say where the robot stands.
+        do not say where the robot stands. Of a camera, a shift and a turn of all poses together do not count: where
+        the frame of a board stands, only the arm says, and only as far as the board is seen.
         """
         columns = self.columns(q)[:, :3]
+        if self.instrument.sight is not None:
+            points = forward_kinematics(self.uncertainty.geometry.robot, self.moved(q))[:, :3, 3]
+            shifts = torch.eye(3).to(points).expand(len(points), 3, 3)
+            rigid = torch.linalg.qr(torch.cat([shifts, skew(points - points.mean(0))], -1).flatten(0, 1)).Q
+            flat = columns.flatten(0, 1)
+            columns = (flat - rigid @ (rigid.t() @ flat)).view_as(columns)
         if self.instrument.kind == "distance":
             columns[..., [*self.uncertainty.space.of("base")]] = 0.0
         return self.uncertainty.covariance_root.along(columns)
@@ -183,10 +194,32 @@ class Knowledge:
             columns = (away / away.norm(dim=1, keepdim=True))[:, None] @ columns[:, :3] / instrument.sigma
         elif instrument.kind == "position":
             columns = columns[:, :3] / instrument.sigma
+        elif instrument.sight is not None:
+            T = forward_kinematics(self.uncertainty.geometry.robot, self.moved(q))
+            columns = instrument.sight.weight(T) @ columns
         else:
             noise = q.new_tensor([instrument.sigma] * 3 + [instrument.sigma_rotation] * 3)
             columns = columns / noise[:, None]
         return self.uncertainty.covariance_root.along(columns)
+
+    def seen_anew(self, base: Float64[np.ndarray, " 6"], tool: Float64[np.ndarray, " 6"]) -> "Knowledge":
+        """Return what is known of the same arm in another frame, at another target, of which nothing is known.
+
+        Args:
+            base: about where the robot's base is in that frame, as x, y, z, roll, pitch, yaw [m, rad].
+            tool: about where the target is behind the last joint, likewise.
+        """
+        known = self.uncertainty
+        robot = known.geometry.robot.with_geometry(base=base, tool=tool)
+        geometry = IdentifiedGeometry(robot, {"": base}, {"": tool}, {})
+        space = ParameterSpace(known.space.robot)
+        arm, weights = known.root[: space.arm_size], known.root[len(known.space.parameters) :]
+        wide = torch.diag(torch.tensor(WIDE, dtype=torch.float64))
+        blank = arm.new_zeros(len(wide), arm.shape[1])
+        beside = [rows.new_zeros(len(rows), len(wide)) for rows in (arm, weights)]
+        rows = [torch.cat(pair, 1) for pair in ((arm, beside[0]), (blank, wide), (weights, beside[1]))]
+        root = CovarianceRoot(torch.cat(rows))
+        return replace(self, uncertainty=replace(known, space=space, geometry=geometry, covariance_root=root))
 
     def deviation(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
         """Standard deviation of the predicted position [m], `sqrt(σx² + σy² + σz²)`."""
@@ -232,8 +265,7 @@ def _geometric_sizes(space: ParameterSpace) -> Float64[Tensor, " parameters"]:
     for parameter, value in arm:
         group = PriorGroup(prior_group_of(parameter.group, abs(value) > usual.length))
         sizes.append(usual.geometric(group))
-    sizes += [WIDE_LENGTH] * 3 + [WIDE_ANGLE] * 3 + [WIDE_TOOL] * 3 + [WIDE_ANGLE] * 3
-    return torch.tensor(sizes, dtype=torch.float64)
+    return torch.tensor([*sizes, *WIDE], dtype=torch.float64)
 
 
 def _weight_sizes(feature: AbstractFeature, of_groups: tuple[float, ...]) -> Float64[Tensor, " weights"]:

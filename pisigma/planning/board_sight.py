@@ -1,0 +1,59 @@
+"""A camera that sees a board: what an image says of a pose, before it is taken."""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float64
+from torch import Tensor
+
+from pisigma.camera.board import Board
+from pisigma.camera.camera import Camera
+from pisigma.camera.image_rows import Repeatability
+from pisigma.se3 import invert, skew
+
+
+@dataclass(frozen=True, eq=False)
+class BoardSight:
+    """A camera and the board that it sees; one of them is on the flange (the target), the other one is the frame.
+
+    Attributes:
+        camera: its intrinsics are taken as they are.
+        board: all corners of which an image shows.
+        is_fixed: whether the camera stands beside the robot and the board is on the flange; else the other way round.
+        corner_noise: standard deviation of u and v of a corner [px].
+        repeatability: of the robot.
+    """
+
+    camera: Camera
+    board: Board
+    is_fixed: bool
+    corner_noise: float
+    repeatability: Repeatability
+
+    def board_in_camera(self, T_frame_target: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses 4 4"]:
+        """T_camera_board [m]."""
+        return T_frame_target if self.is_fixed else invert(T_frame_target)
+
+    def weight(self, T_frame_target: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, "poses 6 6"]:
+        """Return lower triangular W with `W^T W` the inverse covariance of the poses that images give.
+
+        The covariance is that of (shift [m], turn [rad]) of the target in the axes of the frame: `(Σ J^T J)^-1 noise²`
+        of all corners plus the repeatability, as `CornerSensor` has it of measured corners. A corner X of the frame
+        moves in the camera by `F (δ + ω × (X - t))` with the target at t and F from the frame's axes to those of the
+        camera, and in the opposite direction where the camera is the target.
+        """
+        T = self.board_in_camera(T_frame_target)
+        corners = torch.from_numpy(self.board.corners).to(T)
+        in_camera = corners @ T[:, :3, :3].mT + T[:, None, :3, 3]
+        by_point = torch.from_numpy(self.camera.project(in_camera.numpy())[1])
+        origin = T_frame_target[:, None, :3, 3]
+        if self.is_fixed:
+            by_shift, lever = by_point, in_camera - origin
+        else:
+            by_shift, lever = -by_point @ T[:, None, :3, :3], corners - origin
+        J = torch.cat([by_shift, -by_shift @ skew(lever)], -1)
+        covariance = self.corner_noise**2 * torch.linalg.inv(torch.einsum("ncki,nckj->nij", J, J))
+        own = [self.repeatability.length**2] * 3 + [self.repeatability.angle**2] * 3
+        lower = torch.linalg.cholesky(covariance + torch.diag(covariance.new_tensor(own)))
+        weight: Tensor = torch.linalg.solve_triangular(lower, torch.eye(6).to(lower), upper=False)
+        return weight

@@ -1,0 +1,28 @@
+"""What an image says of a pose before it is taken, against what a taken one says."""
+
+import numpy as np
+import pytest
+import torch
+from testing.camera_cell import BOARD, CAMERA, NOISE, camera_cell
+from testing.closeness import assert_close
+
+from pisigma.camera.image_rows import image_measurements
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.planning.board_sight import BoardSight
+from pisigma.sensors.corner import WEIGHT_COLUMN, _weights
+
+
+@pytest.mark.parametrize("is_fixed", [False, True])
+def test_a_pose_has_the_weight_of_its_image(is_fixed: bool):
+    cell = camera_cell(6, is_fixed=is_fixed)
+    rows = image_measurements(cell.images, CAMERA, BOARD, is_fixed, NOISE.repeatability)
+    texts = rows.readings[WEIGHT_COLUMN]
+    measured = torch.zeros(6, 6, 6, dtype=torch.float64)
+    row, column = np.tril_indices(6)
+    measured[:, row, column] = torch.tensor([_weights(text) for text in texts], dtype=torch.float64)
+    sight = BoardSight(CAMERA, BOARD, is_fixed, NOISE.corner, NOISE.repeatability)
+    weight = sight.weight(forward_kinematics(cell.true, cell.images.q))
+    covariance, expected = (torch.linalg.inv(W.mT @ W) for W in (weight, measured))
+    scale = expected.diagonal(dim1=1, dim2=2).sqrt()
+    scale = scale[:, :, None] * scale[:, None]
+    assert_close(covariance / scale, expected / scale, atol=0.15)
