@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pisigma.cli.arguments import AsJson, complete_robot
-from pisigma.cli.calibrate import Base, Tip
+from pisigma.cli.calibrate import Base, FixedCamera, RepeatabilityDeg, RepeatabilityMm, Tip
 from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:
@@ -45,7 +45,16 @@ Task = Annotated[
     ),
 ]
 Measured = Annotated[Path | None, typer.Option(help="Measurements that are there already (CSV).")]
-SensorKind = Annotated[str, typer.Option("--sensor", help="What is measured: position, pose or distance.")]
+SensorKind = Annotated[
+    str, typer.Option("--sensor", help="What is measured: position, pose, distance, or corners by a camera.")
+]
+CameraFile = Annotated[
+    Path | None, typer.Option("--camera", help="Of the sensor camera: its YAML (of pisigma, ROS or OpenCV).")
+]
+BoardFile = Annotated[
+    Path | None, typer.Option("--board", help="Of the sensor camera: the board that it sees (YAML).")
+]
+SigmaPx = Annotated[float, typer.Option(help="Of a camera: standard deviation of u and v of a corner [px].")]
 SigmaMm = Annotated[
     float | None,
     typer.Option(help="Standard deviation of a measured length [mm]. [default: of laser trackers]"),
@@ -86,6 +95,12 @@ def plan(
     task: Task = None,
     measured: Measured = None,
     sensor: SensorKind = "position",
+    camera: CameraFile = None,
+    board: BoardFile = None,
+    fixed_camera: FixedCamera = False,
+    sigma_px: SigmaPx = 0.3,
+    repeatability_mm: RepeatabilityMm = 0.02,
+    repeatability_deg: RepeatabilityDeg = 0.01,
     sigma_mm: SigmaMm = None,
     criterion: CriterionName = None,
     limit_mm: LimitMm = None,
@@ -101,6 +116,7 @@ def plan(
     Prints the accuracy to expect against the number of poses, and writes the poses in the order in which they are
     measured: add the measured columns, and the file goes to `pisigma calibrate`.
     """
+    from pisigma.planning.camera_settings import CameraSettings
     from pisigma.planning.plan_file import yaml_of
     from pisigma.planning.plan_settings import PlanSettings
     from pisigma.planning.subject import Subject as PlanningSubject
@@ -111,6 +127,9 @@ def plan(
     stated |= {"speed_deg_s": speed_deg_s, "settling_s": settling_s, "box_mm": _box(box)}
     files = {"candidates_from": candidates_from, "task": task, "measured": measured}
     stated |= {name: None if file is None else str(file) for name, file in files.items()}
+    if camera is not None and board is not None:
+        noise = (sigma_px, repeatability_mm, repeatability_deg)
+        stated["camera"] = CameraSettings(str(camera), str(board), fixed_camera, *noise)
     settings = PlanSettings(**stated)
     wanted, programs = PlanningSubject.of(subject, base, tip), program or []
     workflow.check_files(out, programs, settings, wanted.robot, (subject, cell))

@@ -1,5 +1,6 @@
 """Poses that could be measured: drawn in the joint limits or read from a file, and allowed by the cell."""
 
+import math
 import os
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -10,13 +11,19 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import PlanningError
+from pisigma.inverse.finishing import nearest_turn
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.csv.reading import read_joints
+from pisigma.planning.board_views import BoardViews
 from pisigma.planning.cell.arm_in_cell import ArmInCell, Faults
+from pisigma.se3 import wrap_to_pi
 
 MOST_DRAWS = 40
 """So many times as many poses are drawn at most as candidates are wanted."""
+WINDOW, SELDOM = 0.25, 0.5
+"""[rad] Width in which angles of a joint are counted, and the share of their mean number that is few."""
 OUTSIDE_WORKSPACE = "the reflector is outside the box of the workspace"
+UNREACHED = "the robot does not reach a view of the board"
 
 Workspace = Float64[Tensor, "2 3"]
 """Lowest and highest x, y, z of the reflector in the robot's base frame [m]."""
@@ -31,12 +38,15 @@ class Candidates:
         number: which row of the file each of them is, or which of the poses that were drawn; from 1.
         looked_at: how many poses were drawn or read.
         refused: how many of them were refused for what.
+        workspace: where the robot is to be accurate, and by way of which it may go: the candidates, but with a camera,
+            which sees its board from a small part of the workspace only, poses that the cell alone allows [rad or m].
     """
 
     q: Float64[Tensor, "candidates dof"]
     number: Int64[Tensor, " candidates"]
     looked_at: int
     refused: Counter[str]
+    workspace: Float64[Tensor, "poses dof"]
 
     @property
     def sentence(self) -> str:
@@ -59,38 +69,78 @@ class Candidates:
             )
 
 
-def draw_candidates(arm: ArmInCell, count: int, seed: int, workspace: Workspace | None = None) -> Candidates:
-    """Draw candidates, uniform in the joint values, until enough are allowed or too many were refused.
+def draw_candidates(
+    arm: ArmInCell,
+    count: int,
+    seed: int,
+    workspace: Workspace | None = None,
+    views: BoardViews | None = None,
+) -> Candidates:
+    """Draw candidates until enough are allowed or too many were refused.
 
-    Joints that turn by more than a full turn are drawn within half a turn of the middle of their limits, and of 0
-    where they have none.
+    They are uniform in the joint values: joints that turn by more than a full turn are drawn within half a turn of the
+    middle of their limits, and of 0 where they have none. Where a camera has to see a board, views are drawn instead.
 
     Args:
         arm: the robot in its cell.
         count: of candidates.
         seed: of the generator.
         workspace: in which the reflector has to be; None for anywhere.
+        views: from where a camera has to see its board; None without a camera.
 
     Raises:
         PlanningError: a joint that slides has no limits.
     """
-    limits = _drawn_range(arm)
     generator = torch.Generator().manual_seed(seed)
-    q = limits.new_zeros((0, arm.robot.dof))
-    faults = _faults(arm, q, workspace)
-    while len(q) < MOST_DRAWS * count and int(faults.allowed.sum()) < count:
-        draws = torch.rand(count, len(limits), generator=generator, dtype=torch.float64)
-        drawn = arm.robot.to_dh(limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws)
-        q = torch.cat([q, drawn])
-        faults = replace(faults, failed=torch.cat([faults.failed, _faults(arm, drawn, workspace).failed]))
+    limits = None if views is not None else _drawn_range(arm)
+    blocks: list[tuple[Tensor, Faults]] = []
+    while len(blocks) < MOST_DRAWS and sum(int(faults.allowed.sum()) for _, faults in blocks) < count:
+        if views is not None:
+            q = views.draw(arm, count, generator)
+        else:
+            assert limits is not None
+            draws = torch.rand(count, len(limits), generator=generator, dtype=torch.float64)
+            q = arm.robot.to_dh(limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws)
+        blocks.append((q, _faults(arm, q, workspace, views)))
+    q = torch.cat([drawn for drawn, _ in blocks])
+    faults = Faults(blocks[0][1].reasons, torch.cat([one.failed for _, one in blocks]))
     enough = (
         int((faults.allowed.cumsum(0) < count).sum()) + 1
     )  # poses, of which the last is the last that is needed
     return _allowed(q[:enough], replace(faults, failed=faults.failed[:enough]))
 
 
+def with_workspace(arm: ArmInCell, candidates: Candidates, others: Candidates) -> Candidates:
+    """Give candidates that lie in a small part of the workspace the rest of it.
+
+    A joint that is seldom free at some angles, such as a shoulder above a floor, is unwrapped about the middle of the
+    others: between values on both sides of half a turn there would be no free motion.
+
+    Args:
+        arm: the robot in its cell.
+        candidates: in that part.
+        others: in the whole workspace.
+    """
+    angles = torch.arange(-180, 180, 5).to(others.q).deg2rad()
+    density = ((others.q[:, None] - angles[:, None]).cos() / WINDOW**2).softmax(1).mean(0)
+    rarest = density.min(0)
+    middle = torch.where(
+        rarest.values < SELDOM / len(angles), wrap_to_pi(angles[rarest.indices] + math.pi), 0.0
+    )
+
+    def unwrapped(q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses dof"]:
+        near = nearest_turn(arm.robot, q, middle, within_limits=True)
+        values, (lower, upper) = arm.robot.to_controller(near), arm.limits.t()
+        return torch.where(((values >= lower) & (values <= upper)).all(1, keepdim=True), near, q)
+
+    return replace(candidates, q=unwrapped(candidates.q), workspace=unwrapped(others.q))
+
+
 def read_candidates(
-    arm: ArmInCell, path: str | os.PathLike[str], workspace: Workspace | None = None
+    arm: ArmInCell,
+    path: str | os.PathLike[str],
+    workspace: Workspace | None = None,
+    views: BoardViews | None = None,
 ) -> Candidates:
     """Take candidates from the joint values of a file, of measurements or of others.
 
@@ -98,12 +148,13 @@ def read_candidates(
         arm: the robot in its cell.
         path: the CSV file.
         workspace: in which the reflector has to be; None for anywhere.
+        views: from where a camera has to see its board; None without a camera.
 
     Raises:
         MeasurementError: the file or a joint's cell cannot be used; the message names file, line and column.
     """
     q = read_joints(path, arm.robot)
-    return _allowed(q, _faults(arm, q, workspace))
+    return _allowed(q, _faults(arm, q, workspace, views))
 
 
 def spread(
@@ -136,19 +187,26 @@ def spread(
     return torch.tensor(chosen, dtype=torch.int64)
 
 
-def _faults(arm: ArmInCell, q: Float64[Tensor, "poses dof"], workspace: Workspace | None) -> Faults:
-    """Why the cell and the workspace do not allow poses."""
+def _faults(
+    arm: ArmInCell, q: Float64[Tensor, "poses dof"], workspace: Workspace | None, views: BoardViews | None
+) -> Faults:
+    """Why poses are not allowed: by the cell, by the workspace, and by what a camera has to see."""
+    failed = {} if views is None else {UNREACHED: q.isnan().any(1)}
+    q = q.nan_to_num()
     faults = arm.faults(q)
-    if workspace is None:
-        return faults
-    reflector = forward_kinematics(arm.robot, q)[:, :3, 3]
-    outside = ((reflector < workspace[0]) | (reflector > workspace[1])).any(1, keepdim=True)
-    return Faults((*faults.reasons, OUTSIDE_WORKSPACE), torch.cat([faults.failed, outside], 1))
+    failed |= dict(zip(faults.reasons, faults.failed.unbind(1), strict=True))
+    if workspace is not None:
+        reflector = forward_kinematics(arm.robot, q)[:, :3, 3]
+        failed[OUTSIDE_WORKSPACE] = ((reflector < workspace[0]) | (reflector > workspace[1])).any(1)
+    if views is not None:
+        failed |= views.faults(arm, q)
+    return Faults(tuple(failed), torch.stack([*failed.values()], 1))
 
 
 def _allowed(q: Float64[Tensor, "poses dof"], faults: Faults) -> Candidates:
     """Keep the poses that fail for nothing."""
-    return Candidates(q[faults.allowed], faults.allowed.nonzero()[:, 0] + 1, len(q), faults.counts())
+    allowed = q[faults.allowed]
+    return Candidates(allowed, faults.allowed.nonzero()[:, 0] + 1, len(q), faults.counts(), allowed)
 
 
 def _drawn_range(arm: ArmInCell) -> Float64[Tensor, "axes 2"]:

@@ -20,7 +20,7 @@ from pisigma.measurement.csv.table import Table, read_table
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.cell.cell import Cell
 from pisigma.planning.knowledge import Instrument
-from pisigma.planning.plan_settings import FILES, PlanSettings
+from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import RobotDocument
 from pisigma.robot.row import Bounded
@@ -118,8 +118,8 @@ class StoredPlan:
     def _document(self, path: Path) -> dict[str, Any]:
         """The content of the YAML, of stated values only."""
         folder = path.resolve().parent
-        settings = {name: value for name, value in asdict(self.settings).items() if value is not None}
-        settings |= {name: os.path.relpath(settings[name], folder) for name in FILES if name in settings}
+        seen = self.settings.with_files(lambda path: os.path.relpath(path, folder))
+        settings = {name: value for name, value in asdict(seen).items() if value is not None}
         settings |= {"box_mm": list(self.settings.box_mm)} if self.settings.box_mm is not None else {}
         document: dict[str, Any] = {"poses": path.name, "settings": settings}
         if self.model is not None:

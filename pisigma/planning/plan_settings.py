@@ -2,6 +2,7 @@
 
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, get_args
@@ -12,15 +13,27 @@ from pydantic import ConfigDict
 from torch import Tensor
 
 from pisigma.errors import PlanningError, nearest_choice
-from pisigma.planning.candidates import Candidates, draw_candidates, read_candidates
+from pisigma.measurement.dataset import Measurements
+from pisigma.planning.board_views import BoardViews
+from pisigma.planning.camera_settings import CameraSettings
+from pisigma.planning.candidates import (
+    Candidates,
+    Workspace,
+    draw_candidates,
+    read_candidates,
+    with_workspace,
+)
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.choice import Criterion
 from pisigma.planning.knowledge import Instrument, SensorKind
 from pisigma.planning.tour import Pace
+from pisigma.robot.description import Robot
 from pisigma.yaml_file import MOST_POSES
 
 SHORTEST_MM, LONGEST_MM = 1e-3, 1e3
 """Of a standard deviation of an instrument, and of an error of a robot: others are slips of the unit."""
+REACHABLE = 1000
+"""Poses that stand for the workspace where a camera measures."""
 FILES = ("candidates_from", "task", "measured")
 """Settings that are files."""
 
@@ -36,7 +49,9 @@ class PlanSettings:
     Attributes:
         count: poses to calibrate with.
         check: poses that are measured besides, to judge the calibration.
-        sensor: what is measured: the position of a reflector, its pose, or its distance from a fixed point.
+        sensor: what is measured: the position of a reflector, its pose, its distance from a fixed point, or corners of
+            a board by a camera.
+        camera: which camera sees which board; None where none measures.
         sigma_mm: standard deviation of a measured length [mm]; None for that of laser trackers, see
             `pisigma.planning.knowledge.Instrument`.
         criterion: "D": what lowers the uncertainty of all unknowns most; "I": what lowers that of the tool's position
@@ -61,6 +76,7 @@ class PlanSettings:
     count: int = 40
     check: int = 10
     sensor: SensorKind = "position"
+    camera: CameraSettings | None = None
     sigma_mm: float | None = None
     criterion: Criterion | None = None
     limit_mm: float | None = None
@@ -79,6 +95,11 @@ class PlanSettings:
             value = getattr(self, name)
             if value is not None and value not in choices:
                 raise PlanningError(f"{name} '{value}' is unknown; {nearest_choice(str(value), choices)}")
+        if (self.sensor == "camera") != (self.camera is not None):
+            raise PlanningError(
+                f"sensor '{self.sensor}': files of a camera and of a board were wanted for the sensor 'camera', and "
+                "for no other one."
+            )
         for name, least in (("count", 1), ("check", 0), ("candidates", 1), ("seed", 0)):
             most = 2**63 - 1 if name == "seed" else MOST_POSES
             if not least <= getattr(self, name) <= most:
@@ -111,6 +132,8 @@ class PlanSettings:
         Raises:
             PlanningError: distances are measured, but from nowhere.
         """
+        if self.camera is not None:
+            return Instrument(self.sensor, sight=self.camera.sight())
         if self.sensor == "distance" and anchor is None:
             raise PlanningError(
                 "where distances are measured from was wanted; state it as the tracker of the cell (--cell)."
@@ -126,22 +149,60 @@ class PlanSettings:
             MeasurementError: their file cannot be used.
             PlanningError: a joint that slides has no limits to draw in.
         """
-        workspace = None
-        if self.box_mm is not None:
-            workspace = torch.tensor(self.box_mm, dtype=torch.float64).reshape(2, 3) / 1e3
+        views, workspace = self.views(arm), self.workspace
         if self.candidates_from is not None:
-            return read_candidates(arm, self.candidates_from, workspace)
-        return draw_candidates(arm, self.candidates, self.seed, workspace)
+            candidates = read_candidates(arm, self.candidates_from, workspace, views)
+        else:
+            candidates = draw_candidates(arm, self.candidates, self.seed, workspace, views)
+        if views is None:
+            return candidates
+        return with_workspace(arm, candidates, draw_candidates(arm, REACHABLE, self.seed, workspace))
+
+    @property
+    def workspace(self) -> Workspace | None:
+        """Where the reflector is measured, or the target of a camera; None for anywhere."""
+        if self.box_mm is None:
+            return None
+        return torch.tensor(self.box_mm, dtype=torch.float64).reshape(2, 3) / 1e3
+
+    def read_rows(self, path: str | os.PathLike[str], robot: Robot) -> Measurements:
+        """Read measured rows, or the corners that a camera saw.
+
+        Raises:
+            MeasurementError: the file cannot be used.
+        """
+        if self.camera is not None:
+            return self.camera.files.read(path, robot)
+        return Measurements.read_csv(path, robot)
+
+    def views(self, arm: ArmInCell) -> BoardViews | None:
+        """From where the camera has to see its board; None without a camera.
+
+        Raises:
+            PlanningError: the cell does not say from where, or where the board is.
+        """
+        if self.camera is None:
+            return None
+        view = arm.cell.view
+        if view is None or view.T_cell_frame is None:
+            frame, target = ("camera", "board") if self.camera.is_fixed else ("board", "camera")
+            raise PlanningError(
+                f"where the {frame} is and from where images are sharp was wanted; state it in the cell (--cell), as "
+                "view: {frame: {x_mm: 400, z_mm: 50, yaw_deg: 180}, near_mm: 300, far_mm: 700}, and where the "
+                f"{target} is on the flange as tool."
+            )
+        return BoardViews.of(self.camera.sight(), view.T_cell_frame, view)
 
     def with_files_from(self, folder: Path) -> "PlanSettings":
         """The same with the paths of its files seen from the working directory instead of a folder."""
+        return self.with_files(lambda path: os.path.normpath(folder / path))
 
-        def seen(path: str | None) -> str | None:
-            return None if path is None else os.path.normpath(folder / path)
-
-        return replace(
-            self,
-            candidates_from=seen(self.candidates_from),
-            task=seen(self.task),
-            measured=seen(self.measured),
-        )
+    def with_files(self, path_of: Callable[[str], str]) -> "PlanSettings":
+        """The same with other paths of its files."""
+        stated: dict[str, Any] = {
+            name: path_of(file) for name in FILES if (file := getattr(self, name)) is not None
+        }
+        camera = self.camera
+        if camera is not None:
+            camera = replace(camera, camera=path_of(camera.camera), board=path_of(camera.board))
+        return replace(self, camera=camera, **stated)

@@ -29,7 +29,7 @@ STARTS = 200
 def task_poses(
     arm: ArmInCell,
     settings: PlanSettings,
-    q: Float64[Tensor, "candidates dof"],
+    q: Float64[Tensor, "poses dof"],
     model: CalibratedModel | None = None,
 ) -> Float64[Tensor, "tasks dof"]:
     """Give joint values [rad or m] where the robot shall be accurate: of the task's file, or where it can be measured.
@@ -37,7 +37,7 @@ def task_poses(
     Args:
         arm: the robot in its cell.
         settings: which name the file.
-        q: joint values [rad or m] of candidates.
+        q: joint values [rad or m] of the workspace.
         model: of the robot, where there is one.
 
     Raises:

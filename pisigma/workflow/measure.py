@@ -31,10 +31,9 @@ from pisigma.measuring.row_alarms import (
 from pisigma.measuring.row_judgement import RowJudgement, judge_rows
 from pisigma.measuring.state import AccuracyPoint, Advice, Alarm, JointSpan, NextPose, RowsSoFar, SessionState
 from pisigma.measuring.stopping import advice
-from pisigma.model.folder.model_folder import load_model
 from pisigma.planning.choice import choose
-from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_file import StoredPlan, read_plan
+from pisigma.planning.subject import Subject
 from pisigma.planning.task import task_poses
 from pisigma.planning.tour import tour
 from pisigma.se3 import invert, transform_from_xyzrpy
@@ -104,9 +103,12 @@ class MeasuringSession:
         candidates = plan.settings.find_candidates(plan.arm)
         some = torch.linspace(0, len(candidates.q) - 1, min(len(candidates.q), CANDIDATES)).round().long()
         self._candidates, self._number = candidates.q[some], candidates.number[some]
-        model = None if plan.model is None else load_model(plan.model)
-        self._task = task_poses(plan.arm, plan.settings, candidates.q, model)
-        self._before = None if model is None else Knowledge.of_model(model, self._instrument)
+        self._by_way_of = candidates.workspace[:CANDIDATES]
+        subject = None if plan.model is None else Subject.of(plan.model)
+        model = None if subject is None else subject.model
+        self._task = task_poses(plan.arm, plan.settings, candidates.workspace, model)
+        unmeasured = replace(plan.settings, measured=None)
+        self._before = None if subject is None else subject.knowledge(plan.arm, unmeasured)
         self._planned, self._planned_check = plan.q, plan.check
         self._names = [f"pose {number} of the plan" for number in range(1, len(plan.q) + 1)]
         self._rows: Measurements | None = None
@@ -269,7 +271,7 @@ class MeasuringSession:
             criterion = plan.settings.criterion or "I"
             chosen = new[choose(knowledge, self._candidates[new], count, self._task, criterion)]
             poses = torch.cat([self._candidates[chosen], plan.q[check]])
-            way = tour(plan.arm, poses, plan.settings.pace, self._candidates, plan.q[first[0]])
+            way = tour(plan.arm, poses, plan.settings.pace, self._by_way_of, plan.q[first[0]])
             shut_in = way.left_out[way.left_out < count]
             new = new[~torch.isin(new, chosen[shut_in])]
             if not len(shut_in):

@@ -136,7 +136,8 @@ def check_files(
     Raises:
         OutputError: see `Plan.save`.
     """
-    read = (*inputs, settings.candidates_from, settings.task, settings.measured)
+    camera = () if settings.camera is None else (settings.camera.camera, settings.camera.board)
+    read = (*inputs, settings.candidates_from, settings.task, settings.measured, *camera)
     check_output(path, (".csv",), "a plan", read)
     check_output(yaml_of(path), inputs=read)
     for program in programs:
@@ -175,7 +176,7 @@ def plan(
     candidates.check_count(settings.count + settings.check)
     progress("what is known")
     knowledge = subject.knowledge(arm, settings)
-    task = task_poses(arm, settings, candidates.q, subject.model)
+    task = task_poses(arm, settings, candidates.workspace, subject.model)
     problem = _Problem(subject, settings, arm, candidates, knowledge, task)
     chosen, stored, way = problem.choose(progress)
     progress("expected accuracy")
@@ -232,7 +233,7 @@ class _Problem:
             check = others[spread(self.arm, q[others], self.settings.check, q[chosen])]
             poses = torch.cat([chosen, check])
             progress("order of the poses")
-            way = tour(self.arm, q[poses], self.settings.pace, q)
+            way = tour(self.arm, q[poses], self.settings.pace, self.candidates.workspace)
             free = free[~torch.isin(free, poses[way.left_out])]
             if not len(way.left_out) or len(free) < len(poses):
                 break

@@ -131,7 +131,7 @@ class ArmInCell:
         if self.cell.tracker is not None:
             T = forward_kinematics(self.robot, q)
             beam = torch.stack([self.cell.tracker.position.expand_as(T[:, :3, 3]), T[:, :3, 3]], -2)
-            faults |= {reason: gap < 0 for reason, gap in self._beam_gaps(beam, segments).items()}
+            faults |= self._hidden(segments, beam[:, None], "the reflector from the tracker")
             faults |= self._turned_away(T, beam)
         return faults
 
@@ -151,20 +151,36 @@ class ArmInCell:
             gaps[f"the robot touches the box '{box.name}'"] = _least(distance, infinite) - clearance
         return gaps
 
-    def _beam_gaps(
-        self, beam: Float64[Tensor, "poses 2 3"], segments: Float64[Tensor, "poses pieces 2 3"]
-    ) -> dict[str, Float64[Tensor, " poses"]]:
-        """Room between the tracker's beam and what may hide the reflector [m], above the clearance."""
+    def hidden(
+        self, q: Float64[Tensor, "poses dof"], lines: Float64[Tensor, "poses lines 2 3"], what: str
+    ) -> dict[str, Bool[Tensor, " poses"]]:
+        """Say in which poses something stands in a line of sight, by what it is.
+
+        Args:
+            q: joint values [rad or m].
+            lines: both ends of the lines, in the cell's frame [m].
+            what: that would be hidden, such as "the reflector from the tracker".
+        """
+        return self._hidden(self.capsules.segments(q), lines, what)
+
+    def _hidden(
+        self,
+        segments: Float64[Tensor, "poses pieces 2 3"],
+        lines: Float64[Tensor, "poses lines 2 3"],
+        what: str,
+    ) -> dict[str, Bool[Tensor, " poses"]]:
+        """Poses in which a line of sight has less room than the clearance."""
         clearance = self.cell.clearance
-        infinite = beam.new_full((len(beam), 1), torch.inf)
+        infinite = lines.new_full((len(lines), 1), torch.inf)
         distance = (
-            segment_distance(beam[:, None], segments[:, self.beside]) - self.capsules.radius[self.beside]
+            segment_distance(lines[:, :, None], segments[:, None, self.beside])
+            - self.capsules.radius[self.beside]
         )
-        gaps = {"a link hides the reflector from the tracker": _least(distance, infinite) - clearance}
+        hidden = {f"a link hides {what}": _least(distance.flatten(1), infinite) < clearance}
         for box in self.cell.boxes:
-            distance = box_distance(box.within(beam), box.half_size)
-            gaps[f"the box '{box.name}' hides the reflector from the tracker"] = distance - clearance
-        return gaps
+            distance = box_distance(box.within(lines), box.half_size)
+            hidden[f"the box '{box.name}' hides {what}"] = distance.amin(1) < clearance
+        return hidden
 
     def _turned_away(
         self, T: Float64[Tensor, "poses 4 4"], beam: Float64[Tensor, "poses 2 3"]

@@ -157,6 +157,83 @@ class ReflectorSection(Section):
         return self
 
 
+class LensSection(Section):
+    """What the depth of field of a camera follows from.
+
+    Attributes:
+        aperture: f-number.
+        focus_mm: depth at which corners are sharpest [mm].
+        pixel_um: edge of a pixel [um].
+        blur_px: diameter of a point's image that still counts as sharp [px].
+    """
+
+    aperture: Positive
+    focus_mm: Positive
+    pixel_um: Positive
+    blur_px: Positive = 1.0
+
+    def depths(self, f: float) -> tuple[float, float]:
+        """Give the nearest and the farthest depth that is sharp [m]; the farthest may be infinite.
+
+        With the image at v = f · pixel behind the lens, focused at s, the focal length is `v s / (v + s)` (thin lens),
+        and a point at depth z has an image with the diameter `A v |1/s - 1/z|` with the aperture A (Hecht, "Optics",
+        section 5.2.3).
+
+        Args:
+            f: focal length of the focused camera [px].
+        """
+        s, pixel = self.focus_mm / 1e3, self.pixel_um / 1e6
+        v = f * pixel
+        opening = v * s / (v + s) / self.aperture
+        reach = self.blur_px * pixel / (opening * v)
+        return 1 / (1 / s + reach), 1 / (1 / s - reach) if reach < 1 / s else float("inf")
+
+
+class ViewSection(Section):
+    """From where a camera has to see its board: whole, sharp, and not too obliquely.
+
+    Attributes:
+        frame: where the board is in the base frame, or a camera that stands beside the robot; None where a model says
+            that. The board's x leads along its rows, y from row to row, and z away from who looks at it.
+        near_mm: depth of the board in front of the camera at least [mm]; None by the lens.
+        far_mm: and at most [mm].
+        lens: what both follow from, where they are not stated.
+        oblique_deg: angle between the board's normal and the line of sight at most [deg].
+        margin_px: that the board keeps from the edges of the image [px].
+    """
+
+    frame: FrameSection | None = None
+    near_mm: Positive | None = None
+    far_mm: Positive | None = None
+    lens: LensSection | None = None
+    oblique_deg: Annotated[float, Field(gt=0, le=80)] = 45.0
+    margin_px: NotNegative = 20.0
+
+    @model_validator(mode="after")
+    def _has_depths(self) -> "ViewSection":
+        stated = self.near_mm is not None and self.far_mm is not None
+        if (self.near_mm is None) != (self.far_mm is None) or stated == (self.lens is not None):
+            raise ValueError(
+                "near_mm and far_mm, or else the lens, were wanted: between which depths are images sharp?"
+            )
+        if stated and not self.near_mm < self.far_mm:  # type: ignore[operator]
+            raise ValueError(f"near_mm below far_mm was wanted, got {self.near_mm:g} and {self.far_mm:g}")
+        return self
+
+    @property
+    def T_cell_frame(self) -> Float64[Tensor, "4 4"] | None:
+        """The frame [m]; None where it is not stated."""
+        return None if self.frame is None else transform_from_xyzrpy(torch.from_numpy(self.frame.to_si()))
+
+    def depths(self, f: float) -> tuple[float, float]:
+        """Give the nearest and the farthest depth [m] for a focal length [px]."""
+        if self.lens is not None:
+            return self.lens.depths(f)
+        assert self.near_mm is not None
+        assert self.far_mm is not None
+        return self.near_mm / 1e3, self.far_mm / 1e3
+
+
 class Cell(Section):
     """What stands around a robot: everything is optional, and in the frame of the robot's base in mm and deg.
 
@@ -167,9 +244,11 @@ class Cell(Section):
         joints: margins and limits.
         boxes: that the robot keeps out of.
         links: how thick the links are.
-        tool: where the reflector is; None for the tool of the robot.
+        tool: where the reflector is, or what a camera needs on the flange (camera or board); None for the tool of the
+            robot.
         tracker: that has to see the reflector; None where the sensor needs no line of sight.
         reflector: from where it can be seen; None where it is turned to the tracker at every pose.
+        view: from where a camera has to see its board; None without a camera.
     """
 
     clearance_mm: NotNegative = 20.0
@@ -180,6 +259,7 @@ class Cell(Section):
     tool: ToolSection | None = None
     tracker: TrackerSection | None = None
     reflector: ReflectorSection | None = None
+    view: ViewSection | None = None
 
     @model_validator(mode="after")
     def _fits_together(self) -> "Cell":

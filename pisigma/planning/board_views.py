@@ -1,0 +1,178 @@
+"""Poses from which a camera sees the whole board: which they are, and how to draw some."""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from pisigma.camera.pattern import board_pattern
+from pisigma.kinematics.closed_form.registry import closed_form_solver
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.kinematics.numeric import solve_numeric
+from pisigma.planning.board_sight import BoardSight
+from pisigma.planning.cell.arm_in_cell import CHUNK, ArmInCell
+from pisigma.planning.cell.cell import ViewSection
+from pisigma.se3 import invert, rotation_from_rpy, transform
+
+WHOLE_POSE = 6
+"""Joints with which an arm reaches every pose that is near enough, in a closed form."""
+MIDDLE = 0.5
+"""Share of the image's width and height in which the middle of the board is drawn."""
+STEPS = 30
+"""Of the numeric inverse."""
+SMALLEST = 8.0
+"""Boards are not drawn farther away than this many times the depth at which they fill the image."""
+LINE = (0.1, 0.8)
+"""Share of the way from the camera to the board from and to which lines of sight are looked at: camera and board may
+stand on a box."""
+
+
+@dataclass(frozen=True, eq=False)
+class BoardViews:
+    """Poses of a robot from which a camera sees a board whole, sharp, and not too obliquely.
+
+    Attributes:
+        sight: camera and board.
+        T_cell_frame: where the board is in the frame of the cell, or the fixed camera [m].
+        nearest: depth of a corner in front of the camera at least [m].
+        farthest: and at most [m].
+        oblique: angle between the board's normal and the line of sight to its middle at most [rad].
+        margin: that the board keeps from the edge of the image [px].
+    """
+
+    sight: BoardSight
+    T_cell_frame: Float64[Tensor, "4 4"]
+    nearest: float
+    farthest: float
+    oblique: float
+    margin: float
+
+    @staticmethod
+    def of(sight: BoardSight, T_cell_frame: Float64[Tensor, "4 4"], view: ViewSection) -> "BoardViews":
+        """Views as the cell states them."""
+        nearest, farthest = view.depths(sight.camera.fx)
+        return BoardViews(
+            sight, T_cell_frame, nearest, farthest, math.radians(view.oblique_deg), view.margin_px
+        )
+
+    def draw(self, arm: ArmInCell, count: int, generator: torch.Generator) -> Float64[Tensor, "count dof"]:
+        """Draw joint values [rad or m], each from a view and a branch of the arm at random; NaN where it reaches none.
+
+        Depth, obliqueness, its direction, the turn about the line of sight and the board's place in the image are
+        uniform. An arm without closed form, or with fewer joints than a pose has freedoms, comes as near to a view as
+        the numeric inverse gets from random joint values.
+        """
+        T_board = self._drawn_boards(count, generator)
+        T_frame_target = T_board if self.sight.is_fixed else invert(T_board)
+        T = self.T_cell_frame @ T_frame_target
+        solver = closed_form_solver(arm.robot) if arm.robot.dof == WHOLE_POSE else None
+        if solver is None:
+            limits = torch.from_numpy(arm.robot.limits).nan_to_num(posinf=math.pi, neginf=-math.pi)
+            start = torch.rand(count, len(limits), generator=generator, dtype=T.dtype)
+            start = limits[:, 0] + (limits[:, 1] - limits[:, 0]) * start
+            return solve_numeric(arm.robot, T, start, max_iterations=STEPS).q
+        branches = solver.solve(T).q
+        rank = torch.rand(branches.shape[:2], generator=generator, dtype=T.dtype)
+        rank = torch.where(branches.isfinite().all(-1), rank, -1.0)
+        chosen: Tensor = branches[torch.arange(count), rank.argmax(1)]
+        return chosen
+
+    def faults(self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]) -> dict[str, Bool[Tensor, " poses"]]:
+        """Say for what poses fail, by reason."""
+        chunks = [self._faults(arm, chunk) for chunk in torch.split(q, CHUNK)]
+        return {reason: torch.cat([chunk[reason] for chunk in chunks]) for reason in chunks[0]}
+
+    def obliqueness(self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
+        """Angle between the board's normal and the line of sight to its middle [rad]; above π / 2 from behind."""
+        return self._obliqueness(self._boards(arm, q)[0])
+
+    def room(self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
+        """By how much the board may stand aside of where it is stated before it leaves the image [m]."""
+        points, pixels, _ = self._shown(self._boards(arm, q)[0])
+        edge = pixels.new_tensor([self.sight.camera.width, self.sight.camera.height])
+        room = torch.minimum(pixels, edge - pixels).amin(-1) * points[..., 2] / self.sight.camera.fx
+        return room.amin(1)
+
+    def _drawn_boards(self, count: int, generator: torch.Generator) -> Float64[Tensor, "count 4 4"]:
+        """T_camera_board of random views."""
+        camera = self.sight.camera
+        draws = torch.rand(count, 6, generator=generator, dtype=torch.float64)
+        size = draws.new_tensor([camera.width, camera.height])
+        pixels = size * (0.5 + MIDDLE * (draws[:, :2] - 0.5))
+        rays = torch.from_numpy(camera.undistort(pixels.numpy()))
+        left, top, right, bottom = board_pattern(self.sight.board).sheet
+        fills = camera.fx * min(right - left, bottom - top) / min(camera.width, camera.height)
+        least, most = max(self.nearest, fills), min(self.farthest, SMALLEST * fills)
+        depth = least + (most - least) * draws[:, 2:3]
+        middle = depth * torch.cat([rays, torch.ones_like(depth)], 1)
+        direction, turn = 2 * math.pi * draws[:, 3:5].t()
+        nothing = torch.zeros_like(turn)
+        R = rotation_from_rpy(torch.stack([direction, self.oblique * draws[:, 5], nothing], 1))
+        R = R @ rotation_from_rpy(torch.stack([turn, nothing, nothing], 1))
+        return transform(R, middle - R @ self._middle)
+
+    def _faults(self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]) -> dict[str, Bool[Tensor, " poses"]]:
+        T, T_cell_board = self._boards(arm, q)
+        points, pixels, is_regular = self._shown(T)
+        camera, oblique = self.sight.camera, self._obliqueness(T)
+        edge = pixels.new_tensor([camera.width, camera.height]) - self.margin
+        inside = ((pixels >= self.margin) & (pixels <= edge)).all(-1) & is_regular & (points[..., 2] > 0)
+        faults = {
+            "the camera is behind the board": oblique > math.pi / 2,
+            "the board is not whole in the image": ~inside.all(1),
+            "a part of the board is too near to be sharp": points[..., 2].amin(1) < self.nearest,
+            "a part of the board is too far away to be sharp": points[..., 2].amax(1) > self.farthest,
+            "the board is seen too obliquely": oblique > self.oblique,
+        }
+        corners = self._sheet @ T_cell_board[:, :3, :3].mT + T_cell_board[:, None, :3, 3]
+        T_cell_camera = T_cell_board @ invert(T)
+        eye = T_cell_camera[:, None, :3, 3]
+        lines = torch.stack([eye + share * (corners - eye) for share in LINE], -2)
+        return faults | arm.hidden(q, lines, "the board from the camera")
+
+    def _boards(
+        self, arm: ArmInCell, q: Float64[Tensor, "poses dof"]
+    ) -> tuple[Float64[Tensor, "poses 4 4"], Float64[Tensor, "poses 4 4"]]:
+        """T_camera_board and T_cell_board [m]."""
+        T_cell_target = forward_kinematics(arm.robot, q)
+        T = self.sight.board_in_camera(invert(self.T_cell_frame) @ T_cell_target)
+        return T, T_cell_target if self.sight.is_fixed else self.T_cell_frame.expand_as(T)
+
+    def _shown(
+        self, T_camera_board: Float64[Tensor, "poses 4 4"]
+    ) -> tuple[
+        Float64[Tensor, "poses points 3"], Float64[Tensor, "poses points 2"], Bool[Tensor, "poses points"]
+    ]:
+        """The sheet's corners in the camera's frame [m] and their pixels, and whether the lens shows them there only.
+
+        Far outside of the image the polynomials of a distortion turn back.
+        """
+        points = self._sheet @ T_camera_board[:, :3, :3].mT + T_camera_board[:, None, :3, 3]
+        in_front = points.clone()
+        in_front[..., 2] = points[..., 2].clamp(min=1e-3)
+        pixels, by_point = map(torch.from_numpy, self.sight.camera.project(in_front.numpy()))
+        across = by_point[..., :2]
+        is_regular = (torch.linalg.det(across) > 0) & (across.diagonal(dim1=-2, dim2=-1).sum(-1) > 0)
+        return points, pixels, is_regular
+
+    def _obliqueness(self, T_camera_board: Float64[Tensor, "poses 4 4"]) -> Float64[Tensor, " poses"]:
+        R, t = T_camera_board[:, :3, :3], T_camera_board[:, :3, 3]
+        sight = torch.nn.functional.normalize(R @ self._middle + t, dim=1)
+        return (R[:, :, 2] * sight).sum(1).clamp(-1, 1).acos()
+
+    @property
+    def _sheet(self) -> Float64[Tensor, "9 3"]:
+        """Corners, middles of the edges, and middle of the printed sheet, in the board's frame [m].
+
+        No link is so thin that it stands between the lines of sight to them only.
+        """
+        left, top, right, bottom = board_pattern(self.sight.board).sheet
+        x, y = (np.linspace(*ends, 3) for ends in ((left, right), (top, bottom)))
+        return torch.from_numpy(np.stack([*np.meshgrid(x, y), np.zeros((3, 3))], -1).reshape(9, 3))
+
+    @property
+    def _middle(self) -> Float64[Tensor, " 3"]:
+        return self._sheet[4]

@@ -1,0 +1,58 @@
+"""Plans for a camera from a robot to its files: every pose sees the board, and the same plan is read again."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from testing.board_views import CELL, camera_settings, sees_board
+from testing.closeness import assert_close
+from testing.models import no_type_checker
+
+from pisigma.planning.plan_file import read_plan
+from pisigma.planning.plan_settings import PlanSettings
+from pisigma.workflow.plan import Plan, plan
+
+
+@pytest.fixture(scope="module")
+def settings(tmp_path_factory: pytest.TempPathFactory) -> PlanSettings:
+    camera = camera_settings(tmp_path_factory.mktemp("camera"))
+    return PlanSettings(count=12, check=3, sensor="camera", camera=camera, candidates=60)
+
+
+@pytest.fixture(scope="module")
+def planned(settings: PlanSettings) -> Plan:
+    with no_type_checker():
+        return plan("ur5", settings, CELL)
+
+
+def test_every_planned_pose_sees_the_board(planned: Plan, settings: PlanSettings):
+    arm, camera = planned.stored.arm, settings.camera
+    assert camera is not None
+    assert planned.poses + planned.checks == len(planned.stored.q) >= 14
+    radius = arm.capsules.radius.numpy()
+    assert all(sees_board(arm, camera, q, radius) for q in planned.stored.q.numpy())
+    assert bool(arm.faults(planned.stored.q).allowed.all())
+
+
+def test_more_images_are_expected_to_err_less_than_random_ones(planned: Plan):
+    first, last = planned.curve
+    assert first.poses == 10
+    assert first.rms > last.rms > 0
+    assert last.random_rms > last.rms
+
+
+def test_a_plan_is_read_with_its_camera(planned: Plan, settings: PlanSettings, tmp_path: Path):
+    planned.save(tmp_path / "poses.csv", [tmp_path / "poses.script"])
+    stored = read_plan(tmp_path / "poses.csv")
+    assert settings.camera is not None
+    assert stored.settings.camera is not None
+    assert Path(stored.settings.camera.camera).samefile(settings.camera.camera)
+    assert replace(stored.settings, camera=None, sensor="pose") == replace(
+        settings, camera=None, sensor="pose"
+    )
+    assert stored.arm.cell == CELL
+    assert stored.instrument.sight is not None
+    assert_close(stored.q, planned.stored.q, atol=1e-7)
+    assert (tmp_path / "poses.script").read_text().count("sleep(3.0)") == len(stored.q)
+    assert not np.isnan(stored.q.numpy()).any()
