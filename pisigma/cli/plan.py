@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pisigma.cli.arguments import AsJson, complete_robot
-from pisigma.cli.calibrate import Base, FixedCamera, RepeatabilityDeg, RepeatabilityMm, Tip
+from pisigma.cli.calibrate import Base, Tip
+from pisigma.cli.camera_options import FixedCamera, RepeatabilityDeg, RepeatabilityMm
 from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:

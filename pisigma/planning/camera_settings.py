@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 from pisigma.camera.board import Board
 from pisigma.camera.camera import Camera
-from pisigma.camera.image_rows import CameraFiles, Repeatability
+from pisigma.camera.corner_file import CameraFiles
+from pisigma.camera.image_rows import Repeatability
 from pisigma.errors import PlanningError
 from pisigma.planning.board_sight import BoardSight
 
@@ -52,7 +53,7 @@ class CameraSettings:
     @property
     def files(self) -> CameraFiles:
         """What reads the corners that are measured."""
-        return CameraFiles(self.camera, self.board, self.is_fixed, self.repeatability)
+        return CameraFiles((self.camera,), (self.board,), self.is_fixed, self.repeatability)
 
     def sight(self) -> BoardSight:
         """Read the files of camera and board.
@@ -61,4 +62,5 @@ class CameraSettings:
             MeasurementError: a file cannot be used; the message says which and where.
         """
         camera, board = Camera.load(self.camera), Board.load(self.board)
-        return BoardSight(camera, board, self.is_fixed, self.sigma_px, self.repeatability)
+        is_fixed = self.is_fixed or camera.is_fixed
+        return BoardSight(camera, board, is_fixed, self.sigma_px, self.repeatability)
