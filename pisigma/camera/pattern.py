@@ -32,9 +32,7 @@ def board_pattern(board: Board) -> Pattern:
         ImportError: OpenCV, which draws markers, is not installed.
     """
     if board.kind == "apriltag":
-        margin = board.square / 2
-        last = board.corners.max(0)[:2] + margin
-        return Pattern(_markers(board, board.corners[::4, :2]), np.array([-margin, -margin, *last]))
+        return Pattern(_markers(board, board.corners[::4, :2]), board_sheet(board))
     row, column = np.divmod(np.arange((board.rows + 1) * (board.columns + 1)), board.columns + 1)
     is_black = (row + column) % 2 == 0
     left_top = board.square * (np.stack([column, row], -1) - 1.0)
@@ -42,8 +40,15 @@ def board_pattern(board: Board) -> Pattern:
     if board.kind == "charuco":
         markers = _markers(board, left_top[~is_black] + (board.square - board.marker) / 2)
         black = np.concatenate([black, markers])
-    sheet = np.array([-1.5, -1.5, board.columns + 0.5, board.rows + 0.5])
-    return Pattern(black, board.square * sheet)
+    return Pattern(black, board_sheet(board))
+
+
+def board_sheet(board: Board) -> Float64[np.ndarray, " 4"]:
+    """Return left, top, right and bottom edge of the white sheet of a board with its quiet margin [m]."""
+    if board.kind == "apriltag":
+        margin = board.square / 2
+        return np.array([-margin, -margin, *board.corners.max(0)[:2] + margin])
+    return board.square * np.array([-1.5, -1.5, board.columns + 0.5, board.rows + 0.5])
 
 
 def _markers(board: Board, left_top: np.ndarray) -> Float64[np.ndarray, "rectangles 4"]:

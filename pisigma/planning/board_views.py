@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.camera.pattern import board_pattern
+from pisigma.camera.pattern import board_sheet
 from pisigma.kinematics.closed_form.registry import closed_form_solver
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.numeric import solve_numeric
@@ -103,7 +103,7 @@ class BoardViews:
         size = draws.new_tensor([camera.width, camera.height])
         pixels = size * (0.5 + MIDDLE * (draws[:, :2] - 0.5))
         rays = torch.from_numpy(camera.undistort(pixels.numpy()))
-        left, top, right, bottom = board_pattern(self.sight.board).sheet
+        left, top, right, bottom = board_sheet(self.sight.board)
         fills = camera.fx * min(right - left, bottom - top) / min(camera.width, camera.height)
         least, most = max(self.nearest, fills), min(self.farthest, SMALLEST * fills)
         depth = least + (most - least) * draws[:, 2:3]
@@ -169,7 +169,7 @@ class BoardViews:
 
         No link is so thin that it stands between the lines of sight to them only.
         """
-        left, top, right, bottom = board_pattern(self.sight.board).sheet
+        left, top, right, bottom = board_sheet(self.sight.board)
         x, y = (np.linspace(*ends, 3) for ends in ((left, right), (top, bottom)))
         return torch.from_numpy(np.stack([*np.meshgrid(x, y), np.zeros((3, 3))], -1).reshape(9, 3))
 

@@ -20,7 +20,9 @@ def test_a_pose_has_the_weight_of_its_image(is_fixed: bool):
     texts = rows.readings[WEIGHT_COLUMN]
     measured = torch.zeros(6, 6, 6, dtype=torch.float64)
     row, column = np.tril_indices(6)
-    measured[:, row, column] = torch.tensor([numbers_in(text, WEIGHTS) for text in texts], dtype=torch.float64)
+    measured[:, row, column] = torch.tensor(
+        [numbers_in(text, WEIGHTS) for text in texts], dtype=torch.float64
+    )
     sight = BoardSight(CAMERA, BOARD, is_fixed, NOISE.corner, NOISE.repeatability)
     weight = sight.weight(forward_kinematics(cell.true, cell.images.q))
     covariance, expected = (torch.linalg.inv(W.mT @ W) for W in (weight, measured))
