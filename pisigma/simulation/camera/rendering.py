@@ -1,0 +1,247 @@
+"""Images of a board, drawn pixel by pixel through the model of the camera."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Float64, UInt8
+from scipy.interpolate import RectBivariateSpline
+from scipy.ndimage import gaussian_filter
+
+from pisigma.camera.camera import Camera
+from pisigma.camera.pattern import Pattern
+from pisigma.simulation.camera.true_board import TrueBoard
+
+NODE_STEP = 16
+"""[px] Rays are undistorted so far apart and splined between; a cubic errs by less than 1e-4 px."""
+SURFACE_STEPS = 4
+"""Fixed-point steps from the plane to a bowed surface, each of which shrinks the error to a few percent."""
+SUBPIXELS = 4
+"""Of a pixel across an edge, each way."""
+BLUR_LEVELS = 4
+"""Blurs between the sharpest and the least sharp part of an image, between which pixels interpolate."""
+SMALLEST_BLUR_STEP = 1e-3
+"""[px] Between the levels, for images of one blur."""
+SMALLEST_COSINE = 1e-9
+"""Between a ray and the board's normal; rays along the board meet it far away."""
+FAR = 1e6
+"""[m] Where rays are taken to that never meet the board."""
+OUTLINE = 20
+"""Points of every edge of the sheet whose pixels bound the image of the board."""
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """How an image comes about.
+
+    A lens of the aperture A that is focused at the distance F draws a point at the distance z as a disc of the
+    diameter `f A |1/z - 1/F|`, with f the focal length [px]; it is blurred here by a normal density of the same
+    variance.
+
+    Attributes:
+        black: gray level of print, of 255.
+        white: gray level of paper.
+        background: gray level of what is around the board.
+        blur: standard deviation of the blur where the image is in focus [px].
+        focus: distance in focus [m].
+        aperture: diameter of the lens's opening [m].
+        vignetting: share of the light that the corners of the image lose.
+        gradient: change of the light from the left to the right edge of the image, over its mean.
+        noise: standard deviation of the gray level of a pixel.
+    """
+
+    black: float = 30.0
+    white: float = 200.0
+    background: float = 110.0
+    blur: float = 0.7
+    focus: float = 0.5
+    aperture: float = 0.001
+    vignetting: float = 0.2
+    gradient: float = 0.2
+    noise: float = 2.0
+
+
+def render_image(
+    camera: Camera,
+    board: TrueBoard,
+    T_camera_board: Float64[np.ndarray, "4 4"],
+    exposure: Exposure,
+    rng: np.random.Generator,
+) -> UInt8[np.ndarray, "height width"]:
+    """Draw the gray image that a camera takes of a board; nothing hides the board.
+
+    Args:
+        camera: with its true intrinsics.
+        board: as it really is.
+        T_camera_board: where it is.
+        exposure: light and optics.
+        rng: of the noise.
+    """
+    gray = np.full((camera.height, camera.width), exposure.background, dtype=np.float32)
+    left, top, right, bottom = _bounds(camera, board, T_camera_board, exposure)
+    if left < right and top < bottom:
+        rays = _rays(camera, np.arange(left, right + 1) - 0.5, np.arange(top, bottom + 1) - 0.5)
+        xy, depth = _on_surface(board, T_camera_board, rays)
+        sharp = _reflected(_Surface.of(board.pattern, exposure), xy)
+        gray[top:bottom, left:right] = _blurred(sharp, _blur(camera, exposure, depth[1:, 1:]))
+    gray *= _light(camera, exposure)
+    gray += exposure.noise * rng.standard_normal(gray.shape, dtype=np.float32)
+    return np.clip(np.rint(gray), 0, 255).astype(np.uint8)
+
+
+def _blur(camera: Camera, exposure: Exposure, depth: np.ndarray) -> np.ndarray:
+    """Standard deviation of the blur [px] at a depth [m]; a disc's is a quarter of its diameter along each axis."""
+    disc = camera.fx * exposure.aperture * np.abs(1 / depth - 1 / exposure.focus)
+    blur: np.ndarray = np.hypot(exposure.blur, disc / 4)
+    return blur
+
+
+def _bounds(
+    camera: Camera, board: TrueBoard, T_camera_board: np.ndarray, exposure: Exposure
+) -> tuple[int, int, int, int]:
+    """First and last pixels that the board may touch, blurred; the whole image where its outline leaves the view."""
+    left, top, right, bottom = board.pattern.sheet
+    along = np.linspace(0, 1, OUTLINE)
+    x, y = left + along * (right - left), top + along * (bottom - top)
+    edges = [(x, np.full_like(x, end)) for end in (top, bottom)]
+    edges += [(np.full_like(y, end), y) for end in (left, right)]
+    xy = np.concatenate([np.stack(edge, -1) for edge in edges])
+    points = np.concatenate([xy, board.height(xy)[:, None]], 1) @ T_camera_board[:3, :3].T
+    points += T_camera_board[:3, 3]
+    size = np.array([camera.width, camera.height])
+    if (points[:, 2] <= 0).any():
+        return 0, 0, camera.width, camera.height
+    pixels = camera.project(points)[0]
+    if (np.abs(pixels - size / 2) > size).any():  # so far out distortion may fold back
+        return 0, 0, camera.width, camera.height
+    margin = 2 + 4 * float(_blur(camera, exposure, points[:, 2]).max())
+    first = np.maximum(np.floor(pixels.min(0) - margin), 0).astype(int)
+    last = np.minimum(np.ceil(pixels.max(0) + margin) + 1, size).astype(int)
+    return int(first[0]), int(first[1]), int(last[0]), int(last[1])
+
+
+def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> Float64[np.ndarray, "2 v u"]:
+    """Return x / z and y / z of the rays of a grid of pixels."""
+    nodes_u, nodes_v = (np.linspace(at[0], at[-1], 4 + int((at[-1] - at[0]) / NODE_STEP)) for at in (u, v))
+    at_nodes = camera.undistort(np.stack(np.meshgrid(nodes_u, nodes_v), -1))
+    return np.stack([RectBivariateSpline(nodes_v, nodes_u, at_nodes[..., axis])(v, u) for axis in (0, 1)])
+
+
+def _on_surface(
+    board: TrueBoard, T_camera_board: np.ndarray, rays: np.ndarray
+) -> tuple[Float64[np.ndarray, "2 v u"], Float64[np.ndarray, "v u"]]:
+    """Where rays meet the board, in its frame [m], and how deep in the camera's [m]; far away where they do not."""
+    R, t = T_camera_board[:3, :3], T_camera_board[:3, 3]
+    origin = -R.T @ t
+    along = [R[0, axis] * rays[0] + R[1, axis] * rays[1] + R[2, axis] for axis in range(3)]
+    facing = np.copysign(np.maximum(np.abs(along[2]), SMALLEST_COSINE), along[2])
+    depth = -origin[2] / facing
+    for _ in range(SURFACE_STEPS if board.bow else 0):
+        xy = np.stack([origin[axis] + depth * along[axis] for axis in (0, 1)], -1)
+        depth = (board.height(xy) - origin[2]) / facing
+    depth[depth <= 0] = FAR
+    return np.stack([origin[axis] + depth * along[axis] for axis in (0, 1)]), depth
+
+
+def _reflected(surface: "_Surface", xy: Float64[np.ndarray, "2 v+1 u+1"]) -> Float64[np.ndarray, "v u"]:
+    """Gray level of every pixel before the blur, averaged over its area; from what its four vertices show."""
+    cell = surface.cell(xy)
+    gray: np.ndarray = surface.gray.ravel()[cell[:-1, :-1]]
+    across = (cell[:-1, :-1] != cell[1:, 1:]) | (cell[:-1, 1:] != cell[1:, :-1])
+    a, b, c, d = (
+        xy[:, rows, columns][:, across]
+        for rows in (slice(None, -1), slice(1, None))
+        for columns in (slice(None, -1), slice(1, None))
+    )
+    centre, along_u, along_v = (a + b + c + d) / 4, (b - a + d - c) / 2, (c - a + d - b) / 2
+    half = (np.abs(along_u) + np.abs(along_v)) / 2 / SUBPIXELS
+    total = np.zeros(centre.shape[1])
+    offsets = (np.arange(SUBPIXELS) + 0.5) / SUBPIXELS - 0.5
+    for du in offsets:
+        for dv in offsets:
+            total += surface.mean(centre + du * along_u + dv * along_v, half)
+    gray[across] = total / SUBPIXELS**2
+    return gray
+
+
+@dataclass(frozen=True, eq=False)
+class _Surface:
+    """Gray levels of a sheet as a grid of rectangular cells, and their integral.
+
+    Attributes:
+        x: edges between columns of cells [m].
+        y: edges between rows of cells [m].
+        gray: of every cell, those around the sheet among them.
+        integral: of gray less background over all that is left and above of every crossing of edges [m²].
+        background: gray level around the sheet.
+    """
+
+    x: np.ndarray
+    y: np.ndarray
+    gray: np.ndarray
+    integral: np.ndarray
+    background: float
+
+    @staticmethod
+    def of(pattern: Pattern, exposure: Exposure) -> "_Surface":
+        """Paint the sheet, then what is printed on it."""
+        rectangles = np.concatenate([pattern.sheet[None], pattern.black])
+        x, y = np.unique(rectangles[:, [0, 2]]), np.unique(rectangles[:, [1, 3]])
+        columns, rows = np.searchsorted(x, rectangles[:, [0, 2]]), np.searchsorted(y, rectangles[:, [1, 3]])
+        gray = np.full((len(y) + 1, len(x) + 1), exposure.background)
+        for number, ((left, right), (top, bottom)) in enumerate(zip(columns, rows, strict=True)):
+            level = exposure.black if number else exposure.white
+            gray[top + 1 : bottom + 1, left + 1 : right + 1] = level
+        cells = (gray[1:-1, 1:-1] - exposure.background) * np.diff(y)[:, None] * np.diff(x)
+        integral = np.pad(cells.cumsum(0).cumsum(1), ((1, 0), (1, 0)))
+        return _Surface(x, y, gray, integral, exposure.background)
+
+    def cell(self, xy: np.ndarray) -> np.ndarray:
+        """Number of the cell in which points are."""
+        column, row = np.searchsorted(self.x, xy[0]), np.searchsorted(self.y, xy[1])
+        number: np.ndarray = row * self.gray.shape[1] + column
+        return number
+
+    def mean(self, xy: np.ndarray, half: np.ndarray) -> np.ndarray:
+        """Mean gray level of rectangles about points, half of whose sides are stated."""
+        (left, top), (right, bottom) = xy - half, xy + half
+        total = self._integral(right, bottom) - self._integral(left, bottom)
+        total -= self._integral(right, top) - self._integral(left, top)
+        gray: np.ndarray = total / (4 * half.prod(0)) + self.background
+        return gray
+
+    def _integral(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
+        """Of gray levels left of x and above of y, bilinear within every cell."""
+        column, a = _cell(self.x, x)
+        row, b = _cell(self.y, y)
+        upper = (1 - a) * self.integral[row, column] + a * self.integral[row, column + 1]
+        lower = (1 - a) * self.integral[row + 1, column] + a * self.integral[row + 1, column + 1]
+        total: np.ndarray = (1 - b) * upper + b * lower
+        return total
+
+
+def _cell(edges: np.ndarray, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Number of the cell in which a coordinate is, and how far in it, from 0 to 1."""
+    at = np.clip(at, edges[0], edges[-1])
+    index = np.clip(np.searchsorted(edges, at) - 1, 0, len(edges) - 2)
+    return index, (at - edges[index]) / (edges[index + 1] - edges[index])
+
+
+def _blurred(sharp: np.ndarray, blur: np.ndarray) -> np.ndarray:
+    """Blur every pixel by its own standard deviation, between a few levels of blur for the whole."""
+    levels = np.linspace(blur.min(), max(blur.max(), blur.min() + SMALLEST_BLUR_STEP), BLUR_LEVELS)
+    weight = (blur - levels[0]) / (levels[1] - levels[0])
+    total = np.zeros_like(sharp)
+    for number, level in enumerate(levels):
+        total += np.maximum(1 - np.abs(weight - number), 0) * gaussian_filter(sharp, level, mode="nearest")
+    return total
+
+
+def _light(camera: Camera, exposure: Exposure) -> Float[np.ndarray, "height width"]:
+    """Light that reaches every pixel, over that of the middle of the image."""
+    u = (np.arange(camera.width, dtype=np.float32) + 0.5) / camera.width - 0.5
+    v = (np.arange(camera.height, dtype=np.float32) + 0.5) / camera.height - 0.5
+    radius = (u**2 * camera.width**2 + v[:, None] ** 2 * camera.height**2) * (
+        4 / (camera.width**2 + camera.height**2)
+    )
+    light: np.ndarray = (1 - exposure.vignetting * radius) * (1 + exposure.gradient * u)
+    return light
