@@ -142,8 +142,8 @@ def _on_surface(
     return np.stack([origin[axis] + depth * along[axis] for axis in (0, 1)]), depth
 
 
-def _reflected(surface: "_Surface", xy: Float64[np.ndarray, "2 v+1 u+1"]) -> Float64[np.ndarray, "v u"]:
-    """Gray level of every pixel before the blur, averaged over its area; from what its four vertices show."""
+def _reflected(surface: "_Surface", xy: Float64[np.ndarray, "2 v u"]) -> Float64[np.ndarray, "v-1 u-1"]:
+    """Gray level of every pixel before the blur, averaged over its area, from what its four vertices show."""
     cell = surface.cell(xy)
     gray: np.ndarray = surface.gray.ravel()[cell[:-1, :-1]]
     across = (cell[:-1, :-1] != cell[1:, 1:]) | (cell[:-1, 1:] != cell[1:, :-1])
