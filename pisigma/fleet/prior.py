@@ -215,7 +215,7 @@ def _evidence(
     others = X[:, space.arm_size : len(space.parameters)]
     own = torch.cat([X[:, : space.arm_size], X[:, len(space.parameters) :]], 1)
     inner = others.t() @ others
-    inner.diagonal().add_(ELSEWHERE**-2)
+    inner.diagonal().add_(ELSEWHERE["m"] ** -2)
     taken = torch.linalg.solve(inner, others.t() @ torch.cat([own, y[:, None]], 1))
     normal = own.t() @ own - own.t() @ others @ taken[:, :-1]
     descent = own.t() @ y - own.t() @ others @ taken[:, -1]

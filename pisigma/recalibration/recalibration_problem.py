@@ -26,14 +26,15 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import Frames
 from pisigma.recalibration.drift import DriftGroup, LinearValues
 from pisigma.recalibration.model_posterior import ModelPosterior
+from pisigma.sensors.intrinsics import without_stated
 from pisigma.sensors.registry import unknown_groups
-from pisigma.sensors.sensor import UnknownGroup
+from pisigma.sensors.sensor import ParameterUnit, UnknownGroup
 
 Owner = tuple[str, str]
 """What can stand elsewhere: ("base", frame) or ("tool", target)."""
 
-ELSEWHERE = 0.1
-"""[m or rad] Standard deviation of a base, a tool or a sensor's unknown that stands anywhere, about its guess."""
+ELSEWHERE: dict[ParameterUnit, float] = {"m": 0.1, "rad": 0.1, "px": 100.0, "1": 1.0}
+"""Standard deviation of a base, a tool or a sensor's unknown that stands anywhere, about its guess, by its unit."""
 LARGEST_CORRECTION = 10.0
 """Size 1 of the drift of a correction, in root mean squares of its weights."""
 
@@ -104,7 +105,7 @@ def recalibration_problem(
         PoseError: the joint values do not fit the robot.
     """
     posterior.space.robot.check_joint_count(rows.q.shape[1])
-    usable, rows = usable_rows(rows)
+    usable, rows = usable_rows(without_stated(rows, posterior.geometry.unknowns))
     space = _joined_space(posterior.space, rows)
     known = {("base", name) for name in posterior.geometry.bases}
     known |= {("tool", name) for name in posterior.geometry.tools}
@@ -125,7 +126,7 @@ def recalibration_problem(
     root[len(start) :] = posterior.root[parameters:]
     mean = torch.cat([torch.zeros_like(start), posterior.weights])
     design = Design(problem, posterior.features)
-    groups = _groups(posterior, space, rows, root, new)
+    groups = _groups(posterior, space, rows, root, new, setup.free_unknowns)
     return RecalibrationProblem(posterior, setup, design, mean, root, change, groups, root[:, :0])
 
 
@@ -159,6 +160,9 @@ def _guess(
     geometry = posterior.geometry
     bases, tools = dict(geometry.bases), dict(geometry.tools)
     unknowns = {group: dict(owners) for group, owners in geometry.unknowns.items()}
+    free = {
+        own.name: torch.ones(len(own.owners), len(own.columns), dtype=torch.bool) for own in space.unknowns
+    }
     owners = {
         (own.name, owner)
         for own in space.unknowns
@@ -182,8 +186,10 @@ def _guess(
         bases |= _new_frames("base", there.frames, first.bases, new)
         tools |= _new_frames("tool", there.targets, first.tools, new)
         for own in there.unknowns:
-            for owner, values in zip(own.owners, first.unknowns[own.name].numpy(), strict=True):
-                unknowns.setdefault(own.name, {}).setdefault(owner, values)
+            for number, owner in enumerate(own.owners):
+                unknowns.setdefault(own.name, {}).setdefault(owner, first.unknowns[own.name][number].numpy())
+                if (own.name, owner) in owners:
+                    free[own.name][number] = first.free_unknowns[own.name][number]
     values = {
         own.name: torch.from_numpy(np.stack([unknowns[own.name][owner] for owner in own.owners]))
         for own in space.unknowns
@@ -192,7 +198,7 @@ def _guess(
         np.stack([bases[name] for name in space.frames]),
         np.stack([tools[name] for name in space.targets]),
         values,
-        {group: torch.ones_like(those, dtype=torch.bool) for group, those in values.items()},
+        free,
     )
 
 
@@ -214,6 +220,7 @@ def _groups(
     rows: Measurements,
     root: Float64[Tensor, "unknowns directions"],
     new: Set[Owner],
+    free_unknowns: Collection[int],
 ) -> tuple[DriftGroup, ...]:
     """What may have drifted: the arm, bases and tools, and the correction; and what stands elsewhere."""
     parameters = len(space.parameters)
@@ -228,7 +235,7 @@ def _groups(
             stretch = frame_stretch(space, kind, name)
             index = torch.arange(stretch.start, stretch.stop)
             if (kind, name) in new:
-                groups.append(_elsewhere(what, index))
+                groups.append(_elsewhere(space, what, index))
             elif name in measured:
                 turn = 1 / space.robot.reach
                 scale = torch.tensor([1.0, 1.0, 1.0, turn, turn, turn], dtype=torch.float64)
@@ -237,9 +244,8 @@ def _groups(
         for number, owner in enumerate(own.owners):
             if owner not in posterior.geometry.unknowns.get(own.name, {}):
                 first = space.of(own.name).start + len(own.columns) * number
-                groups.append(
-                    _elsewhere(f"{own.name} {owner}", torch.arange(first, first + len(own.columns)))
-                )
+                index = torch.tensor([k for k in free_unknowns if first <= k < first + len(own.columns)])
+                groups.append(_elsewhere(space, f"{own.name} {owner}", index))
     if len(posterior.weights):
         index = torch.arange(parameters, len(root))
         scale = LARGEST_CORRECTION * posterior.usual_weights
@@ -247,9 +253,10 @@ def _groups(
     return tuple(group for group in groups if len(group.index))
 
 
-def _elsewhere(what: str, index: Tensor) -> DriftGroup:
+def _elsewhere(space: ParameterSpace, what: str, index: Tensor) -> DriftGroup:
     """What stands anywhere about its guess."""
-    return DriftGroup(what, index, torch.full((len(index),), ELSEWHERE).double(), 1.0, stands=True)
+    scale = [ELSEWHERE[space.parameters[number].unit] for number in index.tolist()]
+    return DriftGroup(what, index, torch.tensor(scale, dtype=torch.float64), 1.0, stands=True)
 
 
 def _arm_groups(space: ParameterSpace, free: Bool[Tensor, " parameters"]) -> list[DriftGroup]:

@@ -1,7 +1,8 @@
 """What images say of their camera's intrinsics and of the scale of their board, whatever the poses are."""
 
 import math
-from dataclasses import dataclass, fields
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -38,6 +39,8 @@ CAMERA_UNITS: dict[str, OtherUnit] = {
     name: "px" if name in PIXELS else "1" for name in (*PIXELS, "k1", "k2", "p1", "p2", "k3")
 }
 NUMBERS = len(CAMERA_UNITS)
+UNSTATED = 1e3
+"""Times as large as stated, deviations say nothing beside what the images show."""
 USUAL_SCALE = 1e-3
 """Standard deviation of the scale of a board that states none: so much printers and paper are off."""
 
@@ -103,6 +106,31 @@ def intrinsics_information(
     U[np.ix_(free, free)] = np.linalg.cholesky(information).T / sigma[free]
     mean[free] += sigma[free] * np.linalg.solve(information, pull)
     return U, mean
+
+
+def without_stated(measurements: Measurements, counted: Mapping[str, Collection[str]]) -> Measurements:
+    """Return rows of images that say of some cameras and boards only what their corners show.
+
+    Args:
+        measurements: with rows of images or without.
+        counted: by group the owners whose stated deviations a model has counted already.
+    """
+    if CAMERA_COLUMN not in measurements.readings:
+        return measurements
+    stated, scales = (texts_of(measurements, name) for name in (INTRINSICS_COLUMN, SCALE_COLUMN))
+    images, names = ImageIntrinsics.of(stated), cameras(measurements) or ("",) * len(stated)
+    known = np.array([name in counted.get("camera", ()) for name in names])
+    images = replace(images, sigma=np.where(known[:, None], UNSTATED, 1.0) * images.sigma)
+    texts = {
+        INTRINSICS_COLUMN: tuple(
+            text if name else "" for name, text in zip(names, images.texts, strict=True)
+        ),
+        SCALE_COLUMN: tuple(
+            "1" if board in counted.get("board", ()) else text
+            for board, text in zip(boards(measurements) or (), scales, strict=True)
+        ),
+    }
+    return replace(measurements, readings={**measurements.readings, **texts})
 
 
 def numbers_in(text: str, count: int) -> list[float]:

@@ -9,11 +9,13 @@ from testing.camera_cell import BOARD, CAMERA, camera_cell
 from testing.closeness import assert_close
 from torch import Tensor
 
+from pisigma.camera.camera import USUAL_DEVIATIONS
 from pisigma.camera.image_rows import Repeatability, image_measurements
 from pisigma.errors import MeasurementError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements
 from pisigma.sensors.corner import position_deviations
+from pisigma.sensors.intrinsics import without_stated
 
 
 def test_derivatives_are_those_of_the_weighted_errors() -> None:
@@ -81,3 +83,18 @@ def test_faulty_weights_are_named(tmp_path: Path, cells: str, message: str) -> N
     )
     with pytest.raises(MeasurementError, match=message):
         Measurements.read_csv(path)
+
+
+def test_what_a_model_has_counted_is_not_counted_again() -> None:
+    images = image_measurements(camera_cell(8).images, CAMERA, BOARD, False, Repeatability())
+    plain = Measurements(q=images.q, position=images.position)
+    assert without_stated(plain, {"camera": ["wrist"]}) is plain
+    counted = without_stated(images, {"camera": ["wrist"], "board": ["board"]})
+    calibrator = GeometricCalibrator(camera_cell(8).nominal)
+    before, after = (calibrator.build(rows).problem for rows in (images, counted))
+    first, second = (
+        problem.sensors[1].root[:8, :8, 0] for problem in (before, after)
+    )  # U^T U is the information on fx to p2
+    prior = (first.T @ first - second.T @ second) / torch.as_tensor(images.readings["corner_noise"])[0] ** 2
+    assert_close(prior.diagonal(), 1 / torch.tensor(USUAL_DEVIATIONS[:8]).double().square(), rtol=1e-4)
+    assert [sensor.name for sensor in after.sensors] == ["corner", "intrinsics", "board scale"]
