@@ -80,7 +80,7 @@ def test_a_board_is_drawn_to_be_printed(run, refuses, files, tmp_path):
     command = ("detect", "--board", files / "board.yaml", "--print")
     result = run(*command, tmp_path / "board.pdf")
     assert result.exit_code == 0, result.output
-    assert "print it on A4 at 100 %" in result.stdout
+    assert "print it on A3 at 100 %" in " ".join(result.stdout.split())
     assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
     assert "goes into a .pdf file" in refuses(*command, tmp_path / "board.png")
     assert "--print to draw the board" in refuses(*command[:-1])
