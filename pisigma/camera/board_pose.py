@@ -121,20 +121,35 @@ def _weights(residual: np.ndarray, loss: AbstractLoss) -> np.ndarray:
     return weights
 
 
-def _by_homography(corners: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Pose of a flat board from `ray ~ [r1 r2 t] (x, y, 1)`, linear in its nine numbers up to their scale."""
-    middle, size = corners[:, :2].mean(0), np.ptp(corners[:, :2], axis=0).max()
-    plane = np.concatenate([(corners[:, :2] - middle) / size, np.ones((len(corners), 1))], 1)
-    zero = np.zeros_like(plane)
+def homography(
+    plane: Float64[np.ndarray, "corners 2"], image: Float64[np.ndarray, "corners 2"]
+) -> Float64[np.ndarray, "3 3"]:
+    """Find H of `image ~ H (x, y, 1)`, linear in its nine numbers up to their scale; depths come out positive.
+
+    Args:
+        plane: points on a plane, in any unit.
+        image: where they appear, as x / z and y / z or in another unit that makes them about 1.
+    """
+    middle, size = plane.mean(0), np.ptp(plane, axis=0).max()
+    at = np.concatenate([(plane - middle) / size, np.ones((len(plane), 1))], 1)
+    zero = np.zeros_like(at)
     A = np.concatenate(
         [
-            np.concatenate([plane, zero, -rays[:, :1] * plane], 1),
-            np.concatenate([zero, plane, -rays[:, 1:] * plane], 1),
+            np.concatenate([at, zero, -image[:, :1] * at], 1),
+            np.concatenate([zero, at, -image[:, 1:] * at], 1),
         ]
     )
-    H = np.linalg.svd(A)[2][-1].reshape(3, 3)
-    H *= np.sign(H[2, 2]) * 2 * size / (np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))
-    axes = H[:, :2] / size
-    R = np.column_stack([axes, np.cross(axes[:, 0], axes[:, 1])])
+    H: np.ndarray = np.linalg.svd(A)[2][-1].reshape(3, 3)
+    H *= np.sign(H[2, 2]) / np.array([size, size, 1.0])
+    H[:, 2] -= H[:, :2] @ middle
+    return H
+
+
+def _by_homography(corners: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Pose of a flat board from `ray ~ [r1 r2 t] (x, y, 1)`."""
+    H = homography(corners[:, :2], rays)
+    middle = corners[:, :2].mean(0)
+    H = 2 * H / (np.linalg.norm(H[:, 0]) + np.linalg.norm(H[:, 1]))
+    R = np.column_stack([H[:, :2], np.cross(H[:, 0], H[:, 1])])
     R = nearest_rotation(torch.from_numpy(R)).numpy()
-    return R, H[:, 2] - R[:, :2] @ middle
+    return R, H[:, 2] + (H[:, :2] - R[:, :2]) @ middle

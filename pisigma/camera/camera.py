@@ -12,7 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from pisigma.errors import MeasurementError
 from pisigma.files.input_file import read_text
 from pisigma.sensors.intrinsics import CAMERA_UNITS
-from pisigma.yaml_file import MOST_BYTES, Section, parse_yaml
+from pisigma.yaml_file import MOST_BYTES, Section, parse_yaml, yaml_text
 
 INTRINSICS = tuple(CAMERA_UNITS)
 USUAL_DEVIATIONS = (0.5, 0.5, 1.0, 1.0, 0.002, 0.01, 2e-4, 2e-4, 0.0)
@@ -145,6 +145,13 @@ class Camera:
         size = (document.camera_name, document.image_width, document.image_height)
         k1, k2, p1, p2, k3 = (*bent, 0.0)[:5]
         return Camera(*size, matrix[0], matrix[4], matrix[2], matrix[5], k1, k2, p1, p2, k3)
+
+    def to_yaml(self) -> str:
+        """Write the camera as a file that `load` reads."""
+        numbers = dict(zip(INTRINSICS, self.intrinsics.tolist(), strict=True))
+        content = {"name": self.name, "width": self.width, "height": self.height, **numbers}
+        sigma = {} if self.sigma is None else {"sigma": dict(zip(INTRINSICS, self.sigma, strict=True))}
+        return yaml_text(content | sigma)
 
     @property
     def intrinsics(self) -> Float64[np.ndarray, " 9"]:

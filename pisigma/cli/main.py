@@ -15,6 +15,7 @@ from pisigma.cli.evaluate import evaluate
 from pisigma.cli.export import export
 from pisigma.cli.fleet.commands import fleet
 from pisigma.cli.ik.command import ik
+from pisigma.cli.images.camera import camera
 from pisigma.cli.images.detect import detect
 from pisigma.cli.import_ import import_
 from pisigma.cli.lifetime.compare import compare
@@ -43,6 +44,7 @@ for command in (
     plan,
     measure,
     import_,
+    camera,
     detect,
     calibrate,
     recalibrate,

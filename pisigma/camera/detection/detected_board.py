@@ -60,7 +60,8 @@ def shown_edges(detected: DetectedBoard, board: Board) -> Float64[np.ndarray, "e
 def refined(image: Image, detected: DetectedBoard, board: Board) -> DetectedBoard:
     """Move the corners of squares to where the gradients around them point past (Förstner & Gülch 1987).
 
-    The window around each is as large as it can be without other edges in it.
+    The window around each is as large as it can be without other edges in it; corners whose window leaves the image are
+    left out.
 
     Args:
         image: that shows them.
@@ -72,7 +73,11 @@ def refined(image: Image, detected: DetectedBoard, board: Board) -> DetectedBoar
     half = max(round(WINDOW * board.clearance * shortest), 2) if len(ends) else 2
     start = np.ascontiguousarray(detected.pixels, dtype=np.float32).reshape(-1, 1, 2)
     moved = cv2.cornerSubPix(image, start, (half, half), (-1, -1), _STOP)
-    return DetectedBoard(detected.corners, np.asarray(moved, dtype=np.float64).reshape(-1, 2))
+    pixels = np.asarray(moved, dtype=np.float64).reshape(-1, 2)
+    inside = (np.abs(pixels - np.array(image.shape[::-1]) / 2) < np.array(image.shape[::-1]) / 2 - half).all(
+        1
+    )
+    return DetectedBoard(detected.corners[inside], pixels[inside])
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,6 +27,9 @@ Within = Annotated[float, typer.Option(help="Largest difference of time stamps t
 MostBlur = Annotated[
     float, typer.Option("--most-blur-px", help="Images whose edges are blurred more are left out [px].")
 ]
+Page = Annotated[
+    Path | None, typer.Option(help="HTML page to write: every image with the residuals of its corners.")
+]
 
 
 def detect(
@@ -37,6 +40,7 @@ def detect(
     joints: Joints = None,
     within: Within = 0.2,
     most_blur: MostBlur = 3.0,
+    page: Page = None,
     sheet: Print = None,
     as_json: AsJson = False,
 ) -> None:
@@ -44,7 +48,7 @@ def detect(
 
     Images without a whole board and blurred ones are named and left out.
     """
-    from pisigma.files.output_file import check_output
+    from pisigma.files.output_file import check_output, check_page
     from pisigma.workflow.images import detect as workflow
 
     if sheet is not None:
@@ -54,14 +58,19 @@ def detect(
         fail("IMAGES, --camera, and --out were wanted; state them, or --print to draw the board.")
     inputs = [*images, board, camera, *([joints] if joints else [])]
     check_output(out, (".csv",), "a file of corners", inputs)
+    if page is not None:
+        check_page(page, [*inputs, out])
     settings = workflow.DetectionSettings(most_blur, within)
     with progress_of("detect") as progress:
         detected = workflow.detect(images, board, camera, joints, settings, progress)
+        if page is not None:
+            detected.save_page(page)
     detected.save(out)
     if as_json:
         print_json({"file": str(out)} | detected.to_json())
     else:
         print_lines([*detected.sentences, f"{len(detected.rows) - 1} corners written to {out}."])
+        print_lines([] if page is None else [f"Page written to {page}."])
 
 
 def _print_board(board: Path, sheet: Path, as_json: bool) -> None:

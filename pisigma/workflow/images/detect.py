@@ -7,20 +7,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
-
 from pisigma.camera.board import Board
 from pisigma.camera.camera import Camera
-from pisigma.camera.detection.detector import (
-    MOST_BLUR,
-    DetectedBoards,
-    detect_board,
-    image_files,
-    predict_boards,
-)
+from pisigma.camera.detection.detected_boards import DetectedBoards, predict_boards
+from pisigma.camera.detection.detector import MOST_BLUR, detect_boards, image_files
 from pisigma.camera.detection.joined_joints import JoinedJoints, join_joints
 from pisigma.errors import MeasurementError
-from pisigma.files.output_file import write_whole
+from pisigma.files.output_file import check_page, write_whole
 from pisigma.measurement.foreign.joining import WITHIN
 
 
@@ -64,39 +57,13 @@ class DetectedCorners:
     @property
     def sentences(self) -> tuple[str, ...]:
         """What was found, and what is left out and why."""
-        images, boards = self.detection.images, self.detection.boards
-        count = sum(len(board.corners) for board in boards.values())
-        used = [one for one in images if one.name in boards]
-        blurred = max(used, key=lambda one: one.blur)
-        reasons = [f"{name} is left out: {reason}." for name, reason in self.detection.left_out.items()]
-        return (
-            f"{len(boards)} of {len(images)} images show the board: {count:,} corners, which the pose of the board in "
-            f"each image predicts to {self.detection.rms:.3f} px (RMS of u and v).",
-            f"Edges are blurred by {np.median([one.blur for one in used]):.2f} px (median of the standard deviations), "
-            f"most of all by {blurred.blur:.2f} px in {blurred.name}.",
-            *reasons,
-            *(() if self.joints is None else self.joints.remarks),
-        )
+        return (*self.detection.sentences, *(() if self.joints is None else self.joints.remarks))
 
     def to_json(self) -> dict[str, object]:
         """Return everything but the corners as plain values: the result of `pisigma detect --json`."""
-        residuals, boards = self.detection.residuals, self.detection.boards
         return {
             "rows": len(self.rows) - 1,
-            "rms_px": self.detection.rms,
-            "images": [
-                {
-                    "image": one.name,
-                    "file": str(one.file),
-                    "corners": len(boards[one.name].corners) if one.name in boards else 0,
-                    "rms_px": float(np.sqrt(np.square(residuals[one.name]).mean()))
-                    if one.name in boards
-                    else None,
-                    "blur_px": one.blur if np.isfinite(one.blur) else None,
-                    "left_out": self.detection.left_out.get(one.name),
-                }
-                for one in self.detection.images
-            ],
+            **self.detection.to_json(),
             "sentences": list(self.sentences),
         }
 
@@ -109,6 +76,17 @@ class DetectedCorners:
         text = io.StringIO()
         csv.writer(text, lineterminator="\n").writerows(self.rows)
         write_whole(Path(path), text.getvalue())
+
+    def save_page(self, page: str | os.PathLike[str]) -> None:
+        """Write the images with the residuals of their corners as one HTML page.
+
+        Raises:
+            OutputError: the page is no .html file or cannot be written.
+        """
+        from pisigma.reporting.page.images import images_page  # matplotlib takes a second
+
+        check_page(Path(page))
+        write_whole(Path(page), images_page("Corners of a board", self.detection, (), (self.sentences, ())))
 
 
 def detect(
@@ -140,15 +118,8 @@ def detect(
             "ChArUco board."
         )
     joined = None if joints is None else join_joints([file.stem for file in files], joints, settings.within)
-    detected = []
-    for file in files:
-        progress(file.name)
-        detected.append(detect_board(file, of_board, settings.most_blur))
+    detected = detect_boards(files, of_board, settings.most_blur, progress)
     result = DetectedCorners(predict_boards(detected, of_camera, of_board), joined)
     if len(result.rows) == 1:
-        reasons = [f"{name}: {reason}" for name, reason in result.detection.left_out.items()]
-        first = (reasons or ["those with a board lack joint values"])[0]
-        raise MeasurementError(
-            f"none of {len(files)} images can be used ({first}); check the board's rows and columns, and the light."
-        )
+        raise MeasurementError(f"{joints}: the images with a board lack joint values; complete the file.")
     return result

@@ -1,0 +1,49 @@
+"""`pisigma camera`: the intrinsics of a camera by images of a board."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pisigma.cli.arguments import AsJson
+from pisigma.cli.images.detect import BoardFile, MostBlur, Page
+from pisigma.cli.output import print_json, print_lines, print_table, progress_of
+
+Images = Annotated[list[Path], typer.Argument(help="Image files of one camera, or folders of them.")]
+Name = Annotated[str, typer.Option(help="Name of the camera.")]
+FreeK3 = Annotated[bool, typer.Option("--k3", help="Identify k3, too, which is 0 else.")]
+
+
+def camera(
+    images: Images,
+    board: BoardFile,
+    out: Annotated[Path, typer.Option(help="File of the camera to write (.yaml).")],
+    name: Name = "camera",
+    free_k3: FreeK3 = False,
+    most_blur: MostBlur = 3.0,
+    page: Page = None,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate the intrinsics of a camera by images of a board, with standard deviations.
+
+    Take 20 images or more that fill the whole frame, most of them 20 to 40 deg oblique.
+    """
+    from pisigma.files.output_file import check_output, check_page
+    from pisigma.reporting.intrinsics_table import intrinsics_table
+    from pisigma.workflow.images import calibrate_camera as workflow
+
+    check_output(out, (".yaml", ".yml"), "a camera", [*images, board])
+    if page is not None:
+        check_page(page, [*images, board, out])
+    settings = workflow.CameraSettings(name, free_k3, most_blur)
+    with progress_of("camera") as progress:
+        calibrated = workflow.calibrate_camera(images, board, settings, progress)
+        if page is not None:
+            calibrated.save_page(page)
+    calibrated.save(out)
+    if as_json:
+        print_json({"file": str(out)} | calibrated.to_json())
+        return
+    print_table(f"intrinsics of {name}", *intrinsics_table(calibrated.parameters))
+    print_lines([*calibrated.sentences, *(f"Warning: {one}" for one in calibrated.warnings)])
+    print_lines([f"Camera written to {out}.", *([] if page is None else [f"Page written to {page}."])])

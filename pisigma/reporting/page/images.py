@@ -1,0 +1,101 @@
+"""Images of boards with the corners that were detected, as one page that loads nothing from elsewhere."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from markupsafe import Markup
+from matplotlib.figure import Figure
+from PIL import Image
+
+from pisigma.camera.detection.detected_boards import BoardImage, DetectedBoards, rms_of
+from pisigma.camera.detection.detector import read_image
+from pisigma.reporting.page.figures import AFTER, BEFORE, Drawing, drawing_style
+from pisigma.reporting.page.page import image, resource
+from pisigma.reporting.rendering import render
+from pisigma.reporting.tables import Table
+
+WIDTH = 4.8
+"""Of a picture [inch]."""
+MOST_PIXELS = 480
+"""Of a picture along u; finer images are averaged."""
+GRAY_STEP = 16
+"""Noise below is not shown, as it would make the page ten times as large."""
+ARROW = 0.05
+"""Length of an arrow that 5 % of the residuals exceed, as share of the width of an image."""
+
+
+def images_page(
+    title: str,
+    detection: DetectedBoards,
+    tables: Sequence[tuple[str, Table]],
+    says: tuple[Sequence[str], Sequence[str]],
+) -> str:
+    """Lay images out as HTML; every text is shown as it is, whatever it holds.
+
+    Args:
+        title: of the page.
+        detection: the boards in the images.
+        tables: with their titles.
+        says: sentences, and what to heed.
+    """
+    sentences, warnings = says
+    scale = arrow_scale(detection)
+    return render(
+        "images.html.j2",
+        title=title,
+        sentences=sentences,
+        warnings=warnings,
+        tables=tables,
+        scale=f"{scale:g}",
+        pictures=[draw_image(one, detection, scale) for one in detection.images],
+        image=image,
+        style=Markup(resource("style.css")),  # ours
+    )
+
+
+def arrow_scale(detection: DetectedBoards) -> float:
+    """By how much residuals are enlarged in all pictures: 1, 2 or 5 times a power of ten."""
+    lengths = np.linalg.norm(np.concatenate(list(detection.residuals.values())), axis=1)
+    wanted = ARROW * detection.images[0].size[0] / max(float(np.quantile(lengths, 0.95)), 1e-6)
+    power = 10.0 ** np.floor(np.log10(wanted))
+    return float(power * max(step for step in (1, 2, 5) if step * power <= wanted))
+
+
+def draw_image(one: BoardImage, detection: DetectedBoards, scale: float) -> Drawing:
+    """Draw an image with its corners and arrows from where they are predicted to where they are, enlarged.
+
+    Args:
+        one: the image.
+        detection: with the residuals of its corners, if it has some.
+        scale: of the arrows.
+    """
+    width, height = one.size
+    with drawing_style():
+        figure = Figure(figsize=(WIDTH, WIDTH * height / width))
+        axes = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+        extent = (-0.5, width - 0.5, height - 0.5, -0.5)
+        axes.imshow(
+            _thumbnail(one), cmap="gray", vmin=0, vmax=255, extent=extent, interpolation="antialiased"
+        )
+        axes.set_axis_off()
+        residual = detection.residuals.get(one.name)
+        if residual is None:
+            return Drawing(one.name, one.name, f"Left out: {detection.left_out[one.name]}.", figure)
+        u, v = detection.predicted[one.name].T
+        axes.scatter(u, v, s=9, color=AFTER, linewidths=0)
+        tips = residual * scale
+        axes.quiver(u, v, *tips.T, color=BEFORE, angles="xy", scale_units="xy", scale=1.0, width=0.006)
+        axes.set(xlim=extent[:2], ylim=extent[2:])
+    largest = float(np.linalg.norm(residual, axis=1).max())
+    alt = (
+        f"{len(residual)} corners, RMS {rms_of(residual):.3f} px, largest residual {largest:.3f} px, blur "
+        f"{one.blur:.2f} px; arrows are enlarged {scale:g} times."
+    )
+    return Drawing(one.name, one.name, alt, figure)
+
+
+def _thumbnail(one: BoardImage) -> np.ndarray:
+    """Gray values of an image in a few pixels and levels."""
+    full = Image.fromarray(read_image(one.file))
+    full.thumbnail((MOST_PIXELS, MOST_PIXELS), Image.Resampling.BOX)
+    return np.asarray(full) // GRAY_STEP * GRAY_STEP + GRAY_STEP // 2

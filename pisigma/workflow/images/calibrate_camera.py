@@ -1,0 +1,168 @@
+"""Calibrate the intrinsics of a camera by images of a board."""
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pisigma.camera.board import Board
+from pisigma.camera.camera import INTRINSICS
+from pisigma.camera.detection.detected_board import DetectedBoard
+from pisigma.camera.detection.detected_boards import DetectedBoards, predict_boards
+from pisigma.camera.detection.detector import MOST_BLUR, detect_boards, image_files
+from pisigma.camera.intrinsic_calibration import BoardView, IntrinsicCalibration, calibrate_intrinsics
+from pisigma.errors import MeasurementError
+from pisigma.files.output_file import check_page, write_whole
+from pisigma.reporting.intrinsics_table import intrinsics_table
+from pisigma.sensors.intrinsics import CAMERA_UNITS
+
+OBLIQUE = np.deg2rad(15.0)
+"""Where fewer than a third of the images are more oblique, focal length and distance go together."""
+MANY_IMAGES = 10
+CORNER = 2
+"""Cells of a corner of the image along each axis, a quarter of its width and height."""
+CORNERS = {
+    "upper left": (slice(None, CORNER), slice(None, CORNER)),
+    "upper right": (slice(None, CORNER), slice(-CORNER, None)),
+    "lower left": (slice(-CORNER, None), slice(None, CORNER)),
+    "lower right": (slice(-CORNER, None), slice(-CORNER, None)),
+}
+
+
+@dataclass(frozen=True)
+class CameraSettings:
+    """How a camera is calibrated.
+
+    Attributes:
+        name: of the camera.
+        free_k3: whether k3 is identified; else it is 0.
+        most_blur: images whose edges have a larger standard deviation of blur are left out [px].
+    """
+
+    name: str = "camera"
+    free_k3: bool = False
+    most_blur: float = MOST_BLUR
+
+
+@dataclass(frozen=True, eq=False)
+class CameraCalibration:
+    """A calibrated camera.
+
+    Attributes:
+        calibration: intrinsics and what the images are like.
+        detection: the boards in the images, and where the calibrated camera predicts their corners.
+    """
+
+    calibration: IntrinsicCalibration
+    detection: DetectedBoards
+
+    @property
+    def parameters(self) -> list[tuple[str, float, float, str]]:
+        """Name, value, standard deviation, and unit of every number of the camera."""
+        camera = self.calibration.camera
+        sigma = camera.sigma or (0.0,) * len(INTRINSICS)
+        units = CAMERA_UNITS.values()
+        return list(zip(INTRINSICS, camera.intrinsics.tolist(), sigma, units, strict=True))
+
+    @property
+    def sentences(self) -> tuple[str, ...]:
+        """What the images show of the board and the camera."""
+        tilts = np.rad2deg(self.calibration.tilts)
+        return (
+            *self.detection.sentences,
+            f"Corners lie in {self.calibration.covered.mean():.0%} of the cells of the image; views are "
+            f"{np.median(tilts):.0f} deg oblique (median), from {tilts.min():.0f} to {tilts.max():.0f} deg.",
+        )
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to heed, a sentence each."""
+        calibration, warnings = self.calibration, list[str]()
+        empty = [name for name, cells in CORNERS.items() if not calibration.covered[cells].any()]
+        if empty:
+            warnings.append(
+                f"No corner of the board lies in the {' and '.join(empty)} of the image, where the distortion is "
+                "extrapolated; take images with the board there."
+            )
+        if np.quantile(calibration.tilts, 2 / 3) < OBLIQUE:
+            warnings.append(
+                f"Most images look straight at the board (two thirds of them less than {np.rad2deg(OBLIQUE):.0f} deg "
+                "oblique), so that focal lengths hardly differ from distances; take images 20 to 40 deg oblique."
+            )
+        if len(calibration.tilts) < MANY_IMAGES:
+            warnings.append(
+                f"{len(calibration.tilts)} images are few, so that one can lead astray; take {MANY_IMAGES} or more."
+            )
+        return tuple(warnings)
+
+    def to_json(self) -> dict[str, object]:
+        """Return everything but the corners as plain values: the result of `pisigma camera --json`."""
+        calibration = self.calibration
+        return {
+            "camera": calibration.camera.name,
+            "intrinsics": [
+                {"name": name, "value": value, "sigma": sigma, "unit": unit}
+                for name, value, sigma, unit in self.parameters
+            ],
+            "noise_px": calibration.noise,
+            "covered": float(calibration.covered.mean()),
+            "tilts_deg": np.rad2deg(calibration.tilts).tolist(),
+            **self.detection.to_json(),
+            "sentences": list(self.sentences),
+            "warnings": list(self.warnings),
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the file of the camera.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        write_whole(Path(path), self.calibration.camera.to_yaml())
+
+    def save_page(self, page: str | os.PathLike[str]) -> None:
+        """Write intrinsics and images with the residuals of their corners as one HTML page.
+
+        Raises:
+            OutputError: the page is no .html file or cannot be written.
+        """
+        from pisigma.reporting.page.images import images_page  # matplotlib takes a second
+
+        check_page(Path(page))
+        title = f"Intrinsics of {self.calibration.camera.name}"
+        tables = [("Intrinsics", intrinsics_table(self.parameters))]
+        write_whole(Path(page), images_page(title, self.detection, tables, (self.sentences, self.warnings)))
+
+
+def calibrate_camera(
+    images: Sequence[str | os.PathLike[str]],
+    board: str | os.PathLike[str],
+    settings: CameraSettings = CameraSettings(),
+    progress: Callable[[str], None] = lambda what: None,
+) -> CameraCalibration:
+    """Calibrate the intrinsics of a camera by images of a board, with their standard deviations.
+
+    Args:
+        images: files, or folders of them, of one size.
+        board: its file, see `Board.load`.
+        settings: see `CameraSettings`.
+        progress: called with the name of every image.
+
+    Raises:
+        MeasurementError: a file cannot be used, or the images do not determine the intrinsics.
+    """
+    of_board = Board.load(board)
+    detected = detect_boards(image_files(images), of_board, settings.most_blur, progress)
+    size = detected[0].size
+    for one in detected:
+        if one.size != size:
+            raise MeasurementError(
+                f"{one.file}: an image of {size[0]} x {size[1]} px as {detected[0].file} was wanted, "
+                f"got {one.size[0]} x {one.size[1]}; give images of one camera."
+            )
+    boards = [one.board for one in detected if isinstance(one.board, DetectedBoard)]
+    views = [BoardView(of_board.corners[one.corners], one.pixels) for one in boards]
+    calibration = calibrate_intrinsics(views, settings.name, size, settings.free_k3)
+    return CameraCalibration(calibration, predict_boards(detected, calibration.camera, of_board))
