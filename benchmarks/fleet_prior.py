@@ -1,62 +1,125 @@
 """Calibrations of few poses that begin with what a fleet has in common, beside those without, and odd robots.
 
 Run `OMP_NUM_THREADS=1 python benchmarks/fleet_prior.py [--robots 50] [--odd 5] [--judged 10]`. Robots share errors of
-1 mm and 1 mrad, have 0.2 of their own, and gears whose harmonics have the same sizes; 60 poses of each make the prior.
-All figures are root mean squares of position errors of 400 other poses without noise [mm].
+1 mm and 1 mrad and have individual ones; 60 poses of each make the prior. All figures are root mean squares of position
+errors of 400 other poses without noise [mm].
 """
 
 import argparse
 import sys
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
-from testing.fleet_robots import DRAWN, rows_of
+from testing.fleet_robots import DRAWN, GEARS, NOISE, common_errors, common_gears, rows_of
 
-from pisigma.fleet.prior import fleet_prior
+from pisigma.fleet.prior import FleetPrior, Population, fleet_prior, mean_robot
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.planning.knowledge import Knowledge
+from pisigma.recalibration.adaptation import Adaptation, adapt
+from pisigma.recalibration.model_posterior import ModelPosterior
+from pisigma.recalibration.recalibration_problem import owners_in, recalibration_problem
 from pisigma.workflow.calibrate import CalibrationSettings, calibrate
 from pisigma.workflow.recalibrate import recalibrate
 
+FLEETS = ((2e-4, 1.0), (1e-4, 1.0), (5e-5, 1.0), (2e-5, 1.0), (2e-5, 0.1), (2e-5, 0.01), (1e-5, 0.0))
+"""Individual errors [m or rad], and the share of the variance of harmonics that is individual; the first is usual."""
+NOTHING = 1e-8
+"""[m or rad] Instead of an error of no size, so that covariances have factors."""
 
-def rms(predicts: object, test: Measurements) -> float:
+
+def rms(predicts: Any, test: Measurements) -> float:
     """Root mean square of the errors of anything with `errors_of` [mm]."""
-    errors = predicts.errors_of(test)["position"]  # type: ignore[attr-defined]
-    return float(errors.square().sum(1).mean().sqrt()) * 1e3
+    return float(predicts.errors_of(test)["position"].square().sum(1).mean().sqrt()) * 1e3
 
 
-def judged(model: CalibratedModel, number: int, odd: bool) -> list[float]:
-    """With and without the prior, 10 and 30 poses."""
+def true_prior(individual: float, gears: float) -> CalibratedModel:
+    """The prior of the distribution that the robots are drawn from."""
+    knowledge = Knowledge.of_robot(DRAWN)
+    size = knowledge.uncertainty.space.arm_size
+    means, deviations = [common_errors().flatten()], [torch.full((size,), individual, dtype=torch.float64)]
+    for feature in knowledge.uncertainty.features:
+        mean, deviation = torch.zeros(2, *feature.used.shape, dtype=torch.float64)
+        if feature.name == "series":
+            count, half = len(GEARS), feature.used.shape[1] // 2  # sines, and then cosines
+            columns = [*range(count), *range(half, half + count)]
+            mean[:, columns] = (1 - gears) ** 0.5 * common_gears()
+            deviation[:, columns] = gears**0.5 * torch.tensor(GEARS * 2, dtype=torch.float64)
+        means.append(mean[feature.used])
+        deviations.append(deviation[feature.used])
+    variance = torch.cat(deviations).square() + NOTHING**2
+    population = Population(torch.cat(means), variance.diag(), size)
+    return mean_robot("true", knowledge, population, [rows_of(0, 60, 0)], {"position": NOISE})
+
+
+def begun_with(prior: CalibratedModel, rows: Measurements) -> Adaptation:
+    """The posterior of a robot."""
+    posterior = ModelPosterior.of(prior)
+    rows = posterior.renamed(rows)
+    problem = recalibration_problem(prior, posterior, rows, owners_in(rows, ("base", "tool")))
+    return adapt(problem, posterior.noise)
+
+
+def alone(rows: Measurements) -> Any:
+    """The calibration of a robot without a prior."""
+    return calibrate(DRAWN, rows, CalibrationSettings(folds=0)).result
+
+
+def fleet_table(robots: int, odd: int, judged: int) -> FleetPrior:
+    """Print a line for every fleet: estimated priors beside the true distribution; return the usual one's prior."""
+    print("errors  gears | 10 poses: true  estimated  without | 30 poses: true  estimated  without")
+    priors = []
+    for individual, gears in FLEETS:
+        drawn = partial(rows_of, individual=individual, individual_gears=gears)
+        prior = fleet_prior("fleet", DRAWN, [drawn(k, 60, k, odd=k >= robots - odd) for k in range(robots)])
+        exact, figures = true_prior(individual, gears), []
+        for number in range(500, 500 + judged):
+            test = drawn(number, 400, 9000 + number, noise=0.0)
+            both = [drawn(number, count, 7000 + number) for count in (10, 30)]
+            models = [[begun_with(exact, rows), begun_with(prior.model, rows), alone(rows)] for rows in both]
+            figures.append([rms(model, test) for of_count in models for model in of_count])
+        few, more = np.array(figures).mean(0).reshape(2, 3)
+        lines = (f"{one[0]:15.3f}{one[1]:11.3f}{one[2]:9.3f}" for one in (few, more))
+        print(f"{individual * 1e3:6.2f} {gears:6.2f} |" + " |".join(lines), flush=True)
+        priors.append(prior)
+    return priors[0]
+
+
+def gated(prior: FleetPrior, number: int, odd: bool) -> list[float]:
+    """What `pisigma calibrate --prior` keeps, and the calibration without it, of 10 and 30 poses."""
     test, figures = rows_of(number, 400, 9000 + number, odd, noise=0.0), []
     for count in (10, 30):
         rows = rows_of(number, count, 7000 + number, odd)
-        own = calibrate(DRAWN, rows, CalibrationSettings(folds=0)).result
-        begun = recalibrate(model, rows)
-        figures += [rms(own if begun.gate.kept == "scratch" else begun.adaptation, test), rms(own, test)]
+        without, begun = alone(rows), recalibrate(prior.model, rows)
+        kept = {
+            "scratch": lambda found=without: found,
+            "recalibrated": lambda found=begun: found.adaptation,
+            "old": lambda found=begun: adapt(found.adaptation.problem.without_arm(), found.adaptation.noise),
+        }
+        figures += [rms(kept[begun.gate.kept](), test), rms(without, test)]
     return figures
 
 
 def main() -> None:
-    """Print a line for robots like the fleet, and one for odd ones."""
+    """Print the table of fleets, and what is kept for robots like the usual fleet and for odd ones."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--robots", type=int, default=50)
     parser.add_argument("--odd", type=int, default=5)
     parser.add_argument("--judged", type=int, default=10)
     wanted = parser.parse_args()
     torch.set_num_threads(1)
-    alike = wanted.robots - wanted.odd
-    fleet = [rows_of(k, 60, k, odd=k >= alike) for k in range(wanted.robots)]
-    prior = fleet_prior("fleet", DRAWN, fleet)
+    prior = fleet_table(wanted.robots, wanted.odd, wanted.judged)
     print(
-        f"{wanted.robots} robots, odd {list(range(alike, wanted.robots))}: found {list(prior.odd)}",
-        flush=True,
+        f"usual fleet, odd robots {[*range(wanted.robots - wanted.odd, wanted.robots)]}: named {[*prior.odd]}"
     )
     for odd, count in ((False, wanted.judged), (True, wanted.odd)):
-        figures = np.array([judged(prior.model, 500 + k, odd) for k in range(count)])
+        figures = np.array([gated(prior, 500 + k, odd) for k in range(count)])
         means, (few, more) = figures.mean(0), (figures[:, 0::2] / figures[:, 1::2]).max(0)
         print(
             f"{count} {'odd ' if odd else ''}robots: 10 poses {means[0]:.3f} (without the prior {means[1]:.3f}), "

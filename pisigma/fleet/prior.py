@@ -13,6 +13,7 @@ from pisigma.errors import FleetError
 from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.hybrid.covariance_root import CovarianceRoot
 from pisigma.hybrid.uncertainty import PositionUncertainty
+from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -30,8 +31,11 @@ FEWEST_ROBOTS = 5
 """Below, scatter between robots cannot be told from what each is uncertain by."""
 LINEARISATIONS = 2
 EM_STEPS = 60
-CLASS_ROBOTS = 0.2
-"""The class of the robot counts like so many robots in the variances of the fleet."""
+CLASS_ROBOTS = 0.02
+"""The class of the robot counts like so many robots in the variances of the fleet: hardly, as robots of one type are
+more alike, and only so much that what no rows determine stays as uncertain as in the class."""
+SEARCH_CLASS_ROBOTS = 0.2
+"""The same while odd robots are searched for: a fleet that a few robots make too narrow calls the others odd."""
 CONCENTRATIONS = 10
 ODD = 1e-3
 """Probability that any robot of a fleet without odd ones is called odd."""
@@ -79,6 +83,17 @@ class Population:
         squares = along.square() / (information + information.square())
         return float(squares[seen].sum()), int(seen.sum())
 
+    def log_evidence(self, robot: RobotEvidence) -> float:
+        """Logarithm of the probability of a robot's rows, up to a constant of the robot."""
+        root = torch.linalg.cholesky(self.covariance)
+        factor = torch.linalg.cholesky(torch.eye(len(root)).to(root) + root.t() @ robot.normal @ root)
+        at_mean = robot.normal @ self.mean
+        right = torch.linalg.solve_triangular(
+            factor, root.t() @ (robot.descent - at_mean)[:, None], upper=False
+        )
+        exponent = right.square().sum() / 2 + self.mean @ (robot.descent - at_mean / 2)
+        return float(exponent - factor.diagonal().log().sum())
+
 
 @dataclass(frozen=True, eq=False)
 class FleetPrior:
@@ -102,8 +117,8 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
 
     Every robot has errors `u ~ N(μ, Σ)` and rows that are linear in them. The expectation-maximisation of Dempster,
     Laird and Rubin 1977 (J. Royal Statistical Society B 39(1), 1-38) finds μ and Σ, so that each robot counts by what
-    its rows determine; the usual errors of the robot's class (`pisigma.planning.robot_class`) count like two more
-    robots. Robots whose rows the others make too improbable are left out, and the rest is estimated anew.
+    its rows determine; the usual errors of the robot's class count a little, see `CLASS_ROBOTS`. Robots whose rows the
+    others make too improbable are left out, and the rest is estimated anew.
 
     Args:
         name: of the fleet.
@@ -121,29 +136,49 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
         )
     knowledge = Knowledge.of_robot(robot)
     space = knowledge.uncertainty.space
-    everything = torch.arange(len(knowledge.uncertainty.root))
-    chosen = torch.cat([everything[: space.arm_size], everything[len(space.parameters) :]])
-    usual = knowledge.uncertainty.root[chosen].square().sum(1)
-    first = population = Population(torch.zeros_like(usual), usual.diag(), space.arm_size)
+    first = population = class_population(robot)
+    usual = first.covariance.diagonal()
     noise: Mapping[str, float] = {"position": Instrument().sigma}
     odd: tuple[int, ...] = ()
     for _ in range(LINEARISATIONS):
-        model = _model(name, knowledge, population, fleet, noise)
-        evidence = [_evidence(model, population.mean, rows) for rows in fleet]
+        model = mean_robot(name, knowledge, population, fleet, noise)
+        evidence = [evidence_of(model, population.mean, rows) for rows in fleet]
         population, odd = without_odd(evidence, first, usual)
         noise = _medians([one.noise for one in evidence])
-    model = _model(name, knowledge, population, fleet, noise)
+    model = mean_robot(name, knowledge, population, fleet, noise)
     return FleetPrior(model, population, space.names[: space.arm_size], odd)
 
 
-def _model(
+def class_population(robot: Robot) -> Population:
+    """Give the robots of the class of a robot, see `pisigma.planning.robot_class`."""
+    known = Knowledge.of_robot(robot).uncertainty
+    usual = of_arm(known.root, known.space).square().sum(1)
+    return Population(torch.zeros_like(usual), usual.diag(), known.space.arm_size)
+
+
+def of_arm(
+    root: Float64[Tensor, "unknowns directions"], space: ParameterSpace
+) -> Float64[Tensor, "arm directions"]:
+    """Select the rows of geometric parameters and of weights, without those of base, tool and sensors."""
+    return torch.cat([root[: space.arm_size], root[len(space.parameters) :]])
+
+
+def mean_robot(
     name: str,
     knowledge: Knowledge,
     population: Population,
     fleet: Sequence[Measurements],
     noise: Mapping[str, float],
 ) -> CalibratedModel:
-    """The mean robot of a population, which is uncertain by the scatter between robots."""
+    """Give the mean robot of a population, which is uncertain by the scatter between robots.
+
+    Args:
+        name: of the model.
+        knowledge: of the robot as drawn, with the unknowns of the population.
+        population: errors of the robots.
+        fleet: rows of robots, which say where they were measured.
+        noise: per sensor, see `Adaptation.noise`.
+    """
     usual, size = knowledge.uncertainty, population.geometric
     space, drawn = usual.space, usual.space.robot
     dh = drawn.dh + population.mean[:size].numpy().reshape(drawn.dh.shape)
@@ -200,10 +235,10 @@ def _correction(
     return correction
 
 
-def _evidence(
+def evidence_of(
     model: CalibratedModel, mean: Float64[Tensor, " unknowns"], rows: Measurements
 ) -> RobotEvidence:
-    """What the rows of a robot say, linearised at its most probable errors."""
+    """Say what the rows of a robot say, linearised at its most probable errors; the mean is that of the model."""
     posterior = ModelPosterior.of(model)
     rows = posterior.renamed(rows)
     problem = recalibration_problem(model, posterior, rows, owners_in(rows, ("base", "tool")))
@@ -241,7 +276,8 @@ def without_odd(
     alike = _nearest_to_median(evidence, start)
     population = start
     for _ in range(CONCENTRATIONS):
-        population = expectation_maximisation([evidence[number] for number in alike], start, usual)
+        chosen = [evidence[number] for number in alike]
+        population = expectation_maximisation(chosen, start, usual, SEARCH_CLASS_ROBOTS)
         surprises = [population.surprise(one) for one in evidence]
         ratios = sorted(square / max(count, 1) for square, count in surprises)
         unit = max(ratios[len(ratios) // 2], 1.0)
@@ -253,6 +289,7 @@ def without_odd(
         if now == alike or len(now) < FEWEST_ROBOTS:
             break
         alike = now
+    population = expectation_maximisation([evidence[number] for number in alike], population, usual)
     return population, tuple(number for number in range(len(evidence)) if number not in alike)
 
 
@@ -270,7 +307,10 @@ def _nearest_to_median(evidence: Sequence[RobotEvidence], start: Population) -> 
 
 
 def expectation_maximisation(
-    evidence: Sequence[RobotEvidence], start: Population, usual: Float64[Tensor, " unknowns"]
+    evidence: Sequence[RobotEvidence],
+    start: Population,
+    usual: Float64[Tensor, " unknowns"],
+    class_robots: float = CLASS_ROBOTS,
 ) -> Population:
     """Mean and covariance of the robots' errors.
 
@@ -278,19 +318,26 @@ def expectation_maximisation(
         evidence: of the robots.
         start: to begin with.
         usual: variances of the class of the robots.
+        class_robots: so many robots the class counts like.
     """
     population = start
     for _ in range(EM_STEPS):
-        population = _maximised(evidence, population, usual)
+        population = _maximised(evidence, population, class_robots * usual, class_robots + len(evidence))
     return population
 
 
 def _maximised(
-    evidence: Sequence[RobotEvidence], now: Population, usual: Float64[Tensor, " unknowns"]
+    evidence: Sequence[RobotEvidence], now: Population, of_class: Float64[Tensor, " unknowns"], robots: float
 ) -> Population:
     """One step of expectation and maximisation.
 
     The covariance of geometric parameters is drawn towards its diagonal, the more the fewer robots there are.
+
+    Args:
+        evidence: of the robots.
+        now: the population.
+        of_class: squares that the class adds to those of the robots.
+        robots: how many they are together.
     """
     size, count = now.geometric, len(evidence)
     precision = torch.linalg.inv(now.covariance)
@@ -299,53 +346,11 @@ def _maximised(
     x = torch.einsum("rij,rj->ri", inverses, right)
     off = x - x.mean(0)
     scatter = inverses.sum(0) + off.t() @ off
-    diagonal = (CLASS_ROBOTS * usual + scatter.diagonal()) / (CLASS_ROBOTS + count)
+    diagonal = (of_class + scatter.diagonal()) / robots
     covariance = diagonal.diag()
-    covariance[:size, :size] = count / (count + size) * scatter[:size, :size] / (CLASS_ROBOTS + count)
+    covariance[:size, :size] = count / (count + size) * scatter[:size, :size] / robots
     covariance.diagonal().copy_(diagonal)
     return Population(x.mean(0), covariance, size)
-
-
-@dataclass(frozen=True)
-class Likeness:
-    """How like the other robots of a fleet one is.
-
-    Attributes:
-        probability: that a robot of the fleet is as far from its mean, or farther.
-    """
-
-    probability: float
-
-    @staticmethod
-    def of(model: CalibratedModel, rows: Measurements) -> "Likeness":
-        """See how far the robot of some rows is from the mean of a fleet prior.
-
-        Args:
-            model: of the prior.
-            rows: of the robot.
-
-        Raises:
-            IdentificationError: the rows do not determine where the robot stands.
-        """
-        known = model.uncertainty
-        assert known is not None
-        root = torch.cat([known.root[: known.space.arm_size], known.root[len(known.space.parameters) :]])
-        mean = torch.zeros_like(root[:, 0])
-        population = Population(mean, root @ root.t(), known.space.arm_size)
-        square, count = population.surprise(_evidence(model, mean, rows))
-        return Likeness(float(chi2.sf(square, count)))
-
-    @property
-    def odd(self) -> bool:
-        """Whether the fleet says little of the robot."""
-        return self.probability < ODD
-
-    @property
-    def sentence(self) -> str:
-        """The same in words."""
-        if self.odd:
-            return f"This robot is unlike the fleet: fewer than 1 in {1 / ODD:,.0f} of it are as far from the mean."
-        return f"This robot is like the fleet: {self.probability:.0%} of it are as far from the mean, or farther."
 
 
 def _medians(noises: Sequence[Mapping[str, float]]) -> dict[str, float]:

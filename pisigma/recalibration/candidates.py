@@ -62,6 +62,8 @@ class Gate:
         if not self.rows:
             return f"{NAMES[self.kept]} is kept: the rows are too few to leave any out."
         sizes = {name: size * 1e3 for name, size in self.rms.items() if size is not None}
+        if self.kept not in sizes:
+            return f"{NAMES[self.kept]} is kept: the rows are too few to predict left-out ones with it."
         others = " and ".join(
             f"{size:.3g} mm under {NAMES[name][:1].lower()}{NAMES[name][1:]}"
             for name, size in sizes.items()

