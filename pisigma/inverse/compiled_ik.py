@@ -145,12 +145,9 @@ class CompiledIK:
             )
         dof = len(self.joints)
         beside, sides = self._rows(near, (), "near", throw), self._rows(approach, (), "approach", True)
-        out, task = self._row(), self._checked(axes)
-        # ctypes passes the address of bytes in a fraction of the time in which NumPy states that of an array
-        pairs = [value for rows in (beside, sides, task.row) for value in (rows.tobytes(), len(rows))]
-        options = self._branch(branch), not throw, False
-        wrong = self._kernels(
-            self._address, self._memory(), arrays.SOLVE, 1, T.tobytes(), *pairs, *options, out, 1
+        task = self._checked(axes)
+        wrong, out = self._solve_bytes(
+            T.tobytes(), beside.tobytes(), sides.tobytes(), task, self._branch(branch), not throw
         )
         if wrong >= 0:
             raise PoseError(FAULTS[wrong % 8].format(""))
@@ -158,6 +155,20 @@ class CompiledIK:
         position, rotation, measure, status, index = row[2 * dof :].tolist()
         lies = row[:dof], row[dof : 2 * dof], int(index), self.branches, int(status)
         return Solution(*lies, position, rotation, measure, owner, task.ignored)
+
+    def solve_packed(self, T_base_tool: bytes, near: bytes) -> list[float]:
+        """Find corrected joint values for one pose whose numbers stand in bytes, as they come from a socket.
+
+        Args:
+            T_base_tool: 16 doubles, row by row [m].
+            near: a double for every joint [rad or m], or nothing.
+
+        Returns:
+            The corrected and the nominal joint values, the residuals of position [m] and rotation [rad], the domain
+            measure, the status (INVALID_POSE for what is no pose) and the branch; see `Solution`.
+        """
+        row: list[float] = self._solve_bytes(T_base_tool, near, b"", self.axes, arrays.ANY_BRANCH, True)[1][:]
+        return row
 
     def solve_batch(
         self,
@@ -303,6 +314,18 @@ class CompiledIK:
             at = f" at index {index if len(index) > 1 else index[0]}" if index else ""
             raise PoseError(FAULTS[wrong % 8].format(at))
         return out
+
+    def _solve_bytes(
+        self, T: bytes, near: bytes, approach: bytes, axes: TaskAxes, branch: int, mark: bool
+    ) -> tuple[int, Any]:
+        """What the kernels say of one pose, and the row that they write.
+
+        ctypes passes the address of bytes in a fraction of the time in which NumPy states that of an array.
+        """
+        out = self._row()
+        rows = near, bool(near), approach, bool(approach), axes.row.tobytes(), len(axes.row)
+        memory, settings = self._memory(), (branch, mark, False, out, 1)
+        return self._kernels(self._address, memory, arrays.SOLVE, 1, T, *rows, *settings), out
 
     def _run(
         self,

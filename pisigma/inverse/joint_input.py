@@ -91,6 +91,10 @@ class Postures:
         clipped: np.ndarray = np.clip(q, self._lowest, self._highest)
         return clipped
 
+    def hold(self, values: Sequence[float]) -> bool:
+        """Whether joint values `(dof,)` are a posture; several times as fast as the comparison of arrays."""
+        return all(low <= value <= high for value, (low, high) in zip(values, self._bounds, strict=True))
+
     def checked(self, near: Any, throw: bool = True) -> Any:
         """`near` as a float64 array, with NaN for values that are in no posture; what does not fit at all as it came.
 
@@ -107,9 +111,7 @@ class Postures:
             return near
         if values.shape[-1:] != (len(self._joints),):
             return values
-        if values.ndim == 1 and all(
-            low <= value <= high for value, (low, high) in zip(values.tolist(), self._bounds, strict=True)
-        ):  # some times as fast as the comparison of arrays
+        if values.ndim == 1 and self.hold(values.tolist()):
             return values
         beyond = (values < self._lowest) | (values > self._highest)
         if not beyond.any():

@@ -5,8 +5,6 @@ import math
 import struct
 import time
 
-import numpy as np
-
 from pisigma.errors import RequestError
 from pisigma.kinematics.status import Status
 from pisigma.serve.metrics import Metrics
@@ -20,6 +18,7 @@ HEAD = struct.Struct("<4sIQII")
 """Magic, length of the whole frame, id; then model index and flags, or status and number of joints."""
 REQUEST = struct.Struct(f"<4sIQII16d{JOINTS}d")
 """The pose T_base_tool row by row [m], and the joint values to be near to [rad or m], NaN for none."""
+_POSE, _NEAR = HEAD.size, HEAD.size + 128
 ANSWER = struct.Struct(f"<4sIQII{JOINTS}d2d")
 """Joint values [rad or m], NaN behind the last joint, and the residuals of position [m] and rotation [rad]."""
 LONGEST_TOKEN = 1024
@@ -94,13 +93,8 @@ class BinaryFrames(AbstractProtocol):
     def _solve(self, model: ServedModel, message: bytes, name: int, begun: int) -> bytes:
         try:
             dof = len(model.ik.joints)
-            T = np.frombuffer(message, "<f8", 16, HEAD.size).reshape(4, 4)
-            near = np.frombuffer(message, "<f8", dof, HEAD.size + T.nbytes)
-            stated = any(value == value for value in near.tolist())
-            solution = model.ik(T, near=near if stated else None, throw=False)
-            status = int(solution.status)
-            q = (*solution.q.tolist(), *[math.nan] * (JOINTS - dof))
-            residuals = solution.position_residual, solution.rotation_residual
+            status, q, residuals = model.solve(message[_POSE:_NEAR], message[_NEAR : _NEAR + 8 * dof])
+            q += [math.nan] * (JOINTS - dof)
             reply = ANSWER.pack(MAGIC, ANSWER.size, name, status, dof, *q, *residuals)
         except Exception:
             return self._refuse(name, Refusal.DEFECT, begun)

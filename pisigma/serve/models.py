@@ -1,5 +1,8 @@
 """The models that a server answers for; they are loaded again without a call being dropped."""
 
+import math
+import struct
+import sys
 import threading
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -60,6 +63,30 @@ class ServedModel:
         if controller is None:
             return self.ik.compiled is not None
         return controller.ik.compiled is not None and not controller.coupling.passive
+
+    def solve(self, T_base_tool: bytes, near: bytes) -> tuple[int, list[float], list[float]]:
+        """Solve a pose whose numbers stand in bytes, little-endian; what is no pose gets INVALID_POSE.
+
+        Args:
+            T_base_tool: 16 doubles, row by row [m].
+            near: a double for every joint [rad or m]; all NaN for none.
+
+        Returns:
+            The status, the joint values [rad or m], and the residuals of position [m] and rotation [rad].
+        """
+        ik, dof = self.ik, len(self.ik.joints)
+        values = struct.unpack(f"<{dof}d", near)
+        stated = any(value == value for value in values)
+        if not self.quick or ik.controller is not None or sys.byteorder != "little":
+            T = np.frombuffer(T_base_tool, "<f8").reshape(4, 4)
+            solution = ik(T, near=np.array(values) if stated else None, throw=False)
+            residuals = [solution.position_residual, solution.rotation_residual]
+            return int(solution.status), solution.q.tolist(), residuals
+        assert ik.compiled is not None
+        if stated and not ik.postures.hold(values):
+            near = struct.pack("<d", math.nan) * dof
+        row = ik.compiled.solve_packed(T_base_tool, near if stated else b"")
+        return int(row[-2]), row[:dof], row[2 * dof : 2 * dof + 2]
 
 
 def model_folders(folder: Path) -> list[Path]:
