@@ -2,9 +2,8 @@
 
 import ctypes
 import os
-import sys
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
@@ -17,7 +16,6 @@ from pisigma.inverse.solution import Solution
 from pisigma.kernels import arrays
 from pisigma.kernels.array_kinematics import address_of
 from pisigma.kernels.description_file import read_description
-from pisigma.kernels.forms import KernelForms
 from pisigma.kernels.layout import make_memory, pack
 from pisigma.kernels.machine_code import kernel_forms, load_kernels
 from pisigma.kinematics.task_axes import WHOLE, TaskAxes, default_axes
@@ -30,22 +28,6 @@ CHUNK = 2_048
 """Poses that a thread takes at a time."""
 SOLUTIONS = 8
 """Different solutions of a pose that are looked for on arms without closed form."""
-
-_PATIENCE = 2.0
-"""[s] Kernels that are on disk are loaded in far less."""
-_COMPILING = "pisigma: preparing the inverse kinematics for this processor, once, in some seconds ...\n"
-
-
-def _kernels(forms: KernelForms) -> Callable[..., int]:
-    """The kernels; where machine code has to be made first, somebody at a terminal reads why it takes so long."""
-    notice = threading.Timer(_PATIENCE, sys.stderr.write, (_COMPILING,))
-    notice.daemon = True
-    if sys.stderr.isatty():
-        notice.start()
-    try:
-        return load_kernels(forms)
-    finally:
-        notice.cancel()
 
 
 class CompiledIK:
@@ -76,15 +58,13 @@ class CompiledIK:
         self.description = description
         self._packed = pack(description, name, kernel_forms(description.forms))
         self._address = address_of(self._packed)
-        self.branches = tuple(branches)
-        self.joints = tuple(joints)
-        self.name = name
-        self.belongs_to = belongs_to
+        self.branches, self.joints = tuple(branches), tuple(joints)
+        self.name, self.belongs_to = name, belongs_to
         self._none = np.zeros((0, len(self.joints)))
-        self._row: Any = ctypes.c_double * (2 * len(self.joints) + 5)
+        self._row = ctypes.c_double * (2 * len(self.joints) + 5)
         whole = description.network.used and not description.forms.closed_forms
         self.axes = WHOLE if whole else default_axes(len(self.joints))
-        self._kernels = _kernels(description.forms)
+        self._kernels = load_kernels(description.forms)
         self._threads = threading.local()
 
     @staticmethod
@@ -143,15 +123,14 @@ class CompiledIK:
             raise PoseError(
                 f"T_base_tool has the shape {T.shape}; give one homogeneous transform of shape (4, 4)."
             )
-        dof = len(self.joints)
         beside, sides = self._rows(near, (), "near", throw), self._rows(approach, (), "approach", True)
-        task = self._checked(axes)
+        task, dof = self._checked(axes), len(self.joints)
         wrong, out = self._solve_bytes(
             T.tobytes(), beside.tobytes(), sides.tobytes(), task, self._branch(branch), not throw
         )
         if wrong >= 0:
             raise PoseError(FAULTS[wrong % 8].format(""))
-        row = np.frombuffer(out)
+        row = np.frombuffer(memoryview(out))
         position, rotation, measure, status, index = row[2 * dof :].tolist()
         lies = row[:dof], row[dof : 2 * dof], int(index), self.branches, int(status)
         return Solution(*lies, position, rotation, measure, owner, task.ignored)
@@ -164,11 +143,11 @@ class CompiledIK:
             near: a double for every joint [rad or m], or nothing.
 
         Returns:
-            The corrected and the nominal joint values, the residuals of position [m] and rotation [rad], the domain
-            measure, the status (INVALID_POSE for what is no pose) and the branch; see `Solution`.
+            Corrected and nominal joint values, residuals of position [m] and rotation [rad], domain measure, status
+            (INVALID_POSE for what is no pose) and branch, see `Solution`.
         """
-        row: list[float] = self._solve_bytes(T_base_tool, near, b"", self.axes, arrays.ANY_BRANCH, True)[1][:]
-        return row
+        _, row = self._solve_bytes(T_base_tool, near, b"", self.axes, arrays.ANY_BRANCH, True)
+        return row[:]
 
     def solve_batch(
         self,
@@ -245,18 +224,8 @@ class CompiledIK:
         sides = self._rows(approach, (len(rows),), "approach", True)
         T, out = np.empty((len(rows), 4, 4)), np.empty((len(rows), 7 * dof + 1))
         default = arrays.CORRECTED if self.description.arms.corrected else arrays.IDENTIFIED
-        self._run(
-            arrays.EVALUATE,
-            T,
-            0,
-            len(rows),
-            rows,
-            sides,
-            default if arm is None else arm,
-            False,
-            out,
-            WHOLE.row,
-        )
+        which = default if arm is None else arm
+        self._run(arrays.EVALUATE, T, 0, len(rows), rows, sides, which, False, out, WHOLE.row)
         J = out[:, : 6 * dof].reshape(-1, 6, dof)
         return T, J, out[:, 6 * dof : 7 * dof], out[:, 7 * dof]
 
@@ -317,7 +286,7 @@ class CompiledIK:
 
     def _solve_bytes(
         self, T: bytes, near: bytes, approach: bytes, axes: TaskAxes, branch: int, mark: bool
-    ) -> tuple[int, Any]:
+    ) -> tuple[int, ctypes.Array[ctypes.c_double]]:
         """What the kernels say of one pose, and the row that they write.
 
         ctypes passes the address of bytes in a fraction of the time in which NumPy states that of an array.

@@ -9,6 +9,7 @@ import functools
 import hashlib
 import os
 import stat
+import sys
 import tempfile
 import threading
 from collections.abc import Callable
@@ -27,6 +28,9 @@ _ALLOWED |= {"memcpy", "memset"}
 """Functions of the C library that every process has."""
 _OPTIONS = "speed 3, vectors, internal linkage"
 """What `optimised_object` does, as far as the code depends on it; part of the key of kept code."""
+_PATIENCE = 2.0
+"""[s] Kernels that are on disk are loaded in far less."""
+_COMPILING = "pisigma: preparing the inverse kinematics for this processor, once, in some seconds ...\n"
 _lock = threading.Lock()
 _kept: list[Any] = []
 
@@ -55,6 +59,7 @@ def load_kernels(wanted: KernelForms = _NOTHING) -> Callable[..., int]:
     Bytes and ctypes arrays count as their addresses.
 
     Machine code is made when it is first wanted on a machine, in some seconds, and read from a file afterwards.
+    Somebody at a terminal reads why that takes so long.
 
     Args:
         wanted: what they have to evaluate.
@@ -62,8 +67,15 @@ def load_kernels(wanted: KernelForms = _NOTHING) -> Callable[..., int]:
     Raises:
         ModelError: there is no intermediate code of the present sources, and numba, which makes it, is not installed.
     """
-    with _lock:
-        return _load(kernel_forms(wanted))
+    notice = threading.Timer(_PATIENCE, sys.stderr.write, (_COMPILING,))
+    notice.daemon = True
+    if sys.stderr.isatty():
+        notice.start()
+    try:
+        with _lock:
+            return _load(kernel_forms(wanted))
+    finally:
+        notice.cancel()
 
 
 @functools.cache

@@ -62,6 +62,7 @@ def test_statuses_without_joint_values(frames):
         (2 * T, None, pisigma.Status.INVALID_POSE),
         (T, [math.inf] * 6, pisigma.Status.INVALID_POSE),
         (T, [0.1, math.nan, 0, 0, 0, 0], pisigma.Status.INVALID_POSE),
+        (T, [0.1, 100.0, 0, 0, 0, 0], pisigma.Status.INVALID_POSE),
     ):
         status, q, residuals = frames.solve(pose.ravel(), near)
         assert status == wanted
