@@ -132,7 +132,8 @@ def mixed(arm: Arm, q: Tensor, q_fixed: Tensor, postures: Tensor) -> Iterator[tu
         ("fixed camera, board on the flange, 50 images", [beside], "hand", on_flange),
         ("camera on the flange, 25 images", [few], "wrist", on_flange),
         ("fixed camera, 25 images", [few_beside], "hand", on_flange),
-        ("both cameras, 25 images each", [few, few_beside], "wrist", on_flange),
+        ("both cameras, 25 images each: that on the flange", [few, few_beside], "wrist", on_flange),
+        ("both cameras, 25 images each: the board on the flange", [few, few_beside], "hand", on_flange),
         ("tracker, 10 positions", [tracker], "reflector", REFLECTOR),
         ("camera, 50 images, and tracker, 10 positions", [wrist, tracker], "wrist", on_flange),
     ):

@@ -42,6 +42,7 @@ class BoardDocument(Section):
     tag_mm: Length | None = None
     spacing_mm: Length | None = None
     family: TagFamily = "tag36h11"
+    flatness_mm: float = Field(default=0.0, ge=0)
 
     @model_validator(mode="after")
     def _lengths_of_kind(self) -> "BoardDocument":
@@ -76,6 +77,7 @@ class Board:
         marker: side of the markers of a ChArUco board, or of AprilTags [m].
         dictionary: of its markers: a `Dictionary` or a `TagFamily`.
         scale_deviation: standard deviation of all its lengths together, as a share of them; None where none is stated.
+        flatness: distance of two planes between which its surface lies [m]; 0 where it is taken as flat.
     """
 
     name: str
@@ -86,6 +88,7 @@ class Board:
     marker: float = 0.0
     dictionary: str = ""
     scale_deviation: float | None = None
+    flatness: float = 0.0
 
     @staticmethod
     def load(path: str | os.PathLike[str]) -> "Board":
@@ -100,7 +103,8 @@ class Board:
         names = {"checkerboard": "", "charuco": board.dictionary, "apriltag": board.family}
         lengths = pitch / 1e3, board.kind, marker / 1e3
         scale = None if board.square_sigma_mm is None else board.square_sigma_mm / pitch
-        return Board(board.name, board.rows, board.columns, *lengths, names[board.kind], scale)
+        errors = scale, board.flatness_mm / 1e3
+        return Board(board.name, board.rows, board.columns, *lengths, names[board.kind], *errors)
 
     @property
     def corners(self) -> Float64[np.ndarray, "corners 3"]:

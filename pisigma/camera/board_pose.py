@@ -31,6 +31,7 @@ class BoardPose:
         cofactor: covariance of an error (shift of t [m], turn of R as a rotation vector in the camera's frame [rad])
             for a noise of the corners of 1 px.
         distance: by how much every corner misses its prediction [px: of corners of the usual deviation].
+        weight: how much every corner counts by the loss.
         by_intrinsics: derivative of the pose (shift of t [m], turn of R as a rotation vector in the camera's frame
             [rad]) by the intrinsics, which the corners are solved anew with.
         root: with `rest` what the corners say of the intrinsics k whatever the pose is, for a noise of 1 px:
@@ -42,6 +43,7 @@ class BoardPose:
     t: Float64[np.ndarray, " 3"]
     cofactor: Float64[np.ndarray, "6 6"]
     distance: Float64[np.ndarray, " corners"]
+    weight: Float64[np.ndarray, " corners"]
     by_intrinsics: Float64[np.ndarray, "6 9"]
     root: Float64[np.ndarray, "9 9"]
     rest: Float64[np.ndarray, " 9"]
@@ -60,7 +62,7 @@ def solve_board_pose(
 
     Args:
         camera: its intrinsics are taken as they are.
-        corners: in the frame of the board [m], all with z = 0 and not on one line.
+        corners: in the frame of the board [m], all with z near 0 and not on one line.
         pixels: where the image shows them [px].
         loss: how corners count that are far from their prediction.
         sigma: standard deviation of every corner over the usual one; None where all are alike.
@@ -68,50 +70,51 @@ def solve_board_pose(
     sigma = np.ones(len(pixels)) if sigma is None else sigma
     R, t = _by_homography(corners, camera.undistort(pixels))
     for _ in range(STEPS):
-        residual, J = _linearised(camera, corners, pixels, sigma, R, t)
+        residual, J, _ = linearised(camera, corners, pixels, sigma, R, t)
         weight = _weights(residual, loss)
         normal = np.einsum("nki,n,nkj->ij", J, weight, J)
         step = np.linalg.solve(normal, np.einsum("nki,n,nk->i", J, weight, residual))
         t, R = t + step[:3], rotation_from_vector(torch.from_numpy(step[3:])).numpy() @ R
         if np.abs(step).max() < SMALLEST_STEP:
             break
-    residual, J = _linearised(camera, corners, pixels, sigma, R, t)
-    root = np.sqrt(_weights(residual, loss))[:, None, None]
+    residual, J, _ = linearised(camera, corners, pixels, sigma, R, t)
+    weight = _weights(residual, loss)
     by_intrinsics = camera.by_intrinsics(corners @ R.T + t) / sigma[:, None, None]
     columns = np.concatenate([J, by_intrinsics, residual[..., None]], -1)
-    triangle = _triangle((root * columns).reshape(-1, columns.shape[-1]))
-    inverse = np.linalg.inv(triangle[:POSE, :POSE])
+    factor = triangle((np.sqrt(weight)[:, None, None] * columns).reshape(-1, columns.shape[-1]))
+    inverse = np.linalg.inv(factor[:POSE, :POSE])
     return BoardPose(
         R,
         t,
         inverse @ inverse.T,
         np.linalg.norm(residual, axis=1),
-        by_intrinsics=-inverse @ triangle[:POSE, POSE:-1],
-        root=triangle[POSE:-1, POSE:-1],
-        rest=triangle[POSE:-1, -1],
+        weight,
+        by_intrinsics=-inverse @ factor[:POSE, POSE:-1],
+        root=factor[POSE:-1, POSE:-1],
+        rest=factor[POSE:-1, -1],
     )
 
 
-def _triangle(columns: Float64[np.ndarray, "values columns"]) -> Float64[np.ndarray, "columns columns"]:
-    """Triangular factor of a matrix, square also where it has fewer rows than columns.
+def triangle(columns: Float64[np.ndarray, "values columns"]) -> Float64[np.ndarray, "columns columns"]:
+    """Return the triangular factor of a matrix, square also where it has fewer rows than columns.
 
-    Its first rows belong to the pose, the next ones to what is left for the intrinsics once the pose is eliminated.
+    Its first rows belong to the pose, the next ones to what is left for other unknowns once the pose is eliminated.
     """
     count = columns.shape[1]
     padded = np.concatenate([columns, np.zeros((count, count))])
-    triangle: np.ndarray = np.linalg.qr(padded, mode="r")  # type: ignore[assignment]
-    return triangle
+    factor: np.ndarray = np.linalg.qr(padded, mode="r")  # type: ignore[assignment]
+    return factor
 
 
-def _linearised(
+def linearised(
     camera: Camera, corners: np.ndarray, pixels: np.ndarray, sigma: np.ndarray, R: np.ndarray, t: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Measured minus predicted pixels, and the derivative of the predicted ones by shift and turn, over sigma."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return measured minus predicted pixels, and the predicted ones' derivative by pose and by point, over sigma."""
     turned = corners @ R.T
     predicted, by_point = camera.project(turned + t)
     by_turn = -by_point @ skew(torch.from_numpy(turned)).numpy()
     J = np.concatenate([by_point, by_turn], -1)
-    return (pixels - predicted) / sigma[:, None], J / sigma[:, None, None]
+    return (pixels - predicted) / sigma[:, None], J / sigma[:, None, None], by_point / sigma[:, None, None]
 
 
 def _weights(residual: np.ndarray, loss: AbstractLoss) -> np.ndarray:

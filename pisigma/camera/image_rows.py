@@ -10,14 +10,19 @@ from jaxtyping import Float64
 from pisigma.camera.board import Board
 from pisigma.camera.board_pose import POSE, BoardPose, solve_board_pose
 from pisigma.camera.camera import Camera
-from pisigma.camera.solved_images import IntrinsicsChoice, prior_deviations, solve_images
+from pisigma.camera.flatness import SHAPES, bent_corners, bent_further
+from pisigma.camera.solved_images import IntrinsicsChoice, corner_noise, prior_deviations, solve_images
 from pisigma.errors import IdentificationError, MeasurementError
-from pisigma.identification.problem.loss import HampelLoss
+from pisigma.identification.problem.loss import AbstractLoss, HampelLoss
 from pisigma.measurement.dataset import Measurements
 from pisigma.se3 import skew
 from pisigma.sensors.corner import WEIGHT_COLUMN, weight_text
 from pisigma.sensors.intrinsics import CAMERA_COLUMN, INTRINSICS_COLUMN, NOISE_COLUMN, SCALE_COLUMN
 
+MOST_BENDS = 4
+"""Steps by which a board is bent at one set of intrinsics; the second is near rounding, where no corner is wrong."""
+SMALLEST_BEND = 1e-6
+"""[m] A board is not bent further by less."""
 LARGEST_MISS = 10.0
 """[px] Where half of the corners of an image miss their prediction by more, they are not of this board."""
 
@@ -99,16 +104,11 @@ def image_measurements(
     Raises:
         MeasurementError: the corners of an image are not of this board.
     """
-    loss, corners = HampelLoss(), board.corners
+    loss, bend = HampelLoss(), np.zeros(SHAPES)
 
     def solve(present: Camera) -> list[BoardPose]:
-        poses = [
-            solve_board_pose(present, corners[number], pixels, loss, sigma)
-            for number, pixels, sigma in zip(
-                images.corners, images.pixels, images.relative_sigma, strict=True
-            )
-        ]
-        _refuse_other_boards(images, board, poses)
+        nonlocal bend
+        poses, bend = _board_poses(images, present, board, bend, loss)
         return poses
 
     solved = solve_images(camera, prior_deviations(camera, intrinsics), solve, loss, images.source)
@@ -138,6 +138,34 @@ def image_measurements(
         line=images.lines,
         source=images.source,
     )
+
+
+def _board_poses(
+    images: Images, camera: Camera, board: Board, bend: Float64[np.ndarray, " 3"], loss: AbstractLoss
+) -> tuple[list[BoardPose], Float64[np.ndarray, " 3"]]:
+    """Solve the poses of a board at some intrinsics, bent as the images show it where it need not be flat.
+
+    Returns:
+        The poses, and the heights of the board's shapes [m].
+
+    Raises:
+        MeasurementError: the corners of an image are not of this board.
+    """
+    observed = images.corners, images.pixels, images.relative_sigma
+    for _ in range(MOST_BENDS):
+        corners = bent_corners(board, bend)
+        poses = [
+            solve_board_pose(camera, corners[number], pixels, loss, sigma)
+            for number, pixels, sigma in zip(*observed, strict=True)
+        ]
+        _refuse_other_boards(images, board, poses)
+        if not board.flatness:
+            break
+        before, noise = bend, corner_noise(poses, loss)
+        bend = bent_further(bend, board, camera, *observed, poses, noise)
+        if np.abs(bend - before).max() < SMALLEST_BEND:
+            break
+    return poses, bend
 
 
 def _refuse_other_boards(images: Images, board: Board, poses: Sequence[BoardPose]) -> None:
