@@ -1,12 +1,13 @@
 """Cameras in other set-ups than one camera on the flange, with wrong corners and images, and with gears.
 
-    OMP_NUM_THREADS=1 python benchmarks/camera_setups.py [mixed] [wrong] [gears] [--draws 10]
+    OMP_NUM_THREADS=1 python benchmarks/camera_setups.py [mixed] [wrong] [bent] [gears] [--draws 10]
 
 The arms, cameras, boards and noise of `camera.py`, with intrinsics taken as they are. mixed: a fixed camera with the
 board on the flange, two cameras, and a camera with 10 positions of a tracker (0.02 mm), each beside its parts alone.
-wrong: 5 % of the corners off by 5 px and three images with two joint values swapped. gears: joints that wobble by two
-harmonics of 0.015 deg, 150 images, the hybrid against the geometry alone. Errors are those of the target's position
-over 400 postures of the whole joint space after the best rigid alignment, pooled over draws.
+wrong: 5 % of the corners off by 5 px and three images with two joint values swapped. bent: a board bowed by 0.3 mm,
+taken as flat and with its flatness stated. gears: joints that wobble by two harmonics of 0.015 deg, 150 images, the
+hybrid against the geometry alone. Errors are those of the target's position over 400 postures of the whole joint space
+after the best rigid alignment, pooled over draws.
 """
 
 import argparse
@@ -33,7 +34,9 @@ from camera import (
 )
 from torch import Tensor
 
+from pisigma.camera.flatness import bent_corners
 from pisigma.camera.image_rows import Images, image_measurements
+from pisigma.camera.solved_images import IntrinsicsChoice
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.kinematics.closed_form.registry import closed_form_solver
@@ -49,6 +52,9 @@ CAMERA_IN_BASE = torch.tensor([0.45, -0.1, 0.9, 0.0, 0.0, np.pi], dtype=torch.fl
 REFLECTOR = np.array([0.05, -0.04, 0.1, 0.0, 0.0, 0.0])
 TRACKER_NOISE = 2e-5
 WRONG_SHARE, WRONG_BY, SWAPPED = 0.05, 5.0, 3
+BOW = np.array([1e-4, 0.0, 1e-4])
+"""[m] Heights of the three shapes: the surface lies between planes 0.3 mm apart."""
+CHOICES: tuple[IntrinsicsChoice, ...] = ("fixed", "prior", "free")
 GEAR = np.deg2rad(0.015)
 HARMONICS = (1, 2)
 GEAR_IMAGES = 150
@@ -167,6 +173,28 @@ def wrong(arm: Arm, q: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
     )
 
 
+def bent(arm: Arm, q: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
+    """Errors with a bowed board that is taken as flat, and whose flatness is stated."""
+    images, pixels = arm.images(q), []
+    true = arm.with_frames(IN_BASE, ON_FLANGE.numpy())
+    bowed = bent_corners(BOARD, BOW)
+    for T, number, flat in zip(
+        invert(forward_kinematics(true, q)).numpy(), images.corners, images.pixels, strict=True
+    ):
+        here = (CAMERA.project(at[number] @ T[:3, :3].T + T[:3, 3])[0] for at in (bowed, BOARD.corners))
+        pixels.append(flat + np.subtract(*here))
+    for choice in CHOICES:
+        for name, shown, flatness in (
+            ("flat board", images, 0.0),
+            ("bowed board taken as flat", replace(images, pixels=tuple(pixels)), 0.0),
+            ("bowed board with its flatness", replace(images, pixels=tuple(pixels)), 3e-4),
+        ):
+            board = replace(BOARD, flatness=flatness)
+            rows = image_measurements(shown, CAMERA, board, False, NOISE.repeatability, choice)
+            error = arm.error(fitted(arm, rows, "wrist"), postures, ON_FLANGE.numpy())
+            yield f"intrinsics {choice}, {name}", error
+
+
 def gears(arm: Arm, q: Tensor, postures: Tensor) -> Iterator[tuple[str, float]]:
     """Errors of the geometry alone and of the hybrid where gears wobble."""
     phase = torch.from_numpy(arm.rng.uniform(0, 2 * np.pi, (len(HARMONICS), q.shape[1])))
@@ -200,6 +228,7 @@ def main(chosen: list[str], draws: int) -> None:
     postures = torch.from_numpy(rng.uniform(-np.pi, np.pi, (POSTURES + 10, nominal.dof)))
     parts = {
         "mixed": lambda arm: mixed(arm, q, q_fixed, postures),
+        "bent": lambda arm: bent(arm, q, postures),
         "wrong": lambda arm: wrong(arm, q, postures),
         "gears": lambda arm: gears(arm, q_gears, postures),
     }
@@ -218,7 +247,7 @@ def main(chosen: list[str], draws: int) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser()
-    parser.add_argument("parts", nargs="*", help="mixed, wrong, gears; all where none is named")
+    parser.add_argument("parts", nargs="*", help="mixed, wrong, bent, gears; all where none is named")
     parser.add_argument("--draws", type=int, default=10)
     arguments = parser.parse_args()
     main(arguments.parts, arguments.draws)
