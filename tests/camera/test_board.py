@@ -21,6 +21,8 @@ def loaded(folder: Path, text: str) -> Board:
 def test_files_of_three_kinds(tmp_path: Path) -> None:
     plain = loaded(tmp_path, "rows: 6\ncolumns: 9\nsquare_mm: 30\n")
     assert plain == Board("board", 6, 9, 0.03)
+    bent = loaded(tmp_path, "rows: 6\ncolumns: 9\nsquare_mm: 30\nflatness_mm: 0.3\n")
+    assert_close(bent.flatness, 3e-4, atol=1e-12)
     charuco = loaded(tmp_path, CHARUCO)
     assert (charuco.kind, charuco.dictionary, charuco.square, charuco.marker) == (
         "charuco",

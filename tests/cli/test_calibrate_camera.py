@@ -1,9 +1,10 @@
-"""`pisigma calibrate` with the corners of a board in a camera's images."""
+"""`pisigma calibrate`, `evaluate` and `recalibrate` with the corners of a board in a camera's images."""
 
 import json
 from pathlib import Path
 
 import pytest
+from click.testing import Result
 from testing.camera_cell import BOARD, CAMERA, aligned_error, camera_cell, corner_lines
 from testing.closeness import assert_close
 
@@ -22,15 +23,21 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def options(files: Path) -> tuple[object, ...]:
-    camera, board = files / "camera.yaml", files / "board.yaml"
-    return (files / "corners.csv", "--camera", camera, "--board", board, "--prior-mrad", 5)
+def cameras(files: Path) -> tuple[object, ...]:
+    return ("--camera", files / "camera.yaml", "--board", files / "board.yaml")
 
 
-def test_from_pixels_of_corners_to_a_model(run, files, tmp_path):
-    command = ("calibrate", "ur5", *options(files), "--folds", 2, "--repeats", 1)
-    result = run(*command, "--out", tmp_path / "arm", "--json")
+@pytest.fixture(scope="module")
+def calibrated(run, files: Path) -> tuple[Path, Result]:
+    """A model by corners.csv, and what the command printed."""
+    command = ("calibrate", "ur5", files / "corners.csv", *cameras(files), "--prior-mrad", 5)
+    result = run(*command, "--folds", 2, "--repeats", 1, "--out", files / "arm", "--json")
     assert result.exit_code == 0, result.output
+    return files / "arm", result
+
+
+def test_from_pixels_of_corners_to_a_model(calibrated):
+    folder, result = calibrated
     printed = json.loads(result.stdout)
     (noise,) = printed["noise"]
     assert noise["sensor"] == "corner"
@@ -39,11 +46,25 @@ def test_from_pixels_of_corners_to_a_model(run, files, tmp_path):
     assert figures["geometric"]["rms_mm"] < 1.0 < 2.0 < figures["nominal"]["rms_mm"]  # of one image: 0.5 mm
     assert any("rests on the board" in warning for warning in printed["warnings"])
     assert 0.85 < figures["coverage"] <= 1.0
-    model, q = load_model(tmp_path / "arm"), camera_cell(50, 2).images.q
+    model, q = load_model(folder), camera_cell(50, 2).images.q
     true, estimated = (
         forward_kinematics(robot, q)[:, :3, 3] for robot in (camera_cell(50, 1).true, model.calibrated)
     )
     assert_close(aligned_error(true, estimated), 0.0, atol=1e-4)
+
+
+def test_new_corners_judge_a_model_and_are_added_to_it(run, files, calibrated):
+    (files / "new.csv").write_text("\n".join(corner_lines(camera_cell(20, 1).images)) + "\n")
+    judged = run("evaluate", calibrated[0], files / "new.csv", *cameras(files), "--json")
+    assert judged.exit_code == 0, judged.output
+    nominal, model = json.loads(judged.stdout)["models"]
+    assert model["rms_mm"] < 0.6 < 2.0 < nominal["rms_mm"]
+    added = run("recalibrate", calibrated[0], files / "new.csv", *cameras(files), "--dry-run", "--json")
+    assert added.exit_code == 0, added.output
+    assert json.loads(added.stdout)["left_out"] == 20
+    refused = run("verify", calibrated[0], files / "new.csv")
+    assert refused.exit_code == 2
+    assert "state what they mean with --camera camera.yaml" in " ".join(refused.stderr.split())
 
 
 def test_camera_and_board_belong_together(run, files, tmp_path):
