@@ -150,6 +150,8 @@ class Camera:
         """Write the camera as a file that `load` reads."""
         numbers = dict(zip(INTRINSICS, self.intrinsics.tolist(), strict=True))
         content = {"name": self.name, "width": self.width, "height": self.height, **numbers}
+        if self.is_fixed:
+            content["is_fixed"] = True
         sigma = {} if self.sigma is None else {"sigma": dict(zip(INTRINSICS, self.sigma, strict=True))}
         return yaml_text(content | sigma)
 

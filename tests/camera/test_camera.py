@@ -1,5 +1,6 @@
 """Projection, its derivative and inverse, and camera files of three kinds."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -77,7 +78,11 @@ def test_one_camera_in_three_kinds_of_files(tmp_path: Path, text: str) -> None:
 def test_deviations_of_the_intrinsics_are_read(tmp_path: Path) -> None:
     path = tmp_path / "camera.yaml"
     path.write_text(OWN + "sigma: {fx: 0.5, fy: 0.6, cx: 1, k1: 0.002}\n")
-    assert Camera.load(path).sigma == (0.5, 0.6, 1.0, 0.0, 0.002, 0.0, 0.0, 0.0, 0.0)
+    camera = Camera.load(path)
+    assert camera.sigma == (0.5, 0.6, 1.0, 0.0, 0.002, 0.0, 0.0, 0.0, 0.0)
+    fixed = replace(camera, is_fixed=True)
+    path.write_text(fixed.to_yaml())
+    assert Camera.load(path) == fixed
 
 
 @pytest.mark.parametrize(

@@ -36,7 +36,7 @@ def join_joints(names: Sequence[str], path: str | os.PathLike[str], within: floa
     Args:
         names: of the images, without the endings of their files; where the log has times, time stamps.
         path: CSV file with joint values (`q1_deg` and so on), and a column `image` (with ending or without) or `time`;
-            its further columns are kept.
+            its further columns are kept where measurement files have such.
         within: largest difference of time stamps [s].
 
     Raises:
@@ -60,10 +60,12 @@ def join_joints(names: Sequence[str], path: str | os.PathLike[str], within: floa
     measured = ConvertedRows("the images", tuple(range(1, len(names) + 1)), images)
     joined = join_rows(measured, ConvertedRows(table.source, table.lines, cells), by, within)
     rows = joined.rows.cells
-    columns = tuple(name for name in rows if name not in images)
+    columns = tuple(name for name in rows if find_column(name))
+    others = [name for name in rows if name not in (*columns, *images)]
+    unread = [f"{table.source}: {', '.join(others)} are left out, as measurement files have no such columns."]
     values = zip(*(rows[name] for name in columns), strict=True)
     of_image = dict(zip(rows["point"], values, strict=True))
-    return JoinedJoints(columns, of_image, (*joined.unmatched, *joined.warnings))
+    return JoinedJoints(columns, of_image, (*joined.unmatched, *joined.warnings, *(unread if others else ())))
 
 
 def _stamp(name: str) -> str:

@@ -6,8 +6,9 @@ from typing import Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
-from pisigma.cli.images.detect import BoardFile, MostBlur, Page
-from pisigma.cli.output import print_json, print_lines, print_table, progress_of
+from pisigma.cli.images.detect import BoardFile, MostBlur
+from pisigma.cli.images.result import Page, check_outputs, write_result
+from pisigma.cli.output import progress_of
 
 Images = Annotated[list[Path], typer.Argument(help="Image files of one camera, or folders of them.")]
 Name = Annotated[str, typer.Option(help="Name of the camera.")]
@@ -28,22 +29,10 @@ def camera(
 
     Take 20 images or more that fill the whole frame, most of them 20 to 40 deg oblique.
     """
-    from pisigma.files.output_file import check_output, check_page
-    from pisigma.reporting.intrinsics_table import intrinsics_table
+    check_outputs(out, (".yaml", ".yml"), "a camera", page, [*images, board])
     from pisigma.workflow.images import calibrate_camera as workflow
 
-    check_output(out, (".yaml", ".yml"), "a camera", [*images, board])
-    if page is not None:
-        check_page(page, [*images, board, out])
     settings = workflow.CameraSettings(name, free_k3, most_blur)
     with progress_of("camera") as progress:
         calibrated = workflow.calibrate_camera(images, board, settings, progress)
-        if page is not None:
-            calibrated.save_page(page)
-    calibrated.save(out)
-    if as_json:
-        print_json({"file": str(out)} | calibrated.to_json())
-        return
-    print_table(f"intrinsics of {name}", *intrinsics_table(calibrated.parameters))
-    print_lines([*calibrated.sentences, *(f"Warning: {one}" for one in calibrated.warnings)])
-    print_lines([f"Camera written to {out}.", *([] if page is None else [f"Page written to {page}."])])
+    write_result(calibrated, out, page, as_json)

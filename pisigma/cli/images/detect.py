@@ -7,6 +7,7 @@ import typer
 
 from pisigma.cli.arguments import AsJson
 from pisigma.cli.endings import fail
+from pisigma.cli.images.result import Page, check_outputs, write_result
 from pisigma.cli.output import print_json, print_lines, progress_of
 
 Images = Annotated[list[Path] | None, typer.Argument(help="Image files, or folders of them.")]
@@ -27,9 +28,6 @@ Within = Annotated[float, typer.Option(help="Largest difference of time stamps t
 MostBlur = Annotated[
     float, typer.Option("--most-blur-px", help="Images whose edges are blurred more are left out [px].")
 ]
-Page = Annotated[
-    Path | None, typer.Option(help="HTML page to write: every image with the residuals of its corners.")
-]
 
 
 def detect(
@@ -48,29 +46,18 @@ def detect(
 
     Images without a whole board and blurred ones are named and left out.
     """
-    from pisigma.files.output_file import check_output, check_page
-    from pisigma.workflow.images import detect as workflow
-
     if sheet is not None:
         _print_board(board, sheet, as_json)
         return
     if not images or camera is None or out is None:
         fail("IMAGES, --camera, and --out were wanted; state them, or --print to draw the board.")
-    inputs = [*images, board, camera, *([joints] if joints else [])]
-    check_output(out, (".csv",), "a file of corners", inputs)
-    if page is not None:
-        check_page(page, [*inputs, out])
+    check_outputs(out, (".csv",), "a file of corners", page, [*images, board, camera, joints])
+    from pisigma.workflow.images import detect as workflow
+
     settings = workflow.DetectionSettings(most_blur, within)
     with progress_of("detect") as progress:
         detected = workflow.detect(images, board, camera, joints, settings, progress)
-        if page is not None:
-            detected.save_page(page)
-    detected.save(out)
-    if as_json:
-        print_json({"file": str(out)} | detected.to_json())
-    else:
-        print_lines([*detected.sentences, f"{len(detected.rows) - 1} corners written to {out}."])
-        print_lines([] if page is None else [f"Page written to {page}."])
+    write_result(detected, out, page, as_json)
 
 
 def _print_board(board: Path, sheet: Path, as_json: bool) -> None:

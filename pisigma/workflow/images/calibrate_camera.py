@@ -16,6 +16,7 @@ from pisigma.camera.intrinsic_calibration import BoardView, IntrinsicCalibration
 from pisigma.errors import MeasurementError
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.reporting.intrinsics_table import intrinsics_table
+from pisigma.reporting.tables import Table
 from pisigma.sensors.intrinsics import CAMERA_UNITS
 
 OBLIQUE = np.deg2rad(15.0)
@@ -97,6 +98,11 @@ class CameraCalibration:
             )
         return tuple(warnings)
 
+    @property
+    def tables(self) -> tuple[tuple[str, Table], ...]:
+        """The intrinsics."""
+        return (("Intrinsics", intrinsics_table(self.parameters)),)
+
     def to_json(self) -> dict[str, object]:
         """Return everything but the corners as plain values: the result of `pisigma camera --json`."""
         calibration = self.calibration
@@ -132,8 +138,8 @@ class CameraCalibration:
 
         check_page(Path(page))
         title = f"Intrinsics of {self.calibration.camera.name}"
-        tables = [("Intrinsics", intrinsics_table(self.parameters))]
-        write_whole(Path(page), images_page(title, self.detection, tables, (self.sentences, self.warnings)))
+        says = self.sentences, self.warnings
+        write_whole(Path(page), images_page(title, self.detection, self.tables, says))
 
 
 def calibrate_camera(

@@ -15,6 +15,7 @@ from pisigma.camera.detection.joined_joints import JoinedJoints, join_joints
 from pisigma.errors import MeasurementError
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.measurement.foreign.joining import WITHIN
+from pisigma.reporting.tables import Table
 
 
 @dataclass(frozen=True)
@@ -37,27 +38,42 @@ class DetectedCorners:
     Attributes:
         detection: the boards in the images.
         joints: of the images; None where no log was stated.
+        names: of the camera and of the board, which every row states.
     """
 
     detection: DetectedBoards
     joints: JoinedJoints | None
+    names: tuple[str, str]
 
     @property
     def rows(self) -> list[list[str]]:
         """The file of corners: its header, and a row a corner."""
         columns = () if self.joints is None else self.joints.columns
-        rows = [["image", "corner", "u_px", "v_px", *columns]]
+        rows = [["image", "camera", "board", "corner", "u_px", "v_px", *columns]]
         for name, board in self.detection.boards.items():
             cells = () if self.joints is None else self.joints.cells.get(name)
             if cells is not None:
                 pairs = zip(board.corners.tolist(), board.pixels.tolist(), strict=True)
-                rows += [[name, str(corner), f"{u:.4f}", f"{v:.4f}", *cells] for corner, (u, v) in pairs]
+                rows += [
+                    [name, *self.names, str(corner), f"{u:.4f}", f"{v:.4f}", *cells]
+                    for corner, (u, v) in pairs
+                ]
         return rows
 
     @property
     def sentences(self) -> tuple[str, ...]:
         """What was found, and what is left out and why."""
-        return (*self.detection.sentences, *(() if self.joints is None else self.joints.remarks))
+        return self.detection.sentences
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What to heed, a sentence each."""
+        return () if self.joints is None else self.joints.remarks
+
+    @property
+    def tables(self) -> tuple[tuple[str, Table], ...]:
+        """None, as there is a row a corner."""
+        return ()
 
     def to_json(self) -> dict[str, object]:
         """Return everything but the corners as plain values: the result of `pisigma detect --json`."""
@@ -65,6 +81,7 @@ class DetectedCorners:
             "rows": len(self.rows) - 1,
             **self.detection.to_json(),
             "sentences": list(self.sentences),
+            "warnings": list(self.warnings),
         }
 
     def save(self, path: str | os.PathLike[str]) -> None:
@@ -86,7 +103,8 @@ class DetectedCorners:
         from pisigma.reporting.page.images import images_page  # matplotlib takes a second
 
         check_page(Path(page))
-        write_whole(Path(page), images_page("Corners of a board", self.detection, (), (self.sentences, ())))
+        says = self.sentences, self.warnings
+        write_whole(Path(page), images_page("Corners of a board", self.detection, self.tables, says))
 
 
 def detect(
@@ -119,7 +137,9 @@ def detect(
         )
     joined = None if joints is None else join_joints([file.stem for file in files], joints, settings.within)
     detected = detect_boards(files, of_board, settings.most_blur, progress)
-    result = DetectedCorners(predict_boards(detected, of_camera, of_board), joined)
+    result = DetectedCorners(
+        predict_boards(detected, of_camera, of_board), joined, (of_camera.name, of_board.name)
+    )
     if len(result.rows) == 1:
         raise MeasurementError(f"{joints}: the images with a board lack joint values; complete the file.")
     return result

@@ -14,12 +14,15 @@ def log(folder: Path, text: str) -> Path:
 
 
 def test_by_name_with_ending_or_without(tmp_path: Path) -> None:
-    path = log(tmp_path, "image,q1_deg,q2_deg,payload_kg\na/0001.png,1.5,2,3\n0002,4.25,5,3\n0009,7,8,3\n")
+    path = log(
+        tmp_path, "image,q1_deg,q2_deg,payload_kg,note\na/0001.png,1.5,2,3,\n0002,4.25,5,3,\n0009,7,8,3,\n"
+    )
     joined = join_joints(["0001", "0002", "0003"], path, 0.2)
     assert joined.columns == ("q1_deg", "q2_deg", "payload_kg")
     assert joined.cells == {"0001": ("1.5", "2", "3"), "0002": ("4.25", "5", "3")}
     assert "line 3 (0003)" in joined.remarks[0]
     assert "line 4 (0009)" in joined.remarks[1]
+    assert "note are left out" in joined.remarks[2]
 
 
 def test_by_time_in_seconds_and_nanoseconds(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -48,7 +49,8 @@ def test_corners_with_joint_values_are_written(run, files, tmp_path):
     assert "only a piece" in reasons[2]
     assert "edges are blurred by 3.8" in reasons[3]
     rows = list(csv.DictReader((tmp_path / "corners.csv").read_text().splitlines()))
-    assert list(rows[0]) == ["image", "corner", "u_px", "v_px", "q1_deg", "q2_deg"]
+    assert list(rows[0]) == ["image", "camera", "board", "corner", "u_px", "v_px", "q1_deg", "q2_deg"]
+    assert {(row["camera"], row["board"]) for row in rows} == {("camera", "board")}
     assert [row["q2_deg"] for row in rows] == ["20"] * 20 + ["40"] * 20
     pixels = np.array([[float(row["u_px"]), float(row["v_px"])] for row in rows]).reshape(2, 20, 2)
     for (R, t), detected in zip(VIEWS, pixels, strict=False):
@@ -84,3 +86,22 @@ def test_a_board_is_drawn_to_be_printed(run, refuses, files, tmp_path):
     assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")
     assert "goes into a .pdf file" in refuses(*command, tmp_path / "board.png")
     assert "--print to draw the board" in refuses(*command[:-1])
+
+
+def test_a_page_shows_every_image(run, files, tmp_path):
+    page = tmp_path / "page.html"
+    result = run("detect", *options(files), "--out", tmp_path / "corners.csv", "--page", page)
+    assert result.exit_code == 0, result.output
+    text = page.read_text()
+    assert text.count("<figure>") == 4
+    assert "Left out: its edges are blurred by 3.8 px" in text
+
+
+def test_without_opencv_the_extra_is_named(refuses, files, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "cv2", None)
+    for name in list(sys.modules):
+        if name.startswith(("pisigma.camera.detection", "pisigma.workflow.images")):
+            monkeypatch.delitem(sys.modules, name)
+    message = refuses("detect", *options(files), "--out", tmp_path / "corners.csv")
+    assert message.startswith("this needs the package opencv-python-headless, which is not installed")
+    assert 'pip install "pisigma[camera]"' in message
