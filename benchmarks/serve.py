@@ -172,7 +172,15 @@ def cost(pid: int) -> tuple[float, float]:
     return memory, sum(map(int, used)) / 100
 
 
-def compare(kind: str, port: int, pid: int, options: argparse.Namespace) -> None:
+def inside(json_port: int) -> str:
+    """How long the server took for its last answers, from when a request was read."""
+    with socket.create_connection(("127.0.0.1", json_port)) as stream, stream.makefile("rb") as file:
+        stream.sendall(b'{"ask": "health"}\n')
+        health = json.loads(file.readline())
+    return f"p50 {health['p50_us']:.0f}, p99 {health['p99_us']:.0f} µs"
+
+
+def compare(kind: str, ports: dict[str, int], pid: int, options: argparse.Namespace) -> None:
     """Measure a protocol of the server, and the bare loop before it."""
     queue = multiprocessing.Queue()
     arguments = options.model, kind, options.poll_ms / 1e3, queue
@@ -182,10 +190,11 @@ def compare(kind: str, port: int, pid: int, options: argparse.Namespace) -> None
     bare.join()
     print(f"bare loop, {kind}: {said}", flush=True)
     before, used = cost(pid)
-    times, said = measure(kind, port, options.model, options.seconds)
+    times, said = measure(kind, ports[f"{kind}_port"], options.model, options.seconds)
     after, total = cost(pid)
     (p50, p99), share = times / least, (total - used) / options.seconds
     print(f"pisigma serve, {kind}: {said}; memory {before:.1f} -> {after:.1f} MB")
+    print(f"    inside the server {inside(ports['json_port'])}")
     print(f"    {p50:.2f} and {p99:.2f} times the bare loop; {share:.0%} of a processor", flush=True)
 
 
@@ -201,7 +210,7 @@ def main() -> None:
         assert server.stdout is not None
         ports = json.loads(server.stdout.readline())
         for kind in ("binary", "json"):
-            compare(kind, ports[f"{kind}_port"], server.pid, options)
+            compare(kind, ports, server.pid, options)
         _, before = cost(server.pid)
         time.sleep(IDLE_SECONDS)
         print(f"idle: {(cost(server.pid)[1] - before) / IDLE_SECONDS:.1%} of a processor")
