@@ -1,10 +1,11 @@
 """Simulated images of a board: where its corners appear to the camera of a true robot."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 from torch import Tensor
 
 from pisigma.camera.board import Board
@@ -13,6 +14,7 @@ from pisigma.camera.image_rows import Images, Repeatability
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert, rotation_from_vector, transform
+from pisigma.simulation.camera.true_board import TrueBoard
 
 
 @dataclass(frozen=True)
@@ -28,11 +30,46 @@ class ImageNoise:
     repeatability: Repeatability = field(default_factory=Repeatability)
 
 
+def draw_board_poses(
+    robot: Robot,
+    q: Float64[Tensor, "images dof"],
+    repeatability: Repeatability,
+    generator: torch.Generator,
+    is_fixed: bool = False,
+) -> Float64[Tensor, "images 4 4"]:
+    """Return T_camera_board of images that a true robot stops for.
+
+    Args:
+        robot: true arm; base and tool lead from the board to the base and from the flange to the camera (of a fixed
+            camera: from the camera to the base, and from the flange to the board).
+        q: joint values of the images [rad or m].
+        repeatability: of the robot.
+        generator: of the poses' errors.
+        is_fixed: whether the camera is fixed and the board on the flange.
+    """
+    T = forward_kinematics(robot, q)
+    turn, shift = (torch.randn((len(q), 3), generator=generator, dtype=torch.float64) for _ in range(2))
+    turned = rotation_from_vector(repeatability.angle * turn) @ T[:, :3, :3]
+    T = transform(turned, T[:, :3, 3] + repeatability.length * shift)
+    return T if is_fixed else invert(T)
+
+
+def project_corners(
+    camera: Camera, board: Board | TrueBoard, T_camera_board: Float64[Tensor, "images 4 4"]
+) -> tuple[Float64[np.ndarray, "images corners 2"], Bool[np.ndarray, "images corners"]]:
+    """Return where corners appear [px], and which of them are in front of the camera and inside of its images."""
+    corners = torch.from_numpy(board.corners)
+    points = (corners @ T_camera_board[:, :3, :3].mT + T_camera_board[:, None, :3, 3]).numpy()
+    pixels = camera.project(points)[0]
+    inside = (points[..., 2] > 0) & (pixels >= 0).all(-1) & (pixels < (camera.width, camera.height)).all(-1)
+    return pixels, inside
+
+
 def simulate_images(
     robot: Robot,
     q: Float64[Tensor, "images dof"],
     camera: Camera,
-    board: Board,
+    board: Board | TrueBoard,
     noise: ImageNoise,
     generator: torch.Generator,
     is_fixed: bool = False,
@@ -40,8 +77,7 @@ def simulate_images(
     """Project the corners of a board into the images of a camera.
 
     Args:
-        robot: true arm; base and tool lead from the board to the base and from the flange to the camera (of a fixed
-            camera: from the camera to the base, and from the flange to the board).
+        robot: true arm; see `draw_board_poses`.
         q: joint values of the images [rad or m].
         camera: that takes them.
         board: that they show.
@@ -52,23 +88,23 @@ def simulate_images(
     Returns:
         The corners that are in front of the camera and inside of its images.
     """
-
-    def draw(*shape: int) -> Tensor:
-        return torch.randn(shape, generator=generator, dtype=torch.float64)
-
-    T = forward_kinematics(robot, q)
-    turned = rotation_from_vector(noise.repeatability.angle * draw(len(q), 3)) @ T[:, :3, :3]
-    T = transform(turned, T[:, :3, 3] + noise.repeatability.length * draw(len(q), 3))
-    T_camera_board = T if is_fixed else invert(T)
-    corners = torch.from_numpy(board.corners)
-    points = (corners @ T_camera_board[:, :3, :3].mT + T_camera_board[:, None, :3, 3]).numpy()
-    pixels = camera.project(points)[0] + noise.corner * draw(*points.shape[:2], 2).numpy()
-    inside = (points[..., 2] > 0) & (pixels >= 0).all(-1) & (pixels < (camera.width, camera.height)).all(-1)
-    return Images(
-        source="simulated images",
-        names=tuple(f"{number:04d}" for number in range(len(q))),
-        q=q,
-        lines=(0,) * len(q),
-        corners=tuple(np.flatnonzero(row) for row in inside),
-        pixels=tuple(of_image[row] for of_image, row in zip(pixels, inside, strict=True)),
+    T_camera_board = draw_board_poses(robot, q, noise.repeatability, generator, is_fixed)
+    pixels, inside = project_corners(camera, board, T_camera_board)
+    pixels += noise.corner * torch.randn(pixels.shape, generator=generator, dtype=torch.float64).numpy()
+    return images_of(
+        q, [np.flatnonzero(row) for row in inside], [at[row] for at, row in zip(pixels, inside, strict=True)]
     )
+
+
+def images_of(
+    q: Float64[Tensor, "images dof"], corners: Sequence[np.ndarray], pixels: Sequence[np.ndarray]
+) -> Images:
+    """Gather simulated corners, image by image.
+
+    Args:
+        q: joint values of every image [rad or m].
+        corners: numbers of the corners that every image shows.
+        pixels: where it shows them [px].
+    """
+    names = tuple(f"{number:04d}" for number in range(len(q)))
+    return Images("simulated images", names, q, (0,) * len(q), tuple(corners), tuple(pixels))

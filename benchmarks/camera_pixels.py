@@ -1,0 +1,83 @@
+"""From rendered pixels to a calibrated UR5, beside the same with the exact corners.
+
+    OMP_NUM_THREADS=1 python benchmarks/camera_pixels.py [--draws 5] [--images 40]
+
+The arms, camera, board and repeatability of `camera.py`. Every image is drawn pixel by pixel (through a lens with
+distortion, with blur, defocus, uneven light and noise), its corners are detected, and the arm is calibrated with them;
+beside it the arm calibrated with the corners that the same images ideally have. Intrinsics are taken as they are.
+Errors are those of the camera's position over 400 postures of the whole joint space after the best rigid alignment,
+pooled over draws.
+"""
+
+import argparse
+import time
+from dataclasses import replace
+
+import numpy as np
+import torch
+from camera import ANGLE, BOARD, CAMERA, LENGTH, NOISE, ON_FLANGE, POSTURES, PRIOR, aligned_error, positions
+
+from pisigma.camera.detection.checkerboard import detect_checkerboard
+from pisigma.camera.detection.detected_board import DetectedBoard
+from pisigma.camera.image_rows import image_measurements
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.robot import Robot
+from pisigma.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.simulation.camera.images import draw_board_poses, images_of, project_corners
+from pisigma.simulation.camera.rendering import Exposure, render_image
+from pisigma.simulation.camera.true_board import TrueBoard
+from pisigma.simulation.camera.views import BoardViews
+
+LENS = replace(CAMERA, k1=-0.1, k2=0.05, p1=1e-4, p2=-2e-4)
+IN_BASE = torch.tensor([0.42, 0.08, 0.05, 0.0, 0.0, np.pi], dtype=torch.float64)
+"""The board lies flat in front with its print up, so that its z axis points down."""
+
+
+def main(draws: int, count: int) -> None:
+    """Print root mean squares over all draws."""
+    nominal = Robot.load("ur5")
+    base = xyzrpy_from_transform(invert(transform_from_xyzrpy(IN_BASE))).numpy()
+    aimed = nominal.with_geometry(nominal.dh, base=base, tool=ON_FLANGE.numpy())
+    q = BoardViews(count=count, seed=0).joints(aimed, BOARD)
+    everywhere = torch.from_numpy(np.random.default_rng(0).uniform(-np.pi, np.pi, (POSTURES, nominal.dof)))
+    squares, off, seconds, left_out = {"detected": 0.0, "exact": 0.0}, list[np.ndarray](), 0.0, 0
+    for draw in range(draws):
+        rng = np.random.default_rng(draw)
+        errors = rng.standard_normal(nominal.dh.shape) * [ANGLE, LENGTH, LENGTH, ANGLE, ANGLE]
+        true = nominal.with_geometry(nominal.dh + errors, base=base, tool=ON_FLANGE.numpy())
+        poses = draw_board_poses(true, q, NOISE.repeatability, torch.Generator().manual_seed(draw))
+        ideal, inside = project_corners(LENS, BOARD, poses)
+        corners = {"detected": list[np.ndarray](), "exact": list[np.ndarray]()}
+        whole = list[int]()
+        for number in range(count):
+            started = time.perf_counter()
+            image = render_image(LENS, TrueBoard(BOARD), poses[number].numpy(), Exposure(), rng)
+            seconds += time.perf_counter() - started
+            board = detect_checkerboard(image, BOARD)
+            if isinstance(board, DetectedBoard) and inside[number].all():
+                whole.append(number)
+                corners["detected"].append(board.pixels)
+                corners["exact"].append(ideal[number])
+        left_out += count - len(whole)
+        off.append(np.concatenate(corners["detected"]) - np.concatenate(corners["exact"]))
+        numbers = [np.arange(len(BOARD.corners))] * len(whole)
+        points = positions(true, everywhere)
+        for what, pixels in corners.items():
+            images = images_of(q[whole], numbers, pixels)
+            rows = image_measurements(images, LENS, BOARD, False, NOISE.repeatability, "fixed")
+            robot = GeometricCalibrator(nominal, prior=PRIOR).fit(rows).robot
+            squares[what] += aligned_error(points, positions(robot, everywhere)) ** 2
+    detected, exact = (1e3 * (squares[what] / draws) ** 0.5 for what in ("detected", "exact"))
+    print(f"{count} images of 1920 x 1200 px, {draws} draws; {seconds / draws / count:.2f} s to render one")
+    print(
+        f"corners: {np.sqrt(np.square(np.concatenate(off)).mean()):.4f} px RMS; {left_out} boards not detected"
+    )
+    print(f"workspace: {detected:.4f} mm, with exact corners {exact:.4f} mm (ratio {detected / exact:.3f})")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--draws", type=int, default=5)
+    parser.add_argument("--images", type=int, default=40)
+    arguments = parser.parse_args()
+    main(arguments.draws, arguments.images)

@@ -1,0 +1,86 @@
+"""Joint values at which a camera looks at a board from many sides, by all branches of the arm."""
+
+import numpy as np
+import torch
+from jaxtyping import Float64
+from pydantic import Field
+from torch import Tensor
+
+from pisigma.camera.board import Board
+from pisigma.errors import RecipeError
+from pisigma.kinematics.closed_form.registry import closed_form_solver
+from pisigma.kinematics.status import Status
+from pisigma.robot.description import Robot
+from pisigma.se3 import invert, rotation_from_rpy, transform
+from pisigma.yaml_file import Count, Section, Seed
+
+CANDIDATES = 8
+"""For each view, of which those are taken that are far apart in joint space."""
+ATTEMPTS = 100
+"""For each candidate, of which some cannot be reached."""
+
+
+class BoardViews(Section):
+    """Random views of the middle of a board, by random branches, of which those are taken that are far apart.
+
+    Of all candidates, each joint vector is the one farthest from those before it, in sines and cosines.
+
+    Attributes:
+        count: how many.
+        seed: of the generator.
+        distance_mm: nearest and farthest distance of the camera from the middle of the board [mm].
+        oblique_deg: largest angle between the camera's axis and the board's [deg].
+    """
+
+    count: Count
+    seed: Seed
+    distance_mm: tuple[float, float] = (300.0, 700.0)
+    oblique_deg: float = Field(default=40.0, ge=0, lt=90)
+
+    def joints(self, robot: Robot, board: Board, is_fixed: bool = False) -> Float64[Tensor, "count dof"]:
+        """Joint values to command [rad or m]; the same at every call.
+
+        Args:
+            robot: whose base and tool lead from the board to the base and from the flange to the camera (of a fixed
+                camera: from the camera to the base, and from the flange to the board).
+            board: that is looked at from its printed side, from which its z axis points away.
+            is_fixed: whether the camera is fixed and the board on the flange.
+
+        Raises:
+            RecipeError: the robot has no closed form, or does not reach so many views.
+        """
+        solver, rng = closed_form_solver(robot), np.random.default_rng(self.seed)
+        if solver is None:
+            raise RecipeError(f"views of a board: robot '{robot.name}' has no closed form of its branches.")
+        chosen, wanted = list[Tensor](), CANDIDATES * self.count
+        for _ in range(ATTEMPTS * wanted):
+            T_board_camera = self._view(board, rng)
+            branches = solver.solve(invert(T_board_camera) if is_fixed else T_board_camera)
+            reached = branches.q[branches.status == Status.REACHED]
+            if len(reached):
+                chosen.append(reached[rng.integers(len(reached))])
+            if len(chosen) == wanted:
+                return _far_apart(torch.stack(chosen), self.count)
+        raise RecipeError(
+            f"views of a board: robot '{robot.name}' reaches {len(chosen)} of {ATTEMPTS * wanted} drawn views, but "
+            f"{wanted} were wanted; check where board and camera are, and the distances."
+        )
+
+    def _view(self, board: Board, rng: np.random.Generator) -> Float64[Tensor, "4 4"]:
+        """Draw T_board_camera: a direction, a tilt, a roll about the camera's axis, and a distance."""
+        oblique, (near, far) = np.deg2rad(self.oblique_deg), self.distance_mm
+        tilt, direction, roll, distance = rng.uniform((0, 0, 0, near), (oblique, 2 * np.pi, 2 * np.pi, far))
+        angles = torch.tensor([[direction, tilt, 0.0], [roll, 0.0, 0.0]], dtype=torch.float64)
+        around, about_axis = rotation_from_rpy(angles)
+        middle = torch.from_numpy((board.corners.min(0) + board.corners.max(0)) / 2)
+        return transform(around @ about_axis, middle - distance / 1e3 * around[:, 2])
+
+
+def _far_apart(q: Float64[Tensor, "rows dof"], count: int) -> Float64[Tensor, "count dof"]:
+    """Choose rows by farthest-point sampling, the first one first."""
+    points = torch.cat([q.cos(), q.sin()], 1)
+    chosen, distance = [0], (points - points[0]).norm(dim=1)
+    while len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = torch.minimum(distance, (points - points[chosen[-1]]).norm(dim=1))
+    return q[chosen]
