@@ -38,7 +38,7 @@ def main(draws: int, count: int) -> None:
     nominal = Robot.load("ur5")
     base = xyzrpy_from_transform(invert(transform_from_xyzrpy(IN_BASE))).numpy()
     aimed = nominal.with_geometry(nominal.dh, base=base, tool=ON_FLANGE.numpy())
-    q = BoardViews(count=count, seed=0).joints(aimed, BOARD)
+    q = BoardViews(count=count, seed=0).joints(aimed, LENS, BOARD)
     everywhere = torch.from_numpy(np.random.default_rng(0).uniform(-np.pi, np.pi, (POSTURES, nominal.dof)))
     squares, off, seconds, left_out = {"detected": 0.0, "exact": 0.0}, list[np.ndarray](), 0.0, 0
     for draw in range(draws):

@@ -7,6 +7,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pisigma.camera.board import Board
+from pisigma.camera.camera import Camera
 from pisigma.errors import RecipeError
 from pisigma.kinematics.closed_form.registry import closed_form_solver
 from pisigma.kinematics.status import Status
@@ -21,7 +22,7 @@ ATTEMPTS = 100
 
 
 class BoardViews(Section):
-    """Random views of the middle of a board, by random branches, of which those are taken that are far apart.
+    """Random views of a whole board, by random branches, of which those are taken that are far apart.
 
     Of all candidates, each joint vector is the one farthest from those before it, in sines and cosines.
 
@@ -37,12 +38,15 @@ class BoardViews(Section):
     distance_mm: tuple[float, float] = (300.0, 700.0)
     oblique_deg: float = Field(default=40.0, ge=0, lt=90)
 
-    def joints(self, robot: Robot, board: Board, is_fixed: bool = False) -> Float64[Tensor, "count dof"]:
+    def joints(
+        self, robot: Robot, camera: Camera, board: Board, is_fixed: bool = False
+    ) -> Float64[Tensor, "count dof"]:
         """Joint values to command [rad or m]; the same at every call.
 
         Args:
             robot: whose base and tool lead from the board to the base and from the flange to the camera (of a fixed
                 camera: from the camera to the base, and from the flange to the board).
+            camera: that has the whole board in view, with its squares' rim.
             board: that is looked at from its printed side, from which its z axis points away.
             is_fixed: whether the camera is fixed and the board on the flange.
 
@@ -55,7 +59,10 @@ class BoardViews(Section):
         chosen, wanted = list[Tensor](), CANDIDATES * self.count
         for _ in range(ATTEMPTS * wanted):
             T_board_camera = self._view(board, rng)
-            branches = solver.solve(invert(T_board_camera) if is_fixed else T_board_camera)
+            T_camera_board = invert(T_board_camera)
+            if not _is_whole(camera, board, T_camera_board.numpy()):
+                continue
+            branches = solver.solve(T_camera_board if is_fixed else T_board_camera)
             reached = branches.q[branches.status == Status.REACHED]
             if len(reached):
                 chosen.append(reached[rng.integers(len(reached))])
@@ -74,6 +81,14 @@ class BoardViews(Section):
         around, about_axis = rotation_from_rpy(angles)
         middle = torch.from_numpy((board.corners.min(0) + board.corners.max(0)) / 2)
         return transform(around @ about_axis, middle - distance / 1e3 * around[:, 2])
+
+
+def _is_whole(camera: Camera, board: Board, T_camera_board: Float64[np.ndarray, "4 4"]) -> bool:
+    """Whether all of a board is in view up to half a square beyond its corners."""
+    corners = board.corners
+    out = corners + board.square / 2 * np.sign(corners - corners.mean(0))
+    pixels = camera.project(out @ T_camera_board[:3, :3].T + T_camera_board[:3, 3])[0]
+    return bool(((pixels > 0) & (pixels < (camera.width, camera.height))).all())
 
 
 def _far_apart(q: Float64[Tensor, "rows dof"], count: int) -> Float64[Tensor, "count dof"]:
