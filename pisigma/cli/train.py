@@ -36,6 +36,12 @@ def train(
         Path | None,
         typer.Option(help="Folder for metrics.csv of every epoch, and TensorBoard's events if it is there."),
     ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            help="Processes that judge folds and simulations side by side, with one thread each. [default: threads]"
+        ),
+    ] = None,
     accept_implausible: AcceptImplausible = False,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
@@ -60,7 +66,7 @@ def train(
     if logs is not None:
         check_apart(logs / "metrics.csv", inputs, "--logs")
     checkpoints = folder.parent / f".{folder.name}.training"
-    settings = TrainSettings(checkpoints, resume, show_progress=True, logs=logs)
+    settings = TrainSettings(checkpoints, resume, show_progress=True, logs=logs, jobs=jobs)
     with progress_of("training") as progress:
         training = train_recipe(recipe, data, settings, progress)
     command = ["pisigma", "train", recipe.as_posix(), *(["--data", data.name] if data else [])]

@@ -14,8 +14,8 @@ from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.judging.pose_statistics import PoseErrors, error_statistics
 from pisigma.judging.predicted_spread import PredictedSpread, predicted_spread
-from pisigma.judging.progress import Progress, stage
-from pisigma.judging.side_by_side import side_by_side
+from pisigma.judging.progress import Progress, silent, stage
+from pisigma.judging.side_by_side import in_processes, side_by_side
 from pisigma.judging.trained_calibrations import (
     Calibrator,
     Result,
@@ -166,6 +166,7 @@ def validate(
     measurements: Measurements,
     splits: Sequence[TrainTest],
     progress: Progress = lambda what: None,
+    jobs: int | None = None,
 ) -> CalibrationValidation:
     """Calibrate on the training rows of every split and judge on its test rows.
 
@@ -174,13 +175,14 @@ def validate(
             downweighted. Whatever it chooses, it chooses on the training rows.
         measurements: the rows.
         splits: from `k_folds` or `holdout`.
-        progress: called with the fold that is being judged, and what is being tried.
+        progress: called with the fold that is being judged, and what is being tried; not from other processes.
+        jobs: processes that judge the splits side by side, with one thread each; None for threads of this one.
 
     Raises:
         IdentificationError: the training rows of a split do not determine what is asked for, or no test row has a
             target or anchor that its training rows have too.
     """
-    judged = judged_folds(calibrator, measurements, [splits], progress)
+    judged = judged_folds(calibrator, measurements, [splits], progress, jobs)
     return joined_repeats(measurements, [splits], judged)
 
 
@@ -189,8 +191,11 @@ def judged_folds(
     measurements: Measurements,
     repeats: Sequence[Sequence[TrainTest]],
     progress: Progress = lambda what: None,
+    jobs: int | None = None,
 ) -> Iterator[JudgedFold]:
-    """Judge every fold of every repeat in turn, or in threads; see `fold_tasks`."""
+    """Judge every fold of every repeat in turn, in threads or in processes; see `fold_tasks` and `validate`."""
+    if jobs is not None:
+        return in_processes(fold_tasks(calibrator, measurements, repeats, silent), jobs)
     return side_by_side(fold_tasks(calibrator, measurements, repeats, progress), measurements.rows > FEW_ROWS)
 
 
@@ -262,6 +267,7 @@ def learning_curve(
     seed: int,
     progress: Progress = lambda what: None,
     whole: CalibrationValidation | None = None,
+    jobs: int | None = None,
 ) -> tuple[LearningPoint, ...]:
     """Calibrate with fewer and fewer of the training rows of every split, and judge on all its test rows.
 
@@ -273,6 +279,7 @@ def learning_curve(
         seed: decides which rows are drawn; smaller draws are subsets of larger ones.
         progress: called with what is being done.
         whole: what all training rows gave, as the last point of the curve; None for none.
+        jobs: see `validate`.
 
     Returns:
         The figures of the points, fewest rows first.
@@ -285,7 +292,7 @@ def learning_curve(
     for rows in sorted(sizes):
         fewer = with_fewer(measurements, splits, rows, seed)
         of_rows = stage(progress, f"{rows} training rows")
-        points.append((rows, validate(calibrator, measurements, fewer, of_rows)))
+        points.append((rows, validate(calibrator, measurements, fewer, of_rows, jobs)))
     if whole is not None:
         points.append((min(len(train) for train, _ in splits), whole))
     figures = ((rows, validation.figures().model_dump(exclude_unset=True)) for rows, validation in points)

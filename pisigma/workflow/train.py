@@ -160,12 +160,13 @@ def _train_hybrid(
     started = time.perf_counter()
     result = calibrator.fit(rows, stage(progress, "calibration"), settings.checkpoints, settings.resume)
     seconds = time.perf_counter() - started
-    validation = validate(calibrator, judged, splits, stage(progress, "held-out rows"))
+    validation = validate(calibrator, judged, splits, stage(progress, "held-out rows"), settings.jobs)
     test = None if data.test is None else judge(calibrator, result, rows, data.test)
     curve = None
     if (stated := recipe.learning_curve) is not None:
         of_curve = stage(progress, "learning curve")
-        curve = learning_curve(calibrator, judged, splits, stated.rows, stated.seed, of_curve, validation)
+        sizes, seed, jobs = stated.rows, stated.seed, settings.jobs
+        curve = learning_curve(calibrator, judged, splits, sizes, seed, of_curve, validation, jobs)
     summary = summarise(result).having(
         command=_call(recipe),
         rows=rows.rows,
@@ -197,7 +198,7 @@ def _train_inverse(
     progress: Progress,
 ) -> InverseTraining:
     run = train_networks(recipe, data, settings, sha256)
-    validation = None if data.folds is None else cross_validate(recipe, data, progress)
+    validation = None if data.folds is None else cross_validate(recipe, data, progress, settings.jobs)
     test = None
     if data.test is not None:
         test = ComparisonFigures.of(compare_on(run.model, data.test), rows=data.test.rows)

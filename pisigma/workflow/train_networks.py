@@ -1,6 +1,8 @@
 """Train and cross-validate the networks of a recipe of inverse calibration."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -8,7 +10,8 @@ import torch
 from pisigma.errors import MeasurementError, RecipeError
 from pisigma.identification.initial_guess.base_and_tool import fit_base_and_tool
 from pisigma.judging.pose_statistics import Comparison, PoseErrors, compare_on
-from pisigma.judging.progress import Progress
+from pisigma.judging.progress import Progress, silent
+from pisigma.judging.side_by_side import in_processes
 from pisigma.judging.training_summary import ComparisonFigures, JointErrors, TrainingRun
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import groups_of_equal_joints
@@ -33,16 +36,27 @@ class TrainSettings:
         resume: go on from the checkpoint there.
         show_progress: draw the bar of networks on stderr, if that is a terminal.
         logs: folder for Lightning's logs of networks: `metrics.csv`, and TensorBoard's events where it is installed.
+        jobs: processes that judge folds and simulations side by side, with one thread each; None for threads of this
+            one.
+
+    Raises:
+        RecipeError: there are no jobs.
     """
 
     checkpoints: Path | None = None
     resume: bool = False
     show_progress: bool = False
     logs: Path | None = None
+    jobs: int | None = None
+
+    def __post_init__(self) -> None:
+        """Refuse to work nowhere."""
+        if self.jobs is not None and self.jobs < 1:
+            raise RecipeError(f"jobs: 1 or more were wanted, got {self.jobs}.")
 
 
 DEFAULTS = TrainSettings()
-"""No checkpoints, no bar, no logs."""
+"""No checkpoints, no bar, no logs, no other processes."""
 
 
 def train_networks(
@@ -106,14 +120,18 @@ def train_networks(
 
 
 def cross_validate(
-    recipe: InverseRecipe, data: RecipeData, progress: Progress = lambda what: None
+    recipe: InverseRecipe,
+    data: RecipeData,
+    progress: Progress = lambda what: None,
+    jobs: int | None = None,
 ) -> ComparisonFigures:
     """Train the recipe once per fold, on the other folds, and judge it on the fold.
 
     Args:
         recipe: for measured data.
         data: its robot and rows; every row to train on is held out once.
-        progress: called before every fold.
+        progress: called before every fold, but for those in other processes.
+        jobs: see `TrainSettings`.
 
     Raises:
         RecipeError: the recipe simulates its data.
@@ -124,14 +142,30 @@ def cross_validate(
     measurements, folds = data.splits()
     turned, not_predicted = measurements.rotation is not None, 0
     nominal, corrected = (PoseErrors.none(measurements.rows, turned) for _ in range(2))
-    for number, (training, test) in enumerate(folds, start=1):
-        progress(f"cross-validation: fold {number} of {len(folds)}")
-        model = train_networks(recipe, replace(data, training=measurements.select(training))).model
-        comparison = compare_on(model, measurements.select(test))
+    tasks = [
+        partial(
+            _compared_fold,
+            recipe,
+            replace(data, training=measurements.select(training)),
+            measurements.select(test),
+            partial(progress if jobs is None else silent, f"cross-validation: fold {number} of {len(folds)}"),
+        )
+        for number, (training, test) in enumerate(folds, start=1)
+    ]
+    comparisons = (task() for task in tasks) if jobs is None else in_processes(tasks, jobs)
+    for (_, test), comparison in zip(folds, comparisons, strict=True):
         not_predicted += comparison.not_predicted
         nominal.put(test, comparison.nominal)
         corrected.put(test, comparison.corrected)
     return ComparisonFigures.of(Comparison(nominal, corrected, not_predicted), folds=len(folds))
+
+
+def _compared_fold(
+    recipe: InverseRecipe, data: RecipeData, test: Measurements, begin: Callable[[], None]
+) -> Comparison:
+    """Train on some rows, and compare on others."""
+    begin()
+    return compare_on(train_networks(recipe, data).model, test)
 
 
 def _check_one_pose(measurements: Measurements) -> None:

@@ -76,6 +76,11 @@ def test_rows_that_are_left_out_are_a_warning():
     )
 
 
+def test_no_jobs_are_refused():
+    with pytest.raises(RecipeError, match="jobs: 1 or more were wanted, got 0"):
+        TrainSettings(jobs=0)
+
+
 def test_rows_of_two_frames_are_refused():
     recipe, run = trained_run("kiro3")
     measured = recipe.model_copy(update={"data": MeasuredData(kind="measured")})
