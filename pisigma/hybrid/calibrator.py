@@ -151,12 +151,12 @@ class HybridCalibrator:
 
     def _learned(self, solved: SolvedCalibration, refined: Refined) -> LearnedPart:
         """The correction with the geometry that belongs to it, and where it was measured."""
-        noise = zip(solved.result().noise, refined.posterior.noise, strict=True)
+        noise = zip(solved.problem.sensors, refined.posterior.noise, strict=True)
         return LearnedPart(
             geometry=with_frames_of(solved, refined, identified_geometry(solved.setup, refined.point)),
             correction=refined.correction,
             coverage=JointCoverage.of(self.geometric.robot, solved.problem.q),
-            noise={geometric.sensor: sigma for geometric, sigma in noise},
+            noise={sensor.name: sigma for sensor, sigma in noise if not sensor.certain},
             unknowns=refined.design.unknowns,
             effective=refined.posterior.effective,
             rounds=refined.rounds,
