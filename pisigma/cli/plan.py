@@ -64,8 +64,8 @@ CriterionName = Annotated[
     str | None,
     typer.Option(
         "--criterion",
-        help="D: all unknowns; I: the tool's position over the task. [default: D, or I of up to 18 poses and where "
-        "something is measured]",
+        help="D: all unknowns; I: the tool's position over the task. [default: D, or I of up to 18 poses, of a "
+        "camera and where something is measured]",
     ),
 ]
 LimitMm = Annotated[

@@ -55,7 +55,7 @@ class PlanSettings:
         sigma_mm: standard deviation of a measured length [mm]; None for that of laser trackers, see
             `pisigma.planning.knowledge.Instrument`.
         criterion: "D": what lowers the uncertainty of all unknowns most; "I": what lowers that of the tool's position
-            over the task most; None for I with a model, with measured rows or of up to `FEW_POSES` poses, else for D.
+            over the task most; None for I with a model, measured rows, a camera or up to `FEW_POSES` poses, else for D.
         limit_mm: RMS of the tool's position that is wanted [mm]; None for no limit.
         candidates: poses that are drawn to choose from.
         candidates_from: file of joint values to choose from instead.

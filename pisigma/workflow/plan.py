@@ -224,7 +224,8 @@ class _Problem:
         Poses that no free motion leads to are replaced by others.
         """
         q, count = self.candidates.q, self.settings.count
-        criterion = self.settings.criterion or ("I" if self.anything_known or count <= FEW_POSES else "D")
+        few = self.anything_known or count <= FEW_POSES or self.settings.camera is not None
+        criterion = self.settings.criterion or ("I" if few else "D")
         free = torch.arange(len(q))
         for _ in range(ROUNDS):
             progress(f"{count} of {len(free):,} candidates")

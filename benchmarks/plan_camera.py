@@ -1,0 +1,154 @@
+"""Calibrations from planned images of a board beside as many random views: true errors, and what was predicted.
+
+    OMP_NUM_THREADS=1 python benchmarks/plan_camera.py [--draws 5] [--candidates 3000] [--images 25 50]
+
+A UR5 with errors of 1 mm and 0.3 deg on every parameter carries a camera (1920 x 1200 px, f = 1400 px, 0.3 px a corner,
+intrinsics known) that sees a board of 9 x 6 corners 30 mm apart, sharp from 0.3 to 0.7 m, up to 45 deg oblique; the
+robot repeats to 0.02 mm and 0.01 deg. Errors are those of the camera centre's position over 400 postures of the whole
+joint space, after the best rigid alignment. Random views are drawn from the candidates of which the planned ones are
+chosen, by either criterion, for the geometry alone or for the hybrid, as `pisigma plan` does it.
+"""
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import get_args
+
+import numpy as np
+import torch
+import yaml
+from torch import Tensor
+
+from pisigma.camera.board import Board
+from pisigma.camera.camera import Camera
+from pisigma.camera.image_rows import image_measurements
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.problem.parameters import Prior
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.planning.camera_settings import CameraSettings
+from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.cell.cell import Cell
+from pisigma.planning.choice import Criterion, choose
+from pisigma.planning.expected_accuracy import rms_of
+from pisigma.planning.knowledge import Knowledge
+from pisigma.planning.plan_settings import PlanSettings
+from pisigma.planning.task import TASK_POSES
+from pisigma.robot import Robot
+from pisigma.se3 import skew
+from pisigma.simulation.camera.images import ImageNoise, simulate_images
+
+LENGTH, ANGLE, POSTURES = 1e-3, np.deg2rad(0.3), 400
+PRIOR = Prior(theta=ANGLE, d=LENGTH, a=LENGTH, alpha=ANGLE, beta=ANGLE)
+CELL = Cell.model_validate(
+    {
+        "tool": {"x_mm": 30, "y_mm": 20, "z_mm": 60, "roll_deg": 5.7, "pitch_deg": 1.1, "yaw_deg": -1.7},
+        "view": {
+            "frame": {"x_mm": 420, "y_mm": -120, "z_mm": 50, "yaw_deg": 180},
+            "near_mm": 300,
+            "far_mm": 700,
+        },
+    }
+)
+CAMERA = {"name": "wrist", "width": 1920, "height": 1200, "fx": 1400, "fy": 1400, "cx": 960, "cy": 600}
+BOARD = {"name": "board", "rows": 6, "columns": 9, "square_mm": 30}
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """The arm, what can be measured, and what is known by model before."""
+
+    arm: ArmInCell
+    settings: PlanSettings
+    q: Tensor
+    task: Tensor
+    knowledge: dict[str, Knowledge]
+    camera: Camera
+    board: Board
+
+    @staticmethod
+    def of(candidates: int) -> "Bench":
+        """Draw the candidates."""
+        with TemporaryDirectory() as folder:
+            files = [Path(folder, f"{name}.yaml") for name in ("camera", "board")]
+            for file, content in zip(files, (CAMERA, BOARD), strict=True):
+                file.write_text(yaml.safe_dump(content))
+            settings = PlanSettings(
+                sensor="camera", camera=CameraSettings(*map(str, files)), candidates=candidates
+            )
+            arm, sight = ArmInCell.of(Robot.load("ur5"), CELL), settings.instrument()
+            drawn, views = settings.find_candidates(arm), settings.views(arm)
+        assert views is not None
+        base = _inverse(views.T_cell_frame)
+        robot = arm.robot.with_geometry(base=base)
+        knowledge = {
+            name: Knowledge.of_robot(robot, sight, hybrid=name == "hybrid")
+            for name in ("geometric", "hybrid")
+        }
+        assert sight.sight is not None
+        of_sight = sight.sight
+        return Bench(
+            arm, settings, drawn.q, drawn.workspace[:TASK_POSES], knowledge, of_sight.camera, of_sight.board
+        )
+
+    def figures(self, draw: int, q: Tensor, judged: Tensor) -> tuple[float, float]:
+        """True and predicted error [mm] of a calibration of one true arm with images at joint values."""
+        nominal, rng = self.knowledge["geometric"].uncertainty.geometry.robot, np.random.default_rng(draw)
+        errors = rng.standard_normal(nominal.dh.shape) * [ANGLE, LENGTH, LENGTH, ANGLE, ANGLE]
+        true, noise = nominal.with_geometry(nominal.dh + errors), ImageNoise()
+        images = simulate_images(true, q, self.camera, self.board, noise, torch.Generator().manual_seed(draw))
+        rows = image_measurements(images, self.camera, self.board, False, noise.repeatability, "fixed")
+        robot = GeometricCalibrator(self.arm.robot, prior=PRIOR).fit(rows).robot
+        points, estimated = (forward_kinematics(one, judged)[:, :3, 3] for one in (true, robot))
+        predicted = rms_of(self.knowledge["geometric"].informed(q).tool(judged))
+        return 1e3 * aligned_error(points, estimated), 1e3 * predicted
+
+
+def _inverse(T: Tensor) -> np.ndarray:
+    from pisigma.se3 import invert, xyzrpy_from_transform
+
+    return xyzrpy_from_transform(invert(T)).numpy()
+
+
+def aligned_error(true: Tensor, estimated: Tensor) -> float:
+    """Root mean square distance [m] of points after the best rigid alignment; errors are small against the arm."""
+    shifts = torch.eye(3, dtype=torch.float64).expand(len(true), 3, 3)
+    basis = torch.linalg.qr(torch.cat([shifts, skew(true - true.mean(0))], -1).flatten(0, 1)).Q
+    off = (true - estimated).flatten()
+    off = off - basis @ (basis.T @ off)
+    return float((off.square().sum() / len(true)).sqrt())
+
+
+def main(draws: int, candidates: int, counts: list[int]) -> None:
+    """Print root mean squares over all draws."""
+    bench = Bench.of(candidates)
+    judged = torch.from_numpy(np.random.default_rng(0).uniform(-np.pi, np.pi, (POSTURES, 6)))
+    for count in counts:
+        ways = {
+            "random": [
+                torch.randperm(candidates, generator=torch.Generator().manual_seed(draw))[:count]
+                for draw in range(draws)
+            ]
+        }
+        for name, knowledge in bench.knowledge.items():
+            for criterion in get_args(Criterion):
+                chosen = choose(knowledge, bench.q, count, bench.task, criterion)
+                ways[f"{criterion}, {name}"] = [chosen] * draws
+        pooled = {}
+        for way, choices in ways.items():
+            pairs = [bench.figures(draw, bench.q[chosen], judged) for draw, chosen in enumerate(choices)]
+            pooled[way], predicted = np.sqrt(np.mean(np.square(pairs), 0)).tolist()
+            print(
+                f"{count} images, {way}: {pooled[way]:.4f} mm ({pooled[way] / pooled['random']:.2f} of random), "
+                f"predicted {predicted:.4f} mm ({predicted / pooled[way]:.2f} of true)",
+                flush=True,
+            )
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--draws", type=int, default=5)
+    parser.add_argument("--candidates", type=int, default=3000)
+    parser.add_argument("--images", type=int, nargs="+", default=[25, 50])
+    arguments = parser.parse_args()
+    main(arguments.draws, arguments.candidates, arguments.images)
