@@ -86,6 +86,10 @@ class CameraFiles:
         table = read_table(path)
         if not set(CORNERS) & set(table.header):
             return Measurements.read_csv(path, robot)
+        return self.of_table(table, robot)
+
+    def of_table(self, table: Table, robot: Robot) -> Measurements:
+        """Turn rows of a file of corners into measurements; see `read`."""
         cameras, boards = (
             _by_name(Camera.load, self.cameras, "camera"),
             _by_name(Board.load, self.boards, "board"),
@@ -140,10 +144,10 @@ def read_rows(
                 f"{rows[0].source}: corners of images were wanted, as a camera is stated, but there is none of the "
                 f"columns {', '.join(CORNERS)}; add a file of corners, or leave camera and board out."
             )
-    return _with_one_noise(rows[0] if len(rows) == 1 else join(rows))
+    return with_one_noise(rows[0] if len(rows) == 1 else join(rows))
 
 
-def _with_one_noise(rows: Measurements) -> Measurements:
+def with_one_noise(rows: Measurements) -> Measurements:
     """Return the rows with one noise of corners, as their weights say how cameras differ."""
     noise = rows.readings.get(NOISE_COLUMN)
     if not isinstance(noise, torch.Tensor):

@@ -2,6 +2,7 @@
 
 import os
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,13 +12,17 @@ from pisigma.errors import MeasurementError, printable
 from pisigma.files.input_file import read_text
 from pisigma.measurement.csv.header import read_header
 from pisigma.measurement.csv.reading import sound_rows
-from pisigma.measurement.csv.table import table_of
+from pisigma.measurement.csv.table import Table, table_of
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.fields import LeftOut, MeasuredFields
 from pisigma.robot import Robot
 
 _DIGITS = 9
 """Rows are the same where their values [SI] agree to so many decimals: programs that save a file anew round them."""
+
+
+Reader = Callable[[Table, bool], MeasuredFields]
+"""Turns rows of a table into measurements; the second argument says whether nothing comes any more."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +54,17 @@ class GrowingFile:
     rows of the new file that equal one of them are not read again.
     """
 
-    def __init__(self, path: str | os.PathLike[str], robot: Robot):
+    def __init__(self, path: str | os.PathLike[str], robot: Robot, reader: Reader | None = None):
+        """Follow a file.
+
+        Args:
+            path: the file, which need not exist yet.
+            robot: that is measured.
+            reader: of rows that mean something only together; None for measurement files.
+        """
         self.path = Path(path)
         self._robot = robot
+        self._reader: Reader = reader or (lambda table, final: sound_rows(table, robot))
         self._source = printable(str(path), cut=False)
         self._stamp: tuple[int, ...] = ()
         self._text = ""
@@ -89,7 +102,7 @@ class GrowingFile:
         if not table.records:
             read_header(table, self._robot)
             return Growth(notices=notices, waiting=self._waiting)
-        data = sound_rows(table, self._robot)
+        data = self._reader(table, final)
         left_out = tuple(one for one in data.left_out if one not in self._refused)
         self._refused.update(left_out)
         new = self._new_rows(data)

@@ -17,7 +17,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import k_folds
 from pisigma.measuring.state import AccuracyPoint
 from pisigma.planning.expected_accuracy import curve, p95_of, rms_of
-from pisigma.planning.knowledge import Instrument, Knowledge
+from pisigma.planning.knowledge import Knowledge
 from pisigma.robot.description import Robot
 
 FOLDS = 5
@@ -39,7 +39,7 @@ class Reached:
 
 def reached(
     robot: Robot,
-    instrument: Instrument,
+    before: Knowledge,
     rows: Measurements,
     check: Measurements | None,
     task: Float64[Tensor, "tasks dof"],
@@ -49,7 +49,7 @@ def reached(
 
     Args:
         robot: as drawn.
-        instrument: what measures.
+        before: what is known of a robot that was never measured, and what measures.
         rows: to calibrate with.
         check: rows that are kept apart; None where there are none yet.
         task: joint values [rad or m] where the robot shall be accurate.
@@ -63,9 +63,9 @@ def reached(
     assert isinstance(result, HybridResult)
     if result.learned is None and np.array_equal(result.geometric.robot.dh, robot.dh):
         # Too few rows left the arm as drawn, so that the posterior says nothing of its errors.
-        knowledge = Knowledge.of_robot(robot, instrument).informed(rows.q)
+        knowledge = before.informed(rows.q)
     else:
-        knowledge = Knowledge.of_result(result, instrument)
+        knowledge = Knowledge.of_result(result, before.instrument)
     D = knowledge.tool(task)
     errors = validate(calibrator, rows, k_folds(rows, min(FOLDS, rows.rows), seed=0), progress).models[
         "hybrid"

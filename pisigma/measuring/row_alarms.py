@@ -116,6 +116,8 @@ def contradicted(
         text = f"{what}; it looks like {other}. {advice}"
         return Alarm(line, "swapped", text, repeat=True)
     advice = "Check the reflector, its seat and the line of sight, and measure the pose again."
+    if bool(rows.measured("corner")[row]):
+        advice = "Check the image, and that robot and board stood still, and take it again."
     if rows.rows <= CONTRADICTION:
         advice = f"It may as well be one of the others, as they are few. {advice}"
     return Alarm(line, "off", f"{what}. {advice}", repeat=True)

@@ -27,6 +27,8 @@ from pisigma.se3 import (
     transform_from_xyzrpy,
     xyzrpy_from_transform,
 )
+from pisigma.sensors.corner import CornerSensor, with_held_camera
+from pisigma.sensors.intrinsics import NOISE_COLUMN
 
 REPEATABILITY = {"m": 8e-5, "rad": 1e-4}
 """What a robot of any class does not do again, beside the noise of the sensor."""
@@ -100,7 +102,7 @@ class RowModel:
             PoseError: the joint values do not fit the robot.
         """
         calibrator = GeometricCalibrator(robot)
-        setup = calibrator.build(rows)
+        setup = calibrator.build(with_held_camera(rows, REPEATABILITY["m"], REPEATABILITY["rad"]))
         active = [*setup.free_unknowns, *calibrator.candidates(setup.problem.space)]
         setup = replace(setup, problem=setup.problem.with_active(active))
         gravity = GravityTorques(robot, in_first_row(robot, USUAL))
@@ -182,9 +184,12 @@ class RowModel:
             block = errors[start : start + one.residual.numel()].view_as(one.residual)
             start += block.numel()
             (angle if sensor.unit == "rad" else length)[one.row] = block.norm(dim=1)
-            if sensor.name == "position":
+            if isinstance(sensor, CornerSensor):
+                block = torch.linalg.solve(sensor.weight.permute(2, 0, 1)[one.row], block[..., None])[..., 0]
+                length[one.row], angle[one.row] = block[:, :3].norm(dim=1), block[:, 3:].norm(dim=1)
+            if sensor.name in ("position", "corner"):
                 frames = self.setup.anchors.bases[self.setup.problem.frame[one.row], :3, :3]
-                position[one.row] = (frames @ block[..., None])[..., 0]
+                position[one.row] = (frames @ block[:, :3, None])[..., 0]
         return length, angle, position
 
     def _solution(self) -> Float64[Tensor, " unknowns"]:
@@ -262,7 +267,8 @@ def _noise(
     for sensor, one in zip(setup.problem.sensors, values, strict=True):
         usual = USUAL_NOISE[sensor.unit] if sigma is None or sensor.unit == "rad" else sigma
         noise = 1 / one.root if one.stated else torch.full_like(one.root, usual)
-        blocks.append(
-            (noise.square() + REPEATABILITY[sensor.unit] ** 2).sqrt().repeat_interleave(one.components)
-        )
+        noise = (noise.square() + REPEATABILITY[sensor.unit] ** 2).sqrt()
+        if isinstance(sensor, CornerSensor):  # whose weights hold the repeatability
+            noise = torch.as_tensor(setup.measurements.readings[NOISE_COLUMN])[one.row]
+        blocks.append(noise.repeat_interleave(one.components))
     return torch.cat(blocks)

@@ -19,7 +19,6 @@ from pisigma.measurement.csv.reading import read_joints
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.cell.cell import Cell
-from pisigma.planning.knowledge import Instrument
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import RobotDocument
@@ -84,12 +83,6 @@ class StoredPlan:
     check: Bool[Tensor, " poses"]
     candidate: Int64[Tensor, " poses"]
     way_points: tuple[Float64[Tensor, "_points dof"], ...]
-
-    @property
-    def instrument(self) -> Instrument:
-        """What measures; distances are those from the tracker of the cell."""
-        tracker = self.arm.cell.tracker
-        return self.settings.instrument(None if tracker is None else tracker.position)
 
     def write(self, path: Path) -> None:
         """Write the CSV, and the YAML beside it; both are replaced where they are there.

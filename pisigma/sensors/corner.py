@@ -228,3 +228,32 @@ def as_poses(
         rotation=rotation_from_vector(change[:, 3:]) @ rotation,
         readings=others,
     )
+
+
+def with_held_camera(measurements: Measurements, length: float, angle: float) -> Measurements:
+    """Return rows of images as with certain intrinsics and board, but with more noise of their poses.
+
+    Args:
+        measurements: the rows.
+        length: standard deviation of each coordinate that is added [m].
+        angle: and of a turn about each axis [rad].
+    """
+    texts = measurements.readings.get(WEIGHT_COLUMN)
+    if not isinstance(texts, tuple):
+        return measurements
+    more = np.diag([length**2] * 3 + [angle**2] * 3)
+    weights = []
+    for text in texts:
+        numbers = numbers_in(text, WEIGHTS)
+        if numbers:
+            W = np.zeros((6, 6))
+            W[np.tril_indices(6)] = numbers
+            lower = np.linalg.cholesky(np.linalg.inv(W.T @ W) + more)
+            text = weight_text(np.linalg.inv(lower))
+        weights.append(text)
+    others = {
+        name: values
+        for name, values in measurements.readings.items()
+        if name not in (INTRINSICS_COLUMN, SCALE_COLUMN)
+    }
+    return replace(measurements, readings={**others, WEIGHT_COLUMN: tuple(weights)})

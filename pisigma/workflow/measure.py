@@ -12,11 +12,14 @@ import torch
 from jaxtyping import Bool, Int64
 from torch import Tensor
 
+from pisigma.camera.corner_file import with_one_noise
 from pisigma.errors import IdentificationError, MeasurementError, PlanningError
 from pisigma.identification.prediction import predicted_poses
 from pisigma.judging.progress import Progress
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.fields import LeftOut
+from pisigma.measurement.growing_file import GrowingFile
+from pisigma.measuring.growing_images import ImageReader
 from pisigma.measuring.reached import Reached, expected, reached, reached_with
 from pisigma.measuring.row_alarms import (
     NEAR_POSE,
@@ -99,16 +102,13 @@ class MeasuringSession:
         self.replanned = False
         self._lock = threading.RLock()
         self._settings = settings
-        self._instrument = plan.instrument
         candidates = plan.settings.find_candidates(plan.arm)
         some = torch.linspace(0, len(candidates.q) - 1, min(len(candidates.q), CANDIDATES)).round().long()
         self._candidates, self._number = candidates.q[some], candidates.number[some]
         self._by_way_of = candidates.workspace[:CANDIDATES]
-        subject = None if plan.model is None else Subject.of(plan.model)
-        model = None if subject is None else subject.model
-        self._task = task_poses(plan.arm, plan.settings, candidates.workspace, model)
-        unmeasured = replace(plan.settings, measured=None)
-        self._before = None if subject is None else subject.knowledge(plan.arm, unmeasured)
+        subject = Subject(plan.arm.drawn) if plan.model is None else Subject.of(plan.model)
+        self._task = task_poses(plan.arm, plan.settings, candidates.workspace, subject.model)
+        self._before = subject.knowledge(plan.arm, replace(plan.settings, measured=None))
         self._planned, self._planned_check = plan.q, plan.check
         self._names = [f"pose {number} of the plan" for number in range(1, len(plan.q) + 1)]
         self._rows: Measurements | None = None
@@ -132,6 +132,11 @@ class MeasuringSession:
             MeasurementError: its poses cannot be used.
         """
         return MeasuringSession(read_plan(path), settings)
+
+    def rows_in(self, path: str | os.PathLike[str]) -> GrowingFile:
+        """The file that gets the rows, or the corners of images where a camera measures."""
+        robot, camera = self.plan.arm.robot, self.plan.settings.camera
+        return GrowingFile(path, robot, None if camera is None else ImageReader(camera.files, robot))
 
     def add(self, rows: Measurements | None, left_out: Sequence[LeftOut] = ()) -> tuple[Alarm, ...]:
         """Judge rows that were measured since.
@@ -167,8 +172,8 @@ class MeasuringSession:
         kept_apart = rows.select(counting & check) if bool((counting & check).any()) else None
         robot = self.plan.arm.robot
         try:
-            if self._before is None:
-                came_to = reached(robot, self._instrument, training, kept_apart, self._task, progress)
+            if self.plan.model is None:
+                came_to = reached(robot, self._before, training, kept_apart, self._task, progress)
             else:
                 came_to = reached_with(self._before, training, self._task)
         except (IdentificationError, MeasurementError):  # too few rows as yet
@@ -229,7 +234,7 @@ class MeasuringSession:
 
     def _add(self, row: Measurements) -> list[Alarm]:
         """Judge one more row."""
-        self._rows = rows = row if self._rows is None else join([self._rows, row])
+        self._rows = rows = row if self._rows is None else with_one_noise(join([self._rows, row]))
         new = rows.rows - 1
         alarms = list(stale_readings(rows, new))
         usable = torch.tensor([not alarms], dtype=torch.bool)
@@ -244,7 +249,7 @@ class MeasuringSession:
         trusted = torch.zeros(len(numbers), dtype=torch.bool)
         trusted[: len(self._judgement.counts)] = self._judgement.counts
         usable = rows.select(numbers)
-        sigma = self._instrument.sigma
+        sigma = self._before.instrument.sigma
         self._judgement = judgement = judge_rows(self.plan.arm.robot, usable, sigma, trusted)
         wrong = {
             int(numbers[row]): contradicted(usable, judgement, row, self._planned, self._names)

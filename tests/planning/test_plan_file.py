@@ -68,7 +68,7 @@ def test_a_table_without_its_plan_is_refused(stored: StoredPlan, tmp_path: Path)
 def test_faults_of_the_files_are_named(stored: StoredPlan, tmp_path: Path):
     csv, yaml = tmp_path / "poses.csv", tmp_path / "poses.plan.yaml"
     text = yaml.read_text()
-    yaml.write_text(text.replace("sensor: position", "sensor: camera"))
+    yaml.write_text(text.replace("sensor: position", "sensor: lidar"))
     with pytest.raises(PlanningError, match=r"poses\.plan\.yaml, line \d+: 'settings.sensor'"):
         read_plan(csv)
     yaml.write_text(text)

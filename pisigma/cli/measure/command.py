@@ -59,7 +59,6 @@ def measure(
     planned again, it is written beside them. With --json, sentences go to stderr, and one JSON object to stdout at the
     end.
     """
-    from pisigma.measurement.growing_file import GrowingFile
     from pisigma.workflow.follow import follow, rest_file
     from pisigma.workflow.measure import MeasureSettings, MeasuringSession
 
@@ -72,7 +71,7 @@ def measure(
             shown_in_browser(session.plan.arm, limit_mm, page) as show_page,
             _printer(session, f"measure {plan}", as_json) as show,
         ):
-            for step in follow(session, GrowingFile(rows, session.plan.arm.robot), once):
+            for step in follow(session, session.rows_in(rows), once):
                 show(step)
                 show_page(step.state)
                 if step.replanned:
