@@ -1,5 +1,6 @@
 """Corners that a growing file gets image by image, as measurements."""
 
+import os
 import re
 from dataclasses import replace
 
@@ -10,7 +11,15 @@ from pisigma.errors import MeasurementError
 from pisigma.measurement.csv.table import Table
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.fields import LeftOut, MeasuredFields
+from pisigma.measurement.growing_file import GrowingFile
+from pisigma.planning.plan_settings import PlanSettings
 from pisigma.robot.description import Robot
+
+
+def growing_file(path: str | os.PathLike[str], robot: Robot, settings: PlanSettings) -> GrowingFile:
+    """Give the file that gets the rows of a plan, or the corners of images where a camera measures."""
+    camera = settings.camera
+    return GrowingFile(path, robot, None if camera is None else ImageReader(camera.files, robot))
 
 
 class ImageReader:

@@ -22,6 +22,8 @@ MOST_DRAWS = 40
 """So many times as many poses are drawn at most as candidates are wanted."""
 WINDOW, SELDOM = 0.25, 0.5
 """[rad] Width in which angles of a joint are counted, and the share of their mean number that is few."""
+LEAST_VIEWS = 100
+"""Of a board are drawn together, as a robot reaches few of them."""
 OUTSIDE_WORKSPACE = "the reflector is outside the box of the workspace"
 UNREACHED = "the robot does not reach a view of the board"
 
@@ -96,7 +98,7 @@ def draw_candidates(
     blocks: list[tuple[Tensor, Faults]] = []
     while len(blocks) < MOST_DRAWS and sum(int(faults.allowed.sum()) for _, faults in blocks) < count:
         if views is not None:
-            q = views.draw(arm, count, generator)
+            q = views.draw(arm, max(count, LEAST_VIEWS), generator)
         else:
             assert limits is not None
             draws = torch.rand(count, len(limits), generator=generator, dtype=torch.float64)

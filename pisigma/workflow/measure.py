@@ -18,8 +18,6 @@ from pisigma.identification.prediction import predicted_poses
 from pisigma.judging.progress import Progress
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.fields import LeftOut
-from pisigma.measurement.growing_file import GrowingFile
-from pisigma.measuring.growing_images import ImageReader
 from pisigma.measuring.reached import Reached, expected, reached, reached_with
 from pisigma.measuring.row_alarms import (
     NEAR_POSE,
@@ -132,11 +130,6 @@ class MeasuringSession:
             MeasurementError: its poses cannot be used.
         """
         return MeasuringSession(read_plan(path), settings)
-
-    def rows_in(self, path: str | os.PathLike[str]) -> GrowingFile:
-        """The file that gets the rows, or the corners of images where a camera measures."""
-        robot, camera = self.plan.arm.robot, self.plan.settings.camera
-        return GrowingFile(path, robot, None if camera is None else ImageReader(camera.files, robot))
 
     def add(self, rows: Measurements | None, left_out: Sequence[LeftOut] = ()) -> tuple[Alarm, ...]:
         """Judge rows that were measured since.

@@ -13,6 +13,7 @@ from testing.models import no_type_checker
 from pisigma.camera.board import Board
 from pisigma.camera.camera import Camera
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measuring.growing_images import growing_file
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.plan_file import StoredPlan
 from pisigma.planning.plan_settings import PlanSettings
@@ -60,7 +61,7 @@ def lines(plan: StoredPlan) -> list[str]:
 
 
 def test_an_image_counts_when_the_next_one_begins(plan: StoredPlan, lines: list[str], tmp_path: Path):
-    file = MeasuringSession(plan).rows_in(tmp_path / "corners.csv")
+    file = growing_file(tmp_path / "corners.csv", plan.arm.robot, plan.settings)
     assert "does not exist" in file.read().waiting
     (tmp_path / "corners.csv").write_text("\n".join(lines[: 1 + CORNERS]) + "\n")
     assert file.read().rows is None
@@ -83,7 +84,7 @@ def test_an_image_counts_when_the_next_one_begins(plan: StoredPlan, lines: list[
 def test_a_session_finds_swapped_joints_and_the_accuracy(plan: StoredPlan, lines: list[str], tmp_path: Path):
     session = MeasuringSession(plan, MeasureSettings(replan=False))
     (tmp_path / "corners.csv").write_text("\n".join(lines) + "\n")
-    growth = session.rows_in(tmp_path / "corners.csv").read(final=True)
+    growth = growing_file(tmp_path / "corners.csv", plan.arm.robot, plan.settings).read(final=True)
     with no_type_checker():
         session.add(growth.rows, growth.left_out)
         session.work_out()

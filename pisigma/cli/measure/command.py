@@ -12,6 +12,7 @@ from pisigma.cli.measure.session_page import PageOptions, View, ViewHost, ViewPo
 from pisigma.cli.output import print_json, print_line, print_lines
 
 if TYPE_CHECKING:
+    from pisigma.measuring.growing_images import growing_file
     from pisigma.workflow.follow import SessionStep
     from pisigma.workflow.measure import MeasuringSession
 
@@ -64,6 +65,7 @@ def measure(
 
     settings = MeasureSettings(limit_mm, least_gain_mm, every, replan)
     session = MeasuringSession.read(plan, settings)
+    growing = growing_file(rows, session.plan.arm.robot, session.plan.settings)
     rest = rest_file(plan, rows, rest)
     page = PageOptions(view_host, view_port, view_urdf) if view else None
     try:
@@ -71,7 +73,7 @@ def measure(
             shown_in_browser(session.plan.arm, limit_mm, page) as show_page,
             _printer(session, f"measure {plan}", as_json) as show,
         ):
-            for step in follow(session, session.rows_in(rows), once):
+            for step in follow(session, growing, once):
                 show(step)
                 show_page(step.state)
                 if step.replanned:
