@@ -1,5 +1,6 @@
 """The intrinsics of a camera from images of a board alone, without a robot."""
 
+import math
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
@@ -42,12 +43,17 @@ class IntrinsicCalibration:
         camera: with standard deviations.
         noise: standard deviation of u and v of a corner [px].
         tilts: angle between the board's normal and the camera's axis in every image [rad].
+        disagreement: by how many times their noise images disagree on the intrinsics (Birge 1932): 1 where the model
+            fits, more of a bowed board. Standard deviations are enlarged by it.
+        disagrees: whether that is more than chance (three standard deviations).
         covered: cells of the image, row by row, in which there was a corner in some image.
     """
 
     camera: Camera
     noise: float
     tilts: Float64[np.ndarray, " images"]
+    disagreement: float
+    disagrees: bool
     covered: Bool[np.ndarray, "cells cells"]
 
 
@@ -79,11 +85,16 @@ def calibrate_intrinsics(
         start = start.with_intrinsics(mean)
     free = np.flatnonzero(solved.sigma)
     sigma = np.zeros(len(mean))
-    sigma[free] = np.linalg.norm(np.linalg.inv(root[np.ix_(free, free)]), axis=1)
+    rest = solved.intrinsics.residual
+    freedom = rest.size - len(free)
+    disagreement = float(np.sqrt(np.square(rest).sum() / freedom))
+    sigma[free] = max(disagreement, 1.0) * np.linalg.norm(np.linalg.inv(root[np.ix_(free, free)]), axis=1)
     return IntrinsicCalibration(
         camera=replace(start, sigma=tuple(sigma.tolist())),
         noise=solved.noise,
         tilts=np.array([np.arccos(min(abs(pose.R[2, 2]), 1.0)) for pose in solved.poses]),
+        disagreement=disagreement,
+        disagrees=disagreement > 1 + 3 / math.sqrt(2 * freedom),
         covered=_covered(views, size),
     )
 

@@ -10,6 +10,7 @@ from pisigma.camera.camera import Camera
 from pisigma.camera.intrinsic_calibration import BoardView, calibrate_intrinsics, initial_camera
 from pisigma.errors import MeasurementError
 from pisigma.se3 import rotation_from_rpy
+from pisigma.simulation.camera.true_board import TrueBoard
 
 SIZE = (1920, 1200)
 TRUE = Camera("wrist", *SIZE, 1400.0, 1405.0, 980.0, 590.0, -0.3, 0.08, 1e-3, -5e-4)
@@ -17,14 +18,14 @@ NOISE = 0.2
 """[px]"""
 
 
-def views(count: int, tilt: float, seed: int = 0, noise: float = NOISE) -> list[BoardView]:
+def views(count: int, tilt: float, seed: int = 0, noise: float = NOISE, bow: float = 0.0) -> list[BoardView]:
     """The whole board from 0.3 to 0.5 m anywhere in the image, at most so oblique [rad]."""
     rng, chosen = np.random.default_rng(seed), list[BoardView]()
     while len(chosen) < count:
         rpy = np.append(rng.uniform(-np.pi, np.pi), rng.uniform(-tilt, tilt, 2))
         R = rotation_from_rpy(torch.from_numpy(rpy)).numpy()
         t = rng.uniform((-0.15, -0.1, 0.3), (0.15, 0.1, 0.5)) - R @ BOARD.corners.mean(0)
-        pixels = TRUE.project(BOARD.corners @ R.T + t)[0]
+        pixels = TRUE.project(TrueBoard(BOARD, bow=bow).corners @ R.T + t)[0]
         if (pixels > 0).all() and (pixels < SIZE).all():
             chosen.append(BoardView(BOARD.corners, pixels + noise * rng.standard_normal(pixels.shape)))
     return chosen
@@ -53,6 +54,14 @@ def test_exact_corners_give_the_camera_and_opencv_agrees_on_others() -> None:
     _, K, distortion, *_ = cv2.calibrateCamera(points, pixels, SIZE, None, None, flags=cv2.CALIB_FIX_K3)
     theirs = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *np.ravel(distortion)[:4]]
     assert_close((ours.intrinsics[:8] - theirs) / np.array(ours.sigma)[:8], np.zeros(8), atol=0.2)
+
+
+def test_a_bowed_board_makes_images_disagree() -> None:
+    flat, bowed = (calibrate_intrinsics(views(12, 0.6, bow=bow), "wrist", SIZE) for bow in (0.0, 1e-3))
+    assert not flat.disagrees
+    assert_close(flat.disagreement, 1.0, atol=0.2)
+    assert bowed.disagrees
+    assert bowed.disagreement > 1.5
 
 
 def test_a_focal_length_in_closed_form() -> None:

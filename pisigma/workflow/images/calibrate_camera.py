@@ -92,6 +92,12 @@ class CameraCalibration:
                 f"Most images look straight at the board (two thirds of them less than {np.rad2deg(OBLIQUE):.0f} deg "
                 "oblique), so that focal lengths hardly differ from distances; take images 20 to 40 deg oblique."
             )
+        if calibration.disagrees:
+            warnings.append(
+                f"Images disagree on the camera by {calibration.disagreement:.2f} times the noise of corners: the "
+                "board is not flat, or the lens needs --k3. Standard deviations are enlarged so much, which does not "
+                "cover what all images have in common; glue the board onto something flat."
+            )
         if len(calibration.tilts) < MANY_IMAGES:
             warnings.append(
                 f"{len(calibration.tilts)} images are few, so that one can lead astray; take {MANY_IMAGES} or more."
@@ -113,6 +119,7 @@ class CameraCalibration:
                 for name, value, sigma, unit in self.parameters
             ],
             "noise_px": calibration.noise,
+            "disagreement": calibration.disagreement,
             "covered": float(calibration.covered.mean()),
             "tilts_deg": np.rad2deg(calibration.tilts).tolist(),
             **self.detection.to_json(),
