@@ -71,9 +71,9 @@ def solve_board_pose(
     R, t = _by_homography(corners, camera.undistort(pixels))
     for _ in range(STEPS):
         residual, J, _ = linearised(camera, corners, pixels, sigma, R, t)
-        weight = _weights(residual, loss)
-        normal = np.einsum("nki,n,nkj->ij", J, weight, J)
-        step = np.linalg.solve(normal, np.einsum("nki,n,nk->i", J, weight, residual))
+        root = np.sqrt(_weights(residual, loss))[:, None]
+        A, b = (root[..., None] * J).reshape(-1, POSE), (root * residual).ravel()
+        step = np.linalg.solve(A.T @ A, A.T @ b)
         t, R = t + step[:3], rotation_from_vector(torch.from_numpy(step[3:])).numpy() @ R
         if np.abs(step).max() < SMALLEST_STEP:
             break
@@ -142,7 +142,7 @@ def homography(
             np.concatenate([zero, at, -image[:, 1:] * at], 1),
         ]
     )
-    H: np.ndarray = np.linalg.svd(A)[2][-1].reshape(3, 3)
+    H: np.ndarray = np.linalg.svd(A, full_matrices=False)[2][-1].reshape(3, 3)
     H *= np.sign(H[2, 2]) / np.array([size, size, 1.0])
     H[:, 2] -= H[:, :2] @ middle
     return H
