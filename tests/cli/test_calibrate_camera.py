@@ -44,9 +44,15 @@ def test_from_pixels_of_corners_to_a_model(calibrated):
     figures = printed["cross_validation"]
     assert (figures["rows"], figures["folds"]) == (50, 2)  # a row an image
     assert figures["geometric"]["rms_mm"] < 1.0 < 2.0 < figures["nominal"]["rms_mm"]  # of one image: 0.5 mm
-    assert any("rests on the board" in warning for warning in printed["warnings"])
+    for said in ("rests on the board", "last joint's row", "camera is what limits"):
+        assert any(said in warning for warning in printed["warnings"])
+    fx = next(one for one in printed["parameters"] if one["name"] == "camera_wrist_fx")
+    assert fx["unit"] == "px"
+    assert 0.1 < fx["standard_error"] < 0.4  # a usual calibration leaves 0.5 px
     assert 0.85 < figures["coverage"] <= 1.0
     model, q = load_model(folder), camera_cell(50, 2).images.q
+    assert model.uncertainty is not None
+    assert [group.name for group in model.uncertainty.space.unknowns] == ["camera", "board"]
     true, estimated = (
         forward_kinematics(robot, q)[:, :3, 3] for robot in (camera_cell(50, 1).true, model.calibrated)
     )
@@ -72,4 +78,11 @@ def test_camera_and_board_belong_together(run, files, tmp_path):
     result = run(*command, "--out", tmp_path / "arm")
     assert result.exit_code == 2
     assert "--camera and --board belong together" in " ".join(result.stderr.split())
+    assert not (tmp_path / "arm").exists()
+
+
+def test_intrinsics_are_one_of_three_choices(run, files, tmp_path):
+    result = run("calibrate", "ur5", *options(files), "--intrinsics", "loose", "--out", tmp_path / "arm")
+    assert result.exit_code == 2
+    assert "intrinsics 'loose' is no choice; Valid: fixed, free, prior." in " ".join(result.stderr.split())
     assert not (tmp_path / "arm").exists()
