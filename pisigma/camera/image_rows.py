@@ -11,7 +11,13 @@ from pisigma.camera.board import Board
 from pisigma.camera.board_pose import POSE, BoardPose, solve_board_pose
 from pisigma.camera.camera import Camera
 from pisigma.camera.flatness import SHAPES, bent_corners, bent_further
-from pisigma.camera.solved_images import IntrinsicsChoice, corner_noise, prior_deviations, solve_images
+from pisigma.camera.solved_images import (
+    IntrinsicsChoice,
+    SolvedImages,
+    corner_noise,
+    prior_deviations,
+    solve_images,
+)
 from pisigma.errors import IdentificationError, MeasurementError
 from pisigma.identification.problem.loss import AbstractLoss, HampelLoss
 from pisigma.measurement.dataset import Measurements
@@ -112,20 +118,8 @@ def image_measurements(
         return poses
 
     solved = solve_images(camera, prior_deviations(camera, intrinsics), solve, loss, images.source)
-    at_board = solved.noise / camera.fx * float(np.median([pose.t[2] for pose in solved.poses]))
     seen = [_seen_by_robot(pose, is_fixed) for pose in solved.poses]
-    own = np.diag([repeatability.length**2] * 3 + [repeatability.angle**2] * 3)
-    covariances = [
-        change @ pose.cofactor @ change.T for pose, (_, _, change) in zip(solved.poses, seen, strict=True)
-    ]
-    weights = tuple(weight_text(_inverse_root(solved.noise**2 * one + own)) for one in covariances)
     count, names = len(seen), (board.name, camera.name)
-    texts = {CAMERA_COLUMN: (camera.name,) * count}
-    if solved.sigma.any():
-        by = np.stack([change for _, _, change in seen]) @ solved.intrinsics.by
-        texts[INTRINSICS_COLUMN] = replace(solved.intrinsics, by=by).texts
-    if board.scale_deviation is not None:
-        texts[SCALE_COLUMN] = (f"{board.scale_deviation:.17g}",) * count
     frame, target = reversed(names) if is_fixed else names
     return Measurements(
         q=images.q,
@@ -133,11 +127,35 @@ def image_measurements(
         rotation=torch.from_numpy(np.stack([R for R, _, _ in seen])),
         frame=(frame,) * count,
         target=(target,) * count,
-        readings={NOISE_COLUMN: torch.full_like(images.q[:, 0], at_board), WEIGHT_COLUMN: weights, **texts},
+        readings=_readings(solved, [change for _, _, change in seen], board, repeatability),
         image=images.names,
         line=images.lines,
         source=images.source,
     )
+
+
+def _readings(
+    solved: SolvedImages, changes: Sequence[np.ndarray], board: Board, repeatability: Repeatability
+) -> dict[str, torch.Tensor | tuple[str, ...]]:
+    """Return the columns of `CornerSensor`, by how the pose of every row changes with that of its board."""
+    at_board = solved.noise / solved.camera.fx * float(np.median([pose.t[2] for pose in solved.poses]))
+    of_robot = np.diag([repeatability.length**2] * 3 + [repeatability.angle**2] * 3)
+    of_corners = [
+        solved.noise**2 * change @ pose.cofactor @ change.T
+        for pose, change in zip(solved.poses, changes, strict=True)
+    ]
+    count = len(changes)
+    readings: dict[str, torch.Tensor | tuple[str, ...]] = {
+        NOISE_COLUMN: torch.full((count,), at_board, dtype=torch.float64),
+        WEIGHT_COLUMN: tuple(weight_text(_inverse_root(one + of_robot)) for one in of_corners),
+        CAMERA_COLUMN: (solved.camera.name,) * count,
+    }
+    if solved.sigma.any():
+        by = np.stack(changes) @ solved.intrinsics.by
+        readings[INTRINSICS_COLUMN] = replace(solved.intrinsics, by=by).texts
+    if board.scale_deviation is not None:
+        readings[SCALE_COLUMN] = (f"{board.scale_deviation:.17g}",) * count
+    return readings
 
 
 def _board_poses(

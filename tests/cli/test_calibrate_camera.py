@@ -82,7 +82,8 @@ def test_camera_and_board_belong_together(run, files, tmp_path):
 
 
 def test_intrinsics_are_one_of_three_choices(run, files, tmp_path):
-    result = run("calibrate", "ur5", *options(files), "--intrinsics", "loose", "--out", tmp_path / "arm")
+    command = ("calibrate", "ur5", files / "corners.csv", *cameras(files), "--intrinsics", "loose")
+    result = run(*command, "--out", tmp_path / "arm")
     assert result.exit_code == 2
     assert "intrinsics 'loose' is no choice; Valid: fixed, free, prior." in " ".join(result.stderr.split())
     assert not (tmp_path / "arm").exists()
