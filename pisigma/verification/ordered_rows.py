@@ -53,8 +53,13 @@ class OrderedRows:
         solved = geometric.solved
         data, view, rows = solved.measurements, view_of(solved.refined), solved.setup.rows.cpu()
         errors = None if learned is None else result.errors_of(data)
-        some = chosen_rows(len(rows), MOST_ROWS)
-        some = some[np.lexsort((rows[some].numpy(), np.array(data.line)[rows[some]]))]
+        present = [sensor.present for sensor in solved.problem.sensors if sensor.name in SENSORS]
+        if not present:
+            return None
+        measured = torch.stack(present).any(0).nonzero()[:, 0].cpu()
+        some = measured[chosen_rows(len(measured), MOST_ROWS)]
+        line = np.zeros(data.rows) if data.origin else np.array(data.line)  # files stand one behind the other
+        some = some[np.lexsort((rows[some].numpy(), line[rows[some]]))]
         problem = replace(solved.problem, pairs=0).select(some)
         whole, every = slice(0, len(some)), torch.arange(len(problem.space.parameters))
         motion = problem.motion(solved.refined.point, whole, every)

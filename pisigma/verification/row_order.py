@@ -272,7 +272,7 @@ class _Search:
         """How many values say as much as one that is independent, by what a candidate leaves."""
         left = fit.after * np.sqrt(fit.weights)
         own = left[fit.candidate.index]
-        total = max(float((own**2).sum()), 1e-300)
+        total = max(float((own**2).sum()), 1e-150)
         together: float = own.shape[1] * float(np.square(own.T @ own).sum()) / total**2
         alike = 1.0
         for lag in range(1, len(own) // 2, 2):
