@@ -1,8 +1,8 @@
 """Calibrations of few poses that begin with what a fleet has in common, beside those without, and odd robots.
 
-Run `OMP_NUM_THREADS=1 python benchmarks/fleet_prior.py [--robots 50] [--odd 5] [--judged 10]`. Robots share errors of
-1 mm and 1 mrad and have individual ones; 60 poses of each make the prior. All figures are root mean squares of position
-errors of 400 other poses without noise [mm].
+Run `OMP_NUM_THREADS=1 python benchmarks/fleet_prior.py [--fleets 7] [--robots 50] [--odd 5] [--judged 10]`. Robots
+share errors of 1 mm and 1 mrad and have individual ones; 60 poses of each make the prior. All figures are root mean
+squares of position errors of 400 other poses without noise [mm].
 """
 
 import argparse
@@ -71,11 +71,11 @@ def alone(rows: Measurements) -> Any:
     return calibrate(DRAWN, rows, CalibrationSettings(folds=0)).result
 
 
-def fleet_table(robots: int, odd: int, judged: int) -> FleetPrior:
+def fleet_table(fleets: int, robots: int, odd: int, judged: int) -> FleetPrior:
     """Print a line for every fleet: estimated priors beside the true distribution; return the usual one's prior."""
     print("errors  gears | 10 poses: true  estimated  without | 30 poses: true  estimated  without")
     priors = []
-    for individual, gears in FLEETS:
+    for individual, gears in FLEETS[:fleets]:
         drawn = partial(rows_of, individual=individual, individual_gears=gears)
         prior = fleet_prior("fleet", DRAWN, [drawn(k, 60, k, odd=k >= robots - odd) for k in range(robots)])
         exact, figures = true_prior(individual, gears), []
@@ -109,12 +109,13 @@ def gated(prior: FleetPrior, number: int, odd: bool) -> list[float]:
 def main() -> None:
     """Print the table of fleets, and what is kept for robots like the usual fleet and for odd ones."""
     parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--fleets", type=int, default=len(FLEETS), help="so many lines of the table")
     parser.add_argument("--robots", type=int, default=50)
     parser.add_argument("--odd", type=int, default=5)
     parser.add_argument("--judged", type=int, default=10)
     wanted = parser.parse_args()
     torch.set_num_threads(1)
-    prior = fleet_table(wanted.robots, wanted.odd, wanted.judged)
+    prior = fleet_table(wanted.fleets, wanted.robots, wanted.odd, wanted.judged)
     print(
         f"usual fleet, odd robots {[*range(wanted.robots - wanted.odd, wanted.robots)]}: named {[*prior.odd]}"
     )

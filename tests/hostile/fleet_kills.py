@@ -111,10 +111,16 @@ def _refused(process: subprocess.Popen[str], faults: list[str]) -> dict[str, str
     return {one["robot"]: one["reason"] for one in report["refused"]}
 
 
-def _kill_a_worker(process: subprocess.Popen[str], folder: Path) -> None:
-    """Kill one of the processes that work on robots, once one of them is done."""
-    while process.poll() is None and not list((folder / "worker" / "records").glob("*.json")):
+def _wait_for_records(process: subprocess.Popen[str], out: Path, more: int) -> None:
+    """Wait until so many more robots are done, or all."""
+    folder = out / "records"
+    wanted = len(list(folder.glob("*.json"))) + more
+    while process.poll() is None and len(list(folder.glob("*.json"))) < wanted:
         time.sleep(0.01)
+
+
+def _kill_a_worker(process: subprocess.Popen[str]) -> None:
+    """Kill one of the processes that work on robots."""
     children = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text(encoding="utf-8").split()
     for child in children:
         if "spawn_main" in Path(f"/proc/{child}/cmdline").read_text(encoding="utf-8"):
@@ -147,12 +153,16 @@ def main() -> None:
         faults += faults_of(refused)
         for _ in range(wanted.count):
             process = _start(folder, "killed")
-            time.sleep(float(rng.uniform(0.1, 0.5)) * seconds)
+            _wait_for_records(
+                process, folder / "killed", int(rng.integers(2 * wanted.robots // wanted.count))
+            )
+            time.sleep(float(rng.uniform(0.0, 0.5)))
             process.kill()
             process.communicate()
             killed += process.returncode < 0
         process = _start(folder, "worker")
-        _kill_a_worker(process, folder)
+        _wait_for_records(process, folder / "worker", 1)
+        _kill_a_worker(process)
         _refused(process, faults)
         without_space = _refused(_start(folder, "full", full=True), faults)
         for out in ("killed", "full"):
