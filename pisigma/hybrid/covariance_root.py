@@ -95,8 +95,11 @@ class CovarianceRoot:
             scale: the factor.
             change: parameters in the other coordinates by the first unknowns.
         """
-        directions = torch.cat([self.directions, added], 1).mul_(scale).cpu()
-        active = change.shape[1]
-        directions = torch.cat([change @ directions[:active], directions[active:]])
+        (parameters, active), (unknowns, columns) = change.shape, self.directions.shape
+        directions = change.new_empty((parameters + unknowns - active, columns + added.shape[1]))
+        for block, place in ((self.directions, slice(columns)), (added, slice(columns, None))):
+            directions[:parameters, place] = change @ block[:active].cpu()
+            directions[parameters:, place] = block[active:]
+        directions.mul_(scale)
         few = self.weights
         return CovarianceRoot(directions, None if few is None else replace(few, size=few.size * scale))

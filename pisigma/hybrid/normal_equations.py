@@ -60,8 +60,7 @@ class NormalEquations(AbstractRegression):
         columns = self.design.indices(design.features)
         normal = self.normal.new_empty((len(self.normal), len(columns), len(columns)))
         for whole, part in zip(self.normal, normal, strict=True):
-            for rows in chunks(len(columns)):  # no second matrix beside the large ones
-                torch.index_select(whole[columns[rows]], 1, columns, out=part[rows])
+            _copy_chosen(whole, columns, part)
         return replace(self, design=design, normal=normal, descent=self.descent[:, columns])
 
     def without(self, groups: Int64[Tensor, " groups"]) -> "NormalEquations":
@@ -86,10 +85,12 @@ class NormalEquations(AbstractRegression):
             for k, (sensor, sigma) in enumerate(zip(test, posterior.noise, strict=True)):
                 root = sensor.root[:, None] / sigma
                 columns = self.design.columns(sensor, slice(None))
-                X.append((columns * root[..., None]).flatten(0, 1))
                 r.append(((sensor.residual - columns @ x) * root).flatten())
+                X.append(columns.mul_(root[..., None]).flatten(0, 1))
                 number.append(torch.full(r[-1].shape, k, device=x.device))
-            S = torch.linalg.solve_triangular(factor, (torch.cat(X) * scale).t(), upper=False)
+            whitened = torch.cat(X).mul_(scale)
+            del X, columns
+            S = torch.linalg.solve_triangular(factor, whitened.t(), upper=False)
             M = -S.t() @ S
             M.diagonal().add_(1.0)
             parts.append(LeftOut.of(M, torch.cat(r), torch.cat(number), self.sensors))
@@ -262,10 +263,19 @@ def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> flo
                     own = slice(active + j * count, active + (j + 1) * count)
                     normal[own, active + j * count :] += blocks.transpose(0, 1).reshape(count, -1)
     order = torch.cat([torch.arange(active), active + _places(design, dof, count)])
-    normal.triu_().add_(normal.triu(1).t())
-    N.copy_(normal[order[:, None], order])
+    for rows in chunks(size):
+        corner = normal[rows, rows]
+        corner.copy_(corner.triu() + corner.triu(1).t())
+        normal[rows.stop :, rows] = normal[rows, rows.stop :].t()
+    _copy_chosen(normal, order, N)
     b.copy_(descent[order])
     return square
+
+
+def _copy_chosen(matrix: Tensor, chosen: Int64[Tensor, " chosen"], to: Tensor) -> None:
+    """Copy some rows and columns of a matrix, without another one beside the two."""
+    for rows in chunks(len(chosen)):
+        torch.index_select(matrix[chosen[rows]], 1, chosen, out=to[rows])
 
 
 def _feature_columns(design: Design, row: Tensor) -> Float64[Tensor, "dof rows columns"]:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from pisigma.hybrid.design import FOLDS, Design, Rows
 from pisigma.hybrid.evidence import Posterior
+from pisigma.hybrid.free_memory import return_free_memory
 from pisigma.hybrid.regression import regression
 from pisigma.joint_correction.feature import AbstractFeature
 
@@ -39,6 +40,8 @@ FEW_TOGETHER = 60
 FIRST_MODEL_SIZES = 3
 """A model with all features has one that comes in several sizes in the last of so many."""
 FOLDS_OF_FEW = 20
+MANY_UNKNOWNS = 1_000
+"""Matrices of more are large enough to make room for."""
 FAILURES = 3
 """Sizes that do not help before no larger ones are tried."""
 
@@ -149,6 +152,8 @@ class Search:
             noise, prior = near.posterior.noise, design.prior_like(near.design, near.posterior.prior)
         if sizes is not None:
             prior = replace(prior, sizes=torch.cat([prior.sizes[: -len(sizes)], sizes]))
+        if design.unknowns > MANY_UNKNOWNS:
+            return_free_memory()
         chosen = self._regression.select(design)
         posterior = chosen.maximise_evidence(prior, noise, tolerance=ROUGHLY)
         errors = chosen.left_out(posterior, self._folds)
