@@ -17,15 +17,15 @@ BOARD = Board("board", 4, 4, 0.03)
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with eight images, the last one empty, and a board."""
+    """A folder with six images, the last one empty, and a board."""
     folder = tmp_path_factory.mktemp("images")
     (folder / "images").mkdir()
-    for number in range(7):
-        roll, about_x, about_y = 0.9 * number, 0.5 * np.cos(number), 0.5 * np.sin(number)
+    for number in range(5):
+        roll, about_x, about_y = 0.9 * number, 0.5 * np.cos(1.3 * number), 0.5 * np.sin(1.3 * number)
         R, t = view(BOARD, 0.3, (roll, about_x, about_y))
         t[:2] += 0.05 * np.cos(2 * number), 0.03 * np.sin(2 * number)
         cv2.imwrite(str(folder / "images" / f"{number:02d}.png"), draw_board(BOARD, R, t))
-    cv2.imwrite(str(folder / "images" / "07.png"), np.full((CAMERA.height, CAMERA.width), 90, np.uint8))
+    cv2.imwrite(str(folder / "images" / "05.png"), np.full((CAMERA.height, CAMERA.width), 90, np.uint8))
     (folder / "board.yaml").write_text("rows: 4\ncolumns: 4\nsquare_mm: 30\n")
     return folder
 
@@ -44,16 +44,17 @@ def test_a_camera_and_a_page_are_written(run, files, tmp_path):
     assert [one["name"] for one in printed["intrinsics"]][:2] == ["fx", "fy"]
     assert printed["rms_px"] < 0.05
     assert any("upper left" in warning for warning in printed["warnings"])
-    assert any("7 images are few" in warning for warning in printed["warnings"])
+    assert any("5 images are few" in warning for warning in printed["warnings"])
     text = page.read_text()
-    assert text.count("<figure>") == 8
+    assert text.count("<figure>") == 6
     assert "Left out: no board of 4 x 4 corners is found in it." in text
     assert "http" not in text.replace("http://www.w3.org", "")
 
 
 def test_people_read_a_table(run, files, tmp_path):
     out = tmp_path / "camera.yaml"
-    result = run("camera", files / "images", "--board", files / "board.yaml", "--out", out)
+    four = sorted((files / "images").iterdir())[:4]
+    result = run("camera", *four, "--board", files / "board.yaml", "--out", out)
     assert "standard deviation" in result.stdout
     assert "Warning: No corner of the board lies in the" in result.stdout
     assert f"{out}iswritten." in "".join(result.stdout.split())
