@@ -269,11 +269,11 @@ def _complaint(problem: ValidationError, node: yaml.Node, document: type[BaseMod
     if first["type"] == "missing":
         return f"{where}: the key '{path[-1]}' is missing in '{key}'; add it.{more}"
     if first["type"] == "union_tag_not_found":
-        tag = str(context["discriminator"]).strip("'")
+        tag = str(context["discriminator"]).strip("'()")
         choices = ", ".join(allowed_texts(document, (*path, tag)))
         return f"{where}: the key '{tag}' is missing in '{key}'; add it. Valid: {choices}.{more}"
     if first["type"] == "union_tag_invalid":
-        path = (*path, str(context["discriminator"]).strip("'"))
+        path = (*path, str(context["discriminator"]).strip("'()"))
         line, keys = _locate(node, path)
         return _wrong_choice(source, line, keys, str(context["tag"]), allowed_texts(document, path)) + more
     if first["type"] == "literal_error" and (texts := allowed_texts(document, path)):

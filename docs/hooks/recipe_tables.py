@@ -79,9 +79,10 @@ def _name(section: type[BaseModel]) -> str:
     """How a section is called on the page: by its `kind` or `method`, else by its class."""
     for key in ("kind", "method"):
         if key in section.model_fields:
-            (value,) = typing.get_args(section.model_fields[key].annotation)
-            return f"{key}: {value}"
-    words = re.sub(r"(Section|Figures)$", "", section.__name__)
+            values = typing.get_args(section.model_fields[key].annotation)
+            if len(values) == 1:
+                return f"{key}: {values[0]}"
+    words = re.sub(r"(Section|Figures|Document)$", "", section.__name__)
     return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", words).lower()
 
 

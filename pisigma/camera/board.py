@@ -29,7 +29,22 @@ _LENGTHS: dict[BoardKind, tuple[str, ...]] = {
 
 
 class BoardDocument(Section):
-    """A board as its file states it; see `Board`."""
+    """A board as its file states it.
+
+    Attributes:
+        kind: of the board.
+        name: of the board.
+        rows: of corners inside, or of AprilTags.
+        columns: of corners inside, or of AprilTags.
+        square_mm: side of a square [mm], of a checkerboard or a ChArUco board.
+        square_sigma_mm: its standard deviation, common to all squares [mm].
+        flatness_mm: tolerance of the flatness [mm].
+        marker_mm: side of the markers of a ChArUco board [mm].
+        dictionary: of these markers.
+        tag_mm: side of an AprilTag [mm].
+        spacing_mm: between neighbouring AprilTags [mm].
+        family: of these tags.
+    """
 
     kind: BoardKind = "checkerboard"
     name: str = "board"
@@ -55,6 +70,16 @@ class BoardDocument(Section):
         if self.kind == "charuco" and (self.marker_mm or 0.0) >= (self.square_mm or 0.0):
             raise ValueError("marker_mm is less than square_mm, as a marker lies in a square")
         return self
+
+    def board(self) -> "Board":
+        """The board that it states."""
+        marker = self.marker_mm or self.tag_mm or 0.0
+        pitch = self.square_mm or marker + (self.spacing_mm or 0.0)
+        names = {"checkerboard": "", "charuco": self.dictionary, "apriltag": self.family}
+        lengths = pitch / 1e3, self.kind, marker / 1e3
+        scale = None if self.square_sigma_mm is None else self.square_sigma_mm / pitch
+        errors = scale, self.flatness_mm / 1e3
+        return Board(self.name, self.rows, self.columns, *lengths, names[self.kind], *errors)
 
 
 @dataclass(frozen=True)
@@ -97,14 +122,7 @@ class Board:
         Raises:
             MeasurementError: the file cannot be read or describes no board; the message names file, line and key.
         """
-        board = read_yaml(path, BoardDocument, MeasurementError)
-        marker = board.marker_mm or board.tag_mm or 0.0
-        pitch = board.square_mm or marker + (board.spacing_mm or 0.0)
-        names = {"checkerboard": "", "charuco": board.dictionary, "apriltag": board.family}
-        lengths = pitch / 1e3, board.kind, marker / 1e3
-        scale = None if board.square_sigma_mm is None else board.square_sigma_mm / pitch
-        errors = scale, board.flatness_mm / 1e3
-        return Board(board.name, board.rows, board.columns, *lengths, names[board.kind], *errors)
+        return read_yaml(path, BoardDocument, MeasurementError).board()
 
     @property
     def corners(self) -> Float64[np.ndarray, "corners 3"]:

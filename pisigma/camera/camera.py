@@ -27,7 +27,19 @@ UNDISTORT_STEPS = 20
 
 
 class DeviationsSection(Section):
-    """Standard deviations of a camera's intrinsics; those that are not stated are 0."""
+    """Standard deviations of a camera's intrinsics; those that are not stated are 0.
+
+    Attributes:
+        fx: of the focal length along u [px].
+        fy: of the focal length along v [px].
+        cx: of the principal point, u [px].
+        cy: of the principal point, v [px].
+        k1: of the radial distortion, as k2 and k3.
+        k2: see k1.
+        p1: of the tangential distortion, as p2.
+        p2: see p1.
+        k3: see k1.
+    """
 
     fx: Deviation = 0.0
     fy: Deviation = 0.0
@@ -41,7 +53,24 @@ class DeviationsSection(Section):
 
 
 class CameraDocument(Section):
-    """A camera as pisigma's own files state it; see `Camera`."""
+    """A camera as pisigma's own files state it, with OpenCV's distortion.
+
+    Attributes:
+        name: of the camera.
+        width: of its images [px].
+        height: of its images [px].
+        fx: focal length along u [px].
+        fy: focal length along v [px].
+        cx: principal point, u [px].
+        cy: principal point, v [px].
+        k1: radial distortion, as k2 and k3.
+        k2: see k1.
+        p1: tangential distortion, as p2.
+        p2: see p1.
+        k3: see k1.
+        sigma: standard deviations of all of these.
+        is_fixed: whether it stands beside the robot and the board is on the flange; else the other way round.
+    """
 
     name: str = "camera"
     width: int = Field(gt=0)
@@ -57,6 +86,11 @@ class CameraDocument(Section):
     k3: float = 0.0
     sigma: DeviationsSection | None = None
     is_fixed: bool = False
+
+    def camera(self) -> "Camera":
+        """The camera that it states."""
+        sigma = None if self.sigma is None else tuple(self.sigma.model_dump().values())
+        return Camera(**self.model_dump(exclude={"sigma"}), sigma=sigma)
 
 
 class MatrixSection(BaseModel):
@@ -126,9 +160,7 @@ class Camera:
         source = os.fspath(path)
         text = read_text(path, MeasurementError, "YAML", MOST_BYTES)
         if not re.search(r"^\s*camera_matrix\s*:", text, re.MULTILINE):
-            own = parse_yaml(text, CameraDocument, MeasurementError, source)
-            sigma = None if own.sigma is None else tuple(own.sigma.model_dump().values())
-            return Camera(**own.model_dump(exclude={"sigma"}), sigma=sigma)
+            return parse_yaml(text, CameraDocument, MeasurementError, source).camera()
         # OpenCV writes a directive and a tag that YAML does not know; commented out, they keep the lines' numbers
         plain = re.sub(r"^%YAML.*$|^---\s*$", "#", text, flags=re.MULTILINE).replace("!!opencv-matrix", "")
         document = parse_yaml(plain, MatrixDocument, MeasurementError, source)

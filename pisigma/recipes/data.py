@@ -11,7 +11,7 @@ from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.splits import TrainTest, k_folds
 from pisigma.recipes.recipe import GeometricRecipe, HybridRecipe, MeasuredData, Recipe, SimulatedData
 from pisigma.robot.description import Robot
-from pisigma.simulation.measure import SimulatedMeasurements
+from pisigma.simulation.measure import SimulatedPoses
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.yaml_file import Section
 
@@ -125,7 +125,7 @@ def repeated(data: SimulatedData, repeat: int) -> SimulatedData:
     )
 
 
-def _measured_anew(section: SimulatedMeasurements, repeat: int) -> SimulatedMeasurements:
+def _measured_anew(section: SimulatedPoses, repeat: int) -> SimulatedPoses:
     noise = None if section.noise is None else _reseeded(section.noise, repeat)
     return section.model_copy(update={"poses": _reseeded(section.poses, repeat), "noise": noise})
 

@@ -16,7 +16,8 @@ from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.network.inputs import Inputs
 from pisigma.recipes.recipe import GeometricRecipe, HybridRecipe, InverseRecipe, Recipe, SimulatedData
 from pisigma.robot.description import Robot
-from pisigma.simulation.measure import SimulatedMeasurements
+from pisigma.simulation.camera.simulated_images import SimulatedImages
+from pisigma.simulation.measure import SimulatedPoses
 from pisigma.simulation.poses import JointsRandom
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.training.sections import GradientDescentSection
@@ -84,7 +85,7 @@ def _geometric_checks(recipe: GeometricRecipe, robot: Robot) -> Iterator[Check]:
     yield from _where_checks(("held_out",), recipe.held_out, robot)
     yield ("held_out", "frame"), partial(_check_frames, recipe.measurements.frame, recipe.held_out.frame)
     calibrator = recipe.calibration.calibrator(robot)
-    space = ParameterSpace(robot, (recipe.measurements.frame,), ("",))
+    space = ParameterSpace(robot, (recipe.measurements.frame,), (recipe.measurements.target,))
     yield ("calibration", "free"), partial(calibrator.candidates, space)
 
 
@@ -112,9 +113,11 @@ def _network_checks(recipe: InverseRecipe, robot: Robot) -> Iterator[Check]:
     yield from _simulation_checks(recipe, robot)
 
 
-def _where_checks(keys: Key, section: SimulatedMeasurements, robot: Robot) -> Iterator[Check]:
+def _where_checks(keys: Key, section: SimulatedPoses, robot: Robot) -> Iterator[Check]:
     """What to try with a section that says where to measure."""
-    if isinstance(section.poses, JointsRandom):
+    if isinstance(section, SimulatedImages):
+        yield (*keys, "poses"), partial(section.poses.check, robot)
+    elif isinstance(section.poses, JointsRandom):
         yield (*keys, "poses"), partial(section.poses.joints, robot)
     elif section.branch is not None:
         none = torch.zeros(0, 4, 4, dtype=torch.float64)  # no poses: only the names are looked at

@@ -11,7 +11,7 @@ from pisigma.identification.problem.loss import HampelLoss, SquaredLoss
 from pisigma.identification.problem.parameters import Prior
 from pisigma.judging.training_summary import BeforeAfter
 from pisigma.robot.description import Robot
-from pisigma.simulation.measure import SimulatedMeasurements
+from pisigma.simulation.measure import SimulatedMeasurements, SimulatedPoses
 from pisigma.simulation.true_robot import ErrorSource
 from pisigma.training.sections import FitSection, NetworkSection
 from pisigma.yaml_file import Section, Seed
@@ -45,7 +45,7 @@ class SimulatedData(Section):
 
     kind: Literal["simulated"]
     errors: tuple[ErrorSource, ...]
-    training: SimulatedMeasurements
+    training: SimulatedPoses
     held_out: SimulatedMeasurements
 
 
@@ -169,7 +169,7 @@ class GeometricRecipe(AbstractRecipe):
 
     kind: Literal["geometric_calibration"]
     errors: tuple[ErrorSource, ...]
-    measurements: SimulatedMeasurements
+    measurements: SimulatedPoses
     held_out: SimulatedMeasurements
     calibration: CalibrationSection = CalibrationSection()
     paper: dict[str, float | int | str | list[str] | list[list[str]]] = Field(default_factory=dict)

@@ -5,10 +5,11 @@ from typing import Annotated, Literal
 
 import torch
 from jaxtyping import Float64
-from pydantic import Field
+from pydantic import Discriminator, Field, Tag
 from torch import Tensor
 
 from pisigma.measurement.dataset import Measurements, join
+from pisigma.simulation.camera.simulated_images import SimulatedImages
 from pisigma.simulation.commanded import AbstractCommanded
 from pisigma.simulation.distances import SimulatedDistances, SimulatedPairs, SimulatedSockets
 from pisigma.simulation.noise import MeasurementNoise
@@ -25,17 +26,20 @@ class SimulatedMeasurements(AbstractCommanded):
         sensor: "pose" (position and orientation) or "position".
         noise: of the sensor; left out, it measures exactly.
         frame: name of the tracker's frame, which is the robot's base frame.
+        target: name of what is measured on the robot.
     """
 
     kind: Literal["tracker"] = "tracker"
     sensor: Literal["pose", "position"] = "pose"
     noise: MeasurementNoise | None = None
     frame: str = ""
+    target: str = ""
 
     def measure(self, robot: TrueRobot) -> Measurements:
         """Simulate the measurements, the same at every call. See `simulate`."""
         measured = simulate(robot, self.commanded(robot), self.sensor, self.noise)
-        return replace(measured, frame=(self.frame,) * measured.rows)
+        rows = measured.rows
+        return replace(measured, frame=(self.frame,) * rows, target=(self.target,) * rows)
 
 
 def simulate(
@@ -77,6 +81,17 @@ def simulate(
 def _sigma(q: Float64[Tensor, "rows dof"], sigma: float) -> Float64[Tensor, " rows"] | None:
     return torch.full((len(q),), sigma, dtype=q.dtype, device=q.device) if sigma else None
 
+
+def kind(section: object) -> object:
+    """Tell a section by its kind, which a tracker need not state."""
+    return section.get("kind", "tracker") if isinstance(section, dict) else getattr(section, "kind", None)
+
+
+SimulatedPoses = Annotated[
+    Annotated[SimulatedMeasurements, Tag("tracker")] | Annotated[SimulatedImages, Tag("images")],
+    Discriminator(kind),
+]
+"""What measures poses: a tracker, unless the kind images is stated."""
 
 SimulatedSensor = Annotated[
     SimulatedMeasurements | SimulatedTouches | SimulatedSockets | SimulatedDistances | SimulatedPairs,

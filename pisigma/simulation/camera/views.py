@@ -9,7 +9,7 @@ from torch import Tensor
 from pisigma.camera.board import Board
 from pisigma.camera.camera import Camera
 from pisigma.errors import RecipeError
-from pisigma.kinematics.closed_form.registry import closed_form_solver
+from pisigma.kinematics.closed_form import AbstractClosedForm, closed_form_solver
 from pisigma.kinematics.status import Status
 from pisigma.robot.description import Robot
 from pisigma.se3 import invert, rotation_from_rpy, transform
@@ -53,9 +53,7 @@ class BoardViews(Section):
         Raises:
             RecipeError: the robot has no closed form, or does not reach so many views.
         """
-        solver, rng = closed_form_solver(robot), np.random.default_rng(self.seed)
-        if solver is None:
-            raise RecipeError(f"views of a board: robot '{robot.name}' has no closed form of its branches.")
+        solver, rng = self.check(robot), np.random.default_rng(self.seed)
         chosen, wanted = list[Tensor](), CANDIDATES * self.count
         for _ in range(ATTEMPTS * wanted):
             T_board_camera = self._view(board, rng)
@@ -72,6 +70,20 @@ class BoardViews(Section):
             f"views of a board: robot '{robot.name}' reaches {len(chosen)} of {ATTEMPTS * wanted} drawn views, but "
             f"{wanted} were wanted; check where board and camera are, and the distances."
         )
+
+    def check(self, robot: Robot) -> AbstractClosedForm:
+        """Return the closed form by which views are reached.
+
+        Raises:
+            RecipeError: the robot has none.
+        """
+        solver = closed_form_solver(robot)
+        if solver is None:
+            raise RecipeError(
+                f"views of a board are for robots with a closed form, which robot '{robot.name}' does not have; "
+                "simulate a tracker with joints_random instead."
+            )
+        return solver
 
     def _view(self, board: Board, rng: np.random.Generator) -> Float64[Tensor, "4 4"]:
         """Draw T_board_camera: a direction, a tilt, a roll about the camera's axis, and a distance."""
