@@ -1,4 +1,4 @@
-"""Recipes that stand beside no paper: mini-batches, measured robots, and the hybrid."""
+"""Recipes that stand beside no paper: mini-batches, a camera, measured robots, and the hybrid."""
 
 from markdown_text import command_block, picture
 from pisigma.judging.training_summary import JointFigures
@@ -14,7 +14,7 @@ HYBRIDS = {
     "ur10_hybrid": "UR10, measured, hybrid",
     "ur5_hybrid": "UR5, measured, hybrid",
 }
-OTHERS = ("kiro3_mini_batches", "ur10_inverse", *HYBRIDS)
+OTHERS = ("kiro3_mini_batches", "ur5_camera", "ur10_inverse", *HYBRIDS)
 """Recipes of this part."""
 
 
@@ -23,12 +23,18 @@ def measured_sections(published: Published, results: StoredResults) -> list[str]
     found = results["ur10_inverse"]
     rows, figures = found["rows"], found["cross_validation"]
     joints = [JointFigures.model_validate(joint) for joint in results["kiro3_mini_batches"]["joints"]]
+    camera = ErrorFigures.model_validate(results["ur5_camera"]["held_out"]["geometric"])
     text = [
         "### KIRO-3 at 4000 poses, mini-batches",
         command_block("kiro3_mini_batches"),
         "Absolute joint errors at the training poses and at 2000 new ones:",
         joint_table(joints),
         published.notes["kiro3_mini_batches"],
+        "### UR5 with a camera on its flange",
+        command_block("ur5_camera"),
+        "Errors of the camera's pose in the frame of the board, in 2000 other postures of the whole joint space:",
+        pose_table({"geometric": camera}),
+        published.notes["ur5_camera"],
         "### UR10, measured, inverse calibration",
         command_block("ur10_inverse"),
         f"Errors of held-out rows, {figures['folds']}-fold cross-validated; {rows['left_out']} of "

@@ -69,7 +69,9 @@ def extra_figures(folder: Path, name: str, training: Training) -> dict[str, Any]
     if isinstance(training, InverseTraining):
         return report_course(training.run) if training.recipe.paper else {}
     recipe = read_recipe(folder / f"{name}.yaml")
-    if not isinstance(recipe, GeometricRecipe) or not isinstance(training.result, CalibrationResult):
+    if not (isinstance(recipe, GeometricRecipe) and isinstance(training.result, CalibrationResult)):
+        return {}
+    if not recipe.paper:
         return {}
     cases = read_published(folder).redundant_sums[name.split("_")[0]].cases
     (_, held_out), *_ = simulate(recipe).simulations
