@@ -153,9 +153,10 @@ def main() -> None:
         faults += faults_of(refused)
         for _ in range(wanted.count):
             process = _start(folder, "killed")
-            _wait_for_records(
-                process, folder / "killed", int(rng.integers(2 * wanted.robots // wanted.count))
-            )
+            more = int(
+                rng.integers(wanted.robots // wanted.count + 1)
+            )  # all are not done before the last kill
+            _wait_for_records(process, folder / "killed", more)
             time.sleep(float(rng.uniform(0.0, 0.5)))
             process.kill()
             process.communicate()
