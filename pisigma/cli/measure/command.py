@@ -12,7 +12,6 @@ from pisigma.cli.measure.session_page import PageOptions, View, ViewHost, ViewPo
 from pisigma.cli.output import print_json, print_line, print_lines
 
 if TYPE_CHECKING:
-    from pisigma.measuring.growing_images import growing_file
     from pisigma.workflow.follow import SessionStep
     from pisigma.workflow.measure import MeasuringSession
 
@@ -60,6 +59,7 @@ def measure(
     planned again, it is written beside them. With --json, sentences go to stderr, and one JSON object to stdout at the
     end.
     """
+    from pisigma.measuring.growing_images import growing_file
     from pisigma.workflow.follow import follow, rest_file
     from pisigma.workflow.measure import MeasureSettings, MeasuringSession
 
