@@ -160,6 +160,7 @@ def _print(planned: "Plan", files: list[Path]) -> None:
             planned.candidates.sentence,
             f"{planned.poses} poses and {planned.checks} to check with take about {planned.travel / 60:.0f} min at "
             f"{settings.speed_deg_s:g} deg/s and {settings.settling_s:g} s a pose, with {points} way points.",
+            *(() if planned.camera is None else planned.camera.sentences),
             *(f"Warning: {sentence}" for sentence in planned.warnings),
             f"Written to {', '.join(map(str, files))}.",
         ]

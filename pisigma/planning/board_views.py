@@ -76,6 +76,8 @@ class BoardViews:
             return solve_numeric(arm.robot, T, start, max_iterations=STEPS).q
         branches = solver.solve(T).q
         rank = torch.rand(branches.shape[:2], generator=generator, dtype=T.dtype)
+        values, (lower, upper) = arm.robot.to_controller(branches), arm.limits.t()
+        rank += ((values >= lower) & (values <= upper)).all(-1)  # those inside the limits first
         rank = torch.where(branches.isfinite().all(-1), rank, -1.0)
         chosen: Tensor = branches[torch.arange(count), rank.argmax(1)]
         return chosen

@@ -17,6 +17,7 @@ from pisigma.files.output_file import check_output, write_whole
 from pisigma.judging.progress import Progress
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_source import HoldsModel
+from pisigma.planning.camera_prospects import CameraProspects
 from pisigma.planning.candidates import Candidates, spread
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.cell.cell import Cell, read_cell
@@ -29,6 +30,7 @@ from pisigma.planning.subject import Subject
 from pisigma.planning.task import task_poses
 from pisigma.planning.tour import Tour, tour
 from pisigma.robot.description import Robot
+from pisigma.verification.checks.camera import view_warnings
 
 STEP = 10
 """Poses between two points of the curve."""
@@ -52,6 +54,7 @@ class Plan:
         remaining: what the error that remains is expected to come from, the largest first.
         travel: time that all of it takes [s].
         warnings: what else should be known, a sentence each.
+        camera: what limits a calibration with images; None without a camera.
         seconds: time that planning took [s].
     """
 
@@ -62,6 +65,7 @@ class Plan:
     remaining: tuple[RemainingError, ...]
     travel: float
     warnings: tuple[str, ...]
+    camera: CameraProspects | None
     seconds: float
 
     @property
@@ -108,6 +112,7 @@ class Plan:
             "way_points": sum(map(len, self.stored.way_points)),
             "weak": list(self.weak),
             "warnings": list(self.warnings),
+            **({} if self.camera is None else {"camera": self.camera.to_json()}),
             "seconds": self.seconds,
         }
 
@@ -188,7 +193,8 @@ def plan(
         problem.needed(chosen, points),
         remaining_errors(knowledge.informed(candidates.q[chosen]), task),
         way.seconds,
-        _warnings(way),
+        (*_warnings(way), *problem.view_warnings(chosen)),
+        problem.prospects(chosen),
         time.perf_counter() - started,
     )
 
@@ -266,6 +272,20 @@ class _Problem:
             (point,) = self._curve(chosen, [middle])
             low, high = (low, middle) if point.rms <= limit else (middle, high)
         return high
+
+    def prospects(self, chosen: Int64[Tensor, " chosen"]) -> CameraProspects | None:
+        """What limits a calibration with the chosen images; None without a camera."""
+        views = self.settings.views(self.arm)
+        if views is None:
+            return None
+        return CameraProspects.of(self.knowledge, self.candidates, chosen, self.task, views, self.arm)
+
+    def view_warnings(self, chosen: Int64[Tensor, " chosen"]) -> tuple[str, ...]:
+        """In which known traps of cameras the chosen images are."""
+        views, q = self.settings.views(self.arm), self.candidates.q[chosen]
+        return (
+            () if views is None else tuple(view_warnings(views.obliqueness(self.arm, q), q, self.arm.robot))
+        )
 
     def _curve(self, chosen: Int64[Tensor, " chosen"], counts: list[int]) -> tuple[ExpectedAccuracy, ...]:
         return curve(self.knowledge, self.candidates.q, chosen, self.task, counts, self.settings.seed)

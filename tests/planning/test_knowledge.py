@@ -94,3 +94,13 @@ def test_distances_say_nothing_of_where_the_robot_stands(robot: Robot) -> None:
     after = known.informed(q).deviation(q)
     assert bool((after < 0.5 * known.deviation(q)).all())
     assert float(after.max()) < 5e-3
+
+
+def test_an_arm_seen_anew_is_known_as_one_never_measured_there(robot: Robot) -> None:
+    """In another frame, at another target, with nothing known of either."""
+    base, tool = (np.array([0.3, -0.2, 0.1, *angles]) for angles in ((0.1, 0.2, 3.0), (0.5, -0.3, 0.2)))
+    q = torch.linspace(-1, 1, 5 * robot.dof, dtype=torch.float64).view(5, robot.dof)
+    anew = Knowledge.of_robot(robot, hybrid=False).seen_anew(base, tool)
+    expected = Knowledge.of_robot(robot.with_geometry(base=base, tool=tool), hybrid=False)
+    for D, wanted in ((anew.tool(q), expected.tool(q)), (anew.measured(q), expected.measured(q))):
+        assert_close(D @ D.mT, wanted @ wanted.mT, rtol=1e-9)

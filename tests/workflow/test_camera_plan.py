@@ -55,3 +55,28 @@ def test_a_plan_is_read_with_its_camera(planned: Plan, settings: PlanSettings, t
     assert_close(stored.q, planned.stored.q, atol=1e-7)
     assert (tmp_path / "poses.script").read_text().count("sleep(3.0)") == len(stored.q)
     assert not np.isnan(stored.q.numpy()).any()
+
+
+def test_what_limits_the_result_and_what_stays_unknown_is_said(planned: Plan):
+    camera = planned.camera
+    assert camera is not None
+    assert_close(camera.rms, planned.curve[-1].rms, rtol=1e-9)
+    for better in (camera.more_images, camera.exact_corners, camera.exact_robot):
+        assert 0 < better < camera.rms
+    assert 0 < camera.room < 0.1
+    text = " ".join(camera.sentences)
+    assert "theta_6, d_6, a_6 and alpha_6" in text
+    assert "theta_1 and d_1 from where the board stands" in text
+    assert "limits it most" in text
+    figures = planned.to_json()["camera"]
+    assert isinstance(figures, dict)
+    assert_close(figures["exact_robot_rms_mm"], camera.exact_robot * 1e3)
+
+
+def test_frontal_views_are_warned_of(settings: PlanSettings):
+    assert CELL.view is not None
+    cell = CELL.model_copy(update={"view": CELL.view.model_copy(update={"oblique_deg": 8.0})})
+    with no_type_checker():
+        frontal = plan("ur5", replace(settings, count=5, check=0, candidates=20), cell)
+    text = " ".join(frontal.warnings)
+    assert "oblique, which hardly determines" in text

@@ -47,7 +47,7 @@ class CameraCheck(AbstractCheck):
             return
         images, result = checked.rows.select(by_corners), checked.geometric
         for sentence in (
-            *_views(images, checked.robot),
+            *view_warnings(images.T[:, 2, 2].abs().clamp(max=1.0).acos().cpu(), images.q, checked.robot),
             *_intrinsics(images, result),
             *_tool(images, checked.rows, result),
             *_limit(images, result),
@@ -55,17 +55,25 @@ class CameraCheck(AbstractCheck):
             yield Diagnostic(kind="camera", severity="warning", sentence=sentence)
 
 
-def _views(images: Measurements, robot: Robot) -> Iterator[str]:
-    """Say where the views are too frontal, or of one branch of the arm."""
-    tilt = np.arccos(images.T[:, 2, 2].abs().clamp(max=1.0).cpu().numpy())
-    if np.quantile(tilt, 0.9) < FRONTAL:
+def view_warnings(
+    tilt: Float64[Tensor, " images"], q: Float64[Tensor, "images dof"], robot: Robot
+) -> Iterator[str]:
+    """Say where views of a board are too frontal, or of one branch of the arm.
+
+    Args:
+        tilt: how oblique they are [rad].
+        q: joint values [rad or m].
+        robot: as drawn.
+    """
+    most = float(tilt.quantile(0.9))
+    if most < FRONTAL:
         yield (
-            f"Nine in ten images show the board less than {np.rad2deg(np.quantile(tilt, 0.9)):.0f} deg oblique, which "
+            f"Nine in ten images show the board less than {np.rad2deg(most):.0f} deg oblique, which "
             "hardly determines the distance and the tilt of the camera and doubles the error; take images up to 40 deg "
             "oblique."
         )
     solver = closed_form_solver(robot)
-    share = 0.0 if solver is None else _largest_share(nearest_branch(solver, images.q))
+    share = 0.0 if solver is None else _largest_share(nearest_branch(solver, q))
     if share >= ONE_BRANCH:
         yield (
             f"{share:.0%} of the images were taken on one branch of the arm (shoulder, elbow and wrist the same way), "
