@@ -41,8 +41,8 @@ def _numbered(
     middles = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
     column, row = np.rint(middles).astype(int).reshape(-1, 2).T
     is_black = np.indices(middles.shape[:2]).sum(0).ravel() % 2 == 0
-    grey = image[row, column]
-    return grid if grey[is_black].mean() < grey[~is_black].mean() else turned
+    gray = image[row, column]
+    return grid if gray[is_black].mean() < gray[~is_black].mean() else turned
 
 
 def _reason(image: Image, board: Board) -> str:

@@ -10,7 +10,7 @@ from scipy.ndimage import map_coordinates
 from pisigma.camera.board import Board
 
 Image = UInt8[np.ndarray, "height width"]
-"""Grey values; the centre of the first pixel is at u = v = 0."""
+"""Gray values; the centre of the first pixel is at u = v = 0."""
 ALONG = np.linspace(0.2, 0.8, 9)
 """Where edges are crossed, as shares of their lengths: away from other edges."""
 ACROSS = np.linspace(-1.0, 1.0, 41)
@@ -133,7 +133,10 @@ class EdgeProfiles:
 
     @property
     def points(self) -> Float64[np.ndarray, "edges crossings 2"]:
-        """Where the middle between black and white is on every crossing [px]: half of its area is on either side."""
-        offset = 1 - 2 * self.profile.mean(2)
+        """Where the middle between black and white is on every crossing [px]: half of its area is on either side.
+
+        Where an edge has no contrast, it stays as it is.
+        """
+        offset = np.nan_to_num(1 - 2 * self.profile.mean(2))
         points: np.ndarray = self.at + offset[..., None] * self.across[:, None]
         return points

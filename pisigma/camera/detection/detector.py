@@ -97,13 +97,18 @@ def detect_board(path: Path, board: Board, most_blur: float) -> BoardImage:
 
 
 def read_image(path: str | os.PathLike[str]) -> Image:
-    """Read the grey values of an image file of any format that OpenCV reads.
+    """Read the gray values of an image file of any format that OpenCV reads, as the sensor has them.
+
+    It is not turned by what a camera notes of its orientation, as the intrinsics are those of the sensor.
 
     Raises:
         MeasurementError: it cannot be read or is no image.
     """
     content = np.frombuffer(read_input(path, MeasurementError), dtype=np.uint8)
-    image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE) if len(content) else None
+    try:
+        image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
+    except cv2.error:  # it is empty, or its header states more pixels than memory can hold
+        image = None
     if image is None:
         raise MeasurementError(f"{path}: is no image that OpenCV reads; give PNG, JPEG, TIFF or BMP files.")
     return np.asarray(image, dtype=np.uint8)

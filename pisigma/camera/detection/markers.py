@@ -28,17 +28,16 @@ def detect_apriltags(image: Image, board: Board) -> DetectedBoard | NoBoard:
 
     Corners of tags are rounded by blur, so that their gradients lead inwards; their sides are not.
     """
-    found, numbers, _ = cv2.aruco.ArucoDetector(dictionary_of(board)).detectMarkers(image)
+    quads, numbers, _ = cv2.aruco.ArucoDetector(dictionary_of(board)).detectMarkers(image)
     number = np.zeros(0, dtype=np.int64) if numbers is None else np.asarray(numbers, dtype=np.int64).ravel()
     used = np.flatnonzero((number < board.rows * board.columns) & (np.bincount(number)[number] == 1))
     if not len(used):
         return NoBoard(f"no AprilTag of family {board.dictionary} of the board is found in it")
-    tags = np.asarray(found, dtype=np.float64).reshape(-1, 4, 2)[used]
+    tags = np.asarray(quads, dtype=np.float64).reshape(-1, 4, 2)[used]
     for _ in range(ROUNDS):
         tags = _crossings(image, tags, board.clearance)
-    sharp = np.isfinite(tags).all((1, 2))
-    corners = 4 * number[used][sharp, None] + np.arange(4)
-    return DetectedBoard(corners.ravel(), tags[sharp].reshape(-1, 2))
+    corners = 4 * number[used, None] + np.arange(4)
+    return DetectedBoard(corners.ravel(), tags.reshape(-1, 2))
 
 
 def _crossings(
@@ -48,8 +47,7 @@ def _crossings(
     ends = np.stack([tags, np.roll(tags, -1, 1)], 2).reshape(-1, 2, 2)
     points = EdgeProfiles.of(image, ends, clearance).points
     middle = points.mean(1)
-    deviation = np.nan_to_num(points - middle[:, None])
-    normal = np.linalg.svd(deviation)[2][:, -1].reshape(tags.shape)
+    normal = np.linalg.svd(points - middle[:, None])[2][:, -1].reshape(tags.shape)
     distance = (normal * middle.reshape(tags.shape)).sum(-1)
     both = np.stack([np.roll(normal, 1, 1), normal], 2)
     crossing: np.ndarray = np.linalg.solve(

@@ -62,7 +62,7 @@ class DetectedCorners:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """What was found, and what is left out and why."""
+        """What the images show, and which are left out and why."""
         return self.detection.sentences
 
     @property

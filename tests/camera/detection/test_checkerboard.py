@@ -42,6 +42,13 @@ def test_why_there_is_no_board() -> None:
     assert nothing.reason == "no board of 4 x 5 corners is found in it"
 
 
+def test_edges_without_contrast_have_no_blur_and_stay() -> None:
+    ends = np.array([[[100.0, 100.0], [150.0, 110.0]]])
+    profiles = EdgeProfiles.of(np.full((400, 640), 90, dtype=np.uint8), ends, 0.2)
+    assert np.isnan(profiles.blur)
+    assert_close(profiles.points, profiles.at)
+
+
 @pytest.mark.parametrize("blur", [1.0, 2.5])
 def test_the_blur_of_edges(blur: float) -> None:
     R, t = view(BOARD, 0.3, (0.4, 0.3, 0.0))
