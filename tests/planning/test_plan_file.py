@@ -80,7 +80,7 @@ def test_faults_of_the_files_are_named(stored: StoredPlan, tmp_path: Path):
 @pytest.mark.parametrize(
     ("stated", "message"),
     [
-        ({"sensor": "camera"}, "sensor 'camera' is unknown; Valid: distance, pose, position"),
+        ({"sensor": "lidar"}, "sensor 'lidar' is unknown; Valid: camera, distance, pose, position"),
         ({"criterion": "A"}, "criterion 'A' is unknown; Valid: D, I"),
         ({"count": 0}, "count: 1 to 100,000 was wanted, got 0"),
         ({"sigma_mm": -1.0}, "sigma_mm: 0.001 to 1000 mm was wanted, got -1"),
