@@ -35,7 +35,7 @@ from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.task import TASK_POSES
 from pisigma.robot import Robot
-from pisigma.se3 import skew
+from pisigma.se3 import invert, skew, xyzrpy_from_transform
 from pisigma.simulation.camera.images import ImageNoise, simulate_images
 
 LENGTH, ANGLE, POSTURES = 1e-3, np.deg2rad(0.3), 400
@@ -76,20 +76,17 @@ class Bench:
             settings = PlanSettings(
                 sensor="camera", camera=CameraSettings(*map(str, files)), candidates=candidates
             )
-            arm, sight = ArmInCell.of(Robot.load("ur5"), CELL), settings.instrument()
+            arm, instrument = ArmInCell.of(Robot.load("ur5"), CELL), settings.instrument()
             drawn, views = settings.find_candidates(arm), settings.views(arm)
         assert views is not None
-        base = _inverse(views.T_cell_frame)
+        base = xyzrpy_from_transform(invert(views.T_cell_frame)).numpy()
         robot = arm.robot.with_geometry(base=base)
         knowledge = {
-            name: Knowledge.of_robot(robot, sight, hybrid=name == "hybrid")
+            name: Knowledge.of_robot(robot, instrument, hybrid=name == "hybrid")
             for name in ("geometric", "hybrid")
         }
-        assert sight.sight is not None
-        of_sight = sight.sight
-        return Bench(
-            arm, settings, drawn.q, drawn.workspace[:TASK_POSES], knowledge, of_sight.camera, of_sight.board
-        )
+        camera, board = views.sight.camera, views.sight.board
+        return Bench(arm, settings, drawn.q, drawn.workspace[:TASK_POSES], knowledge, camera, board)
 
     def figures(self, draw: int, q: Tensor, judged: Tensor) -> tuple[float, float]:
         """True and predicted error [mm] of a calibration of one true arm with images at joint values."""
@@ -102,12 +99,6 @@ class Bench:
         points, estimated = (forward_kinematics(one, judged)[:, :3, 3] for one in (true, robot))
         predicted = rms_of(self.knowledge["geometric"].informed(q).tool(judged))
         return 1e3 * aligned_error(points, estimated), 1e3 * predicted
-
-
-def _inverse(T: Tensor) -> np.ndarray:
-    from pisigma.se3 import invert, xyzrpy_from_transform
-
-    return xyzrpy_from_transform(invert(T)).numpy()
 
 
 def aligned_error(true: Tensor, estimated: Tensor) -> float:

@@ -238,11 +238,11 @@ class Knowledge:
             NaN for rows in which nothing of the kind was measured.
 
         Raises:
-            MeasurementError: the instrument measures distances.
+            MeasurementError: the instrument measures distances, or is a camera.
             IdentificationError: a row has a frame or a target that was not calibrated.
         """
         instrument, geometry = self.instrument, self.uncertainty.geometry
-        if instrument.kind == "distance" or rows.position is None:
+        if instrument.kind in ("distance", "camera") or rows.position is None:
             raise MeasurementError("positions were wanted to compare with the predicted ones, got none.")
         T = predicted_poses(
             geometry.robot, geometry.bases, geometry.tools, replace(rows, q=self.moved(rows.q))
