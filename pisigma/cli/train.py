@@ -19,6 +19,13 @@ if TYPE_CHECKING:
     from pisigma.judging.calibration_summary import CalibrationSummary
     from pisigma.judging.training_summary import TrainingSummary
 
+Jobs = Annotated[
+    int | None,
+    typer.Option(
+        help="Processes that judge folds and simulations side by side, with one thread each. [default: threads]"
+    ),
+]
+
 
 def train(
     recipe: Annotated[Path, typer.Argument(help="Recipe (YAML), such as training/kiro3.yaml.")],
@@ -36,12 +43,7 @@ def train(
         Path | None,
         typer.Option(help="Folder for metrics.csv of every epoch, and TensorBoard's events if it is there."),
     ] = None,
-    jobs: Annotated[
-        int | None,
-        typer.Option(
-            help="Processes that judge folds and simulations side by side, with one thread each. [default: threads]"
-        ),
-    ] = None,
+    jobs: Jobs = None,
     accept_implausible: AcceptImplausible = False,
     overwrite: Overwrite = False,
     as_json: AsJson = False,

@@ -154,17 +154,9 @@ def recalibrate(
     calibrator = HybridCalibrator(drawn)
     judged = gate(parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation"))
     likeness = _likeness(parent, rows)
-    scratch = stage(progress, "from scratch")
     odd = likeness is not None and likeness.odd
-    if odd:
-        judged = replace(judged, kept="scratch")
-    try:
-        kept = _kept_model(judged, parent, adaptation, rows, calibrator, scratch)
-    except IdentificationError:
-        if not odd:
-            raise
-        judged = judged.with_least_error  # the rows are too few for a calibration of their own
-        kept = _kept_model(judged, parent, adaptation, rows, calibrator, scratch)
+    from_scratch = stage(progress, "from scratch")
+    judged, kept = _kept(judged, odd, parent, adaptation, rows, calibrator, from_scratch)
     believable = likeness is None and _believable(judged, drawn)
     moved = moved_by(adaptation) if believable else None
     summary = _summary(parent, rows, adaptation, judged, moved).having(
@@ -191,6 +183,25 @@ def _adapted(
     right = rows.select(torch.tensor([row for row in range(rows.rows) if row not in wrong]))
     adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere), posterior.noise)
     return right, adaptation, _outliers(adaptation, rows, wrong)
+
+
+def _kept(
+    judged: Gate,
+    odd: bool,
+    parent: CalibratedModel,
+    adaptation: Adaptation,
+    rows: Measurements,
+    calibrator: HybridCalibrator,
+    progress: Progress,
+) -> tuple[Gate, CalibratedModel]:
+    """The candidate that is kept, and its model; of a robot unlike its fleet the calibration from scratch."""
+    if odd:
+        alone = replace(judged, kept="scratch")
+        try:
+            return alone, _kept_model(alone, parent, adaptation, rows, calibrator, progress)
+        except IdentificationError:  # the rows are too few for it
+            judged = judged.with_least_error
+    return judged, _kept_model(judged, parent, adaptation, rows, calibrator, progress)
 
 
 def _kept_model(
