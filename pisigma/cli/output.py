@@ -139,12 +139,13 @@ def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> s
     for parameter in context.command.params:
         value = context.params.get(str(parameter.name))
         if parameter.param_type_name == "argument":
-            words.append(Path(str(value)).name)
+            words += [Path(str(one)).name for one in (value if isinstance(value, list) else [value])]
         elif value != parameter.default and parameter.name not in _ONLY_FOR_PRINTING:
             if isinstance(value, bool):
                 words.append((parameter.opts if value else parameter.secondary_opts)[0])
             elif getattr(parameter, "multiple", False):
-                words += [word for one in value or () for word in (parameter.opts[0], str(one))]
+                named = [Path(one).name if isinstance(one, Path) else str(one) for one in value or ()]
+                words += [word for name in named for word in (parameter.opts[0], name)]
             elif isinstance(value, tuple):
                 words += [parameter.opts[0], *(f"{number:g}" for number in value)]
             else:

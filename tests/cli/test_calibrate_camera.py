@@ -50,6 +50,9 @@ def test_from_pixels_of_corners_to_a_model(calibrated):
     assert fx["unit"] == "px"
     assert 0.1 < fx["standard_error"] < 0.4  # a usual calibration leaves 0.5 px
     assert 0.85 < figures["coverage"] <= 1.0
+    card = (folder / "README.md").read_text()
+    assert "pisigma calibrate ur5 corners.csv" in card
+    assert "--camera camera.yaml --board board.yaml" in card
     model, q = load_model(folder), camera_cell(50, 2).images.q
     assert model.uncertainty is not None
     assert [group.name for group in model.uncertainty.space.unknowns] == ["camera", "board"]
