@@ -11,19 +11,38 @@ from pisigma.cli.output import print_json, print_line
 
 def simulate(
     recipe: Annotated[Path, typer.Argument(help="Recipe (YAML) with simulated data.")],
-    out: Annotated[Path, typer.Option(help="CSV file to write.")],
+    out: Annotated[Path | None, typer.Option(help="CSV file to write.")] = None,
+    images: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder to write instead, for a recipe with a camera: rendered images, joints.csv, camera.yaml and "
+            "board.yaml."
+        ),
+    ] = None,
     held_out: Annotated[
         bool, typer.Option("--held-out", help="Write the held-out rows instead of the training rows.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Write the simulated measurements of a recipe as a CSV file."""
+    """Write the simulated measurements of a recipe as a CSV file, or the images that its camera takes."""
+    from pisigma.errors import RecipeError
     from pisigma.files.output_file import check_output
     from pisigma.recipes.data import simulate as simulate_recipe
+    from pisigma.recipes.data import write_recipe_images
     from pisigma.recipes.reader import read_recipe
     from pisigma.robot.robot_file import robot_file
 
     read = read_recipe(recipe)
+    if (out is None) == (images is None):
+        raise RecipeError("state either --out, a CSV file of measurements, or --images, a folder of images.")
+    if images is not None:
+        count = write_recipe_images(read, images)
+        if as_json:
+            print_json({"folder": str(images), "images": count})
+        else:
+            print_line(f"{count} images, joints.csv, camera.yaml and board.yaml written to {images}.")
+        return
+    assert out is not None
     check_output(out, inputs=(recipe, robot_file(read.robot)))
     data = simulate_recipe(read)
     rows = data.simulations[0][1 if held_out else 0]

@@ -11,6 +11,8 @@ from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.splits import TrainTest, k_folds
 from pisigma.recipes.recipe import GeometricRecipe, HybridRecipe, MeasuredData, Recipe, SimulatedData
 from pisigma.robot.description import Robot
+from pisigma.simulation.camera.image_folder import write_images
+from pisigma.simulation.camera.simulated_images import SimulatedImages
 from pisigma.simulation.measure import SimulatedPoses
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.yaml_file import Section
@@ -98,6 +100,22 @@ def simulate(recipe: Recipe, repeats: int = 1) -> RecipeData:
         true = TrueRobot(robot, data.errors)
         simulations.append((data.training.measure(true), data.held_out.measure(true)))
     return RecipeData(robot, simulations[0][0], simulations=tuple(simulations))
+
+
+def write_recipe_images(recipe: Recipe, folder: str | os.PathLike[str]) -> int:
+    """Render the images that a recipe calibrates with; see `write_images`.
+
+    Raises:
+        RecipeError: the recipe simulates no images.
+        RobotError: the robot of the recipe cannot be used.
+        OutputError: the folder exists, or cannot be written.
+    """
+    data = simulated_data(recipe)
+    if not isinstance(data.training, SimulatedImages):
+        raise RecipeError(
+            f"recipe '{recipe.name}' simulates no images but a tracker; write its measurements with --out."
+        )
+    return write_images(data.training, TrueRobot(Robot.load(recipe.robot), data.errors), folder)
 
 
 def simulated_data(recipe: Recipe) -> SimulatedData:
