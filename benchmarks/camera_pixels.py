@@ -4,7 +4,8 @@
 
 The arms, camera, board and repeatability of `camera.py`. Every image is drawn pixel by pixel (through a lens with
 distortion, with blur, defocus, uneven light and noise), its corners are detected, and the arm is calibrated with them;
-beside it the arm calibrated with the corners that the same images ideally have. Intrinsics are taken as they are.
+beside it the arm calibrated with the corners that the same images ideally have: with a normal noise as large as that of
+the detected ones, with the noise of `camera.py`, and without. Intrinsics are taken as they are.
 Errors are those of the camera's position over 400 postures of the whole joint space after the best rigid alignment,
 pooled over draws.
 """
@@ -40,14 +41,15 @@ def main(draws: int, count: int) -> None:
     aimed = nominal.with_geometry(nominal.dh, base=base, tool=ON_FLANGE.numpy())
     q = BoardViews(count=count, seed=0).joints(aimed, LENS, BOARD)
     everywhere = torch.from_numpy(np.random.default_rng(0).uniform(-np.pi, np.pi, (POSTURES, nominal.dof)))
-    squares, off, seconds, left_out = {"detected": 0.0, "exact": 0.0}, list[np.ndarray](), 0.0, 0
+    squares = dict.fromkeys(("detected", "exact", "as_noisy", "usual"), 0.0)
+    off, seconds, left_out = list[np.ndarray](), 0.0, 0
     for draw in range(draws):
         rng = np.random.default_rng(draw)
         errors = rng.standard_normal(nominal.dh.shape) * [ANGLE, LENGTH, LENGTH, ANGLE, ANGLE]
         true = nominal.with_geometry(nominal.dh + errors, base=base, tool=ON_FLANGE.numpy())
         poses = draw_board_poses(true, q, NOISE.repeatability, torch.Generator().manual_seed(draw))
         ideal, inside = project_corners(LENS, BOARD, poses)
-        corners = {"detected": list[np.ndarray](), "exact": list[np.ndarray]()}
+        detected, exact = list[np.ndarray](), list[np.ndarray]()
         whole = list[int]()
         for number in range(count):
             started = time.perf_counter()
@@ -56,10 +58,17 @@ def main(draws: int, count: int) -> None:
             board = detect_checkerboard(image, BOARD)
             if isinstance(board, DetectedBoard) and inside[number].all():
                 whole.append(number)
-                corners["detected"].append(board.pixels)
-                corners["exact"].append(ideal[number])
+                detected.append(board.pixels)
+                exact.append(ideal[number])
         left_out += count - len(whole)
-        off.append(np.concatenate(corners["detected"]) - np.concatenate(corners["exact"]))
+        off.append(np.concatenate(detected) - np.concatenate(exact))
+        normal = rng.standard_normal((len(whole), len(BOARD.corners), 2))
+        corners = {
+            "detected": detected,
+            "exact": exact,
+            "as_noisy": list(exact + np.sqrt(np.square(off[-1]).mean()) * normal),
+            "usual": list(exact + NOISE.corner * normal),
+        }
         numbers = [np.arange(len(BOARD.corners))] * len(whole)
         points = positions(true, everywhere)
         for what, pixels in corners.items():
@@ -67,12 +76,18 @@ def main(draws: int, count: int) -> None:
             rows = image_measurements(images, LENS, BOARD, False, NOISE.repeatability, "fixed")
             robot = GeometricCalibrator(nominal, prior=PRIOR).fit(rows).robot
             squares[what] += aligned_error(points, positions(robot, everywhere)) ** 2
-    detected, exact = (1e3 * (squares[what] / draws) ** 0.5 for what in ("detected", "exact"))
+    of = {what: 1e3 * (square / draws) ** 0.5 for what, square in squares.items()}
     print(f"{count} images of 1920 x 1200 px, {draws} draws; {seconds / draws / count:.2f} s to render one")
     print(
         f"corners: {np.sqrt(np.square(np.concatenate(off)).mean()):.4f} px RMS; {left_out} boards not detected"
     )
-    print(f"workspace: {detected:.4f} mm, with exact corners {exact:.4f} mm (ratio {detected / exact:.3f})")
+    print(f"workspace: {of['detected']:.4f} mm from pixels")
+    for what, name in (
+        ("as_noisy", "as large a normal noise"),
+        ("usual", f"a noise of {NOISE.corner} px"),
+        ("exact", "no noise"),
+    ):
+        print(f"ideal corners with {name}: {of[what]:.4f} mm (ratio {of['detected'] / of[what]:.2f})")
 
 
 if __name__ == "__main__":
