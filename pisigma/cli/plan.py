@@ -1,5 +1,6 @@
 """`pisigma plan`: which poses to measure, and the accuracy that they are expected to give."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -11,6 +12,7 @@ from pisigma.cli.camera_options import FixedCamera, RepeatabilityDeg, Repeatabil
 from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:
+    from pisigma.planning.plan_settings import PlanSettings
     from pisigma.workflow.plan import Plan
 
 Subject = Annotated[
@@ -84,6 +86,7 @@ Programs = Annotated[
 
 
 def plan(
+    context: typer.Context,
     subject: Subject,
     out: Out,
     count: Count = 40,
@@ -117,21 +120,11 @@ def plan(
     Prints the accuracy to expect against the number of poses, and writes the poses in the order in which they are
     measured: add the measured columns, and the file goes to `pisigma calibrate`.
     """
-    from pisigma.planning.camera_settings import CameraSettings
     from pisigma.planning.plan_file import yaml_of
-    from pisigma.planning.plan_settings import PlanSettings
     from pisigma.planning.subject import Subject as PlanningSubject
     from pisigma.workflow import plan as workflow
 
-    stated: dict[str, Any] = {"count": count, "check": check, "sensor": sensor, "criterion": criterion}
-    stated |= {"candidates": candidates, "seed": seed, "sigma_mm": sigma_mm, "limit_mm": limit_mm}
-    stated |= {"speed_deg_s": speed_deg_s, "settling_s": settling_s, "box_mm": _box(box)}
-    files = {"candidates_from": candidates_from, "task": task, "measured": measured}
-    stated |= {name: None if file is None else str(file) for name, file in files.items()}
-    if camera is not None and board is not None:
-        noise = (sigma_px, repeatability_mm, repeatability_deg)
-        stated["camera"] = CameraSettings(str(camera), str(board), fixed_camera, *noise)
-    settings = PlanSettings(**stated)
+    settings = _settings(context.params)
     wanted, programs = PlanningSubject.of(subject, base, tip), program or []
     workflow.check_files(out, programs, settings, wanted.robot, (subject, cell))
     with progress_of("plan") as progress:
@@ -176,6 +169,22 @@ def _limit_lines(planned: "Plan") -> list[str]:
         return [f"An RMS of {limit:g} mm needs more than {planned.poses} poses."]
     needed = f"with {planned.needed} poses" if planned.needed else "already, without more poses"
     return [f"An RMS of {limit:g} mm is expected {needed}."]
+
+
+def _settings(options: Mapping[str, Any]) -> "PlanSettings":
+    """Settings by the options of the command."""
+    from pisigma.planning.camera_settings import CameraSettings
+    from pisigma.planning.plan_settings import PlanSettings
+
+    same = ("count", "check", "sensor", "criterion", "candidates", "seed", "sigma_mm", "limit_mm")
+    stated = {name: options[name] for name in (*same, "speed_deg_s", "settling_s")}
+    files = {name: options[name] for name in ("candidates_from", "task", "measured")}
+    stated |= {name: None if file is None else str(file) for name, file in files.items()}
+    if options["camera"] is not None and options["board"] is not None:
+        noise = (options[name] for name in ("sigma_px", "repeatability_mm", "repeatability_deg"))
+        camera, board = str(options["camera"]), str(options["board"])
+        stated["camera"] = CameraSettings(camera, board, options["fixed_camera"], *noise)
+    return PlanSettings(box_mm=_box(options["box"]), **stated)
 
 
 def _box(stated: str | None) -> Any:
