@@ -117,5 +117,5 @@ def corner_noise(poses: Sequence[BoardPose], loss: AbstractLoss) -> float:
     """Return the standard deviation of u and v of a corner that the residuals of all images show [px]."""
     distance = torch.from_numpy(np.concatenate([pose.distance for pose in poses]))
     used = float(POSE * len(poses))
-    scale = max(loss.scale(distance, 2, used), SMALLEST_NOISE)
-    return max(loss.deviation(distance, 2, used, scale), SMALLEST_NOISE)
+    scale = max(float(loss.scale(distance, 2, used)), SMALLEST_NOISE)
+    return max(float(loss.deviation(distance, 2, used, scale)), SMALLEST_NOISE)

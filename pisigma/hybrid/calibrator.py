@@ -182,6 +182,7 @@ class HybridCalibrator:
         other axes imitate may be products.
         """
         problem, view = solved.problem, view_of(solved.solution.linearisation)
+        noise, prior_scale = tuple(view.noise.tolist()), tuple(view.prior_scale.tolist())
         if problem.q.shape[0] > SEARCHED_ROWS:
             chosen = chosen_rows(problem.q.shape[0], SEARCHED_ROWS).to(problem.q.device)
             chosen = problem.with_partners(chosen)
@@ -194,23 +195,23 @@ class HybridCalibrator:
             for distance, one in zip(distances, values, strict=True)
         ]
         rows = Rows.linearised(design, (point - problem.nominal)[problem.active], values, weights, group)
-        pairs = zip(view.noise, values, strict=True)
+        pairs = zip(noise, values, strict=True)
         if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.certain):
             # The geometry leaves nothing to learn; features would fit the errors of the linearisation.
-            return Search(rows, view.noise, view.prior_scale, [], progress).best([], [])
+            return Search(rows, noise, prior_scale, [], progress).best([], [])
         robot = self.geometric.robot
-        gravity = self.gravity or gravity_by_evidence(robot, rows, view.noise, view.prior_scale)
+        gravity = self.gravity or gravity_by_evidence(robot, rows, noise, prior_scale)
         directions = dict.fromkeys((gravity, self.gravity or USUAL))
         tried = [self._features(solved, problem, in_first_row(robot, one)) for one in directions]
         growing, others = tried[0]
         first = Design(problem, (*others, *growing[:FIRST_MODEL_SIZES][-1:]))
-        posterior = regression(first, rows).maximise_evidence(first.prior(view.prior_scale), view.noise)
+        posterior = regression(first, rows).maximise_evidence(first.prior(prior_scale), noise)
         rows = linearised(first, posterior.x, posterior.effective, group)
         products = [InputProducts(robot)] if self.products and robot.dof > 1 else []
         choices = []
         for growing, others in tried:
             largest = [*others, *growing[-1:], *products]
-            search = Search(rows, view.noise, view.prior_scale, largest, progress)
+            search = Search(rows, noise, prior_scale, largest, progress)
             choices.append(search.best(growing, others, products))
         return max(choices, key=lambda choice: choice.best.posterior.log_evidence)
 

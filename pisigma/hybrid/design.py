@@ -276,6 +276,6 @@ def weigh(
             weights.append(torch.ones_like(distance))
             continue
         taken = effective * counts[number] / max(sum(counts), 1.0)
-        scale = max(loss.scale(distance, sensor.components, taken), 1e-10)
+        scale = max(float(loss.scale(distance, sensor.components, taken)), 1e-10)
         weights.append(loss.weight(distance / scale, sensor.components))
     return tuple(weights)

@@ -230,7 +230,7 @@ class CalibrationResult:
     @property
     def cost(self) -> float:
         """Sum of squared residuals over variances, with loss and prior."""
-        return self.solved.refined.cost
+        return float(self.solved.refined.cost)
 
     @property
     def status(self) -> SolutionStatus:
@@ -240,7 +240,7 @@ class CalibrationResult:
     @cached_property
     def rms_path(self) -> tuple[float, ...]:
         """RMS of the first sensor's residuals' lengths at every point passed [m or rad], the start first."""
-        return tuple(view_of(passed).sums[0].rms for passed in self.solved.solution.path)
+        return self.solved.solution.path
 
     @cached_property
     def warnings(self) -> tuple[str, ...]:
@@ -256,7 +256,7 @@ class CalibrationResult:
         problem, view = self.solved.problem, view_of(self.solved.refined)
         precision, group = problem.precision[problem.active], problem.prior_group
         covariance = covariance_of(self.solved.refined.normal)
-        effective = effective_parameters(precision, group, view, covariance)
+        effective = effective_parameters(precision, group, view.prior_scale, covariance).tolist()
         units = [problem.space.parameters[i].unit for i in problem.active[precision > 0].tolist()]
         groups = set(zip(group[precision > 0].tolist(), units, strict=True))
         kinds: dict[str, Literal["length", "angle"]] = {"m": "length", "rad": "angle"}
@@ -264,7 +264,7 @@ class CalibrationResult:
             PriorRatio(kinds[unit], scale, scale * math.exp(-((2 / effective[number]) ** 0.5)))
             for number, unit in sorted(groups)
             if effective[number] > 0
-            for scale in [view.prior_scale[number]]
+            for scale in [float(view.prior_scale[number])]
         ]
         return tuple(
             max(of_kind, key=lambda ratio: ratio.at_least)
@@ -320,7 +320,7 @@ class CalibrationResult:
 
 def _warnings(solved: SolvedCalibration) -> tuple[str, ...]:
     """Sentences on angles that disagree with lengths, and on frames that do not fit."""
-    disagreement = max(view_of(solved.refined).disagreement)
+    disagreement = float(view_of(solved.refined).disagreement.max())
     sentences = []
     if disagreement > DISAGREEING:
         sentences.append(
@@ -363,11 +363,11 @@ def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
     noise = []
     problem, here = solved.problem, solved.refined
     view = view_of(here)
-    used = values_used(view, covariance_of(here.normal))
+    used = values_used(view, covariance_of(here.normal)).tolist()
     for k, (sensor, sums) in enumerate(zip(problem.sensors, view.sums, strict=True)):
         if sensor.certain:
             continue
-        sigma = view.noise[k]
+        sigma = float(view.noise[k])
         unit = sensor.unit if sensor.sigma is None else "stated"
         noise.append(
             SensorNoise(
@@ -376,7 +376,7 @@ def _noise(solved: SolvedCalibration) -> tuple[SensorNoise, ...]:
                 unit=unit,
                 values=problem.values_measured[k],
                 used=used[k],
-                rms=sums.rms,
+                rms=float(sums.rms),
                 quantity=sensor.unit,
                 components=sensor.components,
             )

@@ -14,7 +14,6 @@ Axes and origins are kept as `(3, poses)` blocks of few large tensors: few opera
 cache lines for large ones.
 """
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -96,7 +95,7 @@ def identification_jacobian(
 
 def tool_motion(
     robot: Robot,
-    dh: Float64[np.ndarray, "rows 5"],
+    dh: Float64[np.ndarray, "*robots rows 5"],
     base: Float[Tensor, "6 bases"],
     tool: Float[Tensor, "6 tools"],
     q: Float[Tensor, "poses dof"],
@@ -106,11 +105,13 @@ def tool_motion(
 ) -> ToolMotion:
     """Tool pose and its derivative, with the batch index last.
 
+    Several robots of one type stand one behind the other among the poses, each with equally many.
+
     Args:
         robot: says which rows move.
-        dh: the parameters of the rows.
-        base: x, y, z [m], roll, pitch, yaw [rad]; one for all poses, or one a frame.
-        tool: the same; one for all poses, or one a target.
+        dh: the parameters of the rows; of one robot, or of several.
+        base: x, y, z [m], roll, pitch, yaw [rad]; one for all poses, one a robot, or one a frame.
+        tool: the same; one for all poses, one a robot, or one a target.
         q: joint values [rad or m].
         turning: whether the derivative of the rotation is wanted too.
         frame: per pose the number of its base, where there is one a frame.
@@ -124,10 +125,10 @@ def tool_motion(
     number = 3 * count + 6
     J = q.new_empty((number + 2 * count + 6, 6 if turning else 3, poses))
     turns = J[:number, 3:] if turning else q.new_empty((number, 3, poses))
-    base_steps = base_axes[:6, :3].expand(6, 3, poses)
+    base_steps = _spread(base_axes[: ORIGIN + 1, :3], poses)
     torch.cat([walked.z, walked.x, walked.y, base_steps[:3], tool_steps[:3]], out=turns)
     origins = q.new_empty((number, 3, poses))
-    base_origin = base_axes[None, ORIGIN, :3].expand(3, 3, poses)
+    base_origin = base_steps[None, ORIGIN].expand(3, 3, poses)
     torch.cat(
         [walked.before, walked.moved, walked.moved, base_origin, position.expand(3, 3, poses)], out=origins
     )
@@ -135,7 +136,7 @@ def tool_motion(
     for k in range(3):  # the cross product of the axes and the ways from the origins to the tool
         i, j = (k + 1) % 3, (k + 2) % 3
         torch.mul(u[i], v[j], out=shift[k]).addcmul_(u[j], v[i], value=-1)
-    torch.cat([walked.z, walked.x, base_steps[3:], tool_steps[3:6]], out=J[number:, :3])
+    torch.cat([walked.z, walked.x, base_steps[3:6], tool_steps[3:6]], out=J[number:, :3])
     if turning:
         J[number:, 3:] = 0
     return ToolMotion(position, tool_steps[AXES].transpose(0, 1), J)
@@ -165,7 +166,9 @@ class _Walked:
     last: Float[Tensor, "4 3 poses"]
 
 
-def _walk_rows(robot: Robot, dh: Float64[np.ndarray, "rows 5"], q: Tensor, base_axes: Tensor) -> _Walked:
+def _walk_rows(
+    robot: Robot, dh: Float64[np.ndarray, "*robots rows 5"], q: Tensor, base_axes: Tensor
+) -> _Walked:
     """Walk from the base to the last row.
 
     Per row are kept, one after the other: x and y turned; z, the origin, x, y and -x before. The turn about z
@@ -173,20 +176,20 @@ def _walk_rows(robot: Robot, dh: Float64[np.ndarray, "rows 5"], q: Tensor, base_
     """
     count, poses = len(robot.rows), q.shape[0]
     frames = q.new_empty((count + 1, 7, 3, poses))
-    frames[0, 2:] = base_axes[FRAME, :3]
+    frames[0, 2:] = _spread(base_axes[FRAME, :3], poses)
     turning = np.zeros((count, robot.dof))
     turning[robot.joint_rows, range(robot.dof)] = robot.directions * robot.revolute
-    angles = torch.addmm(q.new_tensor(dh[:, :1]), q.new_tensor(turning), q.t())
-    before, flat = frames[:-1], frames.flatten(2)
+    offsets = q.new_tensor(np.atleast_2d(dh[..., 0]).T)
+    angles = torch.addmm(_spread(offsets, poses), q.new_tensor(turning), q.t())
+    before, flat, matrices = frames[:-1], frames.flatten(2), _row_matrices(dh, q)
     turns = zip(
         *(block.unbind(0) for block in (before[:, :2], before[:, 4:6], before[:, 5:])),
         angles.cos().unbind(0),
         angles.sin().unbind(0),
         strict=True,
     )
-    steps = zip(
-        *(block.unbind(0) for block in (_row_matrices(dh, q), flat[:-1, :4], flat[1:, 2:])), strict=True
-    )
+    lead = torch.mm if matrices.ndim == 3 else _led_by_robots
+    steps = zip(*(block.unbind(0) for block in (matrices, flat[:-1, :4], flat[1:, 2:])), strict=True)
     sliding = {
         row: joint for joint, row in enumerate(robot.joint_rows) if robot.rows[row].type == "prismatic"
     }
@@ -194,7 +197,7 @@ def _walk_rows(robot: Robot, dh: Float64[np.ndarray, "rows 5"], q: Tensor, base_
         zip(turns, steps, strict=True)
     ):
         torch.mul(xy, cosine, out=turned).addcmul_(side, sine)
-        torch.mm(matrix, state, out=after)
+        lead(matrix, state, out=after)
         if row in sliding:
             joint = sliding[row]
             frames[row + 1, 3].addcmul_(frames[row, 2], q[:, joint], value=robot.directions[joint])
@@ -202,18 +205,20 @@ def _walk_rows(robot: Robot, dh: Float64[np.ndarray, "rows 5"], q: Tensor, base_
     return _Walked(before[:, 2], before[:, 0], frames[1:, 5], before[:, 3], frames[1:, 3], last)
 
 
-def _row_matrices(dh: Float64[np.ndarray, "rows 5"], like: Tensor) -> Float[Tensor, "rows 5 4"]:
+def _row_matrices(
+    dh: Float64[np.ndarray, "*robots rows 5"], like: Tensor
+) -> Float[Tensor, "rows *robots 5 4"]:
     """Per row z, origin, x, y and -x after it, by x and y turned, z and the origin before.
 
     `Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; a joint that slides comes on top.
     """
-    result = []
-    for _, d, a, alpha, beta in dh.tolist():
-        ca, cb, sa, sb = math.cos(alpha), math.cos(beta), math.sin(alpha), math.sin(beta)
-        z, origin = (sb, -sa * cb, ca * cb, 0.0), (a, 0.0, d, 1.0)
-        x, x_back = (cb, sa * sb, -ca * sb, 0.0), (-cb, -sa * sb, ca * sb, 0.0)
-        result.append((z, origin, x, (0.0, ca, sa, 0.0), x_back))
-    return like.new_tensor(result)
+    _, d, a, alpha, beta = dh.T
+    ca, cb, sa, sb = np.cos(alpha), np.cos(beta), np.sin(alpha), np.sin(beta)
+    zero, one = np.zeros_like(d), np.ones_like(d)
+    x, y, z, w = cb, sa * sb, -ca * sb, zero
+    columns = [[sb, a, x, zero, -x], [-sa * cb, zero, y, ca, -y], [ca * cb, d, z, sa, -z], [zero, one, w, w, w]]
+    matrices = np.array(columns)  # column, line, row and, where there are several, robot
+    return like.new_tensor(np.ascontiguousarray(matrices.transpose(2, *range(3, matrices.ndim), 1, 0)))
 
 
 def _frame_axes(
@@ -225,23 +230,48 @@ def _frame_axes(
     the axes x, y, z and the origin before `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`; with an index
     one a pose.
     """
-    result = []
-    for x, y, z, *angles in xyzrpy.t().tolist():
-        (cr, cp, cy), (sr, sp, sy) = (tuple(map(turn, angles)) for turn in (math.cos, math.sin))
-        x_axis = (cr * cp, sr * cp, -sp, 0.0)
-        y_axis = (cr * sp * sy - sr * cy, sr * sp * sy + cr * cy, cp * sy, 0.0)
-        z_axis = (cr * sp * cy + sr * sy, sr * sp * cy - cr * sy, cp * cy, 0.0)
-        turns = ((0.0, 0.0, 1.0, 0.0), (-sr, cr, 0.0, 0.0), x_axis)
-        shifts = ((1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 0.0, 0.0), (0.0, 0.0, 1.0, 0.0))
-        origin, x_back = (x, y, z, 1.0), tuple(-part for part in x_axis)
-        result.append((*turns, *shifts, x_axis, y_axis, z_axis, origin, x_axis, y_axis, x_back))
-    axes = like.new_tensor(result).permute(1, 2, 0)
-    return axes if index is None else axes[..., index]
+    x, y, z, *angles = values = xyzrpy.cpu().numpy()
+    (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
+    axes = np.zeros((13, 4, values.shape[1]))
+    axes[[0, 3, 4, 5, 9], [2, 0, 1, 2, 3]] = 1
+    axes[1, 0], axes[1, 1] = -sr, cr
+    axes[6, :3] = axes[2, :3] = axes[10, :3] = cr * cp, sr * cp, -sp
+    axes[7, :3] = axes[11, :3] = cr * sp * sy - sr * cy, sr * sp * sy + cr * cy, cp * sy
+    axes[8, :3] = cr * sp * cy + sr * sy, sr * sp * cy - cr * sy, cp * cy
+    axes[9, :3], axes[12] = (x, y, z), -axes[6]
+    result = like.new_tensor(axes)
+    return result if index is None else result[..., index]
 
 
-def _behind(frame: Float[Tensor, "4 3 poses"], axes: Float[Tensor, "13 4 frames"]) -> Tensor:
+def _spread(values: Float[Tensor, "*shape ways"], poses: int) -> Float[Tensor, "*shape poses"]:
+    """Values that are the same for all poses, or for all of a robot, one a pose."""
+    ways = values.shape[-1]
+    return values[..., None].expand(*values.shape, poses // ways).flatten(-2)
+
+
+def _behind(
+    frame: Float[Tensor, "4 3 poses"], axes: Float[Tensor, "size 4 ways"]
+) -> Float[Tensor, "size 3 poses"]:
     """Axes and origins that are given in a frame, seen from outside of it."""
-    if axes.shape[-1] == 1:
-        return (axes[..., 0] @ frame.flatten(1)).view(13, *frame.shape[1:])
-    result: Tensor = (axes[:, :, None] * frame).sum(1)
-    return result
+    (size, _, ways), poses = axes.shape, frame.shape[-1]
+    if ways == poses:
+        result: Tensor = (axes[:, :, None] * frame).sum(1)
+        return result
+    if ways == 1:
+        return (axes[..., 0] @ frame.flatten(1)).view(size, 3, poses)
+    result = frame.new_empty((size, 3 * poses))
+    _led_by_robots(axes.permute(2, 0, 1).contiguous(), frame.flatten(1), out=result)
+    return result.view(size, 3, poses)
+
+
+def _led_by_robots(
+    matrices: Float[Tensor, "robots size 4"],
+    state: Float[Tensor, "4 three_poses"],
+    *,
+    out: Float[Tensor, "size three_poses"],
+) -> None:
+    """Multiply the axes and origins of several robots, one behind the other among the poses, each by its matrix."""
+    robots, size, _ = matrices.shape
+    of_robots = state.view(4, 3, robots, -1).permute(2, 0, 1, 3).flatten(2)
+    led = torch.bmm(matrices, of_robots).view(robots, size, 3, -1)
+    out.view(size, 3, robots, -1).copy_(led.permute(1, 2, 0, 3))

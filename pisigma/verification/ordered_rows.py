@@ -67,7 +67,7 @@ class OrderedRows:
         R = solved.setup.anchors.bases[:, :3, :3][problem.frame]
         residuals, derivatives, values = [], [], 0
         for k, sensor in enumerate(problem.sensors):
-            sigma = view.noise[k] if learned is None else learned.noise[sensor.name]
+            sigma = float(view.noise[k]) if learned is None else learned.noise[sensor.name]
             if sensor.name not in SENSORS or sigma <= ALWAYS_GOOD:
                 continue
             residual = view.sums[k].residual[:, some]

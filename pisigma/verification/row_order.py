@@ -333,7 +333,9 @@ def _sensors(values: Float64[np.ndarray, "rows values"]) -> Sequence[Float64[np.
 def _scale(residual: Float64[np.ndarray, "rows 3"]) -> float:
     """Standard deviation of one value, by the median of the rows that were measured."""
     lengths = np.linalg.norm(residual, axis=1)
-    return max(_LOSS.scale(torch.from_numpy(lengths[lengths > 0]), 3, 0.0), 1e-6) if lengths.any() else 1.0
+    if not lengths.any():
+        return 1.0
+    return max(float(_LOSS.scale(torch.from_numpy(lengths[lengths > 0]), 3, 0.0)), 1e-6)
 
 
 def _by_sensor(

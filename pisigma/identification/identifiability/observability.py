@@ -78,7 +78,7 @@ def find_weak_directions(problem: CalibrationProblem, here: Linearisation[Tensor
     precision = view.scaled(stated, problem.prior_group)
     held = bool((precision > 0).any())
     data = here.normal - torch.diag(precision)
-    wide = replace(view, prior_scale=tuple(max(factor, 1.0) for factor in view.prior_scale))
+    wide = replace(view, prior_scale=view.prior_scale.clamp(min=1.0))
     precision = wide.scaled(stated, problem.prior_group)
     usual = torch.where(precision > 0, precision.clamp(min=1e-30).rsqrt(), problem.step_scale)
     data = data * usual * usual[:, None]

@@ -130,7 +130,7 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
 
     def renewed(
         self, linearisation: Linearisation[BaseToolState]
-    ) -> tuple[Linearisation[BaseToolState], bool]:
+    ) -> tuple[Linearisation[BaseToolState], Tensor]:
         """Weight positions and rotations by 1 / their own scatter, where no sigma is stated."""
         view = _view_of(linearisation)
         values = (3 * len(self.position), 3 * self._rotations)
@@ -140,15 +140,16 @@ class BaseToolProblem(AbstractLeastSquares[BaseToolState]):
             if not stated[k]:
                 noise[k] = max((part[2] / values[k]) ** 0.5, SMALLEST_NOISE)
         settled = all(abs(new / old - 1) < 1e-2 for new, old in zip(noise, view.noise, strict=True))
-        return self._combined(linearisation.point, _View(view.blocks, (noise[0], noise[1]))), settled
+        renewed = self._combined(linearisation.point, _View(view.blocks, (noise[0], noise[1])))
+        return renewed, torch.tensor(settled)
 
     def _combined(self, point: BaseToolState, view: "_View") -> Linearisation[BaseToolState]:
         noise = view.noise[: len(view.blocks)]
         pairs = list(zip(view.blocks, noise, strict=True))
         normal = torch.stack([part[0] / s**2 for part, s in pairs]).sum(0)
         descent = torch.stack([part[1] / s**2 for part, s in pairs]).sum(0)
-        cost = sum(part[2] / s**2 for part, s in pairs)
-        rounding = sum(3 * len(self.position) * (self._rounding / s) ** 2 for s in noise)
+        cost = descent.new_tensor(sum(part[2] / s**2 for part, s in pairs))
+        rounding = descent.new_tensor(sum(3 * len(self.position) * (self._rounding / s) ** 2 for s in noise))
         return Linearisation(point, cost, descent, normal, cost, rounding, view)
 
     def moved(self, point: BaseToolState, step: Float64[Tensor, " active"]) -> BaseToolState:

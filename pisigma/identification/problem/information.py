@@ -84,10 +84,10 @@ class Information:
 
 def information(
     problem: CalibrationProblem,
-    point: Float64[Tensor, " parameters"],
+    point: Float64[Tensor, "*robots parameters"],
     candidates: list[int],
     view: SensorView | None = None,
-) -> Information:
+) -> list[Information]:
     """Condense the Jacobian at a point by QR factorisations, chunk by chunk.
 
     No normal equations are formed, so that singular values down to 1e-15 of the largest stay right.
@@ -97,31 +97,35 @@ def information(
         point: values of all parameters.
         candidates: indices of the parameters to look at.
         view: gives the rows' weights, in 1 / standard deviations; in 1/mm and 1/mrad where None.
+
+    Returns:
+        One of every robot.
     """
     index = torch.tensor(candidates, dtype=torch.int64, device=point.device)
     usual = torch.from_numpy(problem.space.usual_errors).to(point)[index, None, None]
-    root = point.new_zeros((0, len(candidates) + 2))
+    root, roots = point.new_zeros((0, len(candidates) + 2)), []
     unknowns = problem.space.sensor_unknowns(point)
-    values = 0
     for rows in problem.chunks():
         motion = problem.motion(point, rows, index)
-        blocks = [root.t()]
+        blocks = [] if problem.robots else [root.t()]
         for k, sensor in enumerate(problem.sensors):
             J, r = (
                 problem.derivative(sensor, motion, unknowns, rows, index),
                 sensor.residual(motion, unknowns, rows),
             )
             weight = torch.full_like(r[0], 1e3) if view is None else problem.row_weights(view, k, rows)
+            J, r, weight = problem.by_robot(J), problem.by_robot(r), problem.by_robot(weight)
             if not problem.measured_everywhere[k]:
-                present = sensor.present[rows]
-                J, r, weight = J[..., present], r[..., present], weight[present]
-            block = r.new_empty((len(candidates) + 2, *r.shape))
-            block[0] = weight
-            torch.mul(J, usual * weight, out=block[1:-1])
-            torch.mul(r, weight, out=block[-1])
-            blocks.append(block.flatten(1))
-            values += r.numel()
-        root = torch.linalg.qr(torch.cat(blocks, 1).t(), mode="r").R
+                present = sensor.present[rows][: weight.shape[-1]]
+                J, r, weight = J[..., present], r[..., present], weight[..., present]
+            block = r.new_empty((*r.shape[:-2], len(candidates) + 2, *r.shape[-2:]))
+            block[..., 0, :, :] = weight[..., None, :]
+            torch.mul(J, usual * weight[..., None, None, :], out=block[..., 1:-1, :, :])
+            torch.mul(r, weight[..., None, :], out=block[..., -1, :, :])
+            blocks.append(block.flatten(-2))
+        root = torch.linalg.qr(torch.cat(blocks, -1).mT, mode="r").R
+        roots += list(root.cpu().numpy()) if problem.robots else []
     present = torch.stack([sensor.present for sensor in problem.sensors]).any(0)
+    poses, values = int(present[: problem.rows].sum()), sum(problem.values_measured)
     parameters = tuple(problem.space.parameters[i] for i in candidates)
-    return Information(parameters, root.cpu().numpy(), values, int(present.sum()))
+    return [Information(parameters, one, values, poses) for one in roots or [root.cpu().numpy()]]

@@ -1,16 +1,18 @@
 """Levenberg-Marquardt on normal equations; problem, solver and solution are apart."""
 
-import math
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import Generic, TypeVar
 
+import numpy as np
 import torch
-from jaxtyping import Float, Float64
+from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
+from pisigma.identification.problem.robots import of_robots, with_robots
 
 Point = TypeVar("Point")
 START_DAMPING = 1e-3
@@ -42,7 +44,7 @@ class SolutionStatus(Enum):
 
 @dataclass(frozen=True, eq=False)
 class Linearisation(Generic[Point]):
-    """A least-squares problem linearised from one point, with cost `Σ (r / sigma)²`.
+    """A least-squares problem linearised from one point, with cost `Σ (r / sigma)²`; or those of several robots.
 
     Attributes:
         point: where.
@@ -55,33 +57,60 @@ class Linearisation(Generic[Point]):
     """
 
     point: Point
-    cost: float
-    descent: Float[Tensor, " unknowns"]
-    normal: Float[Tensor, "unknowns unknowns"]
-    misfit: float
-    rounding: float
+    cost: Float[Tensor, "*robots"]
+    descent: Float[Tensor, "*robots unknowns"]
+    normal: Float[Tensor, "*robots unknowns unknowns"]
+    misfit: Float[Tensor, "*robots"]
+    rounding: Float[Tensor, "*robots"]
     detail: object
 
 
 class AbstractLeastSquares(ABC, Generic[Point]):
-    """What the solver needs to know of a problem."""
+    """What the solver needs to know of a problem, which may be those of several robots side by side."""
 
     @abstractmethod
     def linearise(self, point: Point, like: Linearisation[Point] | None) -> Linearisation[Point]:
         """See the problem from a point, with the noise of `like` (a guess of its own where None)."""
 
     @abstractmethod
-    def renewed(self, linearisation: Linearisation[Point]) -> tuple[Linearisation[Point], bool]:
-        """The same with the noise estimated from its residuals, and whether the noise has settled."""
+    def renewed(self, linearisation: Linearisation[Point]) -> tuple[Linearisation[Point], Tensor]:
+        """The same with the noise estimated from its residuals, and whether the noise has settled, `*robots`."""
 
     @abstractmethod
-    def moved(self, point: Point, step: Float[Tensor, " unknowns"]) -> Point:
+    def moved(self, point: Point, step: Float[Tensor, "*robots unknowns"]) -> Point:
         """The point after a step."""
 
     @property
     @abstractmethod
     def step_scale(self) -> Float[Tensor, " unknowns"]:
         """A usual size of every unknown, which the damping is measured with."""
+
+    def rms(self, linearisation: Linearisation[Point]) -> Float[Tensor, "*robots"]:
+        """A size of the residuals, by which the path of a search is shown; in standard deviations unless said."""
+        return linearisation.misfit.sqrt()
+
+    def of_robots(self, robots: Int64[Tensor, " chosen"]) -> "AbstractLeastSquares[Point]":
+        """The problem of some of its robots; of one robot there are no parts."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class SearchEnd:
+    """How the search for one robot ended.
+
+    Attributes:
+        iterations: steps tried.
+        status: why it ended.
+        path: size of the residuals at every point passed, the start first; see `AbstractLeastSquares.rms`.
+    """
+
+    iterations: int
+    status: SolutionStatus
+    path: tuple[float, ...]
+
+    def before(self, other: "SearchEnd") -> "SearchEnd":
+        """The end of a search that went on from this one."""
+        return SearchEnd(self.iterations + other.iterations, other.status, self.path + other.path[1:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,21 +119,34 @@ class Solution(Generic[Point]):
 
     Attributes:
         linearisation: the problem seen from the end point, the noise renewed.
-        iterations: steps tried.
-        status: why it ended.
-        path: the problem seen from every point passed, the start first.
+        ends: how it ended for every robot.
     """
 
     linearisation: Linearisation[Point]
-    iterations: int
-    status: SolutionStatus
-    path: tuple[Linearisation[Point], ...]
+    ends: tuple[SearchEnd, ...]
+
+    @property
+    def iterations(self) -> int:
+        """Steps tried, most of all robots."""
+        return max(end.iterations for end in self.ends)
+
+    @property
+    def status(self) -> SolutionStatus:
+        """Why the search for one robot ended."""
+        (end,) = self.ends
+        return end.status
+
+    @property
+    def path(self) -> tuple[float, ...]:
+        """Size of one robot's residuals at every point passed, the start first."""
+        (end,) = self.ends
+        return end.path
 
 
 def levenberg_marquardt(
     problem: AbstractLeastSquares[Point],
     start: Point | Linearisation[Point],
-    maximum_iterations: int = 50,
+    maximum_iterations: int | Sequence[int] = 50,
     close_enough: float = 0.0,
 ) -> Solution[Point]:
     """Minimise by Levenberg-Marquardt steps `(normal + damping / step_scale²) step = descent`.
@@ -116,87 +158,201 @@ def levenberg_marquardt(
     left and met again that way; if the best cost is not undercut by then, the search goes back there with a
     hundredfold damping (watchdog technique, Chamberlain et al. 1982).
 
+    Several robots go side by side, each with its own damping and its own end, as if each were searched for alone.
+
     Args:
         problem: what to minimise.
         start: where to begin, or the problem as already seen from there.
-        maximum_iterations: steps tried at most.
+        maximum_iterations: steps tried at most; of all robots, or of each.
         close_enough: length [standard errors] of a step that is not taken any more; the search has converged then.
 
     Returns:
         The best point, with the reason for stopping (see `SolutionStatus`).
     """
     first = start if isinstance(start, Linearisation) else problem.linearise(start, None)
-    best, settled = problem.renewed(first)
-    here, path, damping, uphill, iterations = best, [best], START_DAMPING, 0, 0
+    search = _Search(problem, problem.renewed(first)[0])
+    limits = np.broadcast_to(np.array(maximum_iterations), len(search.robots))
+    while len(search.robots):
+        search.end(limits[search.robots] <= search.iterations, SolutionStatus.ITERATION_LIMIT)
+        if len(search.robots):
+            search.propose()
+            near = search.at_best & (search.decrement < close_enough**2)
+            search.end(near, SolutionStatus.CONVERGED)
+        if len(search.robots):
+            search.go()
+    return Solution(search.last, tuple(search.ends))
 
-    def ended(status: SolutionStatus) -> Solution[Point]:
-        return Solution(best, iterations, status, tuple(path))
 
-    while iterations < maximum_iterations:
-        step = solve_damped(here, problem.step_scale, damping)
-        decrement = float((here.normal @ step).dot(step))
-        if here is best and decrement < close_enough**2:
-            return ended(SolutionStatus.CONVERGED)
-        iterations += 1
-        there = problem.linearise(problem.moved(here.point, step), best)
-        if there.cost <= best.cost:
-            best, settled = problem.renewed(there) if iterations <= SWINGING else (there, True)
-            here, uphill, damping = best, 0, max(damping / 10, SMALLEST_DAMPING)
-            path.append(best)
-            if best.misfit <= best.rounding:
-                return ended(SolutionStatus.EXACT)
-            if decrement <= SHORTEST_STEP**2 and settled:
-                return ended(SolutionStatus.CONVERGED)
-            continue
-        if best.misfit <= 1e4 * best.rounding:
-            return ended(SolutionStatus.EXACT)
-        if here is best and (decrement <= SHORTEST_STEP**2 or decrement <= 1e-10 * best.cost):
-            return ended(SolutionStatus.CONVERGED)
-        if damping > LARGEST_DAMPING:
-            return ended(SolutionStatus.STALLED)
-        uphill += 1
-        lost = not bool(there.descent.any())  # such as where a loss rejects every row
-        if uphill <= PATIENCE and there.cost < float("inf") and not lost:
-            here = problem.renewed(there)[0]
+class _Search(Generic[Point]):
+    """The searches that go on; arrays have one entry for each of them.
+
+    Attributes:
+        robots: whose searches they are, their numbers among all.
+        last: the best points, of the robots whose search has ended too.
+        ends: how the searches have ended.
+        best: the best points.
+        here: where the next steps start.
+        at_best: whether those are the best points.
+        iterations: steps tried.
+        decrement: by how much the next step lowers the cost if the problem is linear [squared standard errors].
+    """
+
+    def __init__(self, problem: AbstractLeastSquares[Point], best: Linearisation[Point]) -> None:
+        self.problem, self.here, self.best, self.last = problem, best, best, best
+        count = best.cost.numel()
+        self.robots, self.iterations = np.arange(count), 0
+        self.at_best, self.uphill = np.ones(count, dtype=bool), np.zeros(count, dtype=np.int64)
+        self.damping, self.decrement, self.step = np.full(count, START_DAMPING), np.zeros(count), best.descent
+        self.ends = [SearchEnd(0, SolutionStatus.ITERATION_LIMIT, (rms,)) for rms in self._rms()]
+
+    def propose(self) -> None:
+        """Work out the next steps."""
+        damping = self.best.cost.new_tensor(self.damping).view_as(self.best.cost)
+        self.step = solve_damped(self.here, self.problem.step_scale, damping)
+        self.decrement = _array(_product(self.here.normal, self.step).mul_(self.step).sum(-1))
+
+    def go(self) -> None:
+        """Take the steps; end the searches that are over, and decide where the others go on."""
+        self.iterations += 1
+        there = self.problem.linearise(self.problem.moved(self.here.point, self.step), self.best)
+        lower, small = _array(there.cost <= self.best.cost), self.decrement <= SHORTEST_STEP**2
+        over = self._over(~lower, small)
+        # there is no descent such as where a loss rejects every row
+        going = np.isfinite(_array(there.cost)) & _array(there.descent.any(-1))
+        climbing = ~lower & (over == None) & (self.uphill < PATIENCE) & going  # noqa: E711 - of every entry
+        there, settled = self._renewed(there, climbing | (lower & (self.iterations <= SWINGING)))
+        self.best = _where(lower, there, self.best)
+        self.here = _where(climbing, there, self.best)
+        self.damping[~lower & ~climbing] = np.maximum(100 * self.damping[~lower & ~climbing], 0.1)
+        self.damping[lower] = np.maximum(self.damping[lower] / 10, SMALLEST_DAMPING)
+        self.uphill, self.at_best = np.where(climbing, self.uphill + 1, 0), ~climbing
+        for robot, rms in zip(self.robots[lower], np.array(self._rms())[lower].tolist(), strict=True):
+            self.ends[robot] = replace(self.ends[robot], path=(*self.ends[robot].path, rms))
+        over[lower & small & settled] = SolutionStatus.CONVERGED
+        over[lower & _array(self.best.misfit <= self.best.rounding)] = SolutionStatus.EXACT
+        self.end(over != None, over)  # noqa: E711 - of every entry
+
+    def end(self, ended: np.ndarray, status: SolutionStatus | np.ndarray) -> None:
+        """End some of the searches, all by one status or each by its own, and go on with the others."""
+        if not ended.any():
+            return
+        reasons = np.broadcast_to(np.array(status, dtype=object), len(ended))
+        for robot, reason in zip(self.robots[ended], reasons[ended], strict=True):
+            self.ends[robot] = replace(self.ends[robot], iterations=self.iterations, status=reason)
+        everyone = np.isin(np.arange(len(self.ends)), self.robots[ended])
+        self.last = _where(everyone, self.best, self.last, ended)
+        self.robots = self.robots[~ended]
+        if len(self.robots):
+            left = torch.from_numpy(np.flatnonzero(~ended))
+            self.problem = self.problem.of_robots(left)
+            self.best, self.here, self.step = of_robots((self.best, self.here, self.step), left)
+            for name in ("at_best", "uphill", "damping", "decrement"):
+                setattr(self, name, getattr(self, name)[~ended])
+
+    def _over(self, higher: np.ndarray, small: np.ndarray) -> np.ndarray:
+        """Return why searches are over whose step has raised the cost, None where they are not."""
+        over = np.full(len(higher), None, dtype=object)
+        over[higher & (self.damping > LARGEST_DAMPING)] = SolutionStatus.STALLED
+        small = small | (self.decrement <= 1e-10 * _array(self.best.cost))
+        over[higher & self.at_best & small] = SolutionStatus.CONVERGED
+        over[higher & _array(self.best.misfit <= 1e4 * self.best.rounding)] = SolutionStatus.EXACT
+        return over
+
+    def _renewed(
+        self, there: Linearisation[Point], chosen: np.ndarray
+    ) -> tuple[Linearisation[Point], np.ndarray]:
+        """Renew the noise of the chosen, and say where it has settled; that of the others stays as it is."""
+        settled = np.ones(len(chosen), dtype=bool)
+        if chosen.all():
+            renewed, now = self.problem.renewed(there)
+        elif chosen.any():
+            robots = torch.from_numpy(np.flatnonzero(chosen))
+            renewed, now = self.problem.of_robots(robots).renewed(of_robots(there, robots))
+            renewed = with_robots(there, robots, renewed)
         else:
-            here, uphill, damping = best, 0, max(100 * damping, 0.1)
-    return ended(SolutionStatus.ITERATION_LIMIT)
+            return there, settled
+        settled[chosen] = _array(now)
+        return renewed, settled
+
+    def _rms(self) -> list[float]:
+        """Size of the residuals at the best points."""
+        sizes: list[float] = _array(self.problem.rms(self.best)).tolist()
+        return sizes
+
+
+def _array(values: Tensor) -> np.ndarray:
+    """One entry for each search."""
+    array: np.ndarray = values.reshape(-1).cpu().numpy()
+    return array
+
+
+def _product(matrix: Float[Tensor, "*robots rows columns"], vector: Float[Tensor, "*robots columns"]) -> Tensor:
+    return (matrix @ vector[..., None])[..., 0]
+
+
+def _where(
+    chosen: np.ndarray,
+    these: Linearisation[Point],
+    those: Linearisation[Point],
+    of_these: np.ndarray | None = None,
+) -> Linearisation[Point]:
+    """Return these linearisations for the chosen robots, and those for all others.
+
+    Args:
+        chosen: per robot of those, whether it is one.
+        these: of the chosen and others.
+        those: of all robots.
+        of_these: per robot of these, whether it is chosen; None where they are of the same robots.
+    """
+    of_these = chosen if of_these is None else of_these
+    if chosen.all() and of_these.all():
+        return these
+    if not chosen.any():
+        return those
+    theirs = of_robots(these, torch.from_numpy(np.flatnonzero(of_these)))
+    return with_robots(those, torch.from_numpy(np.flatnonzero(chosen)), theirs)
 
 
 def solve_damped(
-    linearisation: Linearisation[Point], step_scale: Float[Tensor, " unknowns"], damping: float
-) -> Float[Tensor, " unknowns"]:
+    linearisation: Linearisation[Point],
+    step_scale: Float[Tensor, " unknowns"],
+    damping: Float[Tensor, "*robots"],
+) -> Float[Tensor, "*robots unknowns"]:
     """Solve `(normal + damping / step_scale²) step = descent` by Cholesky with column scaling.
 
     Raises:
         IdentificationError: they are not finite.
     """
-    normal = linearisation.normal
-    if not math.isfinite(float(normal.sum() + linearisation.descent.sum())):
+    normal, descent = linearisation.normal, linearisation.descent
+    if not bool(torch.isfinite(normal.sum() + descent.sum())):
         raise IdentificationError(
             "the normal equations are not finite; look for huge values, or standard deviations of next to nothing, in "
             "the measurements."
         )
     while True:
-        damped = normal.diagonal() + damping / step_scale.square()
+        damped = normal.diagonal(dim1=-2, dim2=-1) + damping[..., None] / step_scale.square()
         scale = damped.rsqrt()
-        scaled = normal * (scale * scale[:, None])
-        scaled.diagonal().copy_(damped * scale.square() + 1e-14)
+        scaled = normal * (scale[..., None, :] * scale[..., None])
+        scaled.diagonal(dim1=-2, dim2=-1).copy_(damped * scale.square() + 1e-14)
         factor, failed = torch.linalg.cholesky_ex(scaled)
-        if not failed:
-            return scale * torch.cholesky_solve((scale * linearisation.descent)[:, None], factor)[:, 0]
-        damping = max(10 * damping, 1e-6)
+        if not bool(failed.any()):
+            solved = torch.cholesky_solve((scale * descent)[..., None], factor)[..., 0]
+            return scale * solved
+        damping = torch.where(failed > 0, (10 * damping).clamp(min=1e-6), damping)
 
 
-def covariance_of(normal: Float64[Tensor, "active active"]) -> Float64[Tensor, "active active"]:
+def covariance_of(normal: Float64[Tensor, "*robots active active"]) -> Float64[Tensor, "*robots active active"]:
     """Invert a normal matrix, with column scaling; directions that it does not hold get no variance."""
-    diagonal = normal.diagonal()
+    diagonal = normal.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
-    scales = scale * scale[:, None]
+    scales = scale[..., None, :] * scale[..., None]
     scaled = normal * scales
     factor, failed = torch.linalg.cholesky_ex(scaled)
-    if not failed and bool((factor.diagonal() > 1e-6).all()):
-        inverse = torch.cholesky_inverse(factor)
-    else:
-        inverse = torch.linalg.pinv(scaled, rtol=1e-12, hermitian=True)
-    return inverse * scales
+    clear = (failed == 0) & (factor.diagonal(dim1=-2, dim2=-1) > 1e-6).all(-1)
+    if bool(clear.all()):
+        return torch.cholesky_inverse(factor).mul_(scales)
+    inverse = torch.linalg.pinv(scaled, rtol=1e-12, hermitian=True)
+    if bool(clear.any()):
+        inverse[clear] = torch.cholesky_inverse(factor[clear])
+    covariance: Tensor = inverse * scales
+    return covariance

@@ -1,6 +1,5 @@
 """Losses: how much a row counts, given its distance from the prediction in standard deviations."""
 
-import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -17,19 +16,24 @@ HAMPEL_VARIANCE = {1: 0.990933, 2: 0.995409, 3: 0.996914, 6: 0.998435}
 """Weighted variance of standard normal noise under Hampel's weights: `E[w d²] / (components · E[w])`."""
 
 
+Figure = Float[Tensor, "*batch"] | float
+
+
 class AbstractLoss(ABC):
     """What a row's distance (in standard deviations) costs; `components` is how many values the row has."""
 
     @abstractmethod
-    def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+    def cost(self, distance: Float[Tensor, "*batch rows"], components: int) -> Float[Tensor, "*batch rows"]:
         """Cost of every row; the distance's square for small distances."""
 
     @abstractmethod
-    def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+    def weight(self, distance: Float[Tensor, "*batch rows"], components: int) -> Float[Tensor, "*batch rows"]:
         """Weight of every row in least squares: half the derivative of the cost over the distance."""
 
     @abstractmethod
-    def scale(self, distance: Float[Tensor, " rows"], components: int, used: float) -> float:
+    def scale(
+        self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure
+    ) -> Float[Tensor, "*batch"]:
         """Standard deviation of one value while the scale is still unknown.
 
         Args:
@@ -40,8 +44,8 @@ class AbstractLoss(ABC):
 
     @abstractmethod
     def deviation(
-        self, distance: Float[Tensor, " rows"], components: int, used: float, scale: float
-    ) -> float:
+        self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure, scale: Figure
+    ) -> Float[Tensor, "*batch"]:
         """Standard deviation of one value, from all good rows.
 
         Args:
@@ -56,23 +60,25 @@ class AbstractLoss(ABC):
 class SquaredLoss(AbstractLoss):
     """Plain least squares."""
 
-    def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+    def cost(self, distance: Float[Tensor, "*batch rows"], components: int) -> Float[Tensor, "*batch rows"]:
         """The square."""
         return distance.square()
 
-    def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+    def weight(self, distance: Float[Tensor, "*batch rows"], components: int) -> Float[Tensor, "*batch rows"]:
         """One."""
         return torch.ones_like(distance)
 
-    def scale(self, distance: Float[Tensor, " rows"], components: int, used: float) -> float:
+    def scale(
+        self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure
+    ) -> Float[Tensor, "*batch"]:
         """Root mean square, corrected for the parameters."""
         return self.deviation(distance, components, used, 1.0)
 
     def deviation(
-        self, distance: Float[Tensor, " rows"], components: int, used: float, scale: float
-    ) -> float:
+        self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure, scale: Figure
+    ) -> Float[Tensor, "*batch"]:
         """Root mean square, corrected for the parameters."""
-        return math.sqrt(float(distance.square().sum()) / max(len(distance) * components - used, 1.0))
+        return (distance.square().sum(-1) / _left(distance, components, used)).sqrt()
 
 
 @dataclass(frozen=True)
@@ -85,7 +91,7 @@ class HampelLoss(AbstractLoss):
     nearly half of the rows being wrong.
     """
 
-    def cost(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+    def cost(self, distance: Float[Tensor, "*batch rows"], components: int) -> Float[Tensor, "*batch rows"]:
         """Square, line, parabola, constant."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
@@ -93,23 +99,30 @@ class HampelLoss(AbstractLoss):
         cost: Tensor = distance.clamp(max=a).square().add_(straight, alpha=2 * a)
         return cost.add_(bent.square(), alpha=-a / (c - b))
 
-    def weight(self, distance: Float[Tensor, " rows"], components: int) -> Float[Tensor, " rows"]:
+    def weight(self, distance: Float[Tensor, "*batch rows"], components: int) -> Float[Tensor, "*batch rows"]:
         """One, a / distance, falling, zero."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
         return (a / distance.clamp(min=a)) * ((c - distance) / (c - b)).clamp(0, 1)
 
-    def scale(self, distance: Float[Tensor, " rows"], components: int, used: float) -> float:
+    def scale(
+        self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure
+    ) -> Float[Tensor, "*batch"]:
         """Median over that of a standard normal vector, corrected for the parameters."""
-        values = len(distance) * components
-        left = max(values - used, 1.0) / values
-        return float(distance.median()) / MEDIAN_DISTANCE[components] / math.sqrt(left)
+        share = _left(distance, components, used) / (distance.shape[-1] * components)
+        return distance.median(-1).values / MEDIAN_DISTANCE[components] / share.sqrt()
 
     def deviation(
-        self, distance: Float[Tensor, " rows"], components: int, used: float, scale: float
-    ) -> float:
+        self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure, scale: Figure
+    ) -> Float[Tensor, "*batch"]:
         """Weighted root mean square, less what the parameters used up and what the weights take off."""
-        weight = self.weight(distance / scale, components)
-        left = float(weight.sum()) * components - used
-        square = float((weight * distance.square()).sum()) / max(left, 1.0)
-        return math.sqrt(square / HAMPEL_VARIANCE[components])
+        divisor = scale[..., None] if isinstance(scale, Tensor) else scale
+        weight = self.weight(distance / divisor, components)
+        left = (weight.sum(-1) * components - used).clamp(min=1.0)
+        return ((weight * distance.square()).sum(-1) / left / HAMPEL_VARIANCE[components]).sqrt()
+
+
+def _left(distance: Float[Tensor, "*batch rows"], components: int, used: Figure) -> Float[Tensor, "*batch"]:
+    """How many values the estimated parameters leave over, at least one."""
+    values = distance.shape[-1] * components
+    return distance.new_full(distance.shape[:-1], values).sub_(used).clamp_(min=1.0)

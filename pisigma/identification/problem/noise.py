@@ -4,6 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -57,30 +58,32 @@ class SensorSums:
         descent: `Σ w J r / sigma_row²`.
         residual: measured minus predicted, 0 where nothing was measured [m or rad].
         distance: length of the residual over sigma_row, 0 where nothing was measured.
-        measured: number of rows of the problem that were measured.
+        measured: number of rows of a robot that were measured.
     """
 
-    normal: Float64[Tensor, "active active"]
-    descent: Float64[Tensor, " active"]
-    residual: Float64[Tensor, "components rows"]
-    distance: Float64[Tensor, " rows"]
+    normal: Float64[Tensor, "*robots active active"]
+    descent: Float64[Tensor, "*robots active"]
+    residual: Float64[Tensor, "*robots components rows"]
+    distance: Float64[Tensor, "*robots rows"]
     measured: int
 
     @property
-    def rms(self) -> float:
+    def rms(self) -> Float64[Tensor, "*robots"]:
         """Root mean square of the residuals' lengths [m or rad]."""
-        return float((self.residual.square().sum() / max(self.measured, 1)).sqrt())
+        return (self.residual.square().sum((-2, -1)) / max(self.measured, 1)).sqrt()
 
 
 def joined_sums(chunks: Sequence[SensorSums]) -> SensorSums:
-    """Add up what a sensor contributes in chunks of rows, one behind the other."""
+    """Add up what a sensor contributes in chunks of rows, one behind the other; chunks of robots stand side by side."""
     first, *others = chunks
     if not others:
         return first
+    robots = first.distance.ndim > 1
+    normals, descents = [sums.normal for sums in chunks], [sums.descent for sums in chunks]
     return SensorSums(
-        normal=torch.stack([sums.normal for sums in chunks]).sum(0),
-        descent=torch.stack([sums.descent for sums in chunks]).sum(0),
-        residual=torch.cat([sums.residual for sums in chunks], 1),
+        normal=torch.cat(normals) if robots else torch.stack(normals).sum(0),
+        descent=torch.cat(descents) if robots else torch.stack(descents).sum(0),
+        residual=torch.cat([sums.residual for sums in chunks], 0 if robots else -1),
         distance=torch.cat([sums.distance for sums in chunks]),
         measured=first.measured,
     )
@@ -102,22 +105,41 @@ class SensorView:
     """
 
     sums: tuple[SensorSums, ...]
-    noise: tuple[float, ...]
-    repetition: tuple[float, ...]
-    disagreement: tuple[float, ...]
-    prior_scale: tuple[float, ...] = (1.0,) * len(PriorGroup)
+    noise: Float64[Tensor, "*robots sensors"]
+    repetition: Float64[Tensor, "*robots sensors"]
+    disagreement: Float64[Tensor, "*robots sensors"]
+    prior_scale: Float64[Tensor, "*robots groups"]
 
-    def scale(self, sensor: int) -> float:
+    @staticmethod
+    def without_noise(sums: tuple[SensorSums, ...]) -> "SensorView":
+        """All sensors as if their values had a standard deviation of 1, the prior being as stated."""
+        ones = sums[0].normal.new_ones((*sums[0].descent.shape[:-1], max(len(sums), len(PriorGroup))))
+        sensors = ones[..., : len(sums)]
+        return SensorView(sums, sensors, sensors, sensors, ones[..., : len(PriorGroup)])
+
+    @cached_property
+    def scales(self) -> Float64[Tensor, "*robots sensors"]:
         """What distances are divided by for the loss."""
-        return max(self.noise[sensor], ALWAYS_GOOD)
+        return self.noise.clamp(min=ALWAYS_GOOD)
 
-    def variance(self, sensor: int) -> float:
+    def scale(self, sensor: int) -> Float64[Tensor, "*robots"]:
+        """What a sensor's distances are divided by for the loss."""
+        return self.scales[..., sensor]
+
+    @cached_property
+    def variances(self) -> Float64[Tensor, "*robots sensors"]:
+        """What the sensors' sums are divided by."""
+        return self.noise.square() * self.repetition * self.disagreement
+
+    def variance(self, sensor: int) -> Float64[Tensor, "*robots"]:
         """What a sensor's sums are divided by."""
-        return self.noise[sensor] ** 2 * self.repetition[sensor] * self.disagreement[sensor]
+        return self.variances[..., sensor]
 
-    def scaled(self, precision: Float64[Tensor, " active"], group: Tensor) -> Float64[Tensor, " active"]:
+    def scaled(
+        self, precision: Float64[Tensor, " active"], group: Int64[Tensor, " active"]
+    ) -> Float64[Tensor, "*robots active"]:
         """1 / variance of parameters by the prior at its present scale."""
-        return precision / precision.new_tensor([scale**2 for scale in self.prior_scale])[group]
+        return scaled_precision(precision, group, self.prior_scale)
 
 
 def view_of(linearisation: Linearisation[Tensor]) -> SensorView:
@@ -126,21 +148,21 @@ def view_of(linearisation: Linearisation[Tensor]) -> SensorView:
     return linearisation.detail
 
 
-def values_used(view: SensorView, covariance: Float64[Tensor, "active active"]) -> tuple[float, ...]:
+def values_used(
+    view: SensorView, covariance: Float64[Tensor, "*robots active active"]
+) -> Float64[Tensor, "*robots sensors"]:
     """How many values of every sensor the parameters use up (Förstner 1979); the prior spares some."""
-    return tuple(
-        float(sums.normal.flatten().dot(covariance.flatten())) / view.variance(k)
-        for k, sums in enumerate(view.sums)
-    )
+    used = [(sums.normal * covariance).sum((-2, -1)) for sums in view.sums]
+    return torch.stack(used, -1) / view.variances
 
 
 def loss_scale(
     sensors: Sequence[AbstractSensor],
     loss: AbstractLoss,
     view: SensorView,
-    used: Sequence[float],
+    used: Float64[Tensor, "*robots sensors"],
     refine: bool,
-) -> tuple[float, ...]:
+) -> Float64[Tensor, "*robots sensors"]:
     """Standard deviation of every sensor's values, or factor of 1 or more on those that its rows give.
 
     `refine` uses all good rows instead of the median.
@@ -148,17 +170,17 @@ def loss_scale(
     scales = []
     for k, sensor in enumerate(sensors):
         if sensor.certain:
-            scales.append(1.0)
+            scales.append(torch.ones_like(used[..., k]))
             continue
         distance = view.sums[k].distance
-        if view.sums[k].measured < len(distance):
-            distance = distance[sensor.present]
+        if view.sums[k].measured < distance.shape[-1]:
+            distance = distance[..., sensor.present[: distance.shape[-1]]]
         if refine:
-            scale = loss.deviation(distance, sensor.components, used[k], view.scale(k))
+            scale = loss.deviation(distance, sensor.components, used[..., k], view.scale(k))
         else:
-            scale = loss.scale(distance, sensor.components, used[k])
-        scales.append(max(scale, SMALLEST_NOISE if sensor.sigma is None else 1.0))
-    return tuple(scales)
+            scale = loss.scale(distance, sensor.components, used[..., k])
+        scales.append(scale.clamp(min=SMALLEST_NOISE if sensor.sigma is None else 1.0))
+    return torch.stack(scales, -1)
 
 
 def renumbered(keys: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
@@ -171,10 +193,10 @@ def group_variance_ratio(
     sensors: Sequence[AbstractSensor],
     loss: AbstractLoss,
     view: SensorView,
-    used: Sequence[float],
-    pose: Int64[Tensor, " rows"] | None,
-    configuration: Int64[Tensor, " rows"] | None = None,
-) -> tuple[float, ...]:
+    used: Float64[Tensor, "*robots sensors"],
+    pose: Int64[Tensor, "*robots rows"] | None,
+    configuration: Int64[Tensor, "*robots rows"] | None = None,
+) -> Float64[Tensor, "*robots sensors"]:
     """Variance of the poses' mean residuals over that of independent rows (Kish 1965: design effect).
 
     Targets on one tool share what the model gets wrong with the joints; by how much the mean residuals of
@@ -190,26 +212,32 @@ def group_variance_ratio(
     """
     ratios = []
     for k, (sensor, sums) in enumerate(zip(sensors, view.sums, strict=True)):
-        if sensor.certain:
-            ratios.append(1.0)
-            continue
-        weight = loss.weight(sums.distance / view.scale(k), sensor.components) * sensor.present
-        if sensor.sigma is not None:
-            weight = torch.where(sensor.present, weight / sensor.sigma.square(), 0.0)
-        square, values = _group_squares(sums.residual, weight, pose)
-        ratio = 1.0
-        if pose is not None:
-            ratio = max(square / max(values - used[k], 1.0) / view.noise[k] ** 2, 1.0)
-        if configuration is not None and square > 0:
-            shared, fewer = _group_squares(sums.residual, weight, configuration)
-            ratio *= max((shared / fewer) / (square / values), 1.0)
+        ratio = torch.ones_like(used[..., k])
         ratios.append(ratio)
-    return tuple(ratios)
+        if sensor.certain:
+            continue
+        present = sensor.present.view_as(sums.distance)
+        weight = loss.weight(sums.distance / view.scale(k)[..., None], sensor.components) * present
+        if sensor.sigma is not None:
+            weight = torch.where(present, weight / sensor.sigma.view_as(weight).square(), 0.0)
+        square, values = _group_squares(sums.residual, weight, pose)
+        if pose is not None:
+            left = (values - used[..., k]).clamp(min=1.0)
+            ratio = (square / left / view.noise[..., k].square()).clamp(min=1.0)
+        if configuration is not None:
+            shared, fewer = _group_squares(sums.residual, weight, configuration)
+            larger = ((shared / fewer) / (square / values)).clamp(min=1.0)
+            ratio = torch.where(square > 0, ratio * larger, ratio)
+        ratios[-1] = ratio
+    return torch.stack(ratios, -1)
 
 
 def angle_disagreement(
-    sensors: Sequence[AbstractSensor], view: SensorView, held: Float64[Tensor, " active"], pull: Tensor
-) -> tuple[float, ...]:
+    sensors: Sequence[AbstractSensor],
+    view: SensorView,
+    held: Float64[Tensor, "*robots active"],
+    pull: Float64[Tensor, "*robots active"],
+) -> Float64[Tensor, "*robots sensors"]:
     """Estimate by which factor the variance of measured angles is to be enlarged, per sensor.
 
     What the geometry does not explain of orientations, such as the wobble of a wrist, depends on the pose. Rows taken
@@ -227,22 +255,36 @@ def angle_disagreement(
         pull: what the prior adds to the descent.
     """
     angular = [sensor.unit == "rad" and not sensor.certain for sensor in sensors]
-    if not any(angular) or all(
-        sensor.certain or angle for sensor, angle in zip(sensors, angular, strict=True)
-    ):
-        return (1.0,) * len(sensors)
-    Q, R = np.zeros((2, len(held), len(held)))
-    lengths, angles = pull.cpu().numpy().copy(), np.zeros(len(held))
-    for k, (sums, angle) in enumerate(zip(view.sums, angular, strict=True)):
-        variance = view.noise[k] ** 2 * view.repetition[k]
-        normal, descent = sums.normal.cpu().numpy() / variance, sums.descent.cpu().numpy() / variance
-        if angle:
-            R += normal
-            angles += descent
-        else:
-            Q += normal
-            lengths += descent
-    A = Q + np.diag(held.cpu().numpy())
+    lengths = [sensor.unit != "rad" and not sensor.certain for sensor in sensors]
+    if not any(angular) or not any(lengths):
+        return torch.ones_like(view.noise)
+    variance = (view.noise.square() * view.repetition)[..., None]
+    normals = [sums.normal / variance[..., k, :, None] for k, sums in enumerate(view.sums)]
+    descents = [sums.descent / variance[..., k, :] for k, sums in enumerate(view.sums)]
+    zero = torch.zeros_like(normals[0]), torch.zeros_like(pull)
+    by_lengths, by_angles = (
+        (
+            sum((one for one, angle in zip(normals, angular, strict=True) if angle is which), zero[0]),
+            sum((one for one, angle in zip(descents, angular, strict=True) if angle is which), zero[1]),
+        )
+        for which in (False, True)
+    )
+    systems = (by_lengths[0], by_lengths[1] + pull, *by_angles, held)
+    arrays = (value.reshape(-1, *value.shape[pull.ndim - 1 :]).cpu().numpy() for value in systems)
+    factors = [_angle_disagreement(*system) for system in zip(*arrays, strict=True)]
+    factor = pull.new_tensor(factors).view(pull.shape[:-1])[..., None]
+    return torch.where(torch.tensor(angular, device=pull.device), factor, 1.0)
+
+
+def _angle_disagreement(
+    Q: Float64[np.ndarray, "active active"],
+    lengths: Float64[np.ndarray, " active"],
+    R: Float64[np.ndarray, "active active"],
+    angles: Float64[np.ndarray, " active"],
+    held: Float64[np.ndarray, " active"],
+) -> float:
+    """Return the factor of one robot: normal matrix and descent by lengths, the same by angles, and the prior."""
+    A = Q + np.diag(held)
     scale = (A + R).diagonal()
     scale = 1 / np.sqrt(np.where(scale > 0, scale, 1.0))
     root = np.linalg.cholesky(A * scale * scale[:, None] + UNDETERMINED * np.eye(len(scale)))
@@ -260,28 +302,30 @@ def angle_disagreement(
 
     low, high = 0.0, math.log(LARGEST_DISAGREEMENT)
     if excess(low) <= 0:
-        return (1.0,) * len(sensors)
+        return 1.0
     while high - low > 1e-3:
         middle = (low + high) / 2
         low, high = (middle, high) if excess(middle) > 0 else (low, middle)
-    return tuple(math.exp(high) if angle else 1.0 for angle in angular)
+    return math.exp(high)
 
 
 def _group_squares(
-    residual: Float64[Tensor, "components rows"],
-    weight: Float64[Tensor, " rows"],
-    group: Int64[Tensor, " rows"] | None,
-) -> tuple[float, int]:
+    residual: Float64[Tensor, "*robots components rows"],
+    weight: Float64[Tensor, "*robots rows"],
+    group: Int64[Tensor, "*robots rows"] | None,
+) -> tuple[Float64[Tensor, "*robots"], Int64[Tensor, "*robots"]]:
     """Sum of the squared mean residuals of groups of rows, by weight, and of how many values it is."""
+    components = residual.shape[-2]
     if group is None:
-        return float((residual.square() * weight).sum()), int((weight > 0).sum()) * len(residual)
+        square = (residual.square() * weight[..., None, :]).sum((-2, -1))
+        return square, (weight > 0).sum(-1) * components
     groups = int(group.max()) + 1
-    total = weight.new_zeros(groups).index_add(0, group, weight)
-    summed = weight.new_zeros((len(residual), groups)).index_add(1, group, residual * weight)
+    total = weight.new_zeros((*weight.shape[:-1], groups)).scatter_add(-1, group, weight)
+    weighted, index = residual * weight[..., None, :], group[..., None, :].expand_as(residual)
+    summed = torch.zeros_like(total)[..., None, :].repeat_interleave(components, -2)
+    squares = summed.scatter_add(-1, index, weighted).square().sum(-2) / total
     measured = total > 0
-    return float((summed[:, measured].square().sum(0) / total[measured]).sum()), int(measured.sum()) * len(
-        residual
-    )
+    return torch.where(measured, squares, 0.0).sum(-1), measured.sum(-1) * components
 
 
 def prior_group_of(column: str, drawn: bool) -> int:
@@ -299,9 +343,9 @@ def prior_group_of(column: str, drawn: bool) -> int:
 def effective_parameters(
     precision: Float64[Tensor, " active"],
     group: Int64[Tensor, " active"],
-    view: SensorView,
-    covariance: Float64[Tensor, "active active"],
-) -> tuple[float, ...]:
+    prior_scale: Float64[Tensor, "*robots groups"],
+    covariance: Float64[Tensor, "*robots active active"],
+) -> Float64[Tensor, "*robots groups"]:
     """How many parameters with a prior the data determine, per group: each counts by how much of it they do.
 
     `γ = Σ (1 - variance after / variance before)` of MacKay 1992, Neural Computation 4(3), eq. 4.5.
@@ -309,27 +353,38 @@ def effective_parameters(
     Args:
         precision: 1 / variance as the prior states it, 0 where it says nothing.
         group: every parameter's group.
-        view: the scale of the prior.
+        prior_scale: the scale of the prior.
         covariance: of the parameters.
     """
-    share = (1 - view.scaled(precision, group) * covariance.diagonal()) * (precision > 0)
-    return _group_totals(share, group)
+    variance = covariance.diagonal(dim1=-2, dim2=-1)
+    share = 1 - scaled_precision(precision, group, prior_scale) * variance
+    return _group_totals(share * (precision > 0), group)
 
 
-def _group_totals(values: Float64[Tensor, " active"], group: Int64[Tensor, " active"]) -> tuple[float, ...]:
+def scaled_precision(
+    precision: Float64[Tensor, " active"],
+    group: Int64[Tensor, " active"],
+    prior_scale: Float64[Tensor, "*robots groups"],
+) -> Float64[Tensor, "*robots active"]:
+    """1 / variance of parameters by the prior at a scale of its standard deviations per group."""
+    return precision / prior_scale.square()[..., group]
+
+
+def _group_totals(
+    values: Float64[Tensor, "*robots active"], group: Int64[Tensor, " active"]
+) -> Float64[Tensor, "*robots groups"]:
     """Sum of the parameters' values per group of the prior."""
-    totals = np.bincount(group.cpu().numpy(), values.cpu().numpy(), len(PriorGroup))
-    return tuple(totals.tolist())
+    return values.new_zeros((*values.shape[:-1], len(PriorGroup))).index_add(-1, group, values)
 
 
 def prior_scales(
-    off: Float64[Tensor, " active"],
+    off: Float64[Tensor, "*robots active"],
     precision: Float64[Tensor, " active"],
     group: Int64[Tensor, " active"],
-    view: SensorView,
-    covariance: Float64[Tensor, "active active"],
+    before: Float64[Tensor, "*robots groups"],
+    covariance: Float64[Tensor, "*robots active active"],
     floor: float = 1.0,
-) -> tuple[float, ...]:
+) -> Float64[Tensor, "*robots groups"]:
     """How many times as large as stated the parameters' errors turn out, per group of parameters.
 
     MacKay's update (1992, Neural Computation 4(3), eq. 4.7) with the `effective_parameters` of every group.
@@ -338,14 +393,12 @@ def prior_scales(
         off: distance of the parameters from their nominal values [m or rad].
         precision: 1 / variance as the prior states it, 0 where it says nothing.
         group: every parameter's group.
-        view: the scale of the prior so far.
+        before: the scale of the prior so far.
         covariance: of the parameters.
         floor: smallest answer; 1 where smaller errors than stated do not tighten the prior.
     """
     squares = _group_totals(off.square() * precision, group)
     least = 1.0 if floor == 1.0 else LEAST_EFFECTIVE
-    effective = effective_parameters(precision, group, view, covariance)
-    return tuple(
-        max(off_square / count, floor**2) ** 0.5 if count > least else now
-        for count, off_square, now in zip(effective, squares, view.prior_scale, strict=True)
-    )
+    effective = effective_parameters(precision, group, before, covariance)
+    sized = (squares / effective).clamp(min=floor**2).sqrt()
+    return torch.where(effective > least, sized, before)

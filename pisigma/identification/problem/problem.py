@@ -1,11 +1,16 @@
-"""The calibration as a least-squares problem: normal equations summed over chunks of poses."""
+"""The calibration as a least-squares problem: normal equations summed over chunks of poses.
+
+A problem may be that of several robots of one type side by side. They have equally many rows, values in the same of
+them, and the same free parameters. Their rows stand one robot behind the other in what has one entry a row; what has
+one a robot has an axis of robots first, which a problem of one robot need not have.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.identification.problem.least_squares import AbstractLeastSquares, Linearisation, covariance_of
@@ -21,13 +26,16 @@ from pisigma.identification.problem.noise import (
     loss_scale,
     prior_group_of,
     prior_scales,
+    scaled_precision,
     renumbered,
     values_used,
     view_of,
 )
 from pisigma.identification.problem.parameters import EVERYWHERE, ParameterSpace, PriorSizes
+from pisigma.identification.problem.robots import of_robots, with_robots
 from pisigma.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion, tool_motion
 from pisigma.measurement.conditions import JointState
+from pisigma.sensors.pose import PositionSensor, RotationSensor
 from pisigma.sensors.sensor import AbstractSensor, Unknowns
 
 CERTAIN_LOSS = SquaredLoss()
@@ -59,10 +67,10 @@ class MotionMemory:
 
 @dataclass(frozen=True, eq=False)
 class CalibrationProblem(AbstractLeastSquares[Tensor]):
-    """Rows, sensors, the parameters that are free and what the prior says of them.
+    """Rows, sensors, the parameters that are free and what the prior says of them; of one robot or of several.
 
     Attributes:
-        space: the parameters; a point is a vector of all of them.
+        space: the parameters; a point is a vector of all of them, or one a robot.
         q: joint values [rad or m] of the rows.
         frame: index of every row's frame.
         target: index of every row's target.
@@ -86,7 +94,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     target: Int64[Tensor, " rows"]
     sensors: tuple[AbstractSensor, ...]
     loss: AbstractLoss
-    nominal: Float64[Tensor, " parameters"]
+    nominal: Float64[Tensor, "*robots parameters"]
     precision: Float64[Tensor, " parameters"]
     active: Int64[Tensor, " active"]
     pose: Int64[Tensor, " rows"] | None = None
@@ -101,15 +109,26 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """1 mm and 1 mrad."""
         return torch.from_numpy(self.space.usual_errors).to(self.q.device)[self.active]
 
+    @property
+    def robots(self) -> torch.Size:
+        """The axis of robots, of several; no axis of one."""
+        return self.nominal.shape[:-1]
+
+    @cached_property
+    def rows(self) -> int:
+        """Number of rows of every robot."""
+        return self.q.shape[0] // self.robots.numel()
+
     @cached_property
     def values_measured(self) -> tuple[int, ...]:
-        """Number of values of every sensor."""
-        return tuple(int(sensor.present.sum()) * sensor.components for sensor in self.sensors)
+        """Number of values of every sensor for a robot."""
+        return tuple(int(sensor.present[: self.rows].sum()) * sensor.components for sensor in self.sensors)
 
     @cached_property
     def prior_group(self) -> Int64[Tensor, " active"]:
         """Which size of the prior every free parameter has: of its `PriorGroup`, or for lengths and for angles."""
-        drawn = (self.nominal.square() * self.precision > 1).tolist()
+        nominal = self.nominal.reshape(-1, len(self.precision))[0]  # robots of one type are drawn alike
+        drawn = (nominal.square() * self.precision > 1).tolist()
         groups = []
         for index in self.active.tolist():
             parameter = self.space.parameters[index]
@@ -149,6 +168,38 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             memory=MotionMemory(),
         )
 
+    @property
+    def pattern(self) -> tuple[object, ...] | None:
+        """What problems of robots of one type agree in that may stand side by side; None where none may."""
+        poses = all(isinstance(sensor, PositionSensor | RotationSensor) for sensor in self.sensors)
+        if self.space.unknowns or self.pairs or not poses or self.rows > JACOBIAN_CHUNK:
+            return None
+        kinds = [(one.name, one.sigma is None, tuple(one.present.tolist())) for one in self.sensors]
+        repeats = (self.pose is None, self.configuration is None)
+        return (self.space.frames, self.space.targets, self.rows, *repeats, *kinds, self.q.device)
+
+    @staticmethod
+    def side_by_side(problems: "Sequence[CalibrationProblem]") -> "CalibrationProblem":
+        """Return the problem of several robots of one type, of problems with one pattern and the same free parameters."""
+        first = problems[0]
+        names = ["q", "frame", "target", *(name for name in ("pose", "configuration") if getattr(first, name) is not None)]
+        rows = {name: torch.cat([getattr(problem, name) for problem in problems]) for name in names}
+        of_sensors = zip(*(problem.sensors for problem in problems), strict=True)
+        return replace(
+            first,
+            **rows,  # type: ignore[arg-type]
+            sensors=tuple(AbstractSensor.joined(sensors) for sensors in of_sensors),
+            nominal=torch.stack([problem.nominal for problem in problems]),
+            stated={},
+            memory=MotionMemory(),
+        )
+
+    def of_robots(self, robots: Int64[Tensor, " chosen"]) -> "CalibrationProblem":
+        """Those of several robots that are chosen."""
+        robots = robots.to(self.q.device)
+        rows = (robots[:, None] * self.rows + torch.arange(self.rows, device=robots.device)).flatten()
+        return replace(self.select(rows), nominal=self.nominal[robots])
+
     @cached_property
     def state(self) -> JointState:
         """Joint values of the rows, and what is stated beside them."""
@@ -156,37 +207,45 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def moved(self, point: Tensor, step: Tensor) -> Tensor:
         """The parameters after a step of the free ones."""
-        return point.index_add(0, self.active, step)
+        return point.index_add(-1, self.active, step)
+
+    def rms(self, linearisation: Linearisation[Tensor]) -> Float64[Tensor, "*robots"]:
+        """Root mean square of the first sensor's residuals' lengths [m or rad]."""
+        return view_of(linearisation).sums[0].rms
 
     def linearise(self, point: Tensor, like: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
         """Sum up the normal equations; rows are weighted by the noise of `like`, where None by that which they show."""
         before = None if like is None else view_of(like)
-        noise = (float("inf"),) * len(self.sensors) if before is None else before.noise
         unknowns = self.space.sensor_unknowns(point)
         chunks = []
         for rows in self.chunks():
             motion = self.motion(point, rows, self.active)
-            chunks.append([self._sums(k, sigma, motion, unknowns, rows) for k, sigma in enumerate(noise)])
-        sums = [joined_sums(of_sensor) for of_sensor in zip(*chunks, strict=True)]
-        ones = (1.0,) * len(sums)
-        view = (
-            SensorView(tuple(sums), ones, ones, ones) if before is None else replace(before, sums=tuple(sums))
-        )
-        linearisation = self.combined(point, view)
+            noise = None if before is None else self._of_rows(before.noise, rows)
+            chunks.append(
+                [self._sums(k, noise, motion, unknowns, rows) for k in range(len(self.sensors))]
+            )
+        sums = tuple(joined_sums(of_sensor) for of_sensor in zip(*chunks, strict=True))
         if before is not None:
-            return linearisation
+            return self.combined(point, replace(before, sums=sums))
+        linearisation = self.combined(point, SensorView.without_noise(sums))
         # gross errors would decide the first step, so the rows are weighted by what they show of the noise
         weighted = self.renewed(linearisation)[0]
-        return self.linearise(point, weighted) if self._rejects(view_of(weighted)) else linearisation
+        rejects = self._rejects(view_of(weighted))
+        if bool(rejects.all()) or not bool(rejects.any()):
+            return self.linearise(point, weighted) if bool(rejects.all()) else linearisation
+        robots = rejects.nonzero()[:, 0]
+        theirs = self.of_robots(robots).linearise(point[robots], of_robots(weighted, robots))
+        return with_robots(linearisation, robots, theirs)
 
-    def _rejects(self, view: SensorView) -> bool:
+    def _rejects(self, view: SensorView) -> Bool[Tensor, "*robots"]:
         """Whether the loss rejects any row."""
-        return any(
-            not bool(self.loss_of(sensor).weight(sums.distance / view.scale(k), sensor.components).all())
+        rejected = [
+            (self.loss_of(sensor).weight(sums.distance / view.scale(k)[..., None], sensor.components) == 0).any(-1)
             for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True))
-        )
+        ]
+        return torch.stack(rejected).any(0)
 
-    def renewed(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], bool]:
+    def renewed(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], Tensor]:
         """Estimate the noise robustly, what repeats are worth, and how wide the prior has to be."""
         return self._renewed(linearisation, refine=False)
 
@@ -196,7 +255,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def _renewed(
         self, linearisation: Linearisation[Tensor], refine: bool
-    ) -> tuple[Linearisation[Tensor], bool]:
+    ) -> tuple[Linearisation[Tensor], Tensor]:
         view = view_of(linearisation)
         covariance = covariance_of(linearisation.normal)
         used = values_used(view, covariance)
@@ -204,9 +263,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         repetition = view.repetition
         if self.pose is not None or self.configuration is not None:
             renewed_noise = replace(view, noise=noise)
-            repetition = group_variance_ratio(
-                self.sensors, self.loss, renewed_noise, used, self.pose, self.configuration
-            )
+            shape = (*self.robots, self.rows)
+            groups = (None if one is None else one.view(shape) for one in (self.pose, self.configuration))
+            repetition = group_variance_ratio(self.sensors, self.loss, renewed_noise, used, *groups)
         off = self._off(linearisation.point)
         renewed = replace(view, noise=noise, repetition=repetition)
         if not refine and self._angular:
@@ -215,9 +274,13 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
                 renewed, disagreement=angle_disagreement(self.sensors, renewed, held, -held * off)
             )
         if self._sized:
-            sized = replace(renewed, prior_scale=self._prior_scales(off, view, covariance))
+            sized = replace(renewed, prior_scale=self._prior_scales(off, view.prior_scale, covariance))
             renewed = sized if refine else self._with_settled_prior(sized, off)
-        return self.combined(linearisation.point, renewed), _alike(view, renewed)
+        before, after = (
+            torch.cat([one.noise, one.repetition, one.disagreement, one.prior_scale], -1)
+            for one in (view, renewed)
+        )
+        return self.combined(linearisation.point, renewed), _alike(before, after, SETTLED)
 
     def _with_settled_prior(self, view: SensorView, off: Tensor) -> SensorView:
         """Estimate the prior's sizes together with the step that they lead to.
@@ -225,35 +288,44 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         Residuals being linear in the step, that takes no further linearisation.
         """
         normal, descent = self._data_sums(view)
-        pull = descent + normal @ off
-        for _ in range(PRIOR_ROUNDS):
-            held = normal.clone()
-            held.diagonal().add_(view.scaled(self._prior, self.prior_group))
-            covariance = covariance_of(held)
-            before = view
-            view = replace(view, prior_scale=self._prior_scales(covariance @ pull, view, covariance))
-            if _alike(before, view, PRIOR_SETTLED):
-                break
-        return view
+        pull = (descent + (normal @ off[..., None])[..., 0])[..., None]
+        return replace(view, prior_scale=self._settled_scales(normal, pull, view.prior_scale, PRIOR_ROUNDS))
 
-    def _prior_scales(self, off: Tensor, view: SensorView, covariance: Tensor) -> tuple[float, ...]:
+    def _settled_scales(self, normal: Tensor, pull: Tensor, before: Tensor, rounds: int) -> Tensor:
+        """Estimate the prior's sizes in so many rounds at most, each robot's until they have settled."""
+        held = normal.clone()
+        held.diagonal(dim1=-2, dim2=-1).add_(scaled_precision(self._prior, self.prior_group, before))
+        covariance = covariance_of(held)
+        scale = self._prior_scales((covariance @ pull)[..., 0], before, covariance)
+        moving = ~_alike(before, scale, PRIOR_SETTLED)
+        if rounds == 1 or not bool(moving.any()):
+            return scale
+        if bool(moving.all()):
+            return self._settled_scales(normal, pull, scale, rounds - 1)
+        scale[moving] = self._settled_scales(normal[moving], pull[moving], scale[moving], rounds - 1)
+        return scale
+
+    def _prior_scales(
+        self, off: Tensor, before: Tensor, covariance: Tensor
+    ) -> Float64[Tensor, "*robots groups"]:
         floor = 1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR
-        return prior_scales(off, self._prior, self.prior_group, view, covariance, floor)
+        return prior_scales(off, self._prior, self.prior_group, before, covariance, floor)
 
     @cached_property
     def _sized(self) -> bool:
         """Whether there is a prior whose sizes are estimated."""
         return self.prior_sizes != "stated" and bool((self._prior > 0).any())
 
-    def _off(self, point: Tensor) -> Float64[Tensor, " active"]:
+    def _off(self, point: Tensor) -> Float64[Tensor, "*robots active"]:
         """Distance of the free parameters from where the prior has them."""
-        return (point - self.nominal)[self.active]
+        return (point - self.nominal).index_select(-1, self.active)
 
     def row_weights(self, view: SensorView, sensor: int, rows: slice) -> Float64[Tensor, " poses"]:
         """1 / standard deviation of each row for a sensor, 0 where it saw nothing [1/m or 1/rad]."""
         kind = self.sensors[sensor]
-        distance = view.sums[sensor].distance[rows] / view.scale(sensor)
-        root = self.loss_of(kind).weight(distance, kind.components).sqrt() / view.variance(sensor) ** 0.5
+        distance = (view.sums[sensor].distance / view.scale(sensor)[..., None])
+        root = self.loss_of(kind).weight(distance, kind.components).sqrt()
+        root = (root / view.variance(sensor).sqrt()[..., None]).flatten()[rows]
         if kind.sigma is not None:
             root = root / kind.sigma[rows]
         return torch.where(kind.present[rows], root, 0.0)
@@ -263,8 +335,18 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return CERTAIN_LOSS if sensor.certain else self.loss
 
     def chunks(self) -> list[slice]:
-        """Rows that are worked on together."""
-        return [slice(start, start + JACOBIAN_CHUNK) for start in range(0, self.q.shape[0], JACOBIAN_CHUNK)]
+        """Rows that are worked on together; all or none of a robot where there are several."""
+        whole = self.rows if self.robots else 1
+        size = max(JACOBIAN_CHUNK // whole, 1) * whole
+        return [slice(start, min(start + size, len(self.q))) for start in range(0, len(self.q), size)]
+
+    def _of_rows(self, values: Float64[Tensor, "*robots size"], rows: slice) -> Float64[Tensor, "*robots size"]:
+        """What has one entry a robot, for the robots of some rows."""
+        return values[rows.start // self.rows : rows.stop // self.rows] if self.robots else values
+
+    def by_robot(self, values: Tensor) -> Tensor:
+        """Values of rows, their last axis, with an axis of robots first where there are several."""
+        return torch.unflatten(values, -1, (-1, self.rows)).movedim(-2, 0) if self.robots else values
 
     def motion(self, point: Tensor, rows: slice, active: Tensor) -> ToolMotion:
         """Tool pose of some rows and its derivative by some parameters.
@@ -289,11 +371,21 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def _whole_motion(self, point: Tensor, rows: slice) -> ToolMotion:
         """Tool pose of some rows and its derivative by every kind of parameter."""
-        dh, bases, tools = self.space.split(point)
-        frame = None if len(bases) == 1 else self.frame[rows]
-        target = None if len(tools) == 1 else self.target[rows]
-        where = (dh.cpu().numpy(), bases.t(), tools.t(), self.q[rows])
+        dh, bases, tools = self.space.split(self._of_rows(point, rows))
+        where = (dh.cpu().numpy(), bases.reshape(-1, 6).t(), tools.reshape(-1, 6).t(), self.q[rows])
+        frame, target = (
+            self._numbers(number[rows], owners.shape[-2])
+            for number, owners in ((self.frame, bases), (self.target, tools))
+        )
         return tool_motion(self.space.robot, *where, self._turning, frame, target)
+
+    def _numbers(self, owner: Int64[Tensor, " poses"], owners: int) -> Int64[Tensor, " poses"] | None:
+        """Number of every row's frame or target among those of all robots; None where a robot has one only."""
+        if owners == 1 or not self.robots:
+            return None if owners == 1 else owner
+        return owner + owners * torch.arange(len(owner) // self.rows, device=owner.device).repeat_interleave(
+            self.rows
+        )
 
     def derivative(
         self, sensor: AbstractSensor, motion: ToolMotion, unknowns: Unknowns, rows: slice, active: Tensor
@@ -313,33 +405,40 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         precision = view.scaled(self._prior, self.prior_group)
         pull = off * precision
         normal, descent = self._data_sums(view)
-        normal.diagonal().add_(precision)
+        normal.diagonal(dim1=-2, dim2=-1).add_(precision)
         descent.sub_(pull)
-        misfit, rounding = 0.0, 0.0
-        for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True)):
-            scale, variance = view.scale(k), view.variance(k)
-            cost = self.loss_of(sensor).cost(sums.distance / scale, sensor.components)
-            misfit += float(cost.sum()) * scale**2 / variance
-            size = self._reach if sensor.unit == "m" else 1.0
-            rounding += self.values_measured[k] * (torch.finfo(point.dtype).eps * size) ** 2 / variance
-        return Linearisation(point, misfit + float(off.dot(pull)), descent, normal, misfit, rounding, view)
+        distances = (sums.distance / view.scales[..., k, None] for k, sums in enumerate(view.sums))
+        costs = [
+            self.loss_of(sensor).cost(distance, sensor.components).sum(-1)
+            for sensor, distance in zip(self.sensors, distances, strict=True)
+        ]
+        misfit = (torch.stack(costs, -1) * view.scales.square() / view.variances).sum(-1)
+        rounding = (self._rounding / view.variances).sum(-1)
+        cost = misfit + (off * pull).sum(-1)
+        return Linearisation(point, cost, descent, normal, misfit, rounding, view)
 
     def _data_sums(
         self, view: SensorView
-    ) -> tuple[Float64[Tensor, "active active"], Float64[Tensor, " active"]]:
+    ) -> tuple[Float64[Tensor, "*robots active active"], Float64[Tensor, "*robots active"]]:
         """Divide the sums by their variances; the prior is not in it."""
-        first, *others = range(len(view.sums))
-        normal, descent = (
-            sums / view.variance(first) for sums in (view.sums[first].normal, view.sums[first].descent)
-        )
-        for k in others:
-            normal.add_(view.sums[k].normal, alpha=1 / view.variance(k))
-            descent.add_(view.sums[k].descent, alpha=1 / view.variance(k))
+        variance = view.variances[..., None]
+        terms = [
+            (sums.normal / variance[..., k, :, None], sums.descent / variance[..., k, :])
+            for k, sums in enumerate(view.sums)
+        ]
+        normal, descent = terms[0]
+        for more_normal, more_descent in terms[1:]:
+            normal.add_(more_normal)
+            descent.add_(more_descent)
         return normal, descent
 
     @cached_property
-    def _reach(self) -> float:
-        return self.space.robot.reach
+    def _rounding(self) -> Float64[Tensor, " sensors"]:
+        """Sum of squares of what rounding makes of every sensor's residuals [m² or rad²]."""
+        sizes = (self.space.robot.reach if sensor.unit == "m" else 1.0 for sensor in self.sensors)
+        pairs = zip(self.values_measured, sizes, strict=True)
+        epsilon = torch.finfo(self.q.dtype).eps
+        return self.q.new_tensor([values * (epsilon * size) ** 2 for values, size in pairs])
 
     @cached_property
     def _turning(self) -> bool:
@@ -358,36 +457,40 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     @cached_property
     def measured_everywhere(self) -> tuple[bool, ...]:
         """Per sensor, whether it has a value in every row."""
-        rows = self.q.shape[0]
         return tuple(
-            values == rows * sensor.components
+            values == self.rows * sensor.components
             for values, sensor in zip(self.values_measured, self.sensors, strict=True)
         )
 
     def _sums(
-        self, number: int, sigma: float, motion: ToolMotion, unknowns: Unknowns, rows: slice
+        self, number: int, noise: Tensor | None, motion: ToolMotion, unknowns: Unknowns, rows: slice
     ) -> SensorSums:
-        """What one sensor contributes in some rows, weighted by its noise."""
+        """What one sensor contributes in some rows, weighted by its noise, or all alike where that is None."""
         sensor, everywhere = self.sensors[number], self.measured_everywhere[number]
         residual = sensor.residual(motion, unknowns, rows)
         if not everywhere:
             residual = torch.where(sensor.present[rows], residual, 0.0)
-        distance = torch.linalg.vector_norm(residual, dim=0)
+        distance = residual.square().sum(0).sqrt_()
         if sensor.sigma is not None:
             distance = torch.where(sensor.present[rows], distance / sensor.sigma[rows], 0.0)
-        root = self.loss_of(sensor).weight(distance / max(sigma, ALWAYS_GOOD), sensor.components).sqrt()
+        residual, distance = self.by_robot(residual), self.by_robot(distance)
+        root = torch.ones_like(distance)
+        if noise is not None:
+            scale = noise[..., number, None].clamp(min=ALWAYS_GOOD)
+            root = self.loss_of(sensor).weight(distance / scale, sensor.components).sqrt_()
         if sensor.sigma is not None:
-            root = root / sensor.sigma[rows]
+            root = root / self.by_robot(sensor.sigma[rows])
         if not everywhere:
-            root = torch.where(sensor.present[rows], root, 0.0)
-        A = (self.derivative(sensor, motion, unknowns, rows, self.active) * root).flatten(1)
+            root = torch.where(self.by_robot(sensor.present[rows]), root, 0.0)
+        J = self.by_robot(self.derivative(sensor, motion, unknowns, rows, self.active))
+        A = J.new_empty(J.shape)
+        torch.mul(J, root[..., None, None, :], out=A)
+        A = A.flatten(-2)
         measured = self.values_measured[number] // sensor.components
-        return SensorSums(A @ A.t(), A @ (residual * root).flatten(), residual, distance, measured)
+        r = (residual * root[..., None, :]).flatten(-2)[..., None]
+        return SensorSums(A @ A.mT, (A @ r)[..., 0], residual, distance, measured)
 
 
-def _alike(before: SensorView, after: SensorView, share: float = SETTLED) -> bool:
+def _alike(before: Tensor, after: Tensor, share: float) -> Tensor:
     """Whether two estimates of noise and of the prior's sizes differ by less than a share."""
-    old, new = (
-        (*view.noise, *view.repetition, *view.disagreement, *view.prior_scale) for view in (before, after)
-    )
-    return all(abs(b / a - 1) < share for a, b in zip(old, new, strict=True))
+    return ((after / before - 1).abs() < share).all(-1)

@@ -57,7 +57,8 @@ def condensed(
     )
     setup = GeometricCalibrator(robot, base="fixed", tool="fixed").build(data)
     count = setup.problem.space.arm_size if arm_only else len(setup.start)
-    return information(setup.problem, setup.start, list(range(count))), setup.start.numpy()[:count]
+    (at_start,) = information(setup.problem, setup.start, list(range(count)))
+    return at_start, setup.start.numpy()[:count]
 
 
 @pytest.mark.parametrize("name", sorted(PAPER))

@@ -1,0 +1,47 @@
+"""Values of several robots side by side: some of them, and theirs put in the place of others."""
+
+from collections.abc import Callable
+from dataclasses import fields, is_dataclass, replace
+from typing import Any, TypeVar
+
+import torch
+from jaxtyping import Int64
+from torch import Tensor
+
+Values = TypeVar("Values")
+
+
+def of_robots(values: Values, robots: Int64[Tensor, " chosen"] | int) -> Values:
+    """Return the values of some robots, or of one without the axis of robots.
+
+    Args:
+        values: a tensor whose first axis is the robots, or a tuple or dataclass of such; all else is common to them.
+        robots: their numbers.
+    """
+    chosen: Values = _mapped(lambda value: value[robots], values)
+    return chosen
+
+
+def with_robots(values: Values, robots: Int64[Tensor, " chosen"], others: Values) -> Values:
+    """Return the values with those of some robots replaced by others, one behind the other."""
+    changed: Values = _mapped(lambda value, other: value.index_copy(0, robots.to(value.device), other), values, others)
+    return changed
+
+
+def side_by_side(values: list[Values]) -> Values:
+    """Return values of several robots with an axis of robots before all others; the inverse of `of_robots`."""
+    stacked: Values = _mapped(lambda *one: torch.stack(one), *values)
+    return stacked
+
+
+def _mapped(function: Callable[..., Tensor], *values: Any) -> Any:  # noqa: ANN401 - of whatever dataclass
+    first = values[0]
+    if isinstance(first, Tensor):
+        return function(*values)
+    if isinstance(first, tuple):
+        return tuple(_mapped(function, *items) for items in zip(*values, strict=True))
+    if is_dataclass(first) and not isinstance(first, type):
+        names = [item.name for item in fields(first)]
+        changed = {name: _mapped(function, *(getattr(value, name) for value in values)) for name in names}
+        return replace(first, **changed)
+    return first
