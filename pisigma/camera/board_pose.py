@@ -119,7 +119,7 @@ def linearised(
 
 def _weights(residual: np.ndarray, loss: AbstractLoss) -> np.ndarray:
     distance = torch.from_numpy(np.linalg.norm(residual, axis=1))
-    scale = max(float(loss.scale(distance, 2, POSE)), SMALLEST_NOISE)
+    scale = max(float(loss.scale(distance, 2, float(POSE))), SMALLEST_NOISE)
     weights: np.ndarray = loss.weight(distance / scale, 2).numpy()
     return weights
 

@@ -12,7 +12,7 @@ from pisigma.errors import IdentificationError
 from pisigma.hybrid.evidence import FIRST_SIZE, GaussianPrior, SensorCount
 from pisigma.hybrid.sensor_values import SensorValues
 from pisigma.identification.problem.loss import SquaredLoss
-from pisigma.identification.problem.noise import PriorGroup
+from pisigma.identification.problem.prior_sizes import PriorGroup
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.measurement.conditions import JointState

@@ -25,6 +25,7 @@ from pisigma.identification.identifiability.sufficiency import (
     refuse_too_few,
 )
 from pisigma.identification.initial_guess.initial_guess import chosen_rows
+from pisigma.identification.problem.alike_setups import build_setups
 from pisigma.identification.problem.information import Information, information
 from pisigma.identification.problem.least_squares import (
     SHORTEST_STEP,
@@ -38,7 +39,8 @@ from pisigma.identification.problem.noise import view_of
 from pisigma.identification.problem.parameters import ParameterSpace, Prior
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.robots import of_robots
-from pisigma.identification.problem.setup import CalibrationSetup, SetupOptions, build_setup
+from pisigma.identification.problem.setup import CalibrationSetup, SetupOptions
+from pisigma.identification.problem.side_by_side import pattern_of, side_by_side
 from pisigma.identification.result import CalibrationResult, SolvedCalibration
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
@@ -161,8 +163,8 @@ class GeometricCalibrator:
 
     def solve_many(self, data: Sequence[Measurements]) -> list[SolvedCalibration]:
         """Calibrate several robots of one type, those whose data are alike side by side; see `fit_many` and `solve`."""
-        robots = [_Robot(measurements, self.build(measurements)) for measurements in data]
-        for alike in _groups(robots, [robot.setup.problem.pattern for robot in robots]):
+        robots = [_Robot(*pair) for pair in zip(data, self._build(data), strict=True)]
+        for alike in _groups(robots, [pattern_of(robot.setup.problem) for robot in robots]):
             self._choose(alike)
             for group in _groups(alike, [tuple(robot.active) for robot in alike]):
                 self._solve(group)
@@ -175,6 +177,10 @@ class GeometricCalibrator:
             IdentificationError: nothing usable was measured, or too little for base and tool.
             PoseError: the joint values do not fit the robot.
         """
+        return self._build([measurements])[0]
+
+    def _build(self, data: Sequence[Measurements]) -> list[CalibrationSetup]:
+        """The problems of several robots of one type."""
         options = SetupOptions(
             free_base=self._finds("base"),
             free_tool=self._finds("tool"),
@@ -184,7 +190,7 @@ class GeometricCalibrator:
             socket_sigma=self.socket_sigma,
             prior_sizes=self.prior_sizes,  # type: ignore[arg-type]
         )
-        return build_setup(self.robot, measurements, options, self.prior, self.loss)
+        return build_setups(self.robot, data, options, self.prior, self.loss)
 
     def _finds(self, group: str) -> bool:
         """Whether a start of bases or tools is wanted: they are free, or named (of a base all six)."""
@@ -222,11 +228,11 @@ class GeometricCalibrator:
         problem, start = _side_by_side(robots)
         space, unknowns = problem.space, robots[0].setup.free_unknowns
         candidates, explicit = self.candidates(space), not isinstance(self.free, str)
-        for robot, every in zip(
-            robots, information(problem, start, unknowns + candidates), strict=True
-        ):
+        for robot, every in zip(robots, information(problem, start, unknowns + candidates), strict=True):
             setup, measurements = robot.setup, robot.measurements
-            robot.candidates, at_start = self._at_start(setup, candidates, every.after(list(range(len(unknowns)))))
+            robot.candidates, at_start = self._at_start(
+                setup, candidates, every.after(list(range(len(unknowns))))
+            )
             sizes = setup.start.cpu().numpy()[robot.candidates]
             redundancy = find_redundancy(at_start, sizes)
             refuse_too_few(setup.problem, redundancy, explicit, len(unknowns), measurements.source)
@@ -314,7 +320,10 @@ class GeometricCalibrator:
         of_each = information(problem, here.point, candidates, view_of(here))
         for robot, now in zip(robots, of_each, strict=True):
             extended = [candidates[i] for i in rank_extension(now, kept)]
-            robot.active, robot.findings = [*robot.active, *extended], replace(robot.findings, extended=extended)
+            robot.active, robot.findings = (
+                [*robot.active, *extended],
+                replace(robot.findings, extended=extended),
+            )
 
 
 class _Robot:
@@ -356,7 +365,7 @@ def _side_by_side(robots: list[_Robot]) -> tuple[CalibrationProblem, Float64[Ten
     setups = [robot.setup for robot in robots]
     if len(setups) == 1:
         return setups[0].problem, setups[0].start
-    problem = CalibrationProblem.side_by_side([setup.problem for setup in setups])
+    problem = side_by_side([setup.problem for setup in setups])
     return problem, problem.nominal
 
 

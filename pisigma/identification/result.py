@@ -29,7 +29,8 @@ from pisigma.identification.problem.least_squares import (
     SolutionStatus,
     covariance_of,
 )
-from pisigma.identification.problem.noise import effective_parameters, values_used, view_of
+from pisigma.identification.problem.noise import values_used, view_of
+from pisigma.identification.problem.prior_sizes import effective_parameters
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.setup import CalibrationSetup, IdentifiedGeometry, identified_geometry
 from pisigma.measurement.dataset import Measurements

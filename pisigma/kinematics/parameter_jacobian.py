@@ -118,7 +118,12 @@ def tool_motion(
         target: per pose the number of its tool, where there is one a target.
     """
     count, poses = len(robot.rows), q.shape[0]
-    base_axes, tool_axes = _frame_axes(base, frame, q), _frame_axes(tool, target, q)
+    axes, bases = _frame_axes(torch.cat([base, tool], 1), q), base.shape[1]
+    base_axes, tool_axes = axes[..., :bases], axes[..., bases:]
+    if frame is not None:
+        base_axes = base_axes[..., frame]
+    if target is not None:
+        tool_axes = tool_axes[..., target]
     walked = _walk_rows(robot, dh, q, base_axes)
     tool_steps = _behind(walked.last, tool_axes)
     position = tool_steps[ORIGIN]
@@ -146,7 +151,7 @@ def flange_frames(
     robot: Robot, q: Float[Tensor, "poses dof"]
 ) -> tuple[Float[Tensor, "poses 3 3"], Float[Tensor, "poses 3"]]:
     """Return orientation and position [m] behind the last row in the first row's frame, without base and tool."""
-    last = _walk_rows(robot, robot.dh, q, _frame_axes(q.new_zeros(6, 1), None, q)).last
+    last = _walk_rows(robot, robot.dh, q, _frame_axes(q.new_zeros(6, 1), q)).last
     return last[:3].permute(2, 1, 0).contiguous(), last[3].t().contiguous()
 
 
@@ -216,19 +221,21 @@ def _row_matrices(
     ca, cb, sa, sb = np.cos(alpha), np.cos(beta), np.sin(alpha), np.sin(beta)
     zero, one = np.zeros_like(d), np.ones_like(d)
     x, y, z, w = cb, sa * sb, -ca * sb, zero
-    columns = [[sb, a, x, zero, -x], [-sa * cb, zero, y, ca, -y], [ca * cb, d, z, sa, -z], [zero, one, w, w, w]]
+    columns = [
+        [sb, a, x, zero, -x],
+        [-sa * cb, zero, y, ca, -y],
+        [ca * cb, d, z, sa, -z],
+        [zero, one, w, w, w],
+    ]
     matrices = np.array(columns)  # column, line, row and, where there are several, robot
     return like.new_tensor(np.ascontiguousarray(matrices.transpose(2, *range(3, matrices.ndim), 1, 0)))
 
 
-def _frame_axes(
-    xyzrpy: Float[Tensor, "6 frames"], index: Int64[Tensor, " poses"] | None, like: Tensor
-) -> Float[Tensor, "13 4 ways"]:
+def _frame_axes(xyzrpy: Float[Tensor, "6 frames"], like: Tensor) -> Float[Tensor, "13 4 frames"]:
     """What bases or tools turn about (roll, pitch, yaw), shift along (x, y, z) and end as.
 
     The end is x, y, z, the origin, x, y, -x, so that `AXES` and `FRAME` are stretches of it. All are given by
-    the axes x, y, z and the origin before `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`; with an index
-    one a pose.
+    the axes x, y, z and the origin before `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
     """
     x, y, z, *angles = values = xyzrpy.cpu().numpy()
     (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
@@ -239,13 +246,14 @@ def _frame_axes(
     axes[7, :3] = axes[11, :3] = cr * sp * sy - sr * cy, sr * sp * sy + cr * cy, cp * sy
     axes[8, :3] = cr * sp * cy + sr * sy, sr * sp * cy - cr * sy, cp * cy
     axes[9, :3], axes[12] = (x, y, z), -axes[6]
-    result = like.new_tensor(axes)
-    return result if index is None else result[..., index]
+    return like.new_tensor(axes)
 
 
 def _spread(values: Float[Tensor, "*shape ways"], poses: int) -> Float[Tensor, "*shape poses"]:
     """Values that are the same for all poses, or for all of a robot, one a pose."""
     ways = values.shape[-1]
+    if ways == 1:
+        return values.expand(*values.shape[:-1], poses)
     return values[..., None].expand(*values.shape, poses // ways).flatten(-2)
 
 

@@ -12,8 +12,8 @@ from pisigma.hybrid.design import Design
 from pisigma.hybrid.gravity import USUAL, in_first_row
 from pisigma.hybrid.sensor_values import SensorValues, sensor_values
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.problem.noise import PriorGroup
 from pisigma.identification.problem.parameters import USUAL_LENGTH
+from pisigma.identification.problem.prior_sizes import PriorGroup
 from pisigma.identification.problem.setup import CalibrationSetup, IdentifiedGeometry, identified_geometry
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques

@@ -15,8 +15,8 @@ from pisigma.hybrid.gravity import USUAL, in_first_row
 from pisigma.hybrid.result import HybridResult
 from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.identification.prediction import predicted_poses
-from pisigma.identification.problem.noise import PriorGroup, prior_group_of
 from pisigma.identification.problem.parameters import ParameterSpace
+from pisigma.identification.problem.prior_sizes import PriorGroup, prior_group_of
 from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.joint_correction.feature import AbstractFeature
 from pisigma.joint_correction.fourier_series import FourierSeries

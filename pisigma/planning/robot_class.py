@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from typing import Final
 
-from pisigma.identification.problem.noise import PriorGroup
+from pisigma.identification.problem.prior_sizes import PriorGroup
 from pisigma.robot.description import Robot
 
 

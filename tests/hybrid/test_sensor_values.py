@@ -14,7 +14,8 @@ from pisigma.hybrid.design import Design
 from pisigma.hybrid.refinement import network
 from pisigma.hybrid.sensor_values import joint_columns, sensor_values
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.problem.problem import CalibrationProblem, MotionMemory
+from pisigma.identification.problem.motion import MotionMemory
+from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.input_products import InputProducts

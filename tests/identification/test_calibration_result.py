@@ -109,7 +109,7 @@ def test_intervals_cover_the_truth(poses: bool) -> None:
     kept = calibrator.fit(first.measurements).redundancy.kept
     columns = ("theta", "d", "a", "alpha", "beta")
     free = np.array([[f"{column}_{row}" in kept for column in columns] for row in range(1, 7)])
-    covered: list[bool] = []
+    truths, data = [], []
     for seed in range(30):
         rng = np.random.default_rng(seed)
         errors = 1e-3 * rng.normal(size=nominal.dh.shape) * free
@@ -119,12 +119,13 @@ def test_intervals_cover_the_truth(poses: bool) -> None:
         position = T[:, :3, 3] + 5e-5 * torch.from_numpy(rng.normal(size=(80, 3)))
         turn = rotation_from_vector(1e-4 * torch.from_numpy(rng.normal(size=(80, 3))))
         rotation = turn @ T[:, :3, :3] if poses else None
-        result = calibrator.fit(Measurements(q=q, position=position, rotation=rotation))
-        truth = np.concatenate([true.dh.ravel(), BASE, TOOL])
-        covered += [
-            abs(parameter.estimated - value) < 1.96 * parameter.standard_error
-            for parameter, value in zip(result.parameters, truth, strict=True)
-            if parameter.name in kept
-        ]
+        data.append(Measurements(q=q, position=position, rotation=rotation))
+        truths.append(np.concatenate([true.dh.ravel(), BASE, TOOL]))
+    covered = [
+        abs(parameter.estimated - value) < 1.96 * parameter.standard_error
+        for result, truth in zip(calibrator.fit_many(data), truths, strict=True)
+        for parameter, value in zip(result.parameters, truth, strict=True)
+        if parameter.name in kept
+    ]
     assert len(covered) == 30 * (30 if poses else 27)
     assert 0.91 < np.mean(covered) < 0.99

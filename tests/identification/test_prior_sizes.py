@@ -10,8 +10,8 @@ from testing.sensors import touch_data, true_robot
 from testing.simulated_arm import dh_errors, mean_error, simulate
 
 from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.identification.problem.noise import PriorGroup, prior_group_of
 from pisigma.identification.problem.parameters import Prior
+from pisigma.identification.problem.prior_sizes import PriorGroup, prior_group_of
 from pisigma.identification.result import CalibrationResult
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements

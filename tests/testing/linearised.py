@@ -101,7 +101,7 @@ def linearised(robot: Robot, measurements: Measurements, **options: object) -> L
     weights = [torch.ones_like(sensor.root) for sensor in values]
     x, group = (here.point - problem.nominal)[problem.active], held_out_groups(solved.setup.measurements)
     rows = Rows.linearised(design, x, values, weights, group)
-    return LinearisedArm(solved.setup, rows, view.noise, view.prior_scale)
+    return LinearisedArm(solved.setup, rows, tuple(view.noise.tolist()), tuple(view.prior_scale.tolist()))
 
 
 def with_directions(robot: Robot, directions: Sequence[int]) -> Robot:

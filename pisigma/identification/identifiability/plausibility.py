@@ -63,7 +63,7 @@ def _refuse_ruined_links(problem: CalibrationProblem, point: Tensor, source: str
         IdentificationError: see above.
     """
     robot = problem.space.robot
-    is_length = np.array([parameter.group in ("d", "a") for parameter in problem.space.parameters])
+    is_length = problem.space.is_length.numpy()
     drawn, fitted = robot.dh.ravel(), point.cpu().numpy()[: problem.space.arm_size]
     long = is_length[: len(drawn)] & (np.abs(drawn) > LONG_SHARE * robot.reach)
     ruined = long & (np.abs(fitted - drawn) > RUINED_SHARE * np.abs(drawn))

@@ -15,6 +15,7 @@ NO_EFFECT = 1e-9
 """Columns smaller than this share of the largest count as zero."""
 PREFERENCE = ("base", "tool", "theta", "a", "d", "alpha", "beta")
 """Which parameters are kept first; each class counts ten times as much as the next."""
+_WEIGHT = {group: 10.0**-rank for rank, group in enumerate(PREFERENCE)}
 CLEARLY_SEEN = 1.0
 """A parameter is added when the data alone determine it to this many mm or mrad."""
 EXPLAINED = 0.5
@@ -125,7 +126,12 @@ def find_redundancy(
     unit = J[:, acting] / lengths[acting]
     singular = np.linalg.svd(unit, compute_uv=False) if len(acting) else np.zeros(0)
     rank = int((singular > tolerance * singular.max(initial=0.0)).sum())
-    preference = np.array([preference_of(information.parameters[i], float(sizes[i]), int(i)) for i in acting])
+    preference = np.array(
+        [
+            preference_of(information.parameters[i], size, i)
+            for i, size in zip(acting.tolist(), sizes[acting].tolist(), strict=True)
+        ]
+    )
     pivots = pivoted_columns(unit * preference, rank)
     kept, removed = acting[np.sort(pivots)], np.delete(acting, pivots)
     names = information.names
@@ -143,7 +149,7 @@ def find_redundancy(
 def preference_of(parameter: Parameter, size: float, index: int) -> float:
     """How much a parameter is wanted among those that are kept; its place decides ties, the earlier wins."""
     bonus = 1e-3 if abs(size) > 1e-9 else 0.0
-    return float(10.0 ** -PREFERENCE.index(parameter.group)) * (1 + bonus - 1e-6 * index)
+    return _WEIGHT[parameter.group] * (1 + bonus - 1e-6 * index)
 
 
 def pivoted_columns(A: Float64[np.ndarray, "rows columns"], count: int) -> Int64[np.ndarray, " pivots"]:

@@ -13,6 +13,8 @@ from pisigma.robot.description import Robot
 from pisigma.se3 import rotation_from_rpy
 
 ALTERNATIONS = 60
+LINEAR_ROWS = 13
+"""Rows from which base and tool follow from a linear system."""
 SINGLE = 0.9
 """A second singular value above this share of the first may mean that the rotations are not unique."""
 
@@ -105,24 +107,39 @@ def starts_from_positions(
 ) -> Iterator[tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"], Float64[Tensor, " 3"]]]:
     """Candidates for `position = R_base (R_flange · point + p_flange) + p_base`, to be polished and compared.
 
-    Written out, every coordinate is linear in 13 unknowns: the products of `R_base`'s row with the point
-    (9), the row itself (3) and the shift (1), which gives one candidate. The others assume a point (the
+    The first is that of `start_from_products`, where there are enough rows. The others assume a point (the
     nominal one, none, a tenth of the reach along each axis) and find the base by Procrustes; they serve
     where the linear system is singular, as with parallel axes or few rows.
 
     Returns:
         R_base, p_base [m], point [m], each.
     """
-    if position.shape[0] >= 13:
-        regressor = torch.cat([R_flange.flatten(1), p_flange, torch.ones_like(p_flange[:, :1])], -1)
-        solution = torch.linalg.pinv(regressor, rtol=1e-9) @ position
-        R_base = nearest_rotation(solution[9:12].mT)
-        yield R_base, *_translations(R_base, R_flange, p_flange, position)
+    if position.shape[0] >= LINEAR_ROWS:
+        yield start_from_products(R_flange, p_flange, position)
     along = 0.1 * reach * torch.eye(3).to(position)
     assumed = torch.cat([nominal_point[None], torch.zeros_like(nominal_point)[None], along, -along])
     for point in assumed.unbind():
         arm = p_flange + R_flange @ point
         yield *base_by_points(arm, position), point
+
+
+def start_from_products(
+    R_flange: Float64[Tensor, "*batch rows 3 3"],
+    p_flange: Float64[Tensor, "*batch rows 3"],
+    position: Float64[Tensor, "*batch rows 3"],
+) -> tuple[Float64[Tensor, "*batch 3 3"], Float64[Tensor, "*batch 3"], Float64[Tensor, "*batch 3"]]:
+    """Solve `position = R_base (R_flange · point + p_flange) + p_base` for base and point.
+
+    Written out, every coordinate is linear in 13 unknowns: the products of `R_base`'s row with the point
+    (9), the row itself (3) and the shift (1).
+
+    Returns:
+        R_base, p_base [m], point [m].
+    """
+    regressor = torch.cat([R_flange.flatten(-2), p_flange, torch.ones_like(p_flange[..., :1])], -1)
+    solution = torch.linalg.pinv(regressor, rtol=1e-9) @ position
+    R_base = nearest_rotation(solution[..., 9:12, :].mT)
+    return R_base, *_translations(R_base, R_flange, p_flange, position)
 
 
 def nearest_rotation(M: Float64[Tensor, "*batch 3 3"]) -> Float64[Tensor, "*batch 3 3"]:
@@ -175,11 +192,11 @@ def _translations(
     R_base: Tensor, R_flange: Tensor, p_flange: Tensor, position: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Positions of base and tool for a fixed rotation of the base; they are linear then."""
-    rows = position.shape[0]
-    A = torch.cat([torch.eye(3).to(position).expand(rows, 3, 3), R_base @ R_flange], -1).flatten(0, 1)
-    b = (position - p_flange @ R_base.mT).flatten()
+    turned = R_base[..., None, :, :] @ R_flange
+    A = torch.cat([torch.eye(3).to(position).expand_as(turned), turned], -1).flatten(-3, -2)
+    b = (position - p_flange @ R_base.mT).flatten(-2)[..., None]
     solution = torch.linalg.pinv(A.mT @ A, rtol=1e-10, hermitian=True) @ (A.mT @ b)
-    return solution[:3], solution[3:]
+    return solution[..., :3, 0], solution[..., 3:, 0]
 
 
 def _cube_rotations(like: Tensor) -> Tensor:

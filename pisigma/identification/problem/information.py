@@ -113,7 +113,7 @@ def information(
                 problem.derivative(sensor, motion, unknowns, rows, index),
                 sensor.residual(motion, unknowns, rows),
             )
-            weight = torch.full_like(r[0], 1e3) if view is None else problem.row_weights(view, k, rows)
+            weight = torch.full_like(r[0], 1e3) if view is None else _row_weights(problem, view, k, rows)
             J, r, weight = problem.by_robot(J), problem.by_robot(r), problem.by_robot(weight)
             if not problem.measured_everywhere[k]:
                 present = sensor.present[rows][: weight.shape[-1]]
@@ -129,3 +129,16 @@ def information(
     poses, values = int(present[: problem.rows].sum()), sum(problem.values_measured)
     parameters = tuple(problem.space.parameters[i] for i in candidates)
     return [Information(parameters, one, values, poses) for one in roots or [root.cpu().numpy()]]
+
+
+def _row_weights(
+    problem: CalibrationProblem, view: SensorView, number: int, rows: slice
+) -> Float64[Tensor, " poses"]:
+    """1 / standard deviation of each row for a sensor, 0 where it saw nothing [1/m or 1/rad]."""
+    sensor = problem.sensors[number]
+    distance = view.sums[number].distance / view.scale(number)[..., None]
+    root = problem.loss_of(sensor).weight(distance, sensor.components).sqrt()
+    root = (root / view.variance(number).sqrt()[..., None]).flatten()[rows]
+    if sensor.sigma is not None:
+        root = root / sensor.sigma[rows]
+    return torch.where(sensor.present[rows], root, 0.0)

@@ -72,6 +72,10 @@ class AbstractLeastSquares(ABC, Generic[Point]):
     def linearise(self, point: Point, like: Linearisation[Point] | None) -> Linearisation[Point]:
         """See the problem from a point, with the noise of `like` (a guess of its own where None)."""
 
+    def begin(self, point: Point) -> Linearisation[Point]:
+        """See the problem from a start, with the noise that its residuals show."""
+        return self.renewed(self.linearise(point, None))[0]
+
     @abstractmethod
     def renewed(self, linearisation: Linearisation[Point]) -> tuple[Linearisation[Point], Tensor]:
         """The same with the noise estimated from its residuals, and whether the noise has settled, `*robots`."""
@@ -169,8 +173,8 @@ def levenberg_marquardt(
     Returns:
         The best point, with the reason for stopping (see `SolutionStatus`).
     """
-    first = start if isinstance(start, Linearisation) else problem.linearise(start, None)
-    search = _Search(problem, problem.renewed(first)[0])
+    first = problem.renewed(start)[0] if isinstance(start, Linearisation) else problem.begin(start)
+    search = _Search(problem, first)
     limits = np.broadcast_to(np.array(maximum_iterations), len(search.robots))
     while len(search.robots):
         search.end(limits[search.robots] <= search.iterations, SolutionStatus.ITERATION_LIMIT)
@@ -215,22 +219,44 @@ class _Search(Generic[Point]):
         """Take the steps; end the searches that are over, and decide where the others go on."""
         self.iterations += 1
         there = self.problem.linearise(self.problem.moved(self.here.point, self.step), self.best)
-        lower, small = _array(there.cost <= self.best.cost), self.decrement <= SHORTEST_STEP**2
-        over = self._over(~lower, small)
+        lower, over = _array(there.cost <= self.best.cost), np.full(len(self.robots), None, dtype=object)
+        settled = self._descend(there) if lower.all() else self._climb_or_descend(there, lower, over)
+        for robot, rms, passed in zip(self.robots, self._rms(), lower, strict=True):
+            if passed:
+                self.ends[robot] = replace(self.ends[robot], path=(*self.ends[robot].path, rms))
+        over[lower & settled & (self.decrement <= SHORTEST_STEP**2)] = SolutionStatus.CONVERGED
+        over[lower & _array(self.best.misfit <= self.best.rounding)] = SolutionStatus.EXACT
+        self.end(over != None, over)  # noqa: E711 - of every entry
+
+    def _descend(self, there: Linearisation[Point]) -> np.ndarray:
+        """Go on from where all costs are lower, and say where the noise has settled."""
+        settled = np.ones(len(self.robots), dtype=bool)
+        if self.iterations <= SWINGING:
+            there, now = self.problem.renewed(there)
+            settled = _array(now)
+        self.best = self.here = there
+        self.damping = np.maximum(self.damping / 10, SMALLEST_DAMPING)
+        self.uphill, self.at_best = np.zeros_like(self.uphill), np.ones_like(self.at_best)
+        return settled
+
+    def _climb_or_descend(
+        self, there: Linearisation[Point], lower: np.ndarray, over: np.ndarray
+    ) -> np.ndarray:
+        """Go on from lower costs, follow higher ones or go back; say where the noise has settled, and what is over."""
+        small = (self.decrement <= SHORTEST_STEP**2) | (self.decrement <= 1e-10 * _array(self.best.cost))
+        over[~lower & (self.damping > LARGEST_DAMPING)] = SolutionStatus.STALLED
+        over[~lower & self.at_best & small] = SolutionStatus.CONVERGED
+        over[~lower & _array(self.best.misfit <= 1e4 * self.best.rounding)] = SolutionStatus.EXACT
         # there is no descent such as where a loss rejects every row
         going = np.isfinite(_array(there.cost)) & _array(there.descent.any(-1))
         climbing = ~lower & (over == None) & (self.uphill < PATIENCE) & going  # noqa: E711 - of every entry
         there, settled = self._renewed(there, climbing | (lower & (self.iterations <= SWINGING)))
         self.best = _where(lower, there, self.best)
         self.here = _where(climbing, there, self.best)
-        self.damping[~lower & ~climbing] = np.maximum(100 * self.damping[~lower & ~climbing], 0.1)
-        self.damping[lower] = np.maximum(self.damping[lower] / 10, SMALLEST_DAMPING)
+        back = np.where(climbing, self.damping, np.maximum(100 * self.damping, 0.1))
+        self.damping = np.where(lower, np.maximum(self.damping / 10, SMALLEST_DAMPING), back)
         self.uphill, self.at_best = np.where(climbing, self.uphill + 1, 0), ~climbing
-        for robot, rms in zip(self.robots[lower], np.array(self._rms())[lower].tolist(), strict=True):
-            self.ends[robot] = replace(self.ends[robot], path=(*self.ends[robot].path, rms))
-        over[lower & small & settled] = SolutionStatus.CONVERGED
-        over[lower & _array(self.best.misfit <= self.best.rounding)] = SolutionStatus.EXACT
-        self.end(over != None, over)  # noqa: E711 - of every entry
+        return settled
 
     def end(self, ended: np.ndarray, status: SolutionStatus | np.ndarray) -> None:
         """End some of the searches, all by one status or each by its own, and go on with the others."""
@@ -239,7 +265,8 @@ class _Search(Generic[Point]):
         reasons = np.broadcast_to(np.array(status, dtype=object), len(ended))
         for robot, reason in zip(self.robots[ended], reasons[ended], strict=True):
             self.ends[robot] = replace(self.ends[robot], iterations=self.iterations, status=reason)
-        everyone = np.isin(np.arange(len(self.ends)), self.robots[ended])
+        everyone = np.zeros(len(self.ends), dtype=bool)
+        everyone[self.robots[ended]] = True
         self.last = _where(everyone, self.best, self.last, ended)
         self.robots = self.robots[~ended]
         if len(self.robots):
@@ -248,15 +275,6 @@ class _Search(Generic[Point]):
             self.best, self.here, self.step = of_robots((self.best, self.here, self.step), left)
             for name in ("at_best", "uphill", "damping", "decrement"):
                 setattr(self, name, getattr(self, name)[~ended])
-
-    def _over(self, higher: np.ndarray, small: np.ndarray) -> np.ndarray:
-        """Return why searches are over whose step has raised the cost, None where they are not."""
-        over = np.full(len(higher), None, dtype=object)
-        over[higher & (self.damping > LARGEST_DAMPING)] = SolutionStatus.STALLED
-        small = small | (self.decrement <= 1e-10 * _array(self.best.cost))
-        over[higher & self.at_best & small] = SolutionStatus.CONVERGED
-        over[higher & _array(self.best.misfit <= 1e4 * self.best.rounding)] = SolutionStatus.EXACT
-        return over
 
     def _renewed(
         self, there: Linearisation[Point], chosen: np.ndarray
@@ -286,7 +304,9 @@ def _array(values: Tensor) -> np.ndarray:
     return array
 
 
-def _product(matrix: Float[Tensor, "*robots rows columns"], vector: Float[Tensor, "*robots columns"]) -> Tensor:
+def _product(
+    matrix: Float[Tensor, "*robots rows columns"], vector: Float[Tensor, "*robots columns"]
+) -> Tensor:
     return (matrix @ vector[..., None])[..., 0]
 
 
@@ -341,16 +361,19 @@ def solve_damped(
         damping = torch.where(failed > 0, (10 * damping).clamp(min=1e-6), damping)
 
 
-def covariance_of(normal: Float64[Tensor, "*robots active active"]) -> Float64[Tensor, "*robots active active"]:
+def covariance_of(
+    normal: Float64[Tensor, "*robots active active"],
+) -> Float64[Tensor, "*robots active active"]:
     """Invert a normal matrix, with column scaling; directions that it does not hold get no variance."""
     diagonal = normal.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
     scales = scale[..., None, :] * scale[..., None]
     scaled = normal * scales
     factor, failed = torch.linalg.cholesky_ex(scaled)
-    clear = (failed == 0) & (factor.diagonal(dim1=-2, dim2=-1) > 1e-6).all(-1)
-    if bool(clear.all()):
+    clear = (factor.diagonal(dim1=-2, dim2=-1) > 1e-6).all(-1)
+    if bool(clear.all()) and not bool(failed.any()):
         return torch.cholesky_inverse(factor).mul_(scales)
+    clear &= failed == 0
     inverse = torch.linalg.pinv(scaled, rtol=1e-12, hermitian=True)
     if bool(clear.any()):
         inverse[clear] = torch.cholesky_inverse(factor[clear])

@@ -1,5 +1,6 @@
 """Losses: how much a row counts, given its distance from the prediction in standard deviations."""
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
@@ -109,8 +110,8 @@ class HampelLoss(AbstractLoss):
         self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure
     ) -> Float[Tensor, "*batch"]:
         """Median over that of a standard normal vector, corrected for the parameters."""
-        share = _left(distance, components, used) / (distance.shape[-1] * components)
-        return distance.median(-1).values / MEDIAN_DISTANCE[components] / share.sqrt()
+        factor = math.sqrt(distance.shape[-1] * components) / MEDIAN_DISTANCE[components]
+        return distance.median(-1).values * _left(distance, components, used).rsqrt() * factor
 
     def deviation(
         self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure, scale: Figure
@@ -125,4 +126,6 @@ class HampelLoss(AbstractLoss):
 def _left(distance: Float[Tensor, "*batch rows"], components: int, used: Figure) -> Float[Tensor, "*batch"]:
     """How many values the estimated parameters leave over, at least one."""
     values = distance.shape[-1] * components
-    return distance.new_full(distance.shape[:-1], values).sub_(used).clamp_(min=1.0)
+    if isinstance(used, float | int):
+        return distance.new_tensor(max(values - used, 1.0))
+    return (values - used).clamp(min=1.0)

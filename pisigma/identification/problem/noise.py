@@ -3,16 +3,16 @@
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import IntEnum
 from functools import cached_property
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.identification.problem.least_squares import Linearisation
 from pisigma.identification.problem.loss import AbstractLoss
+from pisigma.identification.problem.prior_sizes import PriorGroup, scaled_precision
 from pisigma.sensors.sensor import AbstractSensor
 
 SMALLEST_NOISE = 1e-14
@@ -21,32 +21,10 @@ ALWAYS_GOOD = 1e-10
 """[m or rad] Rows nearer to their prediction than this never count as wrong."""
 
 
-class PriorGroup(IntEnum):
-    """Parameters whose errors are believed to be of one size, because they come from the same cause.
-
-    Few groups, because only several parameters determine a size: one for every parameter (relevance vectors,
-    Tipping 2001) fits the noise. Lengths that are drawn and that are not are apart, because joining them made
-    weak data worse, while it made no difference whether d and a, or alpha and beta, are apart.
-    """
-
-    JOINT_OFFSET = 0
-    """theta: where the zeros of the joints were set."""
-    LENGTH = 1
-    """d and a that are drawn: how long links are."""
-    NO_LENGTH = 2
-    """d and a drawn as 0, or shorter than their tolerance: how nearly axes meet or are in line."""
-    BETWEEN_AXES = 3
-    """alpha and beta: how square and parallel axes are."""
-
-
 UNDETERMINED = 1e-12
 """Share of the information of angles with which lengths are taken to determine what they do not see."""
 LARGEST_DISAGREEMENT = 1e6
 """Angles of more than so many times their variance say nothing."""
-LEAST_EFFECTIVE = 0.1
-"""The prior of a group of which the data determine less than so many parameters stays as it is."""
-SMALLEST_PRIOR = 0.03
-"""An estimated prior is not narrower than this share of the stated one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +159,17 @@ def loss_scale(
             scale = loss.scale(distance, sensor.components, used[..., k])
         scales.append(scale.clamp(min=SMALLEST_NOISE if sensor.sigma is None else 1.0))
     return torch.stack(scales, -1)
+
+
+def rejecting(
+    sensors: Sequence[AbstractSensor], losses: Sequence[AbstractLoss], view: SensorView
+) -> Bool[Tensor, "*robots"]:
+    """Say whether the loss rejects any row of a sensor."""
+    rejected = [
+        loss.weight(sums.distance / view.scale(k)[..., None], sensor.components) == 0
+        for k, (sensor, loss, sums) in enumerate(zip(sensors, losses, view.sums, strict=True))
+    ]
+    return torch.stack(rejected).any(0).any(-1)
 
 
 def renumbered(keys: Int64[Tensor, " rows"]) -> Int64[Tensor, " rows"]:
@@ -326,79 +315,3 @@ def _group_squares(
     squares = summed.scatter_add(-1, index, weighted).square().sum(-2) / total
     measured = total > 0
     return torch.where(measured, squares, 0.0).sum(-1), measured.sum(-1) * components
-
-
-def prior_group_of(column: str, drawn: bool) -> int:
-    """The group of a parameter whose prior is sized by the data.
-
-    Args:
-        column: "theta", "d", "a", "alpha" or "beta"; of others, which have no prior, any group will do.
-        drawn: whether its nominal value is larger than its tolerance.
-    """
-    if column in ("d", "a"):
-        return PriorGroup.LENGTH if drawn else PriorGroup.NO_LENGTH
-    return PriorGroup.BETWEEN_AXES if column in ("alpha", "beta") else PriorGroup.JOINT_OFFSET
-
-
-def effective_parameters(
-    precision: Float64[Tensor, " active"],
-    group: Int64[Tensor, " active"],
-    prior_scale: Float64[Tensor, "*robots groups"],
-    covariance: Float64[Tensor, "*robots active active"],
-) -> Float64[Tensor, "*robots groups"]:
-    """How many parameters with a prior the data determine, per group: each counts by how much of it they do.
-
-    `γ = Σ (1 - variance after / variance before)` of MacKay 1992, Neural Computation 4(3), eq. 4.5.
-
-    Args:
-        precision: 1 / variance as the prior states it, 0 where it says nothing.
-        group: every parameter's group.
-        prior_scale: the scale of the prior.
-        covariance: of the parameters.
-    """
-    variance = covariance.diagonal(dim1=-2, dim2=-1)
-    share = 1 - scaled_precision(precision, group, prior_scale) * variance
-    return _group_totals(share * (precision > 0), group)
-
-
-def scaled_precision(
-    precision: Float64[Tensor, " active"],
-    group: Int64[Tensor, " active"],
-    prior_scale: Float64[Tensor, "*robots groups"],
-) -> Float64[Tensor, "*robots active"]:
-    """1 / variance of parameters by the prior at a scale of its standard deviations per group."""
-    return precision / prior_scale.square()[..., group]
-
-
-def _group_totals(
-    values: Float64[Tensor, "*robots active"], group: Int64[Tensor, " active"]
-) -> Float64[Tensor, "*robots groups"]:
-    """Sum of the parameters' values per group of the prior."""
-    return values.new_zeros((*values.shape[:-1], len(PriorGroup))).index_add(-1, group, values)
-
-
-def prior_scales(
-    off: Float64[Tensor, "*robots active"],
-    precision: Float64[Tensor, " active"],
-    group: Int64[Tensor, " active"],
-    before: Float64[Tensor, "*robots groups"],
-    covariance: Float64[Tensor, "*robots active active"],
-    floor: float = 1.0,
-) -> Float64[Tensor, "*robots groups"]:
-    """How many times as large as stated the parameters' errors turn out, per group of parameters.
-
-    MacKay's update (1992, Neural Computation 4(3), eq. 4.7) with the `effective_parameters` of every group.
-
-    Args:
-        off: distance of the parameters from their nominal values [m or rad].
-        precision: 1 / variance as the prior states it, 0 where it says nothing.
-        group: every parameter's group.
-        before: the scale of the prior so far.
-        covariance: of the parameters.
-        floor: smallest answer; 1 where smaller errors than stated do not tighten the prior.
-    """
-    squares = _group_totals(off.square() * precision, group)
-    least = 1.0 if floor == 1.0 else LEAST_EFFECTIVE
-    effective = effective_parameters(precision, group, before, covariance)
-    sized = (squares / effective).clamp(min=floor**2).sqrt()
-    return torch.where(effective > least, sized, before)

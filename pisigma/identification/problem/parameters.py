@@ -9,10 +9,11 @@ from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError, nearest_choice
+from pisigma.identification.problem.prior_sizes import PriorGroup, prior_group_of
 from pisigma.kinematics.parameter_jacobian import motion_order
 from pisigma.robot.description import Robot
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS
@@ -155,6 +156,18 @@ class ParameterSpace:
         target = [EVERYWHERE] * (len(arm) + 6 * frames) + at_targets + [NOWHERE] * others
         return torch.tensor([columns, frame, target])
 
+    @cached_property
+    def is_length(self) -> Bool[Tensor, " parameters"]:
+        """Which parameters are lengths."""
+        return torch.tensor([parameter.unit == "m" for parameter in self.parameters])
+
+    @cached_property
+    def prior_groups(self) -> Int64[Tensor, "2 parameters"]:
+        """Which size of the prior every parameter has: as drawn 0, and as drawn otherwise; see `prior_group_of`."""
+        others = [int(PriorGroup.JOINT_OFFSET)] * (len(self.parameters) - self.arm_size)
+        of_row = ([prior_group_of(column, drawn) for column in DH_COLUMNS] for drawn in (False, True))
+        return torch.tensor([groups * len(self.robot.rows) + others for groups in of_row])
+
     @property
     def always_moving(self) -> bool:
         """Whether every parameter moves the tool in all rows."""
@@ -166,11 +179,15 @@ class ParameterSpace:
         Raises:
             IdentificationError: there is none of that name.
         """
-        if name not in self.names:
+        if name not in self._numbers:
             raise IdentificationError(
                 f"robot '{self.robot.name}' has no parameter '{name}'; {nearest_choice(name, self.names)}"
             )
-        return self.names.index(name)
+        return self._numbers[name]
+
+    @cached_property
+    def _numbers(self) -> dict[str, int]:
+        return {name: number for number, name in enumerate(self.names)}
 
     def indices(self, name: str) -> list[int]:
         """Where a parameter stands; with several frames or targets "base_x" and "tool_x" mean all of theirs.
@@ -213,7 +230,9 @@ class ParameterSpace:
     def split(
         self, values: Float64[Tensor, "*robots parameters"]
     ) -> tuple[
-        Float64[Tensor, "*robots rows 5"], Float64[Tensor, "*robots frames 6"], Float64[Tensor, "*robots targets 6"]
+        Float64[Tensor, "*robots rows 5"],
+        Float64[Tensor, "*robots frames 6"],
+        Float64[Tensor, "*robots targets 6"],
     ]:
         """Rows, bases and tools of a vector of all parameters, or of one a robot."""
         bases, tools = (values[..., self.of(group).start : self.of(group).stop] for group in ("base", "tool"))
@@ -222,8 +241,8 @@ class ParameterSpace:
         rows, frames, targets = (block.reshape(*block.shape[:-1], -1, size) for block, size in blocks)
         return rows, frames, targets
 
-    def sensor_unknowns(self, values: Float64[Tensor, " parameters"]) -> Unknowns:
-        """What a vector of all parameters says of the sensors' unknowns."""
+    def sensor_unknowns(self, values: Float64[Tensor, "*robots parameters"]) -> Unknowns:
+        """What a vector of all parameters says of the sensors' unknowns, which several robots side by side lack."""
         return {
             own.name: values[self.of(own.name).start : self.of(own.name).stop].view(-1, len(own.columns)).t()
             for own in self.unknowns
@@ -243,8 +262,8 @@ class ParameterSpace:
         """1 / variance of every parameter's error by the prior; 0 where it says nothing."""
         precision = np.zeros(len(self.parameters))
         if prior is not None:
-            for index, parameter in enumerate(self.parameters[: self.arm_size]):
-                precision[index] = getattr(prior, parameter.group) ** -2
+            of_row = [getattr(prior, column) ** -2 for column in DH_COLUMNS]
+            precision[: self.arm_size] = np.tile(of_row, len(self.robot.rows))
         return precision
 
 

@@ -5,64 +5,45 @@ them, and the same free parameters. Their rows stand one robot behind the other 
 one a robot has an axis of robots first, which a problem of one robot need not have.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.identification.problem.least_squares import AbstractLeastSquares, Linearisation, covariance_of
 from pisigma.identification.problem.loss import AbstractLoss, SquaredLoss
+from pisigma.identification.problem.motion import MotionMemory, motion_at
 from pisigma.identification.problem.noise import (
     ALWAYS_GOOD,
-    SMALLEST_PRIOR,
     SensorSums,
     SensorView,
     angle_disagreement,
     group_variance_ratio,
     joined_sums,
     loss_scale,
-    prior_group_of,
-    prior_scales,
-    scaled_precision,
+    rejecting,
     renumbered,
     values_used,
     view_of,
 )
 from pisigma.identification.problem.parameters import EVERYWHERE, ParameterSpace, PriorSizes
+from pisigma.identification.problem.prior_sizes import (
+    SMALLEST_PRIOR,
+    alike,
+    prior_scales,
+    settled_scales,
+)
 from pisigma.identification.problem.robots import of_robots, with_robots
-from pisigma.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion, tool_motion
+from pisigma.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion
 from pisigma.measurement.conditions import JointState
-from pisigma.sensors.pose import PositionSensor, RotationSensor
 from pisigma.sensors.sensor import AbstractSensor, Unknowns
 
 CERTAIN_LOSS = SquaredLoss()
 SETTLED = 1e-2
 """Estimates of noise and of the prior's sizes have settled that change by a smaller share from point to point."""
-PRIOR_ROUNDS, PRIOR_SETTLED = 8, 1e-3
-"""At one point the prior's sizes are estimated anew so often at most, or until they change by a smaller share."""
-
-
-class MotionMemory:
-    """The motion at the last point, which the rank analysis, the search and its next stage all ask for.
-
-    What the motion was made from is compared by identity; so points are replaced and never changed in place.
-    """
-
-    def __init__(self) -> None:
-        self._made_from: tuple[object, ...] = ()
-        self._motion: ToolMotion | None = None
-
-    def motion(self, made_from: tuple[object, ...], make: Callable[[], ToolMotion]) -> ToolMotion:
-        """Return the motion that was made from the same objects, or else a new one."""
-        same = len(made_from) == len(self._made_from) and all(
-            one is other for one, other in zip(made_from, self._made_from, strict=True)
-        )
-        if not same or self._motion is None:
-            self._made_from, self._motion = made_from, make()
-        return self._motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,14 +108,12 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     @cached_property
     def prior_group(self) -> Int64[Tensor, " active"]:
         """Which size of the prior every free parameter has: of its `PriorGroup`, or for lengths and for angles."""
+        active = self.active
+        if self.prior_sizes != "estimated":
+            return self.space.is_length.to(active.device)[active].long()
         nominal = self.nominal.reshape(-1, len(self.precision))[0]  # robots of one type are drawn alike
-        drawn = (nominal.square() * self.precision > 1).tolist()
-        groups = []
-        for index in self.active.tolist():
-            parameter = self.space.parameters[index]
-            own = prior_group_of(parameter.group, drawn[index])
-            groups.append(own if self.prior_sizes == "estimated" else int(parameter.unit == "m"))
-        return torch.tensor(groups, dtype=torch.int64, device=self.q.device)
+        drawn = (nominal.square() * self.precision > 1)[active].long()
+        return self.space.prior_groups.to(active.device)[drawn, active]
 
     def with_active(self, active: Sequence[int]) -> "CalibrationProblem":
         """The same with other free parameters."""
@@ -168,32 +147,6 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             memory=MotionMemory(),
         )
 
-    @property
-    def pattern(self) -> tuple[object, ...] | None:
-        """What problems of robots of one type agree in that may stand side by side; None where none may."""
-        poses = all(isinstance(sensor, PositionSensor | RotationSensor) for sensor in self.sensors)
-        if self.space.unknowns or self.pairs or not poses or self.rows > JACOBIAN_CHUNK:
-            return None
-        kinds = [(one.name, one.sigma is None, tuple(one.present.tolist())) for one in self.sensors]
-        repeats = (self.pose is None, self.configuration is None)
-        return (self.space.frames, self.space.targets, self.rows, *repeats, *kinds, self.q.device)
-
-    @staticmethod
-    def side_by_side(problems: "Sequence[CalibrationProblem]") -> "CalibrationProblem":
-        """Return the problem of several robots of one type, of problems with one pattern and the same free parameters."""
-        first = problems[0]
-        names = ["q", "frame", "target", *(name for name in ("pose", "configuration") if getattr(first, name) is not None)]
-        rows = {name: torch.cat([getattr(problem, name) for problem in problems]) for name in names}
-        of_sensors = zip(*(problem.sensors for problem in problems), strict=True)
-        return replace(
-            first,
-            **rows,  # type: ignore[arg-type]
-            sensors=tuple(AbstractSensor.joined(sensors) for sensors in of_sensors),
-            nominal=torch.stack([problem.nominal for problem in problems]),
-            stated={},
-            memory=MotionMemory(),
-        )
-
     def of_robots(self, robots: Int64[Tensor, " chosen"]) -> "CalibrationProblem":
         """Those of several robots that are chosen."""
         robots = robots.to(self.q.device)
@@ -214,36 +167,35 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return view_of(linearisation).sums[0].rms
 
     def linearise(self, point: Tensor, like: Linearisation[Tensor] | None) -> Linearisation[Tensor]:
-        """Sum up the normal equations; rows are weighted by the noise of `like`, where None by that which they show."""
+        """Sum up the normal equations; rows are weighted by the noise of `like`, all alike where None."""
         before = None if like is None else view_of(like)
         unknowns = self.space.sensor_unknowns(point)
         chunks = []
         for rows in self.chunks():
             motion = self.motion(point, rows, self.active)
             noise = None if before is None else self._of_rows(before.noise, rows)
-            chunks.append(
-                [self._sums(k, noise, motion, unknowns, rows) for k in range(len(self.sensors))]
-            )
+            chunks.append([self._sums(k, noise, motion, unknowns, rows) for k in range(len(self.sensors))])
         sums = tuple(joined_sums(of_sensor) for of_sensor in zip(*chunks, strict=True))
-        if before is not None:
-            return self.combined(point, replace(before, sums=sums))
-        linearisation = self.combined(point, SensorView.without_noise(sums))
-        # gross errors would decide the first step, so the rows are weighted by what they show of the noise
-        weighted = self.renewed(linearisation)[0]
-        rejects = self._rejects(view_of(weighted))
-        if bool(rejects.all()) or not bool(rejects.any()):
-            return self.linearise(point, weighted) if bool(rejects.all()) else linearisation
-        robots = rejects.nonzero()[:, 0]
-        theirs = self.of_robots(robots).linearise(point[robots], of_robots(weighted, robots))
-        return with_robots(linearisation, robots, theirs)
+        view = SensorView.without_noise(sums) if before is None else replace(before, sums=sums)
+        return self.combined(point, view)
 
-    def _rejects(self, view: SensorView) -> Bool[Tensor, "*robots"]:
-        """Whether the loss rejects any row."""
-        rejected = [
-            (self.loss_of(sensor).weight(sums.distance / view.scale(k)[..., None], sensor.components) == 0).any(-1)
-            for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True))
-        ]
-        return torch.stack(rejected).any(0)
+    def begin(self, point: Tensor) -> Linearisation[Tensor]:
+        """See the problem from a start, the rows being weighted by what they show of the noise.
+
+        Gross errors would decide the first step otherwise, where the loss rejects any.
+        """
+        weighted = self.renewed(self.linearise(point, None))[0]
+        rejects = rejecting(
+            self.sensors, [self.loss_of(sensor) for sensor in self.sensors], view_of(weighted)
+        )
+        if not bool(rejects.any()):
+            return weighted
+        if bool(rejects.all()):
+            return self.renewed(self.linearise(point, weighted))[0]
+        robots = rejects.nonzero()[:, 0]
+        some = self.of_robots(robots)
+        theirs = some.renewed(some.linearise(point[robots], of_robots(weighted, robots)))[0]
+        return with_robots(weighted, robots, theirs)
 
     def renewed(self, linearisation: Linearisation[Tensor]) -> tuple[Linearisation[Tensor], Tensor]:
         """Estimate the noise robustly, what repeats are worth, and how wide the prior has to be."""
@@ -274,42 +226,30 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
                 renewed, disagreement=angle_disagreement(self.sensors, renewed, held, -held * off)
             )
         if self._sized:
-            sized = replace(renewed, prior_scale=self._prior_scales(off, view.prior_scale, covariance))
-            renewed = sized if refine else self._with_settled_prior(sized, off)
+            renewed = replace(renewed, prior_scale=self._prior_scales(renewed, off, covariance, refine))
         before, after = (
             torch.cat([one.noise, one.repetition, one.disagreement, one.prior_scale], -1)
             for one in (view, renewed)
         )
-        return self.combined(linearisation.point, renewed), _alike(before, after, SETTLED)
+        return self.combined(linearisation.point, renewed), alike(before, after, SETTLED)
 
-    def _with_settled_prior(self, view: SensorView, off: Tensor) -> SensorView:
-        """Estimate the prior's sizes together with the step that they lead to.
+    def _prior_scales(
+        self, view: SensorView, off: Tensor, covariance: Tensor, refine: bool
+    ) -> Float64[Tensor, "*robots groups"]:
+        """Estimate the prior's sizes, while a search goes on together with the step that they lead to.
 
         Residuals being linear in the step, that takes no further linearisation.
         """
+        floor, prior = (
+            1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR,
+            (self._prior, self.prior_group),
+        )
+        scale = prior_scales(off, *prior, view.prior_scale, covariance, floor)
+        if refine:
+            return scale
         normal, descent = self._data_sums(view)
         pull = (descent + (normal @ off[..., None])[..., 0])[..., None]
-        return replace(view, prior_scale=self._settled_scales(normal, pull, view.prior_scale, PRIOR_ROUNDS))
-
-    def _settled_scales(self, normal: Tensor, pull: Tensor, before: Tensor, rounds: int) -> Tensor:
-        """Estimate the prior's sizes in so many rounds at most, each robot's until they have settled."""
-        held = normal.clone()
-        held.diagonal(dim1=-2, dim2=-1).add_(scaled_precision(self._prior, self.prior_group, before))
-        covariance = covariance_of(held)
-        scale = self._prior_scales((covariance @ pull)[..., 0], before, covariance)
-        moving = ~_alike(before, scale, PRIOR_SETTLED)
-        if rounds == 1 or not bool(moving.any()):
-            return scale
-        if bool(moving.all()):
-            return self._settled_scales(normal, pull, scale, rounds - 1)
-        scale[moving] = self._settled_scales(normal[moving], pull[moving], scale[moving], rounds - 1)
-        return scale
-
-    def _prior_scales(
-        self, off: Tensor, before: Tensor, covariance: Tensor
-    ) -> Float64[Tensor, "*robots groups"]:
-        floor = 1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR
-        return prior_scales(off, self._prior, self.prior_group, before, covariance, floor)
+        return settled_scales(normal, pull, *prior, scale, floor)
 
     @cached_property
     def _sized(self) -> bool:
@@ -319,16 +259,6 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def _off(self, point: Tensor) -> Float64[Tensor, "*robots active"]:
         """Distance of the free parameters from where the prior has them."""
         return (point - self.nominal).index_select(-1, self.active)
-
-    def row_weights(self, view: SensorView, sensor: int, rows: slice) -> Float64[Tensor, " poses"]:
-        """1 / standard deviation of each row for a sensor, 0 where it saw nothing [1/m or 1/rad]."""
-        kind = self.sensors[sensor]
-        distance = (view.sums[sensor].distance / view.scale(sensor)[..., None])
-        root = self.loss_of(kind).weight(distance, kind.components).sqrt()
-        root = (root / view.variance(sensor).sqrt()[..., None]).flatten()[rows]
-        if kind.sigma is not None:
-            root = root / kind.sigma[rows]
-        return torch.where(kind.present[rows], root, 0.0)
 
     def loss_of(self, sensor: AbstractSensor) -> AbstractLoss:
         """How a sensor's rows count."""
@@ -340,7 +270,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         size = max(JACOBIAN_CHUNK // whole, 1) * whole
         return [slice(start, min(start + size, len(self.q))) for start in range(0, len(self.q), size)]
 
-    def _of_rows(self, values: Float64[Tensor, "*robots size"], rows: slice) -> Float64[Tensor, "*robots size"]:
+    def _of_rows(
+        self, values: Float64[Tensor, "*robots size"], rows: slice
+    ) -> Float64[Tensor, "*robots size"]:
         """What has one entry a robot, for the robots of some rows."""
         return values[rows.start // self.rows : rows.stop // self.rows] if self.robots else values
 
@@ -354,11 +286,13 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         The columns are 0 for base and tool in rows of other frames and targets, and for parameters that do not
         move the tool.
         """
-        if self.chunks() == [rows]:
-            made_from = (point, self.space, self.q, self.frame, self.target, self._turning)
-            motion = self.memory.motion(made_from, lambda: self._whole_motion(point, rows))
-        else:
-            motion = self._whole_motion(point, rows)
+
+        def make() -> ToolMotion:
+            of_rows = (self.q[rows], self.frame[rows], self.target[rows])
+            return motion_at(self.space, self._of_rows(point, rows), *of_rows, self._turning)
+
+        made_from = (point, self.space, self.q, self.frame, self.target, self._turning)
+        motion = self.memory.motion(made_from, make) if self.chunks() == [rows] else make()
         columns = self.space.motion_columns.to(active.device)
         J = motion.derivative.index_select(0, columns[0, active])
         if not self.space.always_moving:
@@ -368,24 +302,6 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             )
             J = J * moving[:, None, :]
         return ToolMotion(motion.position, motion.rotation, J)
-
-    def _whole_motion(self, point: Tensor, rows: slice) -> ToolMotion:
-        """Tool pose of some rows and its derivative by every kind of parameter."""
-        dh, bases, tools = self.space.split(self._of_rows(point, rows))
-        where = (dh.cpu().numpy(), bases.reshape(-1, 6).t(), tools.reshape(-1, 6).t(), self.q[rows])
-        frame, target = (
-            self._numbers(number[rows], owners.shape[-2])
-            for number, owners in ((self.frame, bases), (self.target, tools))
-        )
-        return tool_motion(self.space.robot, *where, self._turning, frame, target)
-
-    def _numbers(self, owner: Int64[Tensor, " poses"], owners: int) -> Int64[Tensor, " poses"] | None:
-        """Number of every row's frame or target among those of all robots; None where a robot has one only."""
-        if owners == 1 or not self.robots:
-            return None if owners == 1 else owner
-        return owner + owners * torch.arange(len(owner) // self.rows, device=owner.device).repeat_interleave(
-            self.rows
-        )
 
     def derivative(
         self, sensor: AbstractSensor, motion: ToolMotion, unknowns: Unknowns, rows: slice, active: Tensor
@@ -489,8 +405,3 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         measured = self.values_measured[number] // sensor.components
         r = (residual * root[..., None, :]).flatten(-2)[..., None]
         return SensorSums(A @ A.mT, (A @ r)[..., 0], residual, distance, measured)
-
-
-def _alike(before: Tensor, after: Tensor, share: float) -> Tensor:
-    """Whether two estimates of noise and of the prior's sizes differ by less than a share."""
-    return ((after / before - 1).abs() < share).all(-1)

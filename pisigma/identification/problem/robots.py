@@ -24,7 +24,9 @@ def of_robots(values: Values, robots: Int64[Tensor, " chosen"] | int) -> Values:
 
 def with_robots(values: Values, robots: Int64[Tensor, " chosen"], others: Values) -> Values:
     """Return the values with those of some robots replaced by others, one behind the other."""
-    changed: Values = _mapped(lambda value, other: value.index_copy(0, robots.to(value.device), other), values, others)
+    changed: Values = _mapped(
+        lambda value, other: value.index_copy(0, robots.to(value.device), other), values, others
+    )
     return changed
 
 
@@ -34,7 +36,7 @@ def side_by_side(values: list[Values]) -> Values:
     return stacked
 
 
-def _mapped(function: Callable[..., Tensor], *values: Any) -> Any:  # noqa: ANN401 - of whatever dataclass
+def _mapped(function: Callable[..., Tensor], *values: Any) -> Any:
     first = values[0]
     if isinstance(first, Tensor):
         return function(*values)

@@ -204,12 +204,17 @@ def repeated(q: Tensor, *names: Tensor) -> Tensor | None:
     Returns:
         None where no two rows are the same.
     """
-    keys = torch.stack([*(q * 1e9).round().long().unbind(1), *names])
+    numbers = renumbered(mixed_keys(q, *names))
+    return None if int(numbers.max()) + 1 == len(q) else numbers
+
+
+def mixed_keys(q: Float64[Tensor, "*batch rows dof"], *names: Tensor) -> Int64[Tensor, "*batch rows"]:
+    """Mix every row's joint values (to 1e-9) and names into one number, which is the same where they are."""
+    keys = [*(q * 1e9).round().long().unbind(-1), *names]
     mixed = torch.zeros_like(keys[0])
     for key in keys:  # integers wrap around, so equal rows mix equally
         mixed = mixed * 6_364_136_223_846_793_005 + key * 1_442_695_040_888_963_407
-    numbers = renumbered(mixed)
-    return None if int(numbers.max()) + 1 == len(q) else numbers
+    return mixed
 
 
 def _anchored(

@@ -35,7 +35,9 @@ class Curve(AbstractLeastSquares[torch.Tensor]):
         J = torch.tensor(slopes, dtype=torch.float64) / SIGMA
         return Linearisation(point, r @ r, -J.mT @ r, J.mT @ J, r @ r, ROUNDING, None)
 
-    def renewed(self, linearisation: Linearisation[torch.Tensor]) -> tuple[Linearisation[torch.Tensor], torch.Tensor]:
+    def renewed(
+        self, linearisation: Linearisation[torch.Tensor]
+    ) -> tuple[Linearisation[torch.Tensor], torch.Tensor]:
         return linearisation, torch.tensor(True)
 
     def moved(self, point: torch.Tensor, step: torch.Tensor) -> torch.Tensor:
@@ -54,11 +56,11 @@ class Swinging(AbstractLeastSquares[torch.Tensor]):
     ) -> Linearisation[torch.Tensor]:
         believed = 1.0 if like is None else float(like.detail)
         r = torch.stack([point[0] - believed, torch.ones(()).double()])
-        return Linearisation(
-            point, r @ r, -r[:1], torch.eye(1).double(), r @ r, ROUNDING, believed
-        )
+        return Linearisation(point, r @ r, -r[:1], torch.eye(1).double(), r @ r, ROUNDING, believed)
 
-    def renewed(self, linearisation: Linearisation[torch.Tensor]) -> tuple[Linearisation[torch.Tensor], torch.Tensor]:
+    def renewed(
+        self, linearisation: Linearisation[torch.Tensor]
+    ) -> tuple[Linearisation[torch.Tensor], torch.Tensor]:
         other = replace(linearisation, detail=-float(linearisation.detail))
         return self.linearise(linearisation.point, other), torch.tensor(False)
 

@@ -1,0 +1,59 @@
+"""How the tool moves with the parameters in the rows of a problem, and the memory of the last such motion."""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float64, Int64
+from torch import Tensor
+
+from pisigma.identification.problem.parameters import ParameterSpace
+from pisigma.kinematics.parameter_jacobian import ToolMotion, tool_motion
+
+
+class MotionMemory:
+    """The motion at the last point, which the rank analysis, the search and its next stage all ask for.
+
+    What the motion was made from is compared by identity; so points are replaced and never changed in place.
+    """
+
+    def __init__(self) -> None:
+        self._made_from: tuple[object, ...] = ()
+        self._motion: ToolMotion | None = None
+
+    def motion(self, made_from: tuple[object, ...], make: Callable[[], ToolMotion]) -> ToolMotion:
+        """Return the motion that was made from the same objects, or else a new one."""
+        same = len(made_from) == len(self._made_from) and all(
+            one is other for one, other in zip(made_from, self._made_from, strict=True)
+        )
+        if not same or self._motion is None:
+            self._made_from, self._motion = made_from, make()
+        return self._motion
+
+
+def motion_at(
+    space: ParameterSpace,
+    point: Float64[Tensor, "*robots parameters"],
+    q: Float64[Tensor, "rows dof"],
+    frame: Int64[Tensor, " rows"],
+    target: Int64[Tensor, " rows"],
+    turning: bool,
+) -> ToolMotion:
+    """Work out tool poses and their derivative by every kind of parameter.
+
+    Args:
+        space: the parameters.
+        point: their values, of one robot or of several.
+        q: joint values [rad or m]; of several robots one behind the other.
+        frame: number of every row's frame among those of its robot.
+        target: number of every row's target among those of its robot.
+        turning: whether the derivative of the rotation is wanted too.
+    """
+    dh, bases, tools = space.split(point)
+    robots, rows = point.shape[:-1].numel(), len(q)
+    robot = torch.arange(robots, device=q.device).repeat_interleave(rows // robots) if robots > 1 else 0
+    frame_of_all, target_of_all = (
+        None if owners.shape[-2] == 1 else number + owners.shape[-2] * robot
+        for number, owners in ((frame, bases), (target, tools))
+    )
+    base, tool = bases.reshape(-1, 6).t(), tools.reshape(-1, 6).t()
+    return tool_motion(space.robot, dh.cpu().numpy(), base, tool, q, turning, frame_of_all, target_of_all)
