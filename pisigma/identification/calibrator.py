@@ -164,7 +164,8 @@ class GeometricCalibrator:
     def solve_many(self, data: Sequence[Measurements]) -> list[SolvedCalibration]:
         """Calibrate several robots of one type, those whose data are alike side by side; see `fit_many` and `solve`."""
         robots = [_Robot(*pair) for pair in zip(data, self._build(data), strict=True)]
-        for alike in _groups(robots, [pattern_of(robot.setup.problem) for robot in robots]):
+        patterns = [pattern_of(robot.setup.problem) if len(robots) > 1 else None for robot in robots]
+        for alike in _groups(robots, patterns):
             self._choose(alike)
             for group in _groups(alike, [tuple(robot.active) for robot in alike]):
                 self._solve(group)

@@ -228,20 +228,20 @@ def rank_extension(information: Information, kept: list[int]) -> list[int]:
 
 def _pivots(rest: np.ndarray, rounding: np.ndarray, kept: list[int]) -> list[tuple[int, float]]:
     """Pivots of a QR factorisation with column pivoting, with the length each has beside those before it."""
-    rest = rest.copy()
-    taken = np.zeros(rest.shape[1], dtype=bool)
-    taken[kept] = True
+    columns = np.delete(np.arange(rest.shape[1]), kept)
+    rest, rounding = rest[:, columns], rounding[columns]
     pivots: list[tuple[int, float]] = []
-    while True:
-        lengths = np.linalg.norm(rest, axis=0)
-        lengths[taken | (lengths <= rounding)] = 0.0
-        best = int(lengths.argmax()) if len(lengths) else 0
-        if not len(lengths) or lengths[best] == 0.0:
-            return pivots
-        pivots.append((best, float(lengths[best])))
-        taken[best] = True
+    while len(columns):
+        lengths = np.sqrt(np.einsum("ij,ij->j", rest, rest))
+        lengths[lengths <= rounding] = 0.0
+        best = int(lengths.argmax())
+        if lengths[best] == 0.0:
+            break
+        pivots.append((int(columns[best]), float(lengths[best])))
         direction = rest[:, best] / lengths[best]
-        rest -= np.outer(direction, direction @ rest)
+        rest -= direction[:, None] * (direction @ rest)
+        rest[:, best] = 0.0
+    return pivots
 
 
 def _needed(columns: np.ndarray, left: np.ndarray, freedom: int) -> bool:

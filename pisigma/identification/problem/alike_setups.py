@@ -25,7 +25,7 @@ from pisigma.identification.problem.setup import (
 from pisigma.kinematics.parameter_jacobian import flange_frames
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
-from pisigma.se3 import rotation_from_rpy, rpy_from_rotation, transform
+from pisigma.se3 import rotation_from_rpy, transform
 from pisigma.sensors.pose import PositionSensor
 
 TOGETHER = 32
@@ -65,9 +65,9 @@ def build_setups(
 
 
 @lru_cache(maxsize=16)
-def _space(robot: Robot, frame: str, target: str) -> ParameterSpace:
-    """The parameters of a robot; remembered, as fits of one robot or type ask for them again and again."""
-    return ParameterSpace(robot, (frame,), (target,))
+def _space_and_tool(robot: Robot, frame: str, target: str) -> tuple[ParameterSpace, Float64[Tensor, "1 3 3"]]:
+    """The parameters of a robot and how its tool is turned; remembered, as every fit of its type asks for them."""
+    return ParameterSpace(robot, (frame,), (target,)), rotation_from_rpy(torch.tensor(robot.tool[None, 3:]))
 
 
 def _kind(measurements: Measurements, options: SetupOptions) -> tuple[object, ...] | None:
@@ -102,8 +102,8 @@ def _setups_of_positions(
     T_base, point, measured, clear = _bases_and_points(robot, data)
     arms = torch.cat([like.new_tensor(robot.dh).flatten(), like.new_zeros(6)]).expand(len(data), -1)
     start = torch.cat([arms, point, torch.zeros_like(point)], 1)
-    R_tool = rotation_from_rpy(torch.tensor(robot.tool[None, 3:]))
-    space, rows = _space(robot, first.frame[0], first.target[0]), torch.arange(first.rows, device=like.device)
+    space, R_tool = _space_and_tool(robot, first.frame[0], first.target[0])
+    rows = torch.arange(first.rows, device=like.device)
     common = CalibrationProblem(
         space=space,
         q=like,
@@ -151,6 +151,5 @@ def _bases_and_points(
     arm = p_flange + (R_flange @ point[:, None, :, None])[..., 0]
     missed = (position - (arm @ R_base.mT + p_base[:, None])).square().sum(-1).mean(-1).sqrt()
     repeats = (mixed_keys(q).sort(-1).values.diff(dim=-1) == 0).any(-1)
-    T_base = transform(rotation_from_rpy(rpy_from_rotation(R_base)), p_base)
-    measured = ((position - p_base[:, None]) @ T_base[:, :3, :3]).mT.contiguous()
-    return T_base, point, measured, (missed < CLEAR_FIT * robot.reach) & ~repeats
+    measured = ((position - p_base[:, None]) @ R_base).mT.contiguous()
+    return transform(R_base, p_base), point, measured, (missed < CLEAR_FIT * robot.reach) & ~repeats

@@ -107,7 +107,7 @@ def information(
     unknowns = problem.space.sensor_unknowns(point)
     for rows in problem.chunks():
         motion = problem.motion(point, rows, index)
-        blocks = [] if problem.robots else [root.t()]
+        blocks = [root.t()] if len(root) else []
         for k, sensor in enumerate(problem.sensors):
             J, r = (
                 problem.derivative(sensor, motion, unknowns, rows, index),
@@ -123,8 +123,11 @@ def information(
             torch.mul(J, usual * weight[..., None, None, :], out=block[..., 1:-1, :, :])
             torch.mul(r, weight[..., None, :], out=block[..., -1, :, :])
             blocks.append(block.flatten(-2))
-        root = torch.linalg.qr(torch.cat(blocks, -1).mT, mode="r").R
-        roots += list(root.cpu().numpy()) if problem.robots else []
+        condensed = torch.linalg.qr((torch.cat(blocks, -1) if len(blocks) > 1 else blocks[0]).mT, mode="r").R
+        if problem.robots:
+            roots += list(condensed.cpu().numpy())
+        else:
+            root = condensed
     present = torch.stack([sensor.present for sensor in problem.sensors]).any(0)
     poses, values = int(present[: problem.rows].sum()), sum(problem.values_measured)
     parameters = tuple(problem.space.parameters[i] for i in candidates)

@@ -1,5 +1,6 @@
 """Levenberg-Marquardt on normal equations; problem, solver and solution are apart."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -226,7 +227,7 @@ class _Search(Generic[Point]):
                 self.ends[robot] = replace(self.ends[robot], path=(*self.ends[robot].path, rms))
         over[lower & settled & (self.decrement <= SHORTEST_STEP**2)] = SolutionStatus.CONVERGED
         over[lower & _array(self.best.misfit <= self.best.rounding)] = SolutionStatus.EXACT
-        self.end(over != None, over)  # noqa: E711 - of every entry
+        self.end(over.astype(bool), over)
 
     def _descend(self, there: Linearisation[Point]) -> np.ndarray:
         """Go on from where all costs are lower, and say where the noise has settled."""
@@ -344,7 +345,7 @@ def solve_damped(
         IdentificationError: they are not finite.
     """
     normal, descent = linearisation.normal, linearisation.descent
-    if not bool(torch.isfinite(normal.sum() + descent.sum())):
+    if not math.isfinite(float(normal.sum() + descent.sum())):
         raise IdentificationError(
             "the normal equations are not finite; look for huge values, or standard deviations of next to nothing, in "
             "the measurements."

@@ -63,8 +63,8 @@ def effective_parameters(
         covariance: of the parameters.
     """
     variance = covariance.diagonal(dim1=-2, dim2=-1)
-    share = 1 - scaled_precision(precision, group, prior_scale) * variance
-    return _group_totals(share * (precision > 0), group)
+    lost = scaled_precision(precision, group, prior_scale) * variance
+    return _group_totals(torch.where(precision > 0, 1 - lost, 0.0), group)
 
 
 def scaled_precision(

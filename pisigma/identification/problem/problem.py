@@ -1,8 +1,7 @@
 """The calibration as a least-squares problem: normal equations summed over chunks of poses.
 
-A problem may be that of several robots of one type side by side. They have equally many rows, values in the same of
-them, and the same free parameters. Their rows stand one robot behind the other in what has one entry a row; what has
-one a robot has an axis of robots first, which a problem of one robot need not have.
+A problem may be that of several robots of one type, with equally many rows, values in the same of them and the same
+free parameters. Rows stand one robot behind the other; what is one a robot has an axis of robots first.
 """
 
 from collections.abc import Mapping, Sequence
@@ -220,7 +219,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
             repetition = group_variance_ratio(self.sensors, self.loss, renewed_noise, used, *groups)
         off = self._off(linearisation.point)
         renewed = replace(view, noise=noise, repetition=repetition)
-        if not refine and self._angular:
+        if not refine and any(sensor.unit == "rad" for sensor in self.sensors):
             held = view.scaled(self._prior, self.prior_group)
             renewed = replace(
                 renewed, disagreement=angle_disagreement(self.sensors, renewed, held, -held * off)
@@ -236,10 +235,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def _prior_scales(
         self, view: SensorView, off: Tensor, covariance: Tensor, refine: bool
     ) -> Float64[Tensor, "*robots groups"]:
-        """Estimate the prior's sizes, while a search goes on together with the step that they lead to.
-
-        Residuals being linear in the step, that takes no further linearisation.
-        """
+        """Estimate the prior's sizes; during a search with the step they lead to, the residuals being linear in it."""
         floor, prior = (
             1.0 if self.prior_sizes == "widened" else SMALLEST_PRIOR,
             (self._prior, self.prior_group),
@@ -270,9 +266,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         size = max(JACOBIAN_CHUNK // whole, 1) * whole
         return [slice(start, min(start + size, len(self.q))) for start in range(0, len(self.q), size)]
 
-    def _of_rows(
-        self, values: Float64[Tensor, "*robots size"], rows: slice
-    ) -> Float64[Tensor, "*robots size"]:
+    def _of_rows(self, values: Float64[Tensor, "*robots size"], rows: slice) -> Float64[Tensor, "*some size"]:
         """What has one entry a robot, for the robots of some rows."""
         return values[rows.start // self.rows : rows.stop // self.rows] if self.robots else values
 
@@ -323,10 +317,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         normal, descent = self._data_sums(view)
         normal.diagonal(dim1=-2, dim2=-1).add_(precision)
         descent.sub_(pull)
-        distances = (sums.distance / view.scales[..., k, None] for k, sums in enumerate(view.sums))
         costs = [
-            self.loss_of(sensor).cost(distance, sensor.components).sum(-1)
-            for sensor, distance in zip(self.sensors, distances, strict=True)
+            self.loss_of(sensor).cost(sums.distance / view.scale(k)[..., None], sensor.components).sum(-1)
+            for k, (sensor, sums) in enumerate(zip(self.sensors, view.sums, strict=True))
         ]
         misfit = (torch.stack(costs, -1) * view.scales.square() / view.variances).sum(-1)
         rounding = (self._rounding / view.variances).sum(-1)
@@ -360,11 +353,6 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
     def _turning(self) -> bool:
         """Whether any sensor needs the tool's rotation."""
         return any(sensor.turning for sensor in self.sensors)
-
-    @cached_property
-    def _angular(self) -> bool:
-        """Whether any sensor measures angles."""
-        return any(sensor.unit == "rad" for sensor in self.sensors)
 
     @cached_property
     def _prior(self) -> Float64[Tensor, " active"]:

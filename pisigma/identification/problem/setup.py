@@ -210,10 +210,11 @@ def repeated(q: Tensor, *names: Tensor) -> Tensor | None:
 
 def mixed_keys(q: Float64[Tensor, "*batch rows dof"], *names: Tensor) -> Int64[Tensor, "*batch rows"]:
     """Mix every row's joint values (to 1e-9) and names into one number, which is the same where they are."""
-    keys = [*(q * 1e9).round().long().unbind(-1), *names]
-    mixed = torch.zeros_like(keys[0])
-    for key in keys:  # integers wrap around, so equal rows mix equally
-        mixed = mixed * 6_364_136_223_846_793_005 + key * 1_442_695_040_888_963_407
+    keys = (q * 1e9).round().long()
+    factors = [pow(6_364_136_223_846_793_005, power, 2**63) for power in range(1, q.shape[-1] + 1)]
+    mixed: Tensor = (keys * torch.tensor(factors, device=q.device)).sum(-1)  # integers wrap around
+    for name in names:
+        mixed = mixed * 6_364_136_223_846_793_005 + name * 1_442_695_040_888_963_407
     return mixed
 
 
