@@ -1,12 +1,15 @@
 """`pisigma simulate`: the simulated measurements of a recipe as a file."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pisigma.cli.arguments import AsJson
 from pisigma.cli.output import print_json, print_line
+
+if TYPE_CHECKING:
+    from pisigma.recipes.recipe import Recipe
 
 
 def simulate(
@@ -28,7 +31,6 @@ def simulate(
     from pisigma.errors import RecipeError
     from pisigma.files.output_file import check_output
     from pisigma.recipes.data import simulate as simulate_recipe
-    from pisigma.recipes.data import write_recipe_images
     from pisigma.recipes.reader import read_recipe
     from pisigma.robot.robot_file import robot_file
 
@@ -36,11 +38,7 @@ def simulate(
     if (out is None) == (images is None):
         raise RecipeError("state either --out, a CSV file of measurements, or --images, a folder of images.")
     if images is not None:
-        count = write_recipe_images(read, images)
-        if as_json:
-            print_json({"folder": str(images), "images": count})
-        else:
-            print_line(f"{count} images, joints.csv, camera.yaml and board.yaml written to {images}.")
+        _write_images(read, images, as_json)
         return
     assert out is not None
     check_output(out, inputs=(recipe, robot_file(read.robot)))
@@ -51,3 +49,13 @@ def simulate(
         print_json({"file": str(out), "rows": rows.rows, "sha256": rows.content_hash()})
     else:
         print_line(f"{rows.rows} measurements written to {out}.")
+
+
+def _write_images(recipe: "Recipe", folder: Path, as_json: bool) -> None:
+    from pisigma.recipes.data import write_recipe_images
+
+    count = write_recipe_images(recipe, folder)
+    if as_json:
+        print_json({"folder": str(folder), "images": count})
+    else:
+        print_line(f"{count} images, joints.csv, camera.yaml and board.yaml written to {folder}.")
