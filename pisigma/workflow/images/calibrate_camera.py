@@ -1,5 +1,6 @@
 """Calibrate the intrinsics of a camera by images of a board."""
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,6 @@ from pisigma.camera.detection.detector import MOST_BLUR, detect_boards, image_fi
 from pisigma.camera.intrinsic_calibration import BoardView, IntrinsicCalibration, calibrate_intrinsics
 from pisigma.errors import MeasurementError
 from pisigma.files.output_file import check_page, write_whole
-from pisigma.reporting.intrinsics_table import intrinsics_table
 from pisigma.reporting.tables import Table
 from pisigma.sensors.intrinsics import CAMERA_UNITS
 
@@ -106,8 +106,9 @@ class CameraCalibration:
 
     @property
     def tables(self) -> tuple[tuple[str, Table], ...]:
-        """The intrinsics."""
-        return (("Intrinsics", intrinsics_table(self.parameters)),)
+        """The intrinsics, one row a number of the camera."""
+        columns = ("parameter", "value", "standard deviation", "unit")
+        return (("Intrinsics", Table(columns, tuple(_row(*one) for one in self.parameters))),)
 
     def to_json(self) -> dict[str, object]:
         """Return everything but the corners as plain values: the result of `pisigma camera --json`."""
@@ -179,3 +180,9 @@ def calibrate_camera(
     views = [BoardView(of_board.corners[one.corners], one.pixels) for one in boards]
     calibration = calibrate_intrinsics(views, settings.name, size, settings.free_k3)
     return CameraCalibration(calibration, predict_boards(detected, calibration.camera, of_board))
+
+
+def _row(name: str, value: float, sigma: float, unit: str) -> tuple[str, ...]:
+    """Cells of a number of the camera, to two digits of its standard deviation (0 where it is held)."""
+    decimals = max(1 - math.floor(math.log10(sigma)), 0) if sigma > 0 else 0
+    return (name, f"{value:.{decimals}f}", f"{sigma:.{decimals}f}" if sigma > 0 else "held", unit)
