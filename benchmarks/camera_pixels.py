@@ -27,7 +27,7 @@ from pisigma.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
 from pisigma.simulation.camera.images import draw_board_poses, images_of, project_corners
 from pisigma.simulation.camera.rendering import Exposure, render_image
 from pisigma.simulation.camera.true_board import TrueBoard
-from pisigma.simulation.camera.views import BoardViews
+from pisigma.simulation.camera.views import RandomViews
 
 LENS = replace(CAMERA, k1=-0.1, k2=0.05, p1=1e-4, p2=-2e-4)
 IN_BASE = torch.tensor([0.42, 0.08, 0.05, 0.0, 0.0, np.pi], dtype=torch.float64)
@@ -39,7 +39,7 @@ def main(draws: int, count: int) -> None:
     nominal = Robot.load("ur5")
     base = xyzrpy_from_transform(invert(transform_from_xyzrpy(IN_BASE))).numpy()
     aimed = nominal.with_geometry(nominal.dh, base=base, tool=ON_FLANGE.numpy())
-    q = BoardViews(count=count, seed=0).joints(aimed, LENS, BOARD)
+    q = RandomViews(count=count, seed=0).joints(aimed, LENS, BOARD)
     everywhere = torch.from_numpy(np.random.default_rng(0).uniform(-np.pi, np.pi, (POSTURES, nominal.dof)))
     squares = dict.fromkeys(("detected", "exact", "as_noisy", "usual"), 0.0)
     off, seconds, left_out = list[np.ndarray](), 0.0, 0

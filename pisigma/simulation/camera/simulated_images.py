@@ -17,7 +17,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.simulation.camera.images import ImageNoise, draw_board_poses, simulate_images
 from pisigma.simulation.camera.rendering import Exposure, render_image
 from pisigma.simulation.camera.true_board import TrueBoard
-from pisigma.simulation.camera.views import BoardViews
+from pisigma.simulation.camera.views import RandomViews
 from pisigma.simulation.true_robot import TrueRobot
 from pisigma.yaml_file import Section, Seed
 
@@ -112,7 +112,7 @@ class SimulatedImages(Section):
     """
 
     kind: Literal["images"]
-    poses: BoardViews
+    poses: RandomViews
     camera: CameraDocument
     board: BoardDocument
     noise: CornerNoise

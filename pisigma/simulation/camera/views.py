@@ -21,7 +21,7 @@ ATTEMPTS = 100
 """For each candidate, of which some cannot be reached."""
 
 
-class BoardViews(Section):
+class RandomViews(Section):
     """Random views of a whole board, by random branches, of which those are taken that are far apart.
 
     Of all candidates, each joint vector is the one farthest from those before it, in sines and cosines.
