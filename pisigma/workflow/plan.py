@@ -4,6 +4,7 @@ import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import torch
@@ -17,6 +18,7 @@ from pisigma.files.output_file import check_output, write_whole
 from pisigma.judging.progress import Progress
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_source import HoldsModel
+from pisigma.planning.board_views import BoardViews
 from pisigma.planning.camera_prospects import CameraProspects
 from pisigma.planning.candidates import Candidates, spread
 from pisigma.planning.cell.arm_in_cell import ArmInCell
@@ -219,6 +221,11 @@ class _Problem:
     knowledge: Knowledge
     task: Float64[Tensor, "tasks dof"]
 
+    @cached_property
+    def views(self) -> BoardViews | None:
+        """From where the camera has to see its board; None without a camera."""
+        return self.settings.views(self.arm)
+
     @property
     def anything_known(self) -> bool:
         """Whether something was measured already."""
@@ -275,17 +282,16 @@ class _Problem:
 
     def prospects(self, chosen: Int64[Tensor, " chosen"]) -> CameraProspects | None:
         """What limits a calibration with the chosen images; None without a camera."""
-        views = self.settings.views(self.arm)
-        if views is None:
+        if self.views is None:
             return None
-        return CameraProspects.of(self.knowledge, self.candidates, chosen, self.task, views, self.arm)
+        return CameraProspects.of(self.knowledge, self.candidates, chosen, self.task, self.views, self.arm)
 
     def view_warnings(self, chosen: Int64[Tensor, " chosen"]) -> tuple[str, ...]:
-        """In which known traps of cameras the chosen images are."""
-        views, q = self.settings.views(self.arm), self.candidates.q[chosen]
-        return (
-            () if views is None else tuple(view_warnings(views.obliqueness(self.arm, q), q, self.arm.robot))
-        )
+        """Where the chosen images are too frontal or of one branch of the arm, a sentence each."""
+        if self.views is None:
+            return ()
+        q = self.candidates.q[chosen]
+        return tuple(view_warnings(self.views.obliqueness(self.arm, q), q, self.arm.robot))
 
     def _curve(self, chosen: Int64[Tensor, " chosen"], counts: list[int]) -> tuple[ExpectedAccuracy, ...]:
         return curve(self.knowledge, self.candidates.q, chosen, self.task, counts, self.settings.seed)
