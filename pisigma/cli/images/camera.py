@@ -32,7 +32,7 @@ def camera(
     check_outputs(out, (".yaml", ".yml"), "a camera", page, [*images, board])
     from pisigma.workflow.images import calibrate_camera as workflow
 
-    settings = workflow.CameraSettings(name, free_k3, most_blur)
+    settings = workflow.IntrinsicsSettings(name, free_k3, most_blur)
     with progress_of("camera") as progress:
         calibrated = workflow.calibrate_camera(images, board, settings, progress)
     write_result(calibrated, out, page, as_json)

@@ -33,7 +33,7 @@ CORNERS = {
 
 
 @dataclass(frozen=True)
-class CameraSettings:
+class IntrinsicsSettings:
     """How a camera is calibrated.
 
     Attributes:
@@ -153,7 +153,7 @@ class CameraCalibration:
 def calibrate_camera(
     images: Sequence[str | os.PathLike[str]],
     board: str | os.PathLike[str],
-    settings: CameraSettings = CameraSettings(),
+    settings: IntrinsicsSettings = IntrinsicsSettings(),
     progress: Callable[[str], None] = lambda what: None,
 ) -> CameraCalibration:
     """Calibrate the intrinsics of a camera by images of a board, with their standard deviations.
@@ -161,7 +161,7 @@ def calibrate_camera(
     Args:
         images: files, or folders of them, of one size.
         board: its file, see `Board.load`.
-        settings: see `CameraSettings`.
+        settings: see `IntrinsicsSettings`.
         progress: called with the name of every image.
 
     Raises:
