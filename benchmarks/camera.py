@@ -25,8 +25,8 @@ from pisigma.camera.camera import INTRINSICS, USUAL_DEVIATIONS, Camera
 from pisigma.camera.image_rows import Images, Repeatability, image_measurements
 from pisigma.camera.solved_images import IntrinsicsChoice
 from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.problem.motion import MotionMemory
 from pisigma.identification.problem.parameters import Prior
-from pisigma.identification.problem.problem import MotionMemory
 from pisigma.kinematics.closed_form.registry import closed_form_solver
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
@@ -40,6 +40,7 @@ from pisigma.se3 import (
     xyzrpy_from_transform,
 )
 from pisigma.simulation.camera.images import ImageNoise, simulate_images
+from pisigma.simulation.camera.views import far_apart
 
 LENGTH, ANGLE = 1e-3, np.deg2rad(0.3)
 CAMERA = Camera("wrist", 1920, 1200, 1400.0, 1400.0, 960.0, 600.0)
@@ -66,16 +67,6 @@ def views(robot: Robot, count: int, rng: np.random.Generator) -> Tensor:
         if len(reached):
             chosen.append(reached[rng.integers(len(reached))])
     return torch.stack(chosen)
-
-
-def far_apart(q: Tensor, count: int) -> Tensor:
-    """Joint values each of which is as far as possible from those before it (farthest-point sampling)."""
-    points = torch.cat([q.cos(), q.sin()], 1)
-    chosen, distance = [0], (points - points[0]).norm(dim=1)
-    while len(chosen) < count:
-        chosen.append(int(distance.argmax()))
-        distance = torch.minimum(distance, (points - points[chosen[-1]]).norm(dim=1))
-    return q[chosen]
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,6 @@ from camera import (
     POSTURES,
     PRIOR,
     aligned_error,
-    far_apart,
     views,
 )
 from torch import Tensor
@@ -45,6 +44,7 @@ from pisigma.measurement.dataset import Measurements, join
 from pisigma.robot import Robot
 from pisigma.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
 from pisigma.simulation.camera.images import simulate_images
+from pisigma.simulation.camera.views import far_apart
 
 BESIDE = replace(CAMERA, name="beside", is_fixed=True)
 HAND = replace(BOARD, name="hand")

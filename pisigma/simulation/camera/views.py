@@ -65,7 +65,7 @@ class RandomViews(Section):
             if len(reached):
                 chosen.append(reached[rng.integers(len(reached))])
             if len(chosen) == wanted:
-                return _far_apart(torch.stack(chosen), self.count)
+                return far_apart(torch.stack(chosen), self.count)
         raise RecipeError(
             f"views of a board: robot '{robot.name}' reaches {len(chosen)} of {ATTEMPTS * wanted} drawn views, but "
             f"{wanted} were wanted; check where board and camera are, and the distances."
@@ -103,8 +103,8 @@ def _is_whole(camera: Camera, board: Board, T_camera_board: Float64[np.ndarray, 
     return bool(((pixels > 0) & (pixels < (camera.width, camera.height))).all())
 
 
-def _far_apart(q: Float64[Tensor, "rows dof"], count: int) -> Float64[Tensor, "count dof"]:
-    """Choose rows by farthest-point sampling, the first one first."""
+def far_apart(q: Float64[Tensor, "rows dof"], count: int) -> Float64[Tensor, "count dof"]:
+    """Choose joint values [rad] by farthest-point sampling in sines and cosines, the first one first."""
     points = torch.cat([q.cos(), q.sin()], 1)
     chosen, distance = [0], (points - points[0]).norm(dim=1)
     while len(chosen) < count:
