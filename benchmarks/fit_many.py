@@ -2,7 +2,7 @@
 
 Run `OMP_NUM_THREADS=1 python benchmarks/fit_many.py [--robots 1000] [--rows 100]`. Every robot is a UR10 with 0.5 mm
 and 1 mrad errors in all DH and Hayati parameters, base and tool unknown, position noise 0.05 mm per axis. Times are
-those of the processor; of `--turns` turns the fastest counts.
+those of the processor; of `--repeats` repeats the fastest counts.
 """
 
 import argparse
@@ -34,10 +34,10 @@ def measure(nominal: Robot, rows: int, seed: int) -> Measurements:
     return Measurements(q, forward_kinematics(true, q)[:, :3, 3] + noise)
 
 
-def timed(fit: Callable[[], list[CalibrationResult]], turns: int) -> tuple[float, list[CalibrationResult]]:
-    """The least processor time of some turns [s], and the results."""
+def timed(fit: Callable[[], list[CalibrationResult]], repeats: int) -> tuple[float, list[CalibrationResult]]:
+    """The least processor time of some repeats [s], and the results."""
     best, results = float("inf"), []
-    for _ in range(turns):
+    for _ in range(repeats):
         started = time.process_time()
         results = fit()
         best = min(best, time.process_time() - started)
@@ -49,15 +49,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--robots", type=int, default=1000)
     parser.add_argument("--rows", type=int, default=100)
-    parser.add_argument("--turns", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=3)
     options = parser.parse_args()
     torch.set_num_threads(1)
     nominal = Robot.load("ur10")
     calibrator = GeometricCalibrator(nominal)
     data = [measure(nominal, options.rows, seed) for seed in range(options.robots)]
     calibrator.fit_many(data[:2])
-    together, many = timed(lambda: calibrator.fit_many(data), options.turns)
-    apart, each = timed(lambda: [calibrator.fit(one) for one in data], options.turns)
+    together, many = timed(lambda: calibrator.fit_many(data), options.repeats)
+    apart, each = timed(lambda: [calibrator.fit(one) for one in data], options.repeats)
     largest = max(
         float((one.predicted_poses(rows) - other.predicted_poses(rows))[:, :3, 3].norm(dim=1).max())
         for one, other, rows in zip(many, each, data, strict=True)

@@ -98,9 +98,11 @@ def gated(prior: FleetPrior, number: int, odd: bool) -> list[float]:
         rows = rows_of(number, count, 7000 + number, odd)
         without, begun = alone(rows), recalibrate(prior.model, rows)
         kept = {
-            "scratch": lambda found=without: found,
-            "recalibrated": lambda found=begun: found.adaptation,
-            "old": lambda found=begun: adapt(found.adaptation.problem.without_arm(), found.adaptation.noise),
+            "scratch": lambda result=without: result,
+            "recalibrated": lambda result=begun: result.adaptation,
+            "old": lambda result=begun: adapt(
+                result.adaptation.problem.without_arm(), result.adaptation.noise
+            ),
         }
         figures += [rms(kept[begun.gate.kept](), test), rms(without, test)]
     return figures

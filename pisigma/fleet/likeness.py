@@ -34,12 +34,13 @@ class Likeness:
         Raises:
             IdentificationError: the rows do not determine where the robot stands.
         """
-        known = ModelPosterior.of(model)
-        root = of_arm(known.root, known.space)
-        drawn = known.space.robot
-        mean = torch.cat([torch.from_numpy(known.geometry.robot.dh - drawn.dh).flatten(), known.weights])
+        posterior = ModelPosterior.of(model)
+        root = of_arm(posterior.root, posterior.space)
+        drawn = posterior.space.robot
+        errors = torch.from_numpy(posterior.geometry.robot.dh - drawn.dh)
+        mean = torch.cat([errors.flatten(), posterior.weights])
         evidence = evidence_of(model, mean, rows)
-        fleet = Population(mean, root @ root.t(), known.space.arm_size)
+        fleet = Population(mean, root @ root.t(), posterior.space.arm_size)
         square, count = fleet.surprise(evidence)
         gain = fleet.log_evidence(evidence) - class_population(drawn).log_evidence(evidence)
         return Likeness(float(chi2.sf(square, count)), gain)

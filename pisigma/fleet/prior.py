@@ -78,10 +78,10 @@ class Population:
         """
         root = torch.linalg.cholesky(self.covariance)
         information, axes = torch.linalg.eigh(root.t() @ robot.normal @ root)
-        seen = information > 0.1
+        identified = information > 0.1
         along = axes.t() @ (root.t() @ (robot.descent - robot.normal @ self.mean))
         squares = along.square() / (information + information.square())
-        return float(squares[seen].sum()), int(seen.sum())
+        return float(squares[identified].sum()), int(identified.sum())
 
     def log_evidence(self, robot: RobotEvidence) -> float:
         """Logarithm of the probability of a robot's rows, up to a constant of the robot."""
@@ -151,9 +151,9 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
 
 def class_population(robot: Robot) -> Population:
     """Give the robots of the class of a robot, see `pisigma.planning.robot_class`."""
-    known = Knowledge.of_robot(robot).uncertainty
-    usual = of_arm(known.root, known.space).square().sum(1)
-    return Population(torch.zeros_like(usual), usual.diag(), known.space.arm_size)
+    uncertainty = Knowledge.of_robot(robot).uncertainty
+    usual = of_arm(uncertainty.root, uncertainty.space).square().sum(1)
+    return Population(torch.zeros_like(usual), usual.diag(), uncertainty.space.arm_size)
 
 
 def of_arm(
@@ -248,12 +248,12 @@ def evidence_of(
     deviation = values.deviation(adaptation.drift.noise)
     X, y = values.X / deviation[:, None], values.y / deviation
     others = X[:, space.arm_size : len(space.parameters)]
-    own = torch.cat([X[:, : space.arm_size], X[:, len(space.parameters) :]], 1)
+    kept = torch.cat([X[:, : space.arm_size], X[:, len(space.parameters) :]], 1)
     inner = others.t() @ others
     inner.diagonal().add_(ELSEWHERE["m"] ** -2)
-    taken = torch.linalg.solve(inner, others.t() @ torch.cat([own, y[:, None]], 1))
-    normal = own.t() @ own - own.t() @ others @ taken[:, :-1]
-    descent = own.t() @ y - own.t() @ others @ taken[:, -1]
+    taken = torch.linalg.solve(inner, others.t() @ torch.cat([kept, y[:, None]], 1))
+    normal = kept.t() @ kept - kept.t() @ others @ taken[:, :-1]
+    descent = kept.t() @ y - kept.t() @ others @ taken[:, -1]
     normal = (normal + normal.t()) / 2
     return RobotEvidence(normal, descent + normal @ mean, adaptation.noise)
 

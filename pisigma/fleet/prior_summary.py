@@ -70,21 +70,21 @@ def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:
         prior: of the fleet.
         ids: of its robots.
     """
-    population, known = prior.population, prior.model.uncertainty
-    assert known is not None
+    population, uncertainty = prior.population, prior.model.uncertainty
+    assert uncertainty is not None
     deviation = population.covariance.diagonal().sqrt()
     parameters = []
     for number, name in enumerate(prior.names):
-        unit, scale = SHOWN_UNITS[known.space.parameters[number].unit]
+        unit, scale = SHOWN_UNITS[uncertainty.space.parameters[number].unit]
         mean, spread = float(population.mean[number]) * scale, float(deviation[number]) * scale
         parameters.append(CommonFigures(name=name, unit=unit, mean=mean, deviation=spread))
     weights, start, spectrum = deviation[population.geometric :], 0, []
-    for feature in known.features:
+    for feature in uncertainty.features:
         group = feature.group[feature.used]
-        own = weights[start : start + len(group)]
+        chosen = weights[start : start + len(group)]
         start += len(group)
         for number, what in enumerate(feature.group_names):
-            size = float(own[group == number].square().mean().sqrt())
+            size = float(chosen[group == number].square().mean().sqrt())
             spectrum.append(SpectrumFigures(group=f"{feature.name}: {what}", deg=math.degrees(size)))
     return FleetPriorSummary(
         robots=len(ids) - len(prior.odd),

@@ -53,7 +53,7 @@ class BoardSight:
             by_shift, lever = -by_point @ T[:, None, :3, :3], corners - origin
         J = torch.cat([by_shift, -by_shift @ skew(lever)], -1)
         covariance = self.corner_noise**2 * torch.linalg.inv(torch.einsum("ncki,nckj->nij", J, J))
-        own = [self.repeatability.length**2] * 3 + [self.repeatability.angle**2] * 3
-        lower = torch.linalg.cholesky(covariance + torch.diag(covariance.new_tensor(own)))
+        variances = [self.repeatability.length**2] * 3 + [self.repeatability.angle**2] * 3
+        lower = torch.linalg.cholesky(covariance + torch.diag(covariance.new_tensor(variances)))
         weight: Tensor = torch.linalg.solve_triangular(lower, torch.eye(6).to(lower), upper=False)
         return weight

@@ -209,17 +209,19 @@ class Knowledge:
             base: about where the robot's base is in that frame, as x, y, z, roll, pitch, yaw [m, rad].
             tool: about where the target is behind the last joint, likewise.
         """
-        known = self.uncertainty
-        robot = known.geometry.robot.with_geometry(base=base, tool=tool)
+        before = self.uncertainty
+        robot = before.geometry.robot.with_geometry(base=base, tool=tool)
         geometry = IdentifiedGeometry(robot, {"": base}, {"": tool}, {})
-        space = ParameterSpace(known.space.robot)
-        arm, weights = known.root[: space.arm_size], known.root[len(known.space.parameters) :]
+        space = ParameterSpace(before.space.robot)
+        arm, weights = before.root[: space.arm_size], before.root[len(before.space.parameters) :]
         wide = torch.diag(torch.tensor(WIDE, dtype=torch.float64))
         blank = arm.new_zeros(len(wide), arm.shape[1])
         beside = [rows.new_zeros(len(rows), len(wide)) for rows in (arm, weights)]
         rows = [torch.cat(pair, 1) for pair in ((arm, beside[0]), (blank, wide), (weights, beside[1]))]
         root = CovarianceRoot(torch.cat(rows))
-        return replace(self, uncertainty=replace(known, space=space, geometry=geometry, covariance_root=root))
+        return replace(
+            self, uncertainty=replace(before, space=space, geometry=geometry, covariance_root=root)
+        )
 
     def deviation(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, " poses"]:
         """Standard deviation of the predicted position [m], `sqrt(σx² + σy² + σz²)`."""

@@ -126,6 +126,7 @@ class CornerSensor(AbstractSensor):
         turned = (weight.view(-1, 6, 2, 3) @ R[:, None]).view(-1, 6, 6)
         turned = torch.where(present[:, None, None], turned, 0.0)
         images = ImageIntrinsics.of(texts_of(data, INTRINSICS_COLUMN))
+        of_camera, of_board = cameras(data), boards(data)
         at, by = (torch.from_numpy(values).to(R) for values in (images.at, images.by))
         by_scale = torch.where(present, torch.einsum("nij,nj->in", weight[..., :3], data.position), 0.0)
         return cls(
@@ -133,10 +134,10 @@ class CornerSensor(AbstractSensor):
             rotation.permute(1, 2, 0).contiguous(),
             turned.permute(1, 2, 0),
             present,
-            camera=rows.numbers(cameras(data), names_of(cameras(data))),
+            camera=rows.numbers(of_camera, names_of(of_camera)),
             at=at.t(),
             by_intrinsics=(weight @ by).permute(1, 2, 0),
-            board=rows.numbers(boards(data), names_of(boards(data))),
+            board=rows.numbers(of_board, names_of(of_board)),
             by_scale=by_scale,
         )
 

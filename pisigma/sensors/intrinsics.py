@@ -119,8 +119,8 @@ def without_stated(measurements: Measurements, counted: Mapping[str, Collection[
         return measurements
     stated, scales = (texts_of(measurements, name) for name in (INTRINSICS_COLUMN, SCALE_COLUMN))
     images, names = ImageIntrinsics.of(stated), cameras(measurements) or ("",) * len(stated)
-    known = np.array([name in counted.get("camera", ()) for name in names])
-    images = replace(images, sigma=np.where(known[:, None], UNSTATED, 1.0) * images.sigma)
+    is_counted = np.array([name in counted.get("camera", ()) for name in names])
+    images = replace(images, sigma=np.where(is_counted[:, None], UNSTATED, 1.0) * images.sigma)
     texts = {
         INTRINSICS_COLUMN: tuple(
             text if name else "" for name, text in zip(names, images.texts, strict=True)
