@@ -4,7 +4,6 @@ from collections.abc import Callable
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
-import torch
 from jaxtyping import Int64
 from torch import Tensor
 
@@ -28,12 +27,6 @@ def with_robots(values: Values, robots: Int64[Tensor, " chosen"], others: Values
         lambda value, other: value.index_copy(0, robots.to(value.device), other), values, others
     )
     return changed
-
-
-def side_by_side(values: list[Values]) -> Values:
-    """Return values of several robots with an axis of robots before all others; the inverse of `of_robots`."""
-    stacked: Values = _mapped(lambda *one: torch.stack(one), *values)
-    return stacked
 
 
 def _mapped(function: Callable[..., Tensor], *values: Any) -> Any:
