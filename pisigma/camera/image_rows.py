@@ -118,16 +118,16 @@ def image_measurements(
         return poses
 
     solved = solve_images(camera, prior_deviations(camera, intrinsics), solve, loss, images.source)
-    seen = [_seen_by_robot(pose, is_fixed) for pose in solved.poses]
-    count, names = len(seen), (board.name, camera.name)
+    rotations, positions, changes = zip(*(_target_pose(pose, is_fixed) for pose in solved.poses), strict=True)
+    count, names = len(rotations), (board.name, camera.name)
     frame, target = reversed(names) if is_fixed else names
     return Measurements(
         q=images.q,
-        position=torch.from_numpy(np.stack([t for _, t, _ in seen])),
-        rotation=torch.from_numpy(np.stack([R for R, _, _ in seen])),
+        position=torch.from_numpy(np.stack(positions)),
+        rotation=torch.from_numpy(np.stack(rotations)),
         frame=(frame,) * count,
         target=(target,) * count,
-        readings=_readings(solved, [change for _, _, change in seen], board, repeatability),
+        readings=_readings(solved, changes, board, repeatability),
         image=images.names,
         line=images.lines,
         source=images.source,
@@ -210,7 +210,7 @@ def _refuse_other_boards(images: Images, board: Board, poses: Sequence[BoardPose
         )
 
 
-def _seen_by_robot(pose: BoardPose, is_fixed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _target_pose(pose: BoardPose, is_fixed: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Pose of the target in its frame, and its change in the axes of the frame by that of the board's pose.
 
     Of the inverse pose, position `-R^T t` moves by `-R^T (shift + t × turn)`, and the rotation turns by `-R^T turn`.
