@@ -16,7 +16,7 @@ def shapes(board: Board) -> Float64[np.ndarray, "corners 3"]:
     """Return by how much three low shapes stand out of the board's plane at its corners, 1 at most.
 
     They are the squares and the product of the two coordinates in the plane, without what a plane explains of them, so
-    that the pose of the board stays that of its mean plane.
+    that the pose of the board stays that of its mean plane; they have no unit.
     """
     corners = board.corners[:, :2]
     x, y = ((corners - corners.mean(0)) / np.ptp(corners, axis=0)).T

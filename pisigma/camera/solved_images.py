@@ -24,7 +24,7 @@ FREE_DISTORTION = (0.3, 1.0, 0.01, 0.01, 3.0)
 
 
 def prior_deviations(camera: Camera, choice: IntrinsicsChoice) -> Float64[np.ndarray, " 9"]:
-    """Return standard deviations of a camera's intrinsics before its images are looked at, 0 of what is held.
+    """Return prior standard deviations of a camera's intrinsics [px, and 1 from k1 on], 0 of what is held.
 
     Args:
         camera: with the deviations that its file states; where it states none, those of a usual calibration.

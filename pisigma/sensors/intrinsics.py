@@ -94,7 +94,8 @@ def intrinsics_information(
     """Add up what the images of one camera and its stated deviations say of its intrinsics, whatever the poses are.
 
     Returns:
-        U, with `U^T U` the information (0 of intrinsics that are held), and the mean.
+        U [1/px, and 1 from k1 on], with `U^T U` the information (0 of intrinsics that are held), and the mean [px, and
+        1 from k1 on].
     """
     sigma, at = images.sigma[0], images.at[0]
     free = np.flatnonzero(sigma > 0)

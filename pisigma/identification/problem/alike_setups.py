@@ -45,6 +45,17 @@ def build_setups(
 
     Those of robots that were measured in equally many positions, base and tool being looked for, take no longer
     together than a few do apart.
+
+    Args:
+        robot: as drawn.
+        data: rows of every robot.
+        options: what is identified beside the arm, and how.
+        prior: of the arm's parameters; None for none.
+        loss: how rows count that are far from their prediction.
+
+    Raises:
+        IdentificationError: the rows of a robot do not determine what has to be identified.
+        PoseError: joint values do not fit the robot.
     """
     setups: dict[int, CalibrationSetup] = {}
     alike: dict[object, list[int]] = {}

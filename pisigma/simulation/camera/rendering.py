@@ -72,9 +72,12 @@ def render_image(
     Args:
         camera: with its true intrinsics.
         board: as it really is.
-        T_camera_board: where it is.
+        T_camera_board: where it is [m].
         exposure: light and optics.
         rng: of the noise.
+
+    Returns:
+        Gray levels from 0 to 255.
     """
     gray = np.full((camera.height, camera.width), exposure.background, dtype=np.float32)
     left, top, right, bottom = _bounds(camera, board, T_camera_board, exposure)
