@@ -20,7 +20,8 @@ Dictionary = Literal[
 TagFamily = Literal["tag16h5", "tag25h9", "tag36h10", "tag36h11"]
 TAG_CELLS = {"tag16h5": 6, "tag25h9": 7, "tag36h10": 8, "tag36h11": 8}
 """Cells along the side of a tag, with those of its border."""
-Length = Annotated[float, Field(gt=0)]
+Length = Annotated[float, Field(ge=0.2)]
+"""[mm] A length of a board; what is shorter was meant in metres."""
 _LENGTHS: dict[BoardKind, tuple[str, ...]] = {
     "checkerboard": ("square_mm",),
     "charuco": ("square_mm", "marker_mm"),
@@ -65,7 +66,7 @@ class BoardDocument(Section):
         stated = [name for name in ("square_mm", "marker_mm", "tag_mm", "spacing_mm") if getattr(self, name)]
         if sorted(wanted) != sorted(stated):
             raise ValueError(
-                f"a board of kind {self.kind} has {' and '.join(wanted)}, but {', '.join(stated) or 'none'} stated"
+                f"a board of kind {self.kind} has {' and '.join(wanted)} [mm], got {', '.join(stated) or 'none'}"
             )
         if self.kind == "charuco" and (self.marker_mm or 0.0) >= (self.square_mm or 0.0):
             raise ValueError("marker_mm is less than square_mm, as a marker lies in a square")

@@ -31,6 +31,8 @@ SMALLEST_BEND = 1e-6
 """[m] A board is not bent further by less."""
 LARGEST_MISS = 10.0
 """[px] Where half of the corners of an image miss their prediction by more, they are not of this board."""
+MOST_REPEATABILITY = 0.01, 0.105
+"""[m] and [rad] More is that of no robot, but of another unit."""
 
 
 @dataclass(frozen=True)
@@ -47,10 +49,10 @@ class Repeatability:
 
     def __post_init__(self) -> None:
         """Refuse what is no standard deviation."""
-        if not (0 <= self.length < np.inf and 0 <= self.angle < np.inf):
+        if not (0 <= self.length <= MOST_REPEATABILITY[0] and 0 <= self.angle <= MOST_REPEATABILITY[1]):
             raise IdentificationError(
-                f"repeatability: standard deviations of 0 or more were wanted, got {self.length * 1e3:g} mm and "
-                f"{np.rad2deg(self.angle):g} deg."
+                f"repeatability: standard deviations of 0 to 10 mm and 0 to 6 deg were wanted, got "
+                f"{self.length * 1e3:g} mm and {np.rad2deg(self.angle):g} deg."
             )
 
 

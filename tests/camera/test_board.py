@@ -37,8 +37,9 @@ def test_files_of_three_kinds(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "wanted"),
     [
-        ("rows: 6\ncolumns: 9\n", "a board of kind checkerboard has square_mm, but none stated"),
-        (TAGS + "square_mm: 3\n", "apriltag has tag_mm and spacing_mm, but square_mm, tag_mm, spacing_mm stated"),
+        ("rows: 6\ncolumns: 9\n", "a board of kind checkerboard has square_mm [mm], got none"),
+        (TAGS + "square_mm: 3\n", "apriltag has tag_mm and spacing_mm [mm], got square_mm, tag_mm, spacing_mm"),
+        ("rows: 6\ncolumns: 9\nsquare_mm: 0.03\n", "'square_mm': input should be greater than or equal to 0.2"),
         (CHARUCO.replace("22", "31"), "marker_mm is less than square_mm"),
         (CHARUCO.replace("4x4_100", "4x4_99"), "did you mean '4x4_50'?"),
     ],

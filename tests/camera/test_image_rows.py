@@ -125,8 +125,9 @@ def test_mirrored_images_are_named() -> None:
         image_measurements(replace(images, pixels=tuple(pixels)), CAMERA, BOARD, False, Repeatability())
 
 
-def test_repeatability_is_no_negative_number() -> None:
+@pytest.mark.parametrize("length", [-1e-5, 0.02, float("nan")])
+def test_repeatability_is_that_of_a_robot(length: float) -> None:
     with pytest.raises(
-        IdentificationError, match=r"standard deviations of 0 or more were wanted, got -0\.01 mm"
+        IdentificationError, match=r"standard deviations of 0 to 10 mm and 0 to 6 deg were wanted, got"
     ):
-        Repeatability(-1e-5, 0.0)
+        Repeatability(length, 0.0)
