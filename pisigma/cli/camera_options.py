@@ -49,13 +49,30 @@ RepeatabilityDeg = Annotated[
 ]
 
 
+_DEFAULTS = {
+    "fixed_camera": False,
+    "intrinsics": "prior",
+    "repeatability_mm": 0.02,
+    "repeatability_deg": 0.01,
+}
+
+
 def stated_cameras(options: Mapping[str, Any]) -> "CameraFiles | None":
-    """What the pixels mean by the options of a command; None where neither camera nor board is stated."""
+    """What the pixels mean by the options of a command; None where neither camera nor board is stated.
+
+    Raises:
+        BadParameter: another option of cameras is stated without them.
+    """
     from pisigma.camera.corner_file import CameraFiles
     from pisigma.camera.image_rows import Repeatability
 
     cameras, boards = (tuple(map(str, options[name] or ())) for name in ("camera", "board"))
     if not cameras and not boards:
+        unused = [
+            f"--{name.replace('_', '-')}" for name, usual in _DEFAULTS.items() if options[name] != usual
+        ]
+        if unused:
+            raise typer.BadParameter(f"{', '.join(unused)}: only with --camera and --board.")
         return None
     repeatability = Repeatability(
         options["repeatability_mm"] / 1e3, math.radians(options["repeatability_deg"])

@@ -90,3 +90,21 @@ def test_intrinsics_are_one_of_three_choices(run, files, tmp_path):
     assert result.exit_code == 2
     assert "intrinsics 'loose' is no choice; Valid: fixed, free, prior." in " ".join(result.stderr.split())
     assert not (tmp_path / "arm").exists()
+
+
+def test_options_of_cameras_are_refused_without_one(run, files, tmp_path):
+    command = ("calibrate", "ur5", files / "corners.csv", "--fixed-camera", "--repeatability-mm", 0.1)
+    result = run(*command, "--out", tmp_path / "arm")
+    assert result.exit_code == 2
+    assert "--fixed-camera, --repeatability-mm: only with --camera and --board" in " ".join(
+        result.stderr.split()
+    )
+
+
+def test_corners_without_a_camera_are_no_export_to_import(run, files, tmp_path):
+    path = tmp_path / "corners.csv"
+    header, *rows = (files / "corners.csv").read_text().splitlines()
+    path.write_text("\n".join([f"{header},camera", *(f"{row},camera" for row in rows)]) + "\n")
+    result = run("calibrate", "ur5", path, "--out", tmp_path / "arm")
+    assert result.exit_code == 2
+    assert "pisigma import" not in " ".join(result.stderr.split())

@@ -26,7 +26,8 @@ Joints = Annotated[
 ]
 Within = Annotated[float, typer.Option(help="Largest difference of time stamps that are joined [s].")]
 MostBlur = Annotated[
-    float, typer.Option("--most-blur-px", help="Images whose edges are blurred more are left out [px].")
+    float,
+    typer.Option("--most-blur-px", min=0.0, help="Images whose edges are blurred more are left out [px]."),
 ]
 
 

@@ -35,7 +35,8 @@ def import_hint(path: str | os.PathLike[str]) -> str:
 def _has_columns(path: str | os.PathLike[str]) -> bool:
     """Whether the header of a file has the columns of measurement files or of corners; something else is wrong then."""
     try:
-        return all(find_column(name) or name in CORNERS for name in read_table(path).header)
+        header = read_table(path).header
+        return set(CORNERS) <= set(header) or all(find_column(name) or name in CORNERS for name in header)
     except MeasurementError:
         return False
 
