@@ -51,7 +51,8 @@ def units_and_frames(measured: MeasuredPoses) -> Iterator[tuple[MeasuredPoses, C
         place = -(turned_back @ measured.position[..., None])[..., 0]
         clause = "the measured poses are those of the sensor in the target's frame (inverse poses)"
         inverse = replace(measured, position=place, rotation=turned_back)
-        yield inverse, Cause("rotation", clause, "write the target's pose in the sensor's frame", 1.0)
+        forward = "write the target's pose in the sensor's frame; for a camera, check --fixed-camera"
+        yield inverse, Cause("rotation", clause, forward, 1.0)
         what += ", other than the orientations,"
     yield positions, Cause("handedness", _MIRRORED.format(what), advice, 1.0)
 
