@@ -1,6 +1,7 @@
 """What is said of calibrations by cameras: their views, their intrinsics, the tool, and what limits them."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from pisigma.camera.image_rows import Repeatability, image_measurements
 from pisigma.camera.solved_images import IntrinsicsChoice
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.parameters import Prior
+from pisigma.identification.result import CalibrationResult
 from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.stored_starts import nearest_branch
@@ -27,16 +29,19 @@ FRONTAL, BRANCH = "less than", "on one branch"
 HELD, FREE, CONTRADICTED = "were held", "were free", "contradict the calibration"
 
 
-def rows_of(camera: Camera = CAMERA, intrinsics: IntrinsicsChoice = "prior") -> Measurements:
-    """The images of a UR5."""
+@cache
+def calibrated(
+    camera: Camera = CAMERA, intrinsics: IntrinsicsChoice = "prior"
+) -> tuple[Measurements, CalibrationResult]:
+    """The images of a UR5, and its calibration."""
     images = camera_cell(50, 1).images
-    return image_measurements(images, camera, BOARD, False, Repeatability(), intrinsics)
+    rows = image_measurements(images, camera, BOARD, False, Repeatability(), intrinsics)
+    return rows, CALIBRATOR.fit(rows)
 
 
-def sentences(rows: Measurements, checked: Measurements | None = None) -> str:
+def sentences(checked: Measurements, result: CalibrationResult) -> str:
     """What the check says of some of the rows that were calibrated with."""
-    results = {"geometric": CALIBRATOR.fit(rows)}
-    check = CheckedCalibration(CALIBRATOR, rows if checked is None else checked, results)
+    check = CheckedCalibration(CALIBRATOR, checked, {"geometric": result})
     return " ".join(one.sentence for one in CameraCheck().diagnose(check))
 
 
@@ -54,22 +59,21 @@ def sentences(rows: Measurements, checked: Measurements | None = None) -> str:
     ],
 )
 def test_what_applies_is_said(camera: Camera, intrinsics: IntrinsicsChoice, said: set[str]) -> None:
-    text = sentences(rows_of(camera, intrinsics))
+    text = sentences(*calibrated(camera, intrinsics))
     everything = {TOOL, LIMIT, FRONTAL, BRANCH, HELD, FREE, CONTRADICTED}
     assert {one for one in everything if one in text} == said
     assert ("of its square from the intrinsics" in text) == (intrinsics != "fixed")
 
 
 def test_frontal_views_and_a_single_branch_are_named() -> None:
-    rows, solver = rows_of(), closed_form_solver(CALIBRATOR.robot)
+    (rows, result), solver = calibrated(), closed_form_solver(CALIBRATOR.robot)
     assert solver is not None
     tilt = rows.T[:, 2, 2].abs().arccos()
-    assert FRONTAL in sentences(rows, rows.select(tilt < np.deg2rad(12)))
+    assert FRONTAL in sentences(rows.select(tilt < np.deg2rad(12)), result)
     branch = nearest_branch(solver, rows.q)
-    assert BRANCH in sentences(rows, rows.select(branch == torch.bincount(branch).argmax()))
+    assert BRANCH in sentences(rows.select(branch == torch.bincount(branch).argmax()), result)
 
 
 def test_other_sensors_are_no_matter_of_cameras() -> None:
-    rows = rows_of()
-    tracker = replace(rows, rotation=None, readings={})
-    assert not sentences(rows, tracker)
+    rows, result = calibrated()
+    assert not sentences(replace(rows, rotation=None, readings={}), result)
