@@ -22,7 +22,7 @@ from pisigma.se3 import invert, xyzrpy_from_transform
 from pisigma.simulation.camera.images import ImageNoise, simulate_images
 from pisigma.workflow.measure import MeasureSettings, MeasuringSession
 
-IMAGES, SWAPPED = 11, 8
+IMAGES, SWAPPED = 9, 7
 CORNERS = 54
 
 
