@@ -204,8 +204,6 @@ def print_calibration(
     if summary.hybrid is not None:
         print_table("what was tried beyond the geometry", *tables.trial_table(summary.hybrid))
     _print_parameters(summary, verbose)
-    print_line("What these data cannot determine:")
-    print_lines((f"- {line}" for line in tables.undetermined_lines(summary)), indent="  ")
     count = len(summary.outliers)
     worst = f"; the worst is {summary.outliers[0].place}" if count else ""
     print_lines([f"Rank {summary.rank}, {summary.iterations} iterations, {count} outliers{worst}."])
@@ -230,13 +228,15 @@ def _print_accuracy(summary: "CalibrationSummary") -> None:
 
 
 def _print_parameters(summary: "CalibrationSummary", verbose: bool) -> None:
-    """Print the parameters that were estimated, or all."""
-    from pisigma.reporting.calibration_tables import parameter_table
+    """Print the parameters that were estimated, or all, and what the data cannot determine."""
+    from pisigma.reporting.calibration_tables import parameter_table, undetermined_lines
 
     estimated = [row for row in summary.parameters if verbose or row.standard_error is not None]
     rest = len(summary.parameters) - len(estimated)
     title = f"estimated parameters ({rest} others are nominal: --verbose)" if rest else "parameters"
     print_table(title, *parameter_table(estimated))
+    print_line("What these data cannot determine:")
+    print_lines((f"- {line}" for line in undetermined_lines(summary)), indent="  ")
 
 
 def _settings(options: Mapping[str, Any]) -> "CalibrationSettings":

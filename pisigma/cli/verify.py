@@ -11,6 +11,7 @@ from pisigma.errors import AcceptanceError
 
 if TYPE_CHECKING:
     from pisigma.judging.model_comparison import ModelComparison
+    from pisigma.workflow.verify import Verification
 
 FitFrame = Annotated[
     bool,
@@ -63,13 +64,18 @@ def verify(
     if as_json:
         print_json(verification.to_json())
     else:
-        print_lines([verification.sentence])
-        if verification.recalibration:
-            print_line(f"Run {verification.recalibration}")
-        print_comparison(verification.comparison, verification.data)
-        print_lines([*(fault.sentence for fault in verification.setup_faults), *verification.warnings])
+        _print(verification)
     if not verification.accepted:
         raise AcceptanceError(verification.sentence)
+
+
+def _print(verification: "Verification") -> None:
+    """Print the verdict and what to run, the errors, and what else is wrong."""
+    print_lines([verification.sentence])
+    if verification.recalibration:
+        print_line(f"Run {verification.recalibration}")
+    print_comparison(verification.comparison, verification.data)
+    print_lines([*(fault.sentence for fault in verification.setup_faults), *verification.warnings])
 
 
 def print_comparison(comparison: "ModelComparison", data: str) -> None:

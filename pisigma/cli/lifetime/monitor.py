@@ -59,18 +59,18 @@ def monitor(
         monitoring = workflow.monitor(model, sessions, settings, progress)
         if page is not None:
             monitoring.save_page(page)
-    if as_json:
-        print_json(monitoring.to_json())
-    else:
-        _print(monitoring, page)
+    _print(monitoring, page, as_json)
     if monitoring.action:
         raise typer.Exit(NOT_ACCEPTED)
 
 
-def _print(monitoring: "Monitoring", page: Path | None) -> None:
+def _print(monitoring: "Monitoring", page: Path | None, as_json: bool) -> None:
     """Print a line for every session, what each says, and what they say together."""
     from pisigma.reporting.monitoring_tables import chart_table, session_table
 
+    if as_json:
+        print_json(monitoring.to_json())
+        return
     print_table(f"sessions of {monitoring.model.name}", *session_table(monitoring.sessions))
     said = [one for one in monitoring.sessions if one.session.verdict != "unchanged"]
     print_lines((f"{one.date}: {one.session.sentence}" for one in said), indent="  ")
