@@ -15,6 +15,8 @@ from pisigma.cli.output import print_line
 if TYPE_CHECKING:
     from pisigma.measuring.state import SessionState
     from pisigma.planning.cell.arm_in_cell import ArmInCell
+    from pisigma.robot.description import Robot
+    from pisigma.viewing.mesh_body import MeshBody
 
 View = Annotated[
     bool, typer.Option("--view", help="Show robot, rows and errors on a page in the browser too.")
@@ -43,6 +45,16 @@ class PageOptions:
     port: int
     urdf: Path | None
 
+    def body(self, robot: "Robot") -> "MeshBody | None":
+        """Load the meshes of a robot; None where capsules are shown.
+
+        Raises:
+            RobotError: the meshes cannot be shown.
+        """
+        from pisigma.viewing.mesh_body import MeshBody
+
+        return None if self.urdf is None else MeshBody(robot, self.urdf)
+
 
 @contextmanager
 def shown_in_browser(
@@ -65,12 +77,10 @@ def shown_in_browser(
     if options is None:
         yield lambda state: None
         return
-    from pisigma.viewing.mesh_body import MeshBody
     from pisigma.viewing.session_view import SessionView
 
-    body = None if options.urdf is None else MeshBody(arm.robot, options.urdf)
     limit = None if limit_mm is None else limit_mm / 1e3
-    with SessionView(arm, body, limit, options.host, options.port) as view:
+    with SessionView(arm, options.body(arm.robot), limit, options.host, options.port) as view:
         print_line(f"The session is shown at {view.url}", to_stderr=True)
         yield view.show
         if sys.stderr.isatty():
