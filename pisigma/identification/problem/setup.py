@@ -26,6 +26,9 @@ from pisigma.sensors.registry import build_sensors, pairs_first, unknown_groups
 from pisigma.sensors.sensor import SensorRows, numbers_of
 from pisigma.sensors.socket import PairOfSockets, SocketDistanceSensor
 
+MULTIPLIER, FACTOR = 6_364_136_223_846_793_005, 1_442_695_040_888_963_407
+"""Of the linear congruential generator by which joint values are mixed (Knuth, MMIX)."""
+
 
 @dataclass(frozen=True, eq=False)
 class Anchors:
@@ -210,11 +213,12 @@ def repeated(q: Tensor, *names: Tensor) -> Tensor | None:
 
 def mixed_keys(q: Float64[Tensor, "*batch rows dof"], *names: Tensor) -> Int64[Tensor, "*batch rows"]:
     """Mix every row's joint values (to 1e-9) and names into one number, which is the same where they are."""
-    keys = (q * 1e9).round().long()
-    factors = [pow(6_364_136_223_846_793_005, power, 2**63) for power in range(1, q.shape[-1] + 1)]
-    mixed: Tensor = (keys * torch.tensor(factors, device=q.device)).sum(-1)  # integers wrap around
+    keys, dof = (q * 1e9).round().long(), q.shape[-1]
+    factors = [FACTOR * pow(MULTIPLIER, dof - 1 - joint, 2**64) for joint in range(dof)]
+    signed = [(factor + 2**63) % 2**64 - 2**63 for factor in factors]
+    mixed: Tensor = (keys * torch.tensor(signed, device=q.device)).sum(-1)  # integers wrap around
     for name in names:
-        mixed = mixed * 6_364_136_223_846_793_005 + name * 1_442_695_040_888_963_407
+        mixed = mixed * MULTIPLIER + name * FACTOR
     return mixed
 
 
