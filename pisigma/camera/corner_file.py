@@ -135,6 +135,10 @@ def read_rows(
     if isinstance(data, Measurements):
         return data
     paths = [data] if isinstance(data, str | os.PathLike) else list(data)
+    if len({os.path.realpath(path) for path in paths}) < len(paths):
+        raise MeasurementError(
+            f"{', '.join(map(str, paths))}: a file is stated twice; state every file once."
+        )
     if cameras is None:
         rows = [Measurements.read_csv(path, robot) for path in paths]
     else:

@@ -84,6 +84,13 @@ def test_camera_and_board_belong_together(run, files, tmp_path):
     assert not (tmp_path / "arm").exists()
 
 
+def test_a_file_does_not_count_twice(run, files, tmp_path):
+    twice = files / "corners.csv", files / "corners.csv"
+    result = run("calibrate", "ur5", *twice, *cameras(files), "--out", tmp_path / "arm")
+    assert result.exit_code == 2
+    assert "a file is stated twice" in " ".join(result.stderr.split())
+
+
 def test_intrinsics_are_one_of_three_choices(run, files, tmp_path):
     command = ("calibrate", "ur5", files / "corners.csv", *cameras(files), "--intrinsics", "loose")
     result = run(*command, "--out", tmp_path / "arm")
