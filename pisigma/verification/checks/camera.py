@@ -135,7 +135,7 @@ def _limit(images: Measurements, result: CalibrationResult) -> Iterator[str]:
     parts = [f"{share:.0%} of its square from {what}" for what, share in shares.items() if share >= 0.1]
     yield (
         f"The camera is what limits this calibration: its images scatter by {ratio:.2f} times what their corners and "
-        f"the repeatability explain, and a position is predicted to {total * 1e3:.2f} mm over the joint space"
+        f"the repeatability explain, and a position is predicted to {total * 1e3:.2g} mm over the joint space"
         f"{', ' + ' and '.join(parts) if parts else ''}. More images, a larger or nearer board and more pixels improve "
         "it."
     )
