@@ -173,6 +173,7 @@ def _limit_lines(planned: "Plan") -> list[str]:
 
 def _settings(options: Mapping[str, Any]) -> "PlanSettings":
     """Settings by the options of the command."""
+    from pisigma.errors import PlanningError
     from pisigma.planning.camera_settings import CameraSettings
     from pisigma.planning.plan_settings import PlanSettings
 
@@ -180,7 +181,11 @@ def _settings(options: Mapping[str, Any]) -> "PlanSettings":
     stated = {name: options[name] for name in (*same, "speed_deg_s", "settling_s")}
     files = {name: options[name] for name in ("candidates_from", "task", "measured")}
     stated |= {name: None if file is None else str(file) for name, file in files.items()}
-    if options["camera"] is not None and options["board"] is not None:
+    if (options["camera"] is None) != (options["board"] is None):
+        raise PlanningError(
+            "--camera and --board were wanted together, with --sensor camera, got one of the two."
+        )
+    if options["camera"] is not None:
         noise = (options[name] for name in ("sigma_px", "repeatability_mm", "repeatability_deg"))
         camera, board = str(options["camera"]), str(options["board"])
         stated["camera"] = CameraSettings(camera, board, options["fixed_camera"], *noise)

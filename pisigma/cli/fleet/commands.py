@@ -185,8 +185,10 @@ def _print_status(seen: "FleetStatus", page: Path | None) -> None:
     """Print how many robots are in each state, the worst, and what is to be done."""
     from pisigma.reporting.fleet_tables import robot_table, state_table
 
-    print_table(f"{len(seen.robots)} robots, seen on {seen.today}", *state_table(seen))
-    print_table("largest errors", *robot_table(seen.worst_first[:SHOWN]))
+    count = len(seen.robots)
+    print_table(f"{count} robot{'' if count == 1 else 's'}, seen on {seen.today}", *state_table(seen))
+    if worst := seen.worst_first[:SHOWN]:
+        print_table("largest errors", *robot_table(worst))
     for state, title in (("drifting", "Drifting"), ("overdue", "Overdue"), ("refused", "Refused")):
         for one in seen.in_state(state):
             said = one.refused or one.last

@@ -50,7 +50,9 @@ class CameraCheck(AbstractCheck):
             *view_warnings(images.T[:, 2, 2].abs().clamp(max=1.0).acos().cpu(), images.q, checked.robot),
             *_intrinsics(images, result),
             *_tool(images, checked.rows, result),
-            *_limit(images, result),
+            *(
+                _limit(images, result) if bool(by_corners.all()) else ()
+            ),  # beside other sensors it need not be
         ):
             yield Diagnostic(kind="camera", severity="warning", sentence=sentence)
 
