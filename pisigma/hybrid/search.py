@@ -1,7 +1,5 @@
 """Which features: kept where the evidence and left-out rows say so."""
 
-import ctypes
-import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -41,8 +39,6 @@ FEW_TOGETHER = 60
 FIRST_MODEL_SIZES = 3
 """A model with all features has one that comes in several sizes in the last of so many."""
 FOLDS_OF_FEW = 20
-MANY_UNKNOWNS = 1_000
-"""Matrices of more are large enough to make room for."""
 FAILURES = 3
 """Sizes that do not help before no larger ones are tried."""
 
@@ -153,8 +149,6 @@ class Search:
             noise, prior = near.posterior.noise, design.prior_like(near.design, near.posterior.prior)
         if sizes is not None:
             prior = replace(prior, sizes=torch.cat([prior.sizes[: -len(sizes)], sizes]))
-        if design.unknowns > MANY_UNKNOWNS:
-            _return_free_memory()
         chosen = self._regression.select(design)
         posterior = chosen.maximise_evidence(prior, noise, tolerance=ROUGHLY)
         errors = chosen.left_out(posterior, self._folds)
@@ -249,15 +243,3 @@ class Search:
         if better:
             self._least = min(self._least, left_out)
         return tried if better else best
-
-
-def _return_free_memory() -> None:
-    """Give free memory back to the system where the C library offers that (`malloc_trim` of glibc); else do nothing.
-
-    After fits of thousands of unknowns more than 100 MB are free in pieces between what is in use, and the matrices of
-    the next fit would come on top of them.
-    """
-    if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-        if trim is not None:
-            trim(0)
