@@ -89,6 +89,11 @@ def test_a_file_does_not_count_twice(run, files, tmp_path):
     result = run("calibrate", "ur5", *twice, *cameras(files), "--out", tmp_path / "arm")
     assert result.exit_code == 2
     assert "a file is stated twice" in " ".join(result.stderr.split())
+    copy = tmp_path / "copy.csv"
+    copy.write_bytes((files / "corners.csv").read_bytes())
+    result = run("calibrate", "ur5", files / "corners.csv", copy, *cameras(files), "--out", tmp_path / "arm")
+    assert result.exit_code == 2
+    assert "are exactly those of" in " ".join(result.stderr.split())
 
 
 def test_intrinsics_are_one_of_three_choices(run, files, tmp_path):
