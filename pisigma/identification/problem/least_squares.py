@@ -95,7 +95,14 @@ class AbstractLeastSquares(ABC, Generic[Point]):
         return linearisation.misfit.sqrt()
 
     def of_robots(self, robots: Int64[Tensor, " chosen"]) -> "AbstractLeastSquares[Point]":
-        """The problem of some of its robots; of one robot there are no parts."""
+        """The problem of some of its robots.
+
+        Args:
+            robots: numbers of those that are kept, fewer than there are.
+
+        Raises:
+            NotImplementedError: it is a problem of one robot, whose search ends as a whole.
+        """
         raise NotImplementedError
 
 
