@@ -101,13 +101,19 @@ class MatrixSection(BaseModel):
 
 
 class MatrixDocument(BaseModel):
-    """A camera as `camera_info` of ROS and the calibration sample of OpenCV write it."""
+    """A camera as `camera_info` of ROS and the calibration sample of OpenCV write it.
+
+    Fisheye lenses, whose coefficients mean something else, and binned images, whose pixels do, are refused.
+    """
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
     camera_name: str = "camera"
     image_width: int = Field(gt=0)
     image_height: int = Field(gt=0)
     distortion_model: Literal["plumb_bob"] = "plumb_bob"
+    fisheye_model: Literal[0] = 0
+    binning_x: Literal[0, 1] = 0
+    binning_y: Literal[0, 1] = 0
     camera_matrix: MatrixSection
     distortion_coefficients: MatrixSection
 

@@ -92,6 +92,11 @@ def test_deviations_of_the_intrinsics_are_read(tmp_path: Path) -> None:
         (OWN + "sigma: {fx: -1}\n", r"'sigma\.fx': input should be greater than or equal to 0"),
         (OWN.replace("fx: 1400", "fx: -1400"), r"line 3: 'fx': input should be greater than 0"),
         (ROS.replace("plumb_bob", "equidistant"), r"'distortion_model' cannot be 'equidistant'"),
+        (
+            OPENCV.replace("image_width", "fisheye_model: 1\nimage_width"),
+            r"'fisheye_model': input should be 0",
+        ),
+        (ROS + "binning_x: 2\n", r"'binning_x': input should be 0 or 1, but got 2"),
         (ROS.replace("0.01]", "0.01, 3]"), r"k1, k2, p1, p2 and k3 was wanted, got .*3\.0"),
         (ROS.replace("[1400, 0, 960", "[1400, 2, 960"), r"fx, 0, cx, 0, fy, cy, 0, 0, 1 was wanted"),
     ],
