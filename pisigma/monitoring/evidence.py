@@ -111,6 +111,14 @@ class SessionEvidence:
         other._sigma = other.values.deviation(self._usual_noise)
         return other
 
+    def beside(self, groups: Sequence[DriftGroup]) -> "SessionEvidence":
+        """Give the evidence of the same rows where some groups have moved by about their sizes, whatever else has."""
+        other = copy(self)
+        for one in groups:
+            B = self.values.X[:, one.index] * one.deviation
+            other._K = other._K + B @ B.t()
+        return other
+
     def explain(self) -> Explanation:
         """Compare all hypotheses, and again beside what has moved clearly, until nothing more has."""
         motions: list[Motion] = []
@@ -157,11 +165,7 @@ class SessionEvidence:
         self, groups: Sequence[DriftGroup], noise_factor: float
     ) -> Float64[Tensor, "values values"]:
         """Give the covariance of the values where some groups have moved by about their sizes."""
-        V = self._K + self._noise(noise_factor).square().diag()
-        for one in groups:
-            B = self.values.X[:, one.index] * one.deviation
-            V = V + B @ B.t()
-        return V
+        return self.beside(groups)._K + self._noise(noise_factor).square().diag()
 
     def error_score(self) -> float:
         """Root mean square of all values over their standard deviations where nothing moved; about 1 is usual."""

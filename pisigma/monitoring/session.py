@@ -83,6 +83,8 @@ class Session:
         rms: root mean square of the errors under the model, with frames as they stand now [m].
         rms_after: the same expected after recalibrating [m].
         rotation_ratio: errors of the orientation by those expected after recalibrating; 1 where none was measured.
+        score_ratio: with images, whose poses have more noise than error, values over their standard deviations by the
+            same; else 1.
         error_score: root mean square of the errors over their standard deviations; 1 is usual.
         values: number of measured values.
         standing: names of bases and tools that stand elsewhere than when the model was made.
@@ -97,6 +99,7 @@ class Session:
     rms: float
     rms_after: float
     rotation_ratio: float
+    score_ratio: float
     error_score: float
     values: int
     standing: tuple[str, ...]
@@ -122,7 +125,7 @@ class Session:
     def recalibrate(self) -> bool:
         """Whether the arm changed so much that recalibrating pays."""
         arm = any(not is_frame(one.moved.what) for one in self.moved) or bool(self.candidates)
-        return arm and (self.rms > PAYS * self.rms_after or self.rotation_ratio > PAYS)
+        return arm and (self.rms > PAYS * self.rms_after or max(self.rotation_ratio, self.score_ratio) > PAYS)
 
     @property
     def sentence(self) -> str:
@@ -221,6 +224,11 @@ class _Solved:
         return self.explanation.motions or self.explanation.candidates[:1]
 
     @property
+    def moved_frames(self) -> list[DriftGroup]:
+        """Bases and tools that moved, beside which joints and errors are charted: the arm is as it was."""
+        return [_freed(one) for one in self.explanation.motions if is_frame(one.group.what)]
+
+    @property
     def frame_moved(self) -> bool:
         """Whether a base or a tool seems to stand so far off that its motion is not linear."""
         return any(is_frame(one.group.what) and one.size >= FAR for one in self.suspected)
@@ -228,6 +236,13 @@ class _Solved:
     def arm_with(self, motions: tuple[DriftGroup, ...]) -> AdaptedArm:
         """The arm with what stands elsewhere, and some motions, as these rows have it; all else as in the model."""
         return AdaptedArm.at(self.problem, self.unknowns(motions))
+
+    def score_ratio(self, before: tuple[DriftGroup, ...], after: tuple[DriftGroup, ...]) -> float:
+        """Divide the values that some motions leave, over their standard deviations, by those that others leave."""
+        values, deviation = self.values, self.values.deviation(self.noise)
+        left = [values.y - values.X @ (self.unknowns(those) - self.problem.mean) for those in (before, after)]
+        first, second = (float((one / deviation).square().mean().sqrt()) for one in left)
+        return first / second if second > 0 else 1.0
 
     def unknowns(self, motions: tuple[DriftGroup, ...]) -> Float64[Tensor, " unknowns"]:
         """Most probable unknowns with what stands elsewhere and some motions; all else as in the model."""
@@ -279,6 +294,11 @@ def _sized(motion: Motion) -> DriftGroup:
     return replace(motion.group, size=motion.size)
 
 
+def _freed(motion: Motion) -> DriftGroup:
+    """Let what moved be anywhere near."""
+    return replace(motion.group, size=max(motion.size, ANYWHERE))
+
+
 def _judged(solved: _Solved, elsewhere: dict[Owner, float]) -> Session:
     """Work out what there is to say."""
     every, wrong = solved.problem.setup.measurements, solved.problem.wrong_rows(solved.values)
@@ -300,7 +320,8 @@ def _judged(solved: _Solved, elsewhere: dict[Owner, float]) -> Session:
         rms=rms,
         rms_after=rms_after * optimism,
         rotation_ratio=1.0 if angle_after == 0 else angle / (angle_after * optimism),
-        error_score=evidence.error_score(),
+        score_ratio=solved.score_ratio(frames, motions) / optimism if "corner" in every.kinds else 1.0,
+        error_score=evidence.beside(solved.moved_frames).error_score(),
         values=len(solved.values.y),
         standing=tuple(" ".join(owner).strip() for owner in elsewhere),
         observable=tuple(
@@ -315,9 +336,7 @@ def _judged(solved: _Solved, elsewhere: dict[Owner, float]) -> Session:
 def _moved(solved: _Solved, elsewhere: dict[Owner, float]) -> tuple[Shifted, ...]:
     """How far everything that moved has, all estimated together; the arm first."""
     problem, explanation = solved.problem, solved.explanation
-    found = [
-        (replace(one.group, size=max(one.size, ANYWHERE)), one.probability) for one in explanation.motions
-    ]
+    found = [(_freed(one), one.probability) for one in explanation.motions]
     for (kind, name), probability in elsewhere.items():
         whats = (kind, f"{kind} {name}")
         found += [(one, probability) for one in problem.groups if one.stands and one.what in whats]
@@ -336,7 +355,7 @@ def _moved(solved: _Solved, elsewhere: dict[Owner, float]) -> tuple[Shifted, ...
 
 def _zeros(solved: _Solved) -> JointZeros:
     """Zeros of all joints together."""
-    evidence, noise_factor = solved.evidence, solved.explanation.noise_factor
+    evidence, noise_factor = solved.evidence.beside(solved.moved_frames), solved.explanation.noise_factor
     shift, covariance = evidence.shift(_joints(solved), noise_factor)
     influence, own = evidence.influence(_joints(solved), noise_factor)
     return JointZeros(shift, covariance.diagonal().sqrt(), influence, own)

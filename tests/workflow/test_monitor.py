@@ -26,6 +26,13 @@ def test_rows_of_several_days_are_several_sessions():
     assert [chart.what for chart in monitoring.charts][-2:] == ["joint 6", "error"]
 
 
+def test_an_instrument_that_was_moved_raises_no_alarm():
+    monitoring = monitor(model_before(), [rows_later(12, 3, base=(1e-3, -2e-3, 5e-4, 2e-3, 0.0, 0.0))])
+    assert [one.moved.what for one in monitoring.sessions[0].session.moved] == ["base", "base"]
+    assert monitoring.sentences == ()
+    assert not monitoring.action
+
+
 def test_a_collision_calls_for_action():
     settings = MonitorSettings(dates=("2026-01-01", "2026-02-01"), limit_mm=0.5)
     monitoring = monitor(model_before(), [rows_later(10, 30), rows_later(10, 31, COLLISION)], settings)
