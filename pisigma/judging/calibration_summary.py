@@ -342,4 +342,4 @@ def _or_none(value: float) -> float | None:
 def has_orientation(model: CalibratedModel) -> bool:
     """Say whether a model knows how its tools are turned; one that was calibrated without orientations does not."""
     summary = CalibrationSummary.read(model)
-    return summary is None or any(noise.sensor == "rotation" for noise in summary.noise)
+    return summary is None or any(noise.sensor in ("rotation", "corner") for noise in summary.noise)
