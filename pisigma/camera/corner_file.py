@@ -1,5 +1,6 @@
 """Files of corners, in which rows of other sensors may stand, as measurements."""
 
+import math
 import os
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
@@ -67,6 +68,25 @@ class CameraFiles:
             raise IdentificationError(f"intrinsics '{self.intrinsics}' is no choice; {choices}")
         if not self.cameras or not self.boards:
             raise MeasurementError("--camera and --board belong together; give both.")
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """Of cameras and boards."""
+        return (*self.cameras, *self.boards)
+
+    @property
+    def options(self) -> list[str]:
+        """Options by which commands read the same."""
+        words = [word for path in self.cameras for word in ("--camera", path)]
+        words += [word for path in self.boards for word in ("--board", path)]
+        usual, stated = Repeatability(), self.repeatability
+        words += ["--fixed-camera"] if self.is_fixed else []
+        words += ["--intrinsics", self.intrinsics] if self.intrinsics != "prior" else []
+        if stated.length != usual.length:
+            words += ["--repeatability-mm", f"{stated.length * 1e3:g}"]
+        if not math.isclose(stated.angle, usual.angle, rel_tol=0.01):  # 0.01 deg to three digits
+            words += ["--repeatability-deg", f"{np.rad2deg(stated.angle):g}"]
+        return words
 
     def read(self, path: str | os.PathLike[str], robot: Robot) -> Measurements:
         """Read a CSV file of corners: `image`, `corner`, `u_px`, `v_px` and the joints (`q1_deg` and so on).

@@ -7,15 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from pisigma.cli.arguments import AcceptImplausible, AsJson, Overwrite, complete_model, complete_robot
-from pisigma.cli.camera_options import (
-    Boards,
-    Cameras,
-    FixedCamera,
-    Intrinsics,
-    RepeatabilityDeg,
-    RepeatabilityMm,
-    stated_cameras,
-)
+from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.lifetime.recalibrate import recalibrate_into
 from pisigma.cli.output import (
     command_line,
@@ -29,6 +21,7 @@ from pisigma.cli.output import (
 from pisigma.errors import IdentificationError
 
 if TYPE_CHECKING:
+    from pisigma.camera.corner_file import CameraFiles
     from pisigma.judging.calibration_summary import CalibrationSummary
     from pisigma.workflow.calibrate import CalibrationSettings
 
@@ -119,6 +112,7 @@ Prior = Annotated[
 Verbose = Annotated[bool, typer.Option("--verbose", help="Print all parameters.")]
 
 
+@takes_corners
 def calibrate(
     context: typer.Context,
     robot: RobotName,
@@ -139,12 +133,7 @@ def calibrate(
     gravity: Gravity = None,
     new_frame_at: NewFrameAt = None,
     socket_distance: SocketDistance = None,
-    camera: Cameras = None,
-    board: Boards = None,
-    fixed_camera: FixedCamera = False,
-    intrinsics: Intrinsics = "prior",
-    repeatability_mm: RepeatabilityMm = 0.02,
-    repeatability_deg: RepeatabilityDeg = 0.01,
+    cameras: "CameraFiles | None" = None,
     base: Base = None,
     tip: Tip = None,
     prior: Prior = None,
@@ -163,12 +152,12 @@ def calibrate(
     from pisigma.robot.robot_file import robot_file
     from pisigma.workflow import calibrate as workflow
 
-    files = (*data, *(camera or ()), *(board or ()))
-    check_folder(out, overwrite, inputs=(robot_file(robot), prior, *files))
-    settings, nominal = _settings(context.params), Robot.load(robot, base, tip)
+    stated = cameras.files if cameras else ()
+    check_folder(out, overwrite, inputs=(robot_file(robot), prior, *data, *stated))
+    settings, nominal = _settings(context.params, cameras), Robot.load(robot, base, tip)
     if prior is not None:
         return recalibrate_into(
-            context, prior, data, out, accept_implausible, overwrite, as_json, settings.cameras, drawn=nominal
+            context, prior, data, out, accept_implausible, overwrite, as_json, cameras, drawn=nominal
         )
     with progress_of("calibrate") as progress:
         calibration = workflow.calibrate(nominal, data, settings, progress)
@@ -239,7 +228,7 @@ def _print_parameters(summary: "CalibrationSummary", verbose: bool) -> None:
     print_lines((f"- {line}" for line in undetermined_lines(summary)), indent="  ")
 
 
-def _settings(options: Mapping[str, Any]) -> "CalibrationSettings":
+def _settings(options: Mapping[str, Any], cameras: "CameraFiles | None") -> "CalibrationSettings":
     """Settings by the options of the command."""
     from pisigma.workflow.calibrate import CalibrationSettings
 
@@ -251,7 +240,7 @@ def _settings(options: Mapping[str, Any]) -> "CalibrationSettings":
         gravity=_gravity(options["gravity"]),
         new_frame_at=tuple(options["new_frame_at"] or ()),
         socket_distances=_socket_distances(options["socket_distance"]),
-        cameras=stated_cameras(options),
+        cameras=cameras,
         **{name: options[name] for name in same},
     )
 

@@ -1,7 +1,9 @@
 """Options that say what the pixels of files of corners mean."""
 
+import functools
+import inspect
 import math
-from collections.abc import Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -49,32 +51,49 @@ RepeatabilityDeg = Annotated[
 ]
 
 
-_DEFAULTS = {
-    "fixed_camera": False,
-    "intrinsics": "prior",
-    "repeatability_mm": 0.02,
-    "repeatability_deg": 0.01,
-}
-
-
-def stated_cameras(options: Mapping[str, Any]) -> "CameraFiles | None":
+def stated_cameras(
+    camera: Cameras = None,
+    board: Boards = None,
+    fixed_camera: FixedCamera = False,
+    intrinsics: Intrinsics = "prior",
+    repeatability_mm: RepeatabilityMm = 0.02,
+    repeatability_deg: RepeatabilityDeg = 0.01,
+) -> "CameraFiles | None":
     """What the pixels mean by the options of a command; None where neither camera nor board is stated.
 
     Raises:
         BadParameter: another option of cameras is stated without them.
     """
+    stated: dict[str, Any] = dict(locals())
     from pisigma.camera.corner_file import CameraFiles
     from pisigma.camera.image_rows import Repeatability
 
-    cameras, boards = (tuple(map(str, options[name] or ())) for name in ("camera", "board"))
+    cameras, boards = (tuple(map(str, files or ())) for files in (camera, board))
     if not cameras and not boards:
-        unused = [
-            f"--{name.replace('_', '-')}" for name, usual in _DEFAULTS.items() if options[name] != usual
-        ]
+        unused = [name for name, option in _OPTIONS.items() if stated[name] != option.default]
         if unused:
-            raise typer.BadParameter(f"{', '.join(unused)}: only with --camera and --board.")
+            options = ", ".join(f"--{name.replace('_', '-')}" for name in unused)
+            raise typer.BadParameter(f"{options}: only with --camera and --board.")
         return None
-    repeatability = Repeatability(
-        options["repeatability_mm"] / 1e3, math.radians(options["repeatability_deg"])
-    )
-    return CameraFiles(cameras, boards, options["fixed_camera"], repeatability, options["intrinsics"])
+    repeatability = Repeatability(repeatability_mm / 1e3, math.radians(repeatability_deg))
+    return CameraFiles(cameras, boards, fixed_camera, repeatability, stated["intrinsics"])
+
+
+_OPTIONS = inspect.signature(stated_cameras).parameters
+
+
+def takes_corners(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of `stated_cameras`, whose result it gets as its parameter `cameras`."""
+
+    @functools.wraps(command)
+    def with_options(**values: Any) -> None:
+        options = {name: values.pop(name) for name in _OPTIONS}
+        command(**values, cameras=stated_cameras(**options))
+
+    parameters: list[inspect.Parameter] = []
+    for one in inspect.signature(command).parameters.values():
+        parameters += _OPTIONS.values() if one.name == "cameras" else [one]
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    vars(with_options)["__signature__"] = inspect.Signature([one.replace(kind=keyword) for one in parameters])
+    with_options.__annotations__ = {one.name: one.annotation for one in parameters}
+    return with_options

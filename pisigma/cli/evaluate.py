@@ -5,20 +5,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
-from pisigma.cli.camera_options import (
-    Boards,
-    Cameras,
-    FixedCamera,
-    Intrinsics,
-    RepeatabilityDeg,
-    RepeatabilityMm,
-    stated_cameras,
-)
+from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_lines
 from pisigma.cli.verify import FitFrame, FitTool, print_comparison
 from pisigma.errors import AcceptanceError
 
 if TYPE_CHECKING:
+    from pisigma.camera.corner_file import CameraFiles
     from pisigma.workflow.evaluate import Evaluation
 
 Paths = Annotated[
@@ -54,8 +47,8 @@ Hashes = Annotated[
 Seed = Annotated[int, typer.Option(help="Seed of the resamples.")]
 
 
+@takes_corners
 def evaluate(
-    context: typer.Context,
     paths: Paths,
     max_mean_mm: MaxMean = None,
     max_p95_mm: MaxP95 = None,
@@ -63,12 +56,7 @@ def evaluate(
     max_mean_deg: MaxMeanDeg = None,
     fit_frame: FitFrame = False,
     fit_tool: FitTool = False,
-    camera: Cameras = None,
-    board: Boards = None,
-    fixed_camera: FixedCamera = False,
-    intrinsics: Intrinsics = "prior",
-    repeatability_mm: RepeatabilityMm = 0.02,
-    repeatability_deg: RepeatabilityDeg = 0.01,
+    cameras: "CameraFiles | None" = None,
     resamples: Resamples = 2000,
     seed: Seed = 0,
     sha256: Hashes = None,
@@ -95,8 +83,7 @@ def evaluate(
     for folder, wanted in zip(folders, sha256 or (), strict=False):
         check_model_hash(folder, wanted)
     limits = workflow.Limits(max_mean_mm, max_p95_mm, max_mm, max_mean_deg)
-    bootstrap, cameras = Bootstrap(resamples, seed), stated_cameras(context.params)
-    settings = workflow.EvaluationSettings(limits, fit_frame, fit_tool, bootstrap, cameras)
+    settings = workflow.EvaluationSettings(limits, fit_frame, fit_tool, Bootstrap(resamples, seed), cameras)
     evaluation = workflow.evaluate(paths[:-1], paths[-1], settings)
     if as_json:
         print_json(evaluation.to_json())

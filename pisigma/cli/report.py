@@ -1,14 +1,19 @@
 """`pisigma report`: one page by which a calibration is accepted."""
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder
+from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_lines, progress_of
 
+if TYPE_CHECKING:
+    from pisigma.camera.corner_file import CameraFiles
 
+
+@takes_corners
 def report(
     model: ModelFolder,
     data: Annotated[
@@ -21,14 +26,15 @@ def report(
     figures: Annotated[
         Path | None, typer.Option(help="Folder for the figures as PNG and SVG files; made where missing.")
     ] = None,
+    cameras: "CameraFiles | None" = None,
     as_json: AsJson = False,
 ) -> None:
     """Write a report as one HTML page: how accurate, where worst, what limits it, what to measure next."""
     from pisigma.workflow import report as workflow
 
-    workflow.check_report_outputs(out, figures, inputs=(model, data))
+    workflow.check_report_outputs(out, figures, inputs=(model, data, *(cameras.files if cameras else ())))
     with progress_of("report") as progress:
-        result = workflow.report(model, data, progress)
+        result = workflow.report(model, data, progress, cameras)
         written = result.save(out, figures)
     if as_json:
         print_json({"report": str(out), "figures": [str(path) for path in written]} | result.to_json())

@@ -6,10 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder
+from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of, screen_width
 from pisigma.errors import AcceptanceError
 
 if TYPE_CHECKING:
+    from pisigma.camera.corner_file import CameraFiles
     from pisigma.judging.model_comparison import ModelComparison
     from pisigma.workflow.verify import Verification
 
@@ -38,11 +40,13 @@ Data = Annotated[
 ]
 
 
+@takes_corners
 def verify(
     model: ModelFolder,
     data: Data,
     fit_frame: FitFrame = False,
     fit_tool: FitTool = False,
+    cameras: "CameraFiles | None" = None,
     sha256: Hash = None,
     as_json: AsJson = False,
 ) -> None:
@@ -60,7 +64,8 @@ def verify(
         check_model_hash(model, sha256)
 
     with progress_of(f"verifying {model}"):
-        verification = workflow.verify(model, data, workflow.VerificationSettings(fit_frame, fit_tool))
+        settings = workflow.VerificationSettings(fit_frame, fit_tool, cameras=cameras)
+        verification = workflow.verify(model, data, settings)
     if as_json:
         print_json(verification.to_json())
     else:

@@ -10,6 +10,7 @@ from torch import Tensor
 from pisigma.hybrid.result import HybridResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.sensors.corner import position_deviations
+from pisigma.sensors.intrinsics import NOISE_COLUMN
 
 WITHIN = 1.96
 """95 % of a normal value lie within so many standard deviations."""
@@ -89,6 +90,19 @@ def predicted_spread(result: HybridResult, measurements: Measurements) -> Predic
     spread.error[chosen] = errors[chosen].detach().cpu()
     spread.sigma[chosen] = (result.deviation(judged).square() + noise.square()).sqrt()
     return spread
+
+
+def image_remark(measurements: Measurements) -> tuple[str, ...]:
+    """Say how uncertain the poses of images are by themselves; nothing where there are no images."""
+    noise = measurements.readings.get(NOISE_COLUMN)
+    if not isinstance(noise, Tensor):
+        return ()
+    by_image = position_deviations(measurements) * noise[:, None]
+    own = float(by_image.square().sum(1).nanmean().sqrt())
+    return (
+        f"The position that an image gives is itself uncertain by {own * 1e3:.2g} mm (RMS), which the errors contain: "
+        "the robot is more accurate than they say.",
+    )
 
 
 def _noise(result: HybridResult, measurements: Measurements) -> Float64[Tensor, "rows 3"]:

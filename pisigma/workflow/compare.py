@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, get_args
 
+from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.comparison.displacement import Displacement
 from pisigma.comparison.model_pair import FrameChoice, ModelPair
 from pisigma.comparison.parameter_differences import (
@@ -44,6 +45,7 @@ class ComparisonSettings:
             tool.
         level: probability that any parameter at all is called different by chance.
         bootstrap: how confidence intervals of errors on rows are computed.
+        cameras: what the pixels mean where the rows are corners of boards in images.
 
     Raises:
         IdentificationError: the level is no probability, or the frames are treated otherwise.
@@ -52,6 +54,7 @@ class ComparisonSettings:
     frames: FrameChoice = "fitted"
     level: float = LEVEL
     bootstrap: Bootstrap = field(default_factory=Bootstrap)
+    cameras: CameraFiles | None = None
 
     def __post_init__(self) -> None:
         """Refuse what is no choice, and a level that no test has."""
@@ -188,7 +191,7 @@ class ComparedModels:
 def compare(
     first: ModelSource | HoldsModel,
     second: ModelSource | HoldsModel,
-    rows: str | os.PathLike[str] | Measurements | None = None,
+    rows: MeasurementFiles | Measurements | None = None,
     program: str | os.PathLike[str] | None = None,
     settings: ComparisonSettings = ComparisonSettings(),
 ) -> ComparedModels:
@@ -221,7 +224,7 @@ def compare(
     pair = ModelPair.of(one, other, settings.frames)
     compared = None
     if rows is not None:
-        data = rows if isinstance(rows, Measurements) else Measurements.read_csv(rows, pair.first.robot)
+        data = read_rows(rows, pair.first.robot, settings.cameras)
         free = settings.frames == "fitted"
         fitted = fitted_kinds(free, free)
         compared = compare_models(models, test_rows(data), settings.bootstrap, fitted)

@@ -15,6 +15,7 @@ from pisigma.judging.bootstrap import Bootstrap
 from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.frames.fitted_frames import FrameKind, fitted_kinds, fitted_remark
 from pisigma.judging.model_comparison import ModelComparison, ModelFigures, compare_models
+from pisigma.judging.predicted_spread import image_remark
 from pisigma.judging.reference_models import geometric_model, nominal_model
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -250,6 +251,7 @@ def evaluate(
         ),
         warnings=(
             *fitted_remark(rows, settings.fitted),
+            *image_remark(rows),
             *_warnings(comparison, evaluated),
             *(sentence for model in loaded.values() for sentence in condition_warnings(model, rows)),
         ),

@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from pisigma.camera.corner_file import CameraFiles, read_rows
 from pisigma.errors import IdentificationError, MeasurementError
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
@@ -45,6 +46,7 @@ class MonitorSettings:
         moved: which of "base" and "tool" stand elsewhere than when the model was made; None to find it by evidence.
         limit_mm: RMS error that is forecast; None for no forecast.
         history: whether the sessions are kept beside the model folder, and those kept before count.
+        cameras: what the pixels mean where files hold corners of boards in images.
 
     Raises:
         IdentificationError: something else is named in `moved`, or the limit is no length.
@@ -55,6 +57,7 @@ class MonitorSettings:
     moved: tuple[str, ...] | None = None
     limit_mm: float | None = None
     history: bool = True
+    cameras: CameraFiles | None = None
 
     def __post_init__(self) -> None:
         """Refuse what makes no sense."""
@@ -80,6 +83,7 @@ class Monitoring:
         trends: of the zeros of all joints.
         forecast: of the error; None where no limit was stated.
         warnings: what to heed, a sentence each.
+        cameras: what the pixels of its files of corners mean.
         seconds: time it took [s].
     """
 
@@ -90,6 +94,7 @@ class Monitoring:
     trends: tuple[Trend, ...]
     forecast: Forecast | None
     warnings: tuple[str, ...]
+    cameras: CameraFiles | None = None
     seconds: float = field(default=0.0)
 
     @property
@@ -113,10 +118,11 @@ class Monitoring:
         advice: tuple[str, ...] = ()
         if any(one.session.recalibrate for one in self.sessions):
             best = max(self.sessions, key=lambda one: one.session.gain)
+            command = RecalibrationSettings(cameras=self.cameras).command(self.model.name, best.file)
             advice = (
                 f"Recalibrating pays: errors like those of {best.file} are expected to fall from "
-                f"{best.session.rms * 1e3:.3f} to {best.session.rms_after * 1e3:.3f} mm; run `pisigma recalibrate "
-                f"{self.model.name} {best.file} --out DIR`.",
+                f"{best.session.rms * 1e3:.3f} to {best.session.rms_after * 1e3:.3f} mm; run "
+                f"`{command}`.",
             )
         lines = (*alarms, *trends, *forecast, *advice)
         return tuple(f"{line[:1].upper()}{line[1:]}" for line in lines)
@@ -186,10 +192,7 @@ def monitor(
     source = model_or_folder(model)
     loaded = source if isinstance(source, CalibratedModel) else load_model(source)
     posterior = ModelPosterior.of(loaded)
-    rows = [
-        one if isinstance(one, Measurements) else Measurements.read_csv(one, posterior.space.robot)
-        for one in sessions
-    ]
+    rows = [read_rows(one, posterior.space.robot, settings.cameras) for one in sessions]
     warnings: list[str] = []
     judged = []
     for date, day in _by_day(rows, settings.dates):
@@ -216,6 +219,7 @@ def monitor(
         trends=trends_of(loaded.robot.revolute, records),
         forecast=None if settings.limit_mm is None else forecast_of(records, settings.limit_mm),
         warnings=tuple(dict.fromkeys(warnings)),
+        cameras=settings.cameras,
         seconds=time.perf_counter() - started,
     )
 

@@ -2,6 +2,7 @@
 
 import datetime
 import math
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -71,6 +72,12 @@ class RecalibrationSettings:
 
     moved: tuple[str, ...] | None = None
     cameras: CameraFiles | None = None
+
+    def command(self, model: str, data: str) -> str:
+        """The line that recalibrates a model with a file in this way."""
+        stated = ["--moved", ",".join(self.moved)] if self.moved else []
+        stated += self.cameras.options if self.cameras else []
+        return shlex.join(["pisigma", "recalibrate", model, data, *stated, "--out", "DIR"])
 
     def __post_init__(self) -> None:
         """Refuse what cannot stand elsewhere."""

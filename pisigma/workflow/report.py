@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.files.conflicts import Input
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.judging.progress import Progress
@@ -82,8 +83,9 @@ def check_report_outputs(
 
 def report(
     model: str | os.PathLike[str],
-    data: str | os.PathLike[str] | Measurements | None = None,
+    data: MeasurementFiles | Measurements | None = None,
     progress: Progress = lambda what: None,
+    cameras: CameraFiles | None = None,
 ) -> Report:
     """Work out a report on a calibration: how accurate, where worst, what limits it, what to measure next.
 
@@ -92,6 +94,7 @@ def report(
         data: rows to judge it on, or their file, in the frame that the model was fitted in. None: the held-out rows
             that the folder keeps.
         progress: called with what is being done.
+        cameras: what the pixels mean where the rows are corners of boards in images.
 
     Raises:
         ModelError: the folder cannot be used.
@@ -99,9 +102,7 @@ def report(
     """
     begin, loaded = time.perf_counter(), load_model(model)
     progress("judging rows")
-    rows = data
-    if rows is not None and not isinstance(rows, Measurements):
-        rows = Measurements.read_csv(rows, loaded.robot)
+    rows = None if data is None else read_rows(data, loaded.robot, cameras)
     content = report_content(loaded, Path(model), rows)
     progress("drawing")
     figures = draw_figures(content)

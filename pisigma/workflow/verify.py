@@ -1,7 +1,6 @@
 """Verify whether new measurements are explained better by the corrected model than by the nominal robot."""
 
 import os
-import shlex
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,9 +9,11 @@ from typing import Literal
 import numpy as np
 import torch
 
+from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.judging.bootstrap import Bootstrap
 from pisigma.judging.frames.fitted_frames import FrameKind, fitted_kinds, fitted_remark
 from pisigma.judging.model_comparison import Difference, ModelComparison, compare_models
+from pisigma.judging.predicted_spread import image_remark
 from pisigma.judging.reference_models import geometric_model, nominal_model
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.measurement.dataset import Measurements
@@ -27,6 +28,7 @@ from pisigma.verification.motion import judged_motion, motion_sentence, motion_w
 from pisigma.verification.setup_fault import SetupFault
 from pisigma.verification.setup_faults import find_setup_faults, is_implausible, unexplained
 from pisigma.workflow.evaluate import test_rows
+from pisigma.workflow.recalibrate import RecalibrationSettings
 
 FEWEST_CONFIGURATIONS = 6
 """With fewer different joint values nothing is concluded."""
@@ -61,11 +63,13 @@ class VerificationSettings:
         fit_frame: fit the frames to the rows, as after the sensor was moved; then any frame will do.
         fit_tool: fit the targets to the rows, as after another reflector was mounted; then any target will do.
         seed: of the resamples for confidence intervals.
+        cameras: what the pixels mean where the file holds corners of boards in images.
     """
 
     fit_frame: bool = False
     fit_tool: bool = False
     seed: int = 0
+    cameras: CameraFiles | None = None
 
     @property
     def fitted(self) -> tuple[FrameKind, ...]:
@@ -140,7 +144,9 @@ class Verification:
         }
 
 
-def read_for_verification(path: str | os.PathLike[str], model: CalibratedModel) -> Measurements:
+def read_for_verification(
+    path: MeasurementFiles, model: CalibratedModel, cameras: CameraFiles | None = None
+) -> Measurements:
     """Read measurements whose joint values may lie outside the limits, as those of swapped columns do.
 
     Rows of the set "train" are left out where the file has a column "set".
@@ -151,7 +157,7 @@ def read_for_verification(path: str | os.PathLike[str], model: CalibratedModel) 
     rows, coupling = _without_limits(model.robot.rows), model.robot.coupling
     if coupling is not None:
         coupling = replace(coupling, axes=_without_limits(coupling.axes))
-    return test_rows(Measurements.read_csv(path, replace(model.robot, rows=rows, coupling=coupling)))
+    return test_rows(read_rows(path, replace(model.robot, rows=rows, coupling=coupling), cameras))
 
 
 def _without_limits(rows: Sequence[Row]) -> tuple[Row, ...]:
@@ -180,7 +186,7 @@ def verify(
     settings, begin = settings or VerificationSettings(), time.perf_counter()
     source = model_or_folder(model)
     loaded = source if isinstance(source, CalibratedModel) else load_model(source)
-    rows = data if isinstance(data, Measurements) else read_for_verification(data, loaded)
+    rows = data if isinstance(data, Measurements) else read_for_verification(data, loaded, settings.cameras)
     models = _compared_models(loaded, rows.rotation is not None)
     resamples = int(np.clip(MOST_DRAWN // max(rows.rows, 1), *RESAMPLES))
     comparison = compare_models(models, rows, Bootstrap(resamples, settings.seed), settings.fitted)
@@ -214,6 +220,7 @@ def verify(
             *_warnings(loaded, rows, comparison, faults, motion),
             *([] if motion is None or verdict == "moved" else motion_warnings(motion)),
             *fitted_remark(rows, settings.fitted),
+            *image_remark(rows),
         ),
         seconds=time.perf_counter() - begin,
     )
@@ -231,8 +238,7 @@ def _recalibration(name: str, data: str, settings: VerificationSettings, motion:
     """The command that brings a model up to date, where that pays."""
     if motion is None or not motion.recalibrate:
         return ""
-    stated = ["--moved", ",".join(settings.fitted)] if settings.fitted else []
-    return shlex.join(["pisigma", "recalibrate", name, data, *stated, "--out", "DIR"])
+    return RecalibrationSettings(settings.fitted, settings.cameras).command(name, data)
 
 
 def _motion(

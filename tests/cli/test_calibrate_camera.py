@@ -1,9 +1,12 @@
 """`pisigma calibrate`, `evaluate` and `recalibrate` with the corners of a board in a camera's images."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
+import torch
 from click.testing import Result
 from testing.camera_cell import BOARD, CAMERA, aligned_error, camera_cell, corner_lines
 from testing.closeness import assert_close
@@ -74,6 +77,43 @@ def test_new_corners_judge_a_model_and_are_added_to_it(run, files, calibrated):
     refused = run("verify", calibrated[0], files / "new.csv")
     assert refused.exit_code == 2
     assert "state what they mean with --camera camera.yaml" in " ".join(refused.stderr.split())
+
+
+def test_corners_say_whether_a_model_still_holds(run, files, calibrated):
+    """The zero of joint 3 has moved by 0.05 deg, 0.3 mm at the camera: less than the noise of the images' poses."""
+    cell = camera_cell(20, 1)
+    q = cell.images.q - torch.tensor([0.0, 0.0, np.deg2rad(0.05), 0.0, 0.0, 0.0])
+    (files / "later.csv").write_text("\n".join(corner_lines(replace(cell.images, q=q))) + "\n")
+    verified = run("verify", calibrated[0], files / "new.csv", *cameras(files), "--json")
+    assert verified.exit_code == 0, verified.output
+    assert "is itself uncertain by 0." in json.loads(verified.stdout)["warnings"][-1]
+    moved = run("verify", calibrated[0], files / "later.csv", *cameras(files))
+    assert moved.exit_code == 3
+    said = " ".join(moved.stdout.split())
+    assert "Joint 3 has moved by 0.0499 ± 0.0054 deg" in said
+    assert f"--camera {files / 'camera.yaml'} --board {files / 'board.yaml'} --out DIR" in said
+    sessions = (files / "new.csv", files / "later.csv", "--dates", "2026-01-01,2026-02-01")
+    monitored = run("monitor", calibrated[0], *sessions, *cameras(files), "--no-history", "--json")
+    assert monitored.exit_code == 3, monitored.output
+    result = json.loads(monitored.stdout)
+    assert [(one["verdict"], one["recalibrate"]) for one in result["sessions"]] == [
+        ("unchanged", False),
+        ("moved", True),
+    ]
+    assert any("--camera" in sentence for sentence in result["says"])
+
+
+def test_corners_stand_beside_two_models_and_in_a_report(run, files, calibrated):
+    rows = files / "corners.csv"
+    compared = run("compare", calibrated[0], "nominal", "--rows", rows, *cameras(files), "--json")
+    assert compared.exit_code == 0, compared.output
+    assert json.loads(compared.stdout)["rows"]["better"] == "arm"
+    page = files / "camera.html"
+    page.write_bytes((files / "camera.yaml").read_bytes())
+    over = ("--camera", page, "--board", files / "board.yaml", "--out", page)
+    report = run("report", calibrated[0], rows, *over)
+    assert report.exit_code == 2
+    assert "is an input" in " ".join(report.stderr.split())
 
 
 def test_camera_and_board_belong_together(run, files, tmp_path):

@@ -6,9 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, complete_model
+from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of, screen_width
 
 if TYPE_CHECKING:
+    from pisigma.camera.corner_file import CameraFiles
     from pisigma.workflow.compare import ComparedModels
 
 First = Annotated[
@@ -41,10 +43,12 @@ Level = Annotated[
 Page = Annotated[Path | None, typer.Option(help="HTML page to write, with a map of the workspace.")]
 
 
+@takes_corners
 def compare(
     first: First,
     second: Second,
     rows: Rows = None,
+    cameras: "CameraFiles | None" = None,
     program: Program = None,
     fixed_frames: FixedFrames = False,
     level: Level = 0.01,
@@ -58,10 +62,9 @@ def compare(
     from pisigma.files.output_file import check_page
     from pisigma.workflow import compare as workflow
 
-    inputs = [one for one in (Path(first), Path(second), rows, program) if one is not None]
     if page is not None:
-        check_page(page, inputs)
-    settings = workflow.ComparisonSettings("fixed" if fixed_frames else "fitted", level)
+        check_page(page, (Path(first), Path(second), rows, program, *(cameras.files if cameras else ())))
+    settings = workflow.ComparisonSettings("fixed" if fixed_frames else "fitted", level, cameras=cameras)
     with progress_of("compare") as progress:
         progress("both models")
         compared = workflow.compare(first, second, rows, program, settings)

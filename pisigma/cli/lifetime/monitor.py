@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson, ModelFolder
+from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.lifetime.recalibrate import Moved, stated_to_move
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:
+    from pisigma.camera.corner_file import CameraFiles
     from pisigma.workflow.monitor import Monitoring
 
 Sessions = Annotated[
@@ -33,6 +35,7 @@ Page = Annotated[Path | None, typer.Option(help="HTML page to write, with charts
 NoHistory = Annotated[bool, typer.Option("--no-history", help="Neither read nor write MODEL.history.sqlite.")]
 
 
+@takes_corners
 def monitor(
     model: ModelFolder,
     sessions: Sessions,
@@ -41,6 +44,7 @@ def monitor(
     limit_mm: LimitMm = None,
     page: Page = None,
     no_history: NoHistory = False,
+    cameras: "CameraFiles | None" = None,
     as_json: AsJson = False,
 ) -> None:
     """Say of every session whether the robot is unchanged or what moved, and follow it over the months.
@@ -52,9 +56,9 @@ def monitor(
     from pisigma.workflow import monitor as workflow
 
     if page is not None:
-        check_page(page, (model, *sessions))
+        check_page(page, (model, *sessions, *(cameras.files if cameras else ())))
     days = tuple(day.strip() for day in dates.split(",")) if dates else ()
-    settings = workflow.MonitorSettings(days, stated_to_move(moved), limit_mm, not no_history)
+    settings = workflow.MonitorSettings(days, stated_to_move(moved), limit_mm, not no_history, cameras)
     with progress_of("monitor") as progress:
         monitoring = workflow.monitor(model, sessions, settings, progress)
         if page is not None:

@@ -7,15 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelFolder, Overwrite
-from pisigma.cli.camera_options import (
-    Boards,
-    Cameras,
-    FixedCamera,
-    Intrinsics,
-    RepeatabilityDeg,
-    RepeatabilityMm,
-    stated_cameras,
-)
+from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of, saved
 
 if TYPE_CHECKING:
@@ -38,6 +30,7 @@ Moved = Annotated[
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be kept, and write nothing.")]
 
 
+@takes_corners
 def recalibrate(
     context: typer.Context,
     model: ModelFolder,
@@ -45,12 +38,7 @@ def recalibrate(
     out: Out = None,
     moved: Moved = None,
     dry_run: DryRun = False,
-    camera: Cameras = None,
-    board: Boards = None,
-    fixed_camera: FixedCamera = False,
-    intrinsics: Intrinsics = "prior",
-    repeatability_mm: RepeatabilityMm = 0.02,
-    repeatability_deg: RepeatabilityDeg = 0.01,
+    cameras: "CameraFiles | None" = None,
     accept_implausible: AcceptImplausible = False,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
@@ -65,8 +53,8 @@ def recalibrate(
     if (out is None) is not dry_run:
         raise typer.BadParameter("either --out DIR or --dry-run was wanted.", param_hint="'--out'")
     if out is not None:
-        check_folder(out, overwrite, inputs=(model, *data, *(camera or ()), *(board or ())))
-    cameras, elsewhere = stated_cameras(context.params), stated_to_move(moved)
+        check_folder(out, overwrite, inputs=(model, *data, *(cameras.files if cameras else ())))
+    elsewhere = stated_to_move(moved)
     recalibrate_into(context, model, data, out, accept_implausible, overwrite, as_json, cameras, elsewhere)
 
 
