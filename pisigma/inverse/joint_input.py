@@ -1,6 +1,7 @@
 """What users give as poses and joint values, as arrays; known without torch."""
 
 from collections.abc import Sequence
+from operator import le
 from typing import Any
 
 import numpy as np
@@ -84,7 +85,7 @@ class Postures:
         slack = np.where(revolute, 2 * np.pi, np.maximum(1.0, limits[:, 1] - limits[:, 0]))
         self._limits, self._revolute, self._joints = limits, revolute, tuple(joints)
         self._lowest, self._highest = limits[:, 0] - slack, limits[:, 1] + slack
-        self._bounds = list(zip(self._lowest.tolist(), self._highest.tolist(), strict=True))
+        self._lows, self._highs = self._lowest.tolist(), self._highest.tolist()
 
     def clip(self, q: np.ndarray) -> np.ndarray:
         """The postures nearest to joint values `(*batch, dof)` [rad or m]."""
@@ -93,7 +94,7 @@ class Postures:
 
     def hold(self, values: Sequence[float]) -> bool:
         """Whether joint values `(dof,)` are a posture; several times as fast as the comparison of arrays."""
-        return all(low <= value <= high for value, (low, high) in zip(values, self._bounds, strict=True))
+        return all(map(le, self._lows, values)) and all(map(le, values, self._highs))
 
     def checked(self, near: Any, throw: bool = True) -> Any:
         """`near` as a float64 array, with NaN for values that are in no posture; what does not fit at all as it came.

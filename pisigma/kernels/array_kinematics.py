@@ -186,16 +186,17 @@ def arm_ends(robot: "pisigma.robot.description.Robot") -> np.ndarray:
 
 def transform_of(xyzrpy: Any) -> np.ndarray:
     """The transform `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`, `(4, 4)`; lengths [m] and angles [rad]."""
-    x, y, z, *angles = xyzrpy
-    (c, s), (c_p, s_p), (c_y, s_y) = (_cosine_sine(angle) for angle in angles)
-    return np.array(
-        [
-            [c * c_p, c * s_p * s_y - s * c_y, c * s_p * c_y + s * s_y, x],
-            [s * c_p, s * s_p * s_y + c * c_y, s * s_p * c_y - c * s_y, y],
-            [-s_p, c_p * s_y, c_p * c_y, z],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    return np.array(transform_entries(*xyzrpy)).reshape(4, 4)
+
+
+def transform_entries(
+    x: float, y: float, z: float, roll: float, pitch: float, yaw: float
+) -> tuple[float, ...]:
+    """The 16 entries of `transform_of`, row by row."""
+    (c, s), (c_p, s_p), (c_y, s_y) = _cosine_sine(roll), _cosine_sine(pitch), _cosine_sine(yaw)
+    first = c * c_p, c * s_p * s_y - s * c_y, c * s_p * c_y + s * s_y, x
+    second = s * c_p, s * s_p * s_y + c * c_y, s * s_p * c_y - c * s_y, y
+    return (*first, *second, -s_p, c_p * s_y, c_p * c_y, z, 0.0, 0.0, 0.0, 1.0)
 
 
 def xyzrpy_of(T: Any) -> tuple[float, ...]:

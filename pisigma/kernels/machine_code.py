@@ -31,6 +31,9 @@ _OPTIONS = "speed 3, vectors, internal linkage"
 _PATIENCE = 2.0
 """[s] Kernels that are on disk are loaded in far less."""
 _COMPILING = "pisigma: preparing the inverse kinematics for this processor, once, in some seconds ...\n"
+_Result = ctypes.c_int64 * 1
+_RAISED = _Result()
+"""What a compiled function would say of an exception; the kernels raise none."""
 _lock = threading.Lock()
 _kept: list[Any] = []
 
@@ -123,9 +126,8 @@ def library_object(wanted: KernelForms) -> bytes:
 
 def _call(native: Any, *arguments: Any) -> int:
     """Call the compiled function, which writes its result, and what was raised: nothing ever is."""
-    result = (ctypes.c_int64 * 2)()
-    address = ctypes.addressof(result)
-    native(address, address + 8, *arguments)
+    result = _Result()
+    native(result, _RAISED, *arguments)
     return result[0]
 
 

@@ -93,12 +93,13 @@ class BinaryFrames(AbstractProtocol):
     def _solve(self, model: ServedModel, message: bytes, name: int, begun: int) -> bytes:
         try:
             dof = len(model.ik.joints)
-            status, q, residuals = model.solve(message[_POSE:_NEAR], message[_NEAR : _NEAR + 8 * dof])
-            q += [math.nan] * (JOINTS - dof)
-            reply = ANSWER.pack(MAGIC, ANSWER.size, name, status, dof, *q, *residuals)
+            solved = model.solve(message[_POSE:_NEAR], message[_NEAR : _NEAR + 8 * dof])
+            q = solved.q + [math.nan] * (JOINTS - dof)
+            residuals = solved.position_residual, solved.rotation_residual
+            reply = ANSWER.pack(MAGIC, ANSWER.size, name, solved.status, dof, *q, *residuals)
         except Exception:
             return self._refuse(name, Refusal.DEFECT, begun)
-        self._metrics.count(_NAMES[status], begun)
+        self._metrics.count(_NAMES[solved.status], begun)
         return reply
 
     def _refuse(self, name: int, why: Refusal, begun: int) -> bytes:

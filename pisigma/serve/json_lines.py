@@ -2,6 +2,7 @@
 
 import json
 import math
+import struct
 import time
 from collections.abc import Callable
 from dataclasses import asdict
@@ -11,11 +12,10 @@ import numpy as np
 
 from pisigma.errors import PisigmaError, RequestError, nearest_choice, printable
 from pisigma.inverse.corrected_ik import CorrectedIK
-from pisigma.inverse.solution import Solution
-from pisigma.kernels.array_kinematics import transform_of, xyzrpy_of
+from pisigma.kernels.array_kinematics import transform_entries, xyzrpy_of
 from pisigma.kinematics.status import Status
 from pisigma.serve.metrics import Metrics
-from pisigma.serve.models import ServedModel, ServedModels
+from pisigma.serve.models import ServedModel, ServedModels, SolvedPose
 from pisigma.serve.protocol import AbstractProtocol, BrokenStreamError, Reply
 
 LONGEST_LINE = 2**20
@@ -39,7 +39,12 @@ _KEYS = {
 """Of every task the keys that a request may hold besides."""
 _QUESTIONS = ("health", "models", "reload")
 
-_NAMES = {status: status.name.lower() for status in Status}
+_PLAIN = {"id", "model", "pose", *_NEAR, "brief"}
+"""Keys of requests for poses that state no task of their own."""
+_POSE = struct.Struct("<16d")
+
+_NAMES = {int(status): status.name.lower() for status in Status}
+_REACHING = frozenset(int(status) for status in Status if status.reaches)
 _encode = json.JSONEncoder(allow_nan=False, separators=(", ", ": ")).encode
 
 
@@ -197,32 +202,36 @@ def _read(message: bytes) -> dict[str, Any]:
 
 def _solve(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Solve one pose."""
-    near, branch = _near(model, request), _branch(request)
-    approach = _numbers(request, "approach", len(model.ik.joints)) if "approach" in request else None
-    ik = _for_task(model, request)
-    solution = ik(_transform(request["pose"], "pose"), near=near, branch=branch, approach=approach)
-    values = _record(model, solution)
+    entries, near = _entries(request["pose"], "pose"), _near(model, request)
+    solved = None
+    if request.keys() <= _PLAIN:
+        beside = near or [math.nan] * len(model.ik.joints)
+        solved = model.solve(_POSE.pack(*entries), struct.pack(f"<{len(beside)}d", *beside))
+    if solved is None or solved.status == Status.INVALID_POSE:  # it can state a task, and says what is wrong
+        approach = _numbers(request, "approach", len(model.ik.joints)) if "approach" in request else None
+        ik, T = _for_task(model, request), np.reshape(entries, (4, 4))
+        solved = SolvedPose.of(ik(T, near=near, branch=_branch(request), approach=approach))
+    values = _record(model, solved)
     if _flag(request, "brief"):
         return values["status"], _brief(model, values)
     if _flag(request, "accuracy"):
-        values["accuracy_mm"] = _millimetres(solution.accuracy)
+        values["accuracy_mm"] = _millimetres(model.ik.accuracy(np.array(solved.q)))
     return values["status"], values
 
 
-def _record(model: ServedModel, solution: Solution) -> dict[str, Any]:
+def _record(model: ServedModel, solved: SolvedPose) -> dict[str, Any]:
     """The values of an answer to one pose."""
-    status = Status(int(solution.status))
-    values: dict[str, Any] = {model.joints_key: None, "status": _NAMES[status]}
-    if status.reaches:
-        values[model.joints_key] = (solution.q * model.per_file_unit).tolist()
-        values["branch"] = solution.branches[int(solution.branch)]
-        values["position_residual_mm"] = _millimetres(solution.position_residual)
-        values["rotation_residual_deg"] = math.degrees(solution.rotation_residual)
-        values["domain_measure"] = _or_none(solution.domain_measure)
-    if solution.ignored_axes:
-        values["ignored_axes"] = solution.ignored_axes
-    if status != Status.REACHED:
-        values["sentence"] = status.sentence
+    values: dict[str, Any] = {model.joints_key: None, "status": _NAMES[solved.status]}
+    if solved.status in _REACHING:
+        values[model.joints_key] = [q * unit for q, unit in zip(solved.q, model.per_file_unit, strict=True)]
+        values["branch"] = model.ik.branches[solved.branch]
+        values["position_residual_mm"] = _millimetres(solved.position_residual)
+        values["rotation_residual_deg"] = math.degrees(solved.rotation_residual)
+        values["domain_measure"] = _or_none(solved.domain_measure)
+    if solved.ignored_axes:
+        values["ignored_axes"] = solved.ignored_axes
+    if solved.status != Status.REACHED:
+        values["sentence"] = Status(solved.status).sentence
     return values
 
 
@@ -239,9 +248,9 @@ def _follow(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str,
         raise RequestError(
             "'path' has to be a list of poses [x_mm, y_mm, z_mm, roll_deg, pitch_deg, yaw_deg]."
         )
-    T = np.stack([_transform(pose, f"path[{row}]") for row, pose in enumerate(poses)])
+    T = np.reshape([_entries(pose, f"path[{row}]") for row, pose in enumerate(poses)], (-1, 4, 4))
     path = _for_task(model, request).path(T, near=_near(model, request), branch=_branch(request))
-    q = (np.asarray(path.solution.q) * model.per_file_unit).tolist()
+    q = (np.asarray(path.solution.q) * np.array(model.per_file_unit)).tolist()
     return "path", {
         model.joints_key: [row if math.isfinite(row[0]) else None for row in q],
         "status": [_NAMES[status] for status in path.solution.status.tolist()],
@@ -261,7 +270,7 @@ def _forward(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str
 
 
 def _model_record(model: ServedModel) -> dict[str, Any]:
-    per_unit = model.per_file_unit[:, None] * model.ik.limits
+    per_unit = np.array(model.per_file_unit)[:, None] * model.ik.limits
     return {
         "name": model.name,
         "sha256": model.sha256,
@@ -272,17 +281,17 @@ def _model_record(model: ServedModel) -> dict[str, Any]:
     }
 
 
-def _transform(pose: Any, name: str) -> np.ndarray:
-    """The wanted pose T_base_tool `(4, 4)` [m] of x, y, z [mm], roll, pitch, yaw [deg]."""
+def _entries(pose: Any, name: str) -> tuple[float, ...]:
+    """The 16 entries of the wanted pose T_base_tool [m], row by row, of x, y, z [mm], roll, pitch, yaw [deg]."""
     x, y, z, *angles = _numbers({name: pose}, name, 6)
-    return transform_of([x / 1e3, y / 1e3, z / 1e3, *map(math.radians, angles)])
+    return transform_entries(x / 1e3, y / 1e3, z / 1e3, *map(math.radians, angles))
 
 
-def _near(model: ServedModel, request: dict[str, Any]) -> np.ndarray | None:
+def _near(model: ServedModel, request: dict[str, Any]) -> list[float] | None:
     return _joints(model, request, *_NEAR) if request.keys() & _NEAR else None
 
 
-def _joints(model: ServedModel, request: dict[str, Any], in_degrees: str, mixed: str) -> np.ndarray:
+def _joints(model: ServedModel, request: dict[str, Any], in_degrees: str, mixed: str) -> list[float]:
     """Joint values [rad or m]; the key says whether all joints have to turn.
 
     Raises:
@@ -291,8 +300,8 @@ def _joints(model: ServedModel, request: dict[str, Any], in_degrees: str, mixed:
     wanted, other = (in_degrees, mixed) if model.joints_key == "q_deg" else (mixed, in_degrees)
     if other in request:
         raise RequestError(f"'{other}' is not for model '{model.name}'; give '{wanted}', in deg and mm.")
-    q: np.ndarray = np.array(_numbers(request, wanted, len(model.ik.joints))) / model.per_file_unit
-    return q
+    values, units = _numbers(request, wanted, len(model.ik.joints)), model.per_file_unit
+    return [value / unit for value, unit in zip(values, units, strict=True)]
 
 
 def _numbers(request: dict[str, Any], key: str, count: int) -> list[float]:

@@ -8,12 +8,49 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from pisigma.errors import ModelError, PisigmaError, RequestError, nearest_choice
 from pisigma.files.model_files import is_model, model_hash
 from pisigma.inverse.corrected_ik import CorrectedIK, load
+from pisigma.inverse.solution import Solution
+
+
+class SolvedPose(NamedTuple):
+    """What a model gives for one pose; see `inverse.solution.Solution`, whose numbers these are.
+
+    Attributes:
+        q: joint values [rad or m].
+        position_residual: [m].
+        rotation_residual: [rad].
+        domain_measure: see there.
+        status: a `Status` as a number.
+        branch: index of the branch.
+        ignored_axes: axes of the tool that do not count.
+    """
+
+    q: list[float]
+    position_residual: float
+    rotation_residual: float
+    domain_measure: float
+    status: int
+    branch: int
+    ignored_axes: tuple[str, ...]
+
+    @staticmethod
+    def of(solution: Solution) -> "SolvedPose":
+        """Take the solution of one pose."""
+        return SolvedPose(
+            solution.q.tolist(),
+            float(solution.position_residual),
+            float(solution.rotation_residual),
+            float(solution.domain_measure),
+            int(solution.status),
+            int(solution.branch),
+            solution.ignored_axes,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,13 +61,11 @@ class ServedModel:
         folder: that it was read from.
         ik: its corrected inverse kinematics.
         sha256: of its `model.yaml`.
-        per_file_unit: `(dof,)`: degrees in a radian, or millimetres in a metre.
     """
 
     folder: Path
     ik: CorrectedIK
     sha256: str
-    per_file_unit: np.ndarray
 
     @staticmethod
     def read(folder: Path) -> "ServedModel":
@@ -44,12 +79,17 @@ class ServedModel:
         )  # before it is loaded: it may be written anew meanwhile
         ik = load(folder)
         ik(np.eye(4), near=np.zeros(len(ik.joints)), throw=False)
-        return ServedModel(folder, ik, sha256, np.where(ik.revolute, 180 / np.pi, 1e3))
+        return ServedModel(folder, ik, sha256)
 
     @property
     def name(self) -> str:
         """What requests call it: the name of its folder."""
         return self.folder.name
+
+    @cached_property
+    def per_file_unit(self) -> list[float]:
+        """For every joint, degrees in a radian or millimetres in a metre."""
+        return [180 / math.pi if turns else 1e3 for turns in self.ik.revolute]
 
     @cached_property
     def joints_key(self) -> str:
@@ -64,29 +104,30 @@ class ServedModel:
             return self.ik.compiled is not None
         return controller.ik.compiled is not None and not controller.coupling.passive
 
-    def solve(self, T_base_tool: bytes, near: bytes) -> tuple[int, list[float], list[float]]:
+    @cached_property
+    def _near(self) -> struct.Struct:
+        """How joint values stand in bytes."""
+        return struct.Struct(f"<{len(self.ik.joints)}d")
+
+    def solve(self, T_base_tool: bytes, near: bytes) -> SolvedPose:
         """Solve a pose whose numbers stand in bytes, little-endian; what is no pose gets INVALID_POSE.
 
         Args:
             T_base_tool: 16 doubles, row by row [m].
             near: a double for every joint [rad or m]; all NaN for none.
-
-        Returns:
-            The status, the joint values [rad or m], and the residuals of position [m] and rotation [rad].
         """
-        ik, dof = self.ik, len(self.ik.joints)
-        values = struct.unpack(f"<{dof}d", near)
-        stated = any(value == value for value in values)
+        ik, values = self.ik, self._near.unpack(near)
+        dof = len(values)
         if not self.quick or ik.controller is not None or sys.byteorder != "little":
-            T = np.frombuffer(T_base_tool, "<f8").reshape(4, 4)
-            solution = ik(T, near=np.array(values) if stated else None, throw=False)
-            residuals = [solution.position_residual, solution.rotation_residual]
-            return int(solution.status), solution.q.tolist(), residuals
+            T, none = np.frombuffer(T_base_tool, "<f8").reshape(4, 4), all(map(math.isnan, values))
+            return SolvedPose.of(ik(T, near=None if none else np.array(values), throw=False))
         assert ik.compiled is not None
-        if stated and not ik.postures.hold(values):
-            near = struct.pack("<d", math.nan) * dof
-        row = ik.compiled.solve_packed(T_base_tool, near if stated else b"")
-        return int(row[-2]), row[:dof], row[2 * dof : 2 * dof + 2]
+        if not ik.postures.hold(values):
+            near = b"" if all(map(math.isnan, values)) else self._near.pack(*[math.nan] * dof)
+        row = ik.compiled.solve_packed(T_base_tool, near)
+        position, rotation, measure, status, branch = row[2 * dof :]
+        axes = ik.axes.ignored
+        return SolvedPose(row[:dof], position, rotation, measure, int(status), int(branch), axes)
 
 
 def model_folders(folder: Path) -> list[Path]:
