@@ -1,6 +1,5 @@
 """One connection of a server: what it has received, what it still has to send, and since when it keeps us waiting."""
 
-import contextlib
 import selectors
 import socket
 import time
@@ -55,11 +54,6 @@ class Connection:
         self._watched = selectors.EVENT_READ
         selector.register(stream, self._watched, self.ready)
 
-    @property
-    def idle(self) -> bool:
-        """Whether nothing that was begun is left to do."""
-        return not self.busy and not self._unsent
-
     def ready(self, events: int) -> None:
         """Go on: the client has sent something, or takes something."""
         try:
@@ -88,7 +82,7 @@ class Connection:
 
     def end(self) -> None:
         """Answer what has come in whole, then close."""
-        if self.idle and not self._ending:
+        if not (self.busy or self._unsent or self._ending):
             self.ready(selectors.EVENT_READ)
         self._ending = True
         if not self.closed:
@@ -106,7 +100,9 @@ class Connection:
         """Answer the messages that are whole, as far as answers can be sent."""
         answered = False
         try:
-            while self.idle and (length := self._protocol.cut(self._received)):
+            while self._received and not self.busy and not self._unsent:
+                if not (length := self._protocol.cut(self._received)):
+                    break
                 message = bytes(memoryview(self._received)[:length])
                 del self._received[:length]
                 answered = True
@@ -117,7 +113,7 @@ class Connection:
             self._received.clear()
             self._ending = True
             self._send(problem.last_words)
-        if self._ending and self.idle:
+        if self._ending and not self.busy and not self._unsent:
             self.close()  # what is left of a half message is dropped
         else:
             self._watch(answered)
@@ -139,9 +135,11 @@ class Connection:
             self._submit(self, reply)
 
     def _send(self, reply: bytes) -> None:
-        self._unsent += reply
-        with contextlib.suppress(BlockingIOError):
-            self._unsent = self._unsent[self._stream.send(self._unsent) :]
+        unsent = self._unsent + reply
+        try:
+            self._unsent = unsent[self._stream.send(unsent) :]
+        except BlockingIOError:
+            self._unsent = unsent
 
     def _watch(self, answered: bool) -> None:
         """Wait for what is needed next, and keep the time since when the client owes it."""

@@ -9,6 +9,7 @@ from dataclasses import asdict
 from typing import Any
 
 import numpy as np
+from pydantic_core import from_json
 
 from pisigma.errors import PisigmaError, RequestError, nearest_choice, printable
 from pisigma.inverse.corrected_ik import CorrectedIK
@@ -30,11 +31,11 @@ _TASKS = ("pose", "path", "q_deg", "q", "ask")
 _NEAR = ("near_deg", "near")
 _AXES = ("ignore_axes", "tolerance_mm", "tolerance_deg", "elbow_deg")
 _KEYS = {
-    "pose": {*_NEAR, *_AXES, "branch", "approach", "accuracy", "brief"},
-    "path": {*_NEAR, *_AXES, "branch"},
-    "q_deg": {"approach", "accuracy"},
-    "q": {"approach", "accuracy"},
-    "ask": set(),
+    "pose": {"id", "model", *_NEAR, *_AXES, "branch", "approach", "accuracy", "brief"},
+    "path": {"id", "model", *_NEAR, *_AXES, "branch"},
+    "q_deg": {"id", "model", "approach", "accuracy"},
+    "q": {"id", "model", "approach", "accuracy"},
+    "ask": {"id", "model"},
 }
 """Of every task the keys that a request may hold besides."""
 _QUESTIONS = ("health", "models", "reload")
@@ -59,7 +60,23 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     return values
 
 
-_decode = json.JSONDecoder(object_pairs_hook=_object, parse_constant=_refuse_constant).decode
+_decode_strictly = json.JSONDecoder(object_pairs_hook=_object, parse_constant=_refuse_constant).decode
+
+
+def _decode(message: bytes) -> Any:
+    """Read JSON in which no key stands twice: every key takes a colon, so where there are no more of them, none does.
+
+    Raises:
+        ValueError: it is no such JSON.
+        RecursionError: it is nested too deeply.
+    """
+    try:
+        values = from_json(message, allow_inf_nan=False, cache_strings="keys")
+        if isinstance(values, dict) and message.count(b":") == len(values):
+            return values
+    except ValueError:
+        pass  # what is wrong is said below
+    return _decode_strictly(message.decode())
 
 
 class JsonLines(AbstractProtocol):
@@ -100,7 +117,7 @@ class JsonLines(AbstractProtocol):
     def token_of(self, message: bytes) -> bytes | None:
         """The token of `{"token": "..."}`."""
         try:
-            request = _decode(message.decode())
+            request = _decode(message)
         except (ValueError, RecursionError):
             return None
         token = request.get("token") if isinstance(request, dict) else None
@@ -125,10 +142,8 @@ class JsonLines(AbstractProtocol):
                 f"a request has exactly one of the keys {', '.join(_TASKS)}; this one has {len(tasks)} of them."
             )
         task = tasks[0]
-        for key in request.keys() - _KEYS[task] - {"id", "model", task}:
-            raise RequestError(
-                f"'{key}' does not go with '{task}'; {nearest_choice(key, _KEYS[task] | {'id', 'model'})}"
-            )
+        for key in request.keys() - _KEYS[task] - {task}:
+            raise RequestError(f"'{key}' does not go with '{task}'; {nearest_choice(key, _KEYS[task])}")
         if task == "ask":
             return self._question(request)
         model = self._models.find(request.get("model"))
@@ -189,7 +204,7 @@ def _read(message: bytes) -> dict[str, Any]:
         RequestError: it is no JSON object, or its id is neither a whole number nor a short text.
     """
     try:
-        request = _decode(message.decode())
+        request = _decode(message)
     except ValueError as problem:
         raise RequestError(f"the line is no JSON object ({problem}).") from None
     if not isinstance(request, dict):
