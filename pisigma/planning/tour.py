@@ -1,7 +1,9 @@
 """In which order to go to the poses of a plan, by what way points, and how long that takes."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -13,6 +15,8 @@ from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.cell.motion import is_free, way_points
 from pisigma.robot.description import Robot
 
+FIRST_STAGE = 20
+"""Poses with which a robot that was never measured is calibrated first: fewer do not determine its unknowns."""
 ROUNDS = 8
 """So often motions that turn out to be blocked are avoided by another order; what is left gets way points."""
 SAMPLE = 50
@@ -82,6 +86,7 @@ def tour(
     pace: Pace,
     pool: Float64[Tensor, "free dof"],
     start: Float64[Tensor, " dof"] | None = None,
+    stages: Sequence[int] = (),
 ) -> Tour:
     """Order poses so that all of it takes little time, by motions that touch nothing.
 
@@ -94,19 +99,54 @@ def tour(
         pace: of the robot.
         pool: free poses that way points may be.
         start: joint values where the robot stands [rad or m]; None for anywhere.
+        stages: numbers of poses that are gone to before all that follow in `q`, ascending, such as (20, 40): the
+            first 20 poses, then the next 20, then the rest, each in the order that takes little time.
     """
     poses = q if start is None else torch.cat([start[None], q])
-    seconds = pace.seconds(arm.robot, poses[:, None], poses[None]).numpy().copy()
-    motions = _Motions(arm, poses)
-    order = _nearest_neighbours(seconds, start is not None)
+    seconds = pace.seconds(arm.robot, poses[:, None], poses[None]).numpy()
+    motions, first = _Motions(arm, poses), int(start is not None)
+    order = np.arange(first)
+    ends = [*(end for end in stages if end < len(q)), len(q)]
+    for begin, end in pairwise([0, *ends]):
+        stage = np.concatenate([order[-1:], np.arange(begin, end) + first])
+        order = np.concatenate([order[:-1], _ordered(motions, seconds, stage, len(order) > 0)])
+    return _with_way_points(motions, order, pace, pool, start is not None)
+
+
+def order_of_use(chosen: int, check: int) -> Int64[Tensor, " poses"]:
+    """Put poses that check a calibration evenly between chosen ones, of which the most useful stand first.
+
+    Args:
+        chosen: how many poses there are to calibrate with, numbered from 0.
+        check: how many there are to check with, numbered after these.
+    """
+    between = (torch.arange(check) + 0.5) * chosen / max(check, 1)
+    return torch.cat([torch.arange(chosen) + 0.0, between]).argsort(stable=True)
+
+
+def stages_of(poses: int) -> tuple[int, ...]:
+    """Numbers of poses after which a calibration may be good enough, `FIRST_STAGE` and ever twice as many."""
+    return tuple(FIRST_STAGE * 2**k for k in range(poses.bit_length()) if FIRST_STAGE * 2**k < poses)
+
+
+def _ordered(
+    motions: "_Motions",
+    seconds: Float64[np.ndarray, "poses poses"],
+    stage: Int64[np.ndarray, " stage"],
+    fixed_start: bool,
+) -> Int64[np.ndarray, " stage"]:
+    """Some of the poses in an order that takes little time, the first of them where the robot stands or not."""
+    times = seconds[np.ix_(stage, stage)]
+    order = _nearest_neighbours(times, fixed_start)
     for _ in range(ROUNDS):
-        order = _two_opt(seconds, order, start is not None)
-        blocked = ~motions.are_free(order[:-1], order[1:]) & (seconds[order[:-1], order[1:]] < _BLOCKED)
+        order = _two_opt(times, order, fixed_start)
+        free = motions.are_free(stage[order[:-1]], stage[order[1:]])
+        blocked = ~free & (times[order[:-1], order[1:]] < _BLOCKED)
         if not blocked.any():
             break
         one, other = order[:-1][blocked], order[1:][blocked]
-        seconds[one, other] = seconds[other, one] = _BLOCKED + DETOUR * seconds[one, other]
-    return _with_way_points(motions, order, pace, pool, start is not None)
+        times[one, other] = times[other, one] = _BLOCKED + DETOUR * times[one, other]
+    return np.take(stage, order)
 
 
 class _Motions:

@@ -31,12 +31,12 @@ from pisigma.measuring.row_alarms import (
 )
 from pisigma.measuring.row_judgement import RowJudgement, judge_rows
 from pisigma.measuring.state import AccuracyPoint, Advice, Alarm, JointSpan, NextPose, RowsSoFar, SessionState
-from pisigma.measuring.stopping import advice
+from pisigma.measuring.stopping import AHEAD, advice
 from pisigma.planning.choice import choose
 from pisigma.planning.plan_file import StoredPlan, read_plan
 from pisigma.planning.subject import Subject
 from pisigma.planning.task import task_poses
-from pisigma.planning.tour import tour
+from pisigma.planning.tour import order_of_use, tour
 from pisigma.se3 import invert, transform_from_xyzrpy
 
 CANDIDATES = 1_000
@@ -268,17 +268,20 @@ class MeasuringSession:
                 return None
             criterion = plan.settings.criterion or "I"
             chosen = new[choose(knowledge, self._candidates[new], count, self._task, criterion)]
-            poses = torch.cat([self._candidates[chosen], plan.q[check]])
-            way = tour(plan.arm, poses, plan.settings.pace, self._by_way_of, plan.q[first[0]])
-            shut_in = way.left_out[way.left_out < count]
+            use = order_of_use(count, len(check))
+            poses = torch.cat([self._candidates[chosen], plan.q[check]])[use]
+            start = plan.q[first[0]]
+            way = tour(plan.arm, poses, plan.settings.pace, self._by_way_of, start, stages=(AHEAD,))
+            left_out = use[way.left_out]
+            shut_in = left_out[left_out < count]
             new = new[~torch.isin(new, chosen[shut_in])]
             if not len(shut_in):
                 break
-        number = torch.cat([self._number[chosen], plan.candidate[check]])
+        number = torch.cat([self._number[chosen], plan.candidate[check]])[use]
         return replace(
             self._part(plan, first),
             q=torch.cat([plan.q[first], poses[way.order]]),
-            check=torch.cat([plan.check[first], way.order >= count]),
+            check=torch.cat([plan.check[first], use[way.order] >= count]),
             candidate=torch.cat([plan.candidate[first], number[way.order]]),
             way_points=(plan.way_points[int(first)], *way.before),
         )

@@ -30,7 +30,7 @@ from pisigma.planning.plan_file import StoredPlan, yaml_of
 from pisigma.planning.plan_settings import FEW_POSES, PlanSettings
 from pisigma.planning.subject import Subject
 from pisigma.planning.task import task_poses
-from pisigma.planning.tour import Tour, tour
+from pisigma.planning.tour import Tour, order_of_use, stages_of, tour
 from pisigma.robot.description import Robot
 from pisigma.verification.checks.camera import view_warnings
 
@@ -234,7 +234,8 @@ class _Problem:
     def choose(self, progress: Progress) -> tuple[Int64[Tensor, " chosen"], StoredPlan, Tour]:
         """Choose poses to calibrate with and poses to check with, and order them.
 
-        Poses that no free motion leads to are replaced by others.
+        Poses that no free motion leads to are replaced by others. The most useful ones come first, in stages, so that
+        measuring may end early.
         """
         q, count = self.candidates.q, self.settings.count
         few = self.anything_known or count <= FEW_POSES or self.settings.camera is not None
@@ -245,15 +246,17 @@ class _Problem:
             chosen = free[choose(self.knowledge, q[free], count, self.task, criterion)]
             others = free[~torch.isin(free, chosen)]
             check = others[spread(self.arm, q[others], self.settings.check, q[chosen])]
-            poses = torch.cat([chosen, check])
+            use = order_of_use(count, len(check))
+            poses = torch.cat([chosen, check])[use]
             progress("order of the poses")
-            way = tour(self.arm, q[poses], self.settings.pace, self.candidates.workspace)
+            stages = stages_of(len(poses))
+            way = tour(self.arm, q[poses], self.settings.pace, self.candidates.workspace, stages=stages)
             free = free[~torch.isin(free, poses[way.left_out])]
             if not len(way.left_out) or len(free) < len(poses):
                 break
         chosen = chosen[~torch.isin(chosen, poses[way.left_out])]
         ordered = poses[way.order]
-        is_check, number = way.order >= count, self.candidates.number[ordered]
+        is_check, number = use[way.order] >= count, self.candidates.number[ordered]
         folder = self.subject.folder
         return (
             chosen,

@@ -14,7 +14,7 @@ from pisigma.planning.candidates import draw_candidates
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.cell.cell import Cell
 from pisigma.planning.cell.motion import is_free
-from pisigma.planning.tour import Pace, tour
+from pisigma.planning.tour import Pace, order_of_use, stages_of, tour
 from pisigma.robot import Robot
 
 ARM = ArmInCell.of(Robot.load("fanuc_r2000"), CELL)
@@ -43,6 +43,20 @@ def test_a_tour_goes_on_from_where_the_robot_stands():
     way = tour(arm, q, PACE, q, start)
     assert int(way.order[0]) == 4
     assert sorted(way.order.tolist()) == list(range(7))
+
+
+def test_what_is_most_useful_comes_first_in_stages():
+    q = torch.from_numpy(np.random.default_rng(4).uniform(-0.4, 0.4, (9, 6)))
+    arm = ArmInCell.of(Robot.load("fanuc_r2000"))
+    order = tour(arm, q, PACE, q, q[0], stages=(2, 5, 20)).order.tolist()
+    assert [set(order[:2]), set(order[2:5]), set(order[5:])] == [{0, 1}, {2, 3, 4}, {5, 6, 7, 8}]
+    assert stages_of(20) == ()
+    assert stages_of(81) == (20, 40, 80)
+
+
+def test_poses_to_check_with_stand_evenly_between_the_others():
+    assert order_of_use(6, 2).tolist() == [0, 1, 6, 2, 3, 4, 7, 5]
+    assert order_of_use(2, 0).tolist() == [0, 1]
 
 
 def test_every_motion_touches_nothing():
