@@ -20,6 +20,7 @@ from pisigma.measurement.conditions import JointState
 CHUNK = 512
 """Rows whose columns are in memory at a time."""
 FOLDS = 4
+FOLDS_OF_FEW = 20
 
 
 @dataclass(frozen=True, eq=False)

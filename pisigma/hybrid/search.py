@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pisigma.hybrid.design import FOLDS, Design, Rows
+from pisigma.hybrid.design import FOLDS, FOLDS_OF_FEW, Design, Rows
 from pisigma.hybrid.evidence import Posterior
 from pisigma.hybrid.regression import regression
 from pisigma.joint_correction.feature import AbstractFeature
@@ -38,7 +38,6 @@ FEW_TOGETHER = 60
 """Up to so many groups all features are tried together as well, from the usual sizes of their weights."""
 FIRST_MODEL_SIZES = 3
 """A model with all features has one that comes in several sizes in the last of so many."""
-FOLDS_OF_FEW = 20
 FAILURES = 3
 """Sizes that do not help before no larger ones are tried."""
 

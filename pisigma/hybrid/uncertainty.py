@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.hybrid.covariance_root import CovarianceRoot
-from pisigma.hybrid.design import FOLDS, Design, Rows
+from pisigma.hybrid.design import FOLDS, FOLDS_OF_FEW, Design, Rows
 from pisigma.hybrid.evidence import AbstractRegression, LeftOut, Posterior
 from pisigma.hybrid.sensor_values import joint_columns, weight_columns
 from pisigma.identification.problem.parameters import ParameterSpace
@@ -26,6 +26,9 @@ MOST_GROUPS = 400
 """Left-out rows are looked at of so many groups at most."""
 FEW_GROUPS = 600
 """Up to so many, noise and prior sizes are estimated anew for every fold that is left out."""
+VERY_FEW_GROUPS = 60
+"""Up to so many, `FOLDS_OF_FEW` folds are left out: without a quarter of so few rows a calibration is much worse than
+with all of them, so that its errors say little of theirs."""
 FOLD_UPDATES = 3
 """Updates of noise and prior sizes then."""
 LEAST_EFFECTIVE = 0.5
@@ -161,7 +164,7 @@ def position_uncertainty(
         posterior: of them.
         geometry: in the user's coordinates.
     """
-    folds = rows.folds(FOLDS, MOST_GROUPS)
+    folds = rows.folds(FOLDS if rows.groups > VERY_FEW_GROUPS else FOLDS_OF_FEW, MOST_GROUPS)
     if rows.groups <= FEW_GROUPS:
         missed = fit.left_out_anew(posterior, folds, FOLD_UPDATES)
     else:
