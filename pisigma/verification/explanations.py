@@ -78,7 +78,7 @@ def simplest(hypotheses: Sequence[Hypothesis], most: float) -> list[Hypothesis]:
 def hypotheses(arm: PredictingArm, some: Measurements, here: Hypothesis, most: float) -> Iterator[Hypothesis]:
     """Go through everything that may explain the errors to `most` [m]; first that nothing is wrong."""
     yield from in_frames(arm, some, here, most)
-    for measured, cause in units_and_frames(here.measured):
+    for measured, cause in units_and_frames(here.measured, here.T[:, :3, 3], "corner" in some.kinds):
         yield from in_frames(arm, some, replace(here, measured=measured, causes=(cause,)), most)
     if arm.model is not None:
         for T, clause, advice in _other_corrections(arm.model, some):

@@ -31,15 +31,30 @@ _MIRROR = torch.diag(torch.tensor([1.0, -1.0, 1.0], dtype=torch.float64))
 _MIRRORED = "{} mirrored, as in a left-handed frame (an axis has the wrong sign, or two are swapped)"
 
 
-def units_and_frames(measured: MeasuredPoses) -> Iterator[tuple[MeasuredPoses, Cause]]:
-    """Go through positions in other units, mirrored positions and orientations, and inverse poses."""
-    for factor, are, named in UNITS:
-        clause = f"x, y and z are {are} that are named {named}"
-        yield (
-            replace(measured, position=measured.position * factor),
-            Cause("position_unit", clause, "correct the unit in the column names", 1.0),
-        )
+def units_and_frames(
+    measured: MeasuredPoses, predicted: Float64[Tensor, "rows 3"], by_images: bool
+) -> Iterator[tuple[MeasuredPoses, Cause]]:
+    """Go through positions in other units, mirrored positions and orientations, and inverse poses.
+
+    Args:
+        measured: the poses.
+        predicted: positions, but for the frames [m].
+        by_images: whether boards in images gave the poses: their scale is that of the board.
+    """
     advice = "check the order and the directions of the sensor's axes"
+    if by_images:
+        factor = _spread(predicted) / _spread(measured.position)
+        clause = f"the squares of the board are {factor:.4g} times as large as stated"
+        cause = Cause("position_unit", clause, "measure them and correct the file of the board", 1.0)
+        yield replace(measured, position=measured.position * factor), cause
+        advice = "take the images as the sensor of the camera has them, not flipped"
+    else:
+        for factor, are, named in UNITS:
+            clause = f"x, y and z are {are} that are named {named}"
+            yield (
+                replace(measured, position=measured.position * factor),
+                Cause("position_unit", clause, "correct the unit in the column names", 1.0),
+            )
     positions = replace(measured, position=measured.position @ _MIRROR)
     what = "the measured positions are"
     if bool(measured.has_rotation.any()):
@@ -55,6 +70,11 @@ def units_and_frames(measured: MeasuredPoses) -> Iterator[tuple[MeasuredPoses, C
         yield inverse, Cause("rotation", clause, forward, 1.0)
         what += ", other than the orientations,"
     yield positions, Cause("handedness", _MIRRORED.format(what), advice, 1.0)
+
+
+def _spread(position: Float64[Tensor, "rows 3"]) -> float:
+    """Root mean square distance from the mean [m]."""
+    return float((position - position.mean(0)).square().sum(-1).mean().sqrt())
 
 
 def other_conventions(

@@ -27,7 +27,8 @@ class ResidualCheck(AbstractCheck):
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
         """See `AbstractCheck.diagnose`."""
-        robot = checked.robot
+        robot, by_images = checked.robot, "corner" in checked.rows.kinds
+        rows = "images and joint values" if by_images else "rows and positions"
         for sensor, errors in checked.final_errors.items():
             typical = _typical(errors)
             if SENSORS[sensor].unit == "rad":
@@ -43,8 +44,8 @@ class ResidualCheck(AbstractCheck):
                     severity="implausible",
                     sentence=f"With the best fit a typical {sensor} is still {size} per axis from where robot "
                     f"'{robot.name}' says ({before:.3g} times that as drawn), which no calibration error explains; "
-                    "check units, order, signs and zeros of the joint columns, whether rows and positions belong "
-                    "together, and whether this robot was measured.",
+                    f"check units, order, signs and zeros of the joint columns, whether {rows} belong together, "
+                    f"{'the lengths of the board, ' if by_images else ''}and whether this robot was measured.",
                 )
 
 

@@ -48,12 +48,16 @@ class ScaleCheck(AbstractCheck):
         if scale is None or scale.log_bayes_factor < SUBSTANTIAL:
             return
         implausible = abs(scale.factor - 1) > IMPLAUSIBLE
+        lengths = (
+            "lengths of the board, and whether the intrinsics of the camera are those of these images"
+            if "corner" in checked.rows.kinds
+            else "unit of the position columns, the scale of the instrument and stated distances"
+        )
         yield Diagnostic(
             kind="scale",
             severity="implausible" if implausible else "warning",
             sentence=f"All lengths of the arm come out {scale.factor:.5g} times as large as drawn (standard deviation "
-            f"{scale.sigma:.1g}), which looks like a wrong unit or scale of the measurements; check the unit of the "
-            "position columns, the scale of the instrument and stated distances.",
+            f"{scale.sigma:.1g}), which looks like a wrong unit or scale of the measurements; check the {lengths}.",
         )
 
 
