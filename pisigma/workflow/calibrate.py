@@ -24,6 +24,7 @@ from pisigma.judging.held_out_rows import HeldOutRows
 from pisigma.judging.progress import Progress
 from pisigma.judging.trained_calibrations import Calibrator, Result, geometric_of, trained
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.new_frames import with_new_frames
 from pisigma.measurement.splits import SplitBy, TrainTest, draw_rows, holdout, repeats, with_fewer
 from pisigma.model.calibrated_model import CalibratedModel
@@ -165,6 +166,12 @@ class CalibrationSettings:
             return []
         else:
             folds = FOLDS if self.folds is None and self.split != "placement" else self.folds
+            if folds is not self.folds and len(set(groups_to_keep_whole(measurements).tolist())) < FOLDS:
+                raise MeasurementError(
+                    f"{measurements.source}: {FOLDS} different poses or more were wanted, so that each can be left out "
+                    "once to judge the others; measure more, about 50 for a good calibration, or leave that out "
+                    "(--folds 0)."
+                )
             splits = repeats(measurements, folds, self.seed, self.split, self.repeats)
         if self.train_rows is None:
             return splits
