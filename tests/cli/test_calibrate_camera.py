@@ -87,6 +87,11 @@ def test_corners_say_whether_a_model_still_holds(run, files, calibrated):
     verified = run("verify", calibrated[0], files / "new.csv", *cameras(files), "--json")
     assert verified.exit_code == 0, verified.output
     assert "is itself uncertain by 0." in json.loads(verified.stdout)["warnings"][-1]
+    (files / "small.yaml").write_text("rows: 6\ncolumns: 9\nsquare_mm: 25\n")
+    small = (*cameras(files)[:3], files / "small.yaml")
+    assert (
+        "squares of the board are 1.2 times" in run("verify", calibrated[0], files / "new.csv", *small).stderr
+    )
     moved = run("verify", calibrated[0], files / "later.csv", *cameras(files))
     assert moved.exit_code == 3
     said = " ".join(moved.stdout.split())
@@ -122,6 +127,14 @@ def test_camera_and_board_belong_together(run, files, tmp_path):
     assert result.exit_code == 2
     assert "--camera and --board belong together" in " ".join(result.stderr.split())
     assert not (tmp_path / "arm").exists()
+
+
+def test_three_images_are_too_few(run, files, tmp_path):
+    few = tmp_path / "few.csv"
+    few.write_text("\n".join(corner_lines(camera_cell(20, 1).images)[: 1 + 3 * len(BOARD.corners)]) + "\n")
+    result = run("calibrate", "ur5", few, *cameras(files), "--out", tmp_path / "arm")
+    assert result.exit_code == 2
+    assert "5 different poses or more were wanted" in " ".join(result.stderr.split())
 
 
 def test_a_file_does_not_count_twice(run, files, tmp_path):

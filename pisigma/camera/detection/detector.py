@@ -44,6 +44,8 @@ def image_files(paths: Sequence[str | os.PathLike[str]]) -> tuple[Path, ...]:
     of_name: dict[str, Path] = {}
     for file in files:
         if (other := of_name.setdefault(file.stem, file)) != file:
+            for one in (other, file):
+                read_image(one)  # the name of what is no image does not matter
             raise MeasurementError(f"{file}: has the name of {other}; give every image a name of its own.")
     return tuple(files)
 
@@ -85,6 +87,9 @@ def detect_board(path: Path, board: Board, most_blur: float) -> BoardImage:
     image = read_image(path)
     size, detected = (image.shape[1], image.shape[0]), DETECTORS[board.kind](image, board)
     if isinstance(detected, NoBoard):
+        flipped = DETECTORS[board.kind](np.ascontiguousarray(image[:, ::-1]), board) if board.marker else None
+        if isinstance(flipped, DetectedBoard):
+            detected = NoBoard("it is mirrored, as its markers show; take it as the camera's sensor has it")
         return BoardImage(path, size, detected, np.nan)
     blur = EdgeProfiles.of(image, shown_edges(detected, board), board.clearance).blur
     if len(detected.corners) < FEWEST_CORNERS:

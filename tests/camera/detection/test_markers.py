@@ -2,11 +2,12 @@
 
 import numpy as np
 import pytest
-from testing.board_images import CAMERA, draw_board, view
+from testing.board_images import CAMERA, cv2, draw_board, view
 from testing.closeness import assert_close
 
 from pisigma.camera.board import Board
 from pisigma.camera.detection.detected_board import DetectedBoard, EdgeProfiles, NoBoard, shown_edges
+from pisigma.camera.detection.detector import detect_board
 from pisigma.camera.detection.markers import detect_apriltags, detect_charuco, dictionary_of
 from pisigma.errors import MeasurementError
 
@@ -38,6 +39,15 @@ def test_an_image_without_markers(board, detect) -> None:
     nothing = detect(np.full((400, 640), 120, dtype=np.uint8), board)
     assert isinstance(nothing, NoBoard)
     assert "found in it" in nothing.reason
+
+
+@pytest.mark.parametrize("board", [CHARUCO, TAGS], ids=["charuco", "apriltag"])
+def test_a_mirrored_image_is_named(board, tmp_path) -> None:
+    image = draw_board(board, *view(board, 0.3, (2.0, 0.4, -0.3)))
+    cv2.imwrite(str(tmp_path / "flipped.png"), image[:, ::-1])
+    flipped = detect_board(tmp_path / "flipped.png", board, 3.0).board
+    assert isinstance(flipped, NoBoard)
+    assert flipped.reason.startswith("it is mirrored")
 
 
 def test_a_dictionary_with_too_few_markers_is_refused() -> None:

@@ -75,6 +75,9 @@ def test_what_is_refused(refuses, files, tmp_path):
     assert "1280 x 400 px was wanted" in refuses("detect", *options(files, camera="large.yaml"), *out)
     no_image = ("detect", files / "board.yaml", *options(files)[1:])
     assert "is no image that OpenCV reads" in refuses(*no_image, *out)
+    (files / "00.txt").write_text("notes")
+    beside = ("detect", files / "00.txt", *options(files))
+    assert "00.txt: is no image that OpenCV reads" in refuses(*beside, *out)
     (files / "empty.png").touch()
     assert "is no image that OpenCV reads" in refuses(
         "detect", files / "empty.png", *options(files)[1:], *out
