@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64
 
-from pisigma.identification.identifiability.redundancy import NO_EFFECT, preference_of
+from pisigma.identification.identifiability.redundancy import NO_EFFECT, preferences
 from pisigma.identification.problem.information import Information
 
 CORRELATION_TOLERANCE = 1e-6
@@ -74,7 +74,7 @@ def find_pairwise_redundancy(
     columns = information.jacobian
     lengths = np.linalg.norm(columns, axis=0)
     acting = lengths > NO_EFFECT * max(lengths.max(initial=0.0), 1e-300)
-    parameters = information.parameters
+    parameters, preference = information.parameters, preferences(information.parameters, sizes)
     order = sorted(range(len(parameters)), key=lambda i: (PAPER_ORDER.index(parameters[i].group), i))
     tables, sets, dropped = [], [], set()
     for unit in ("m", "rad"):
@@ -91,7 +91,7 @@ def find_pairwise_redundancy(
                     ("-" if s < 0 else "") + parameters[i].name for i, s in zip(indices, signs, strict=True)
                 )
             )
-            best = max(indices, key=lambda i: preference_of(parameters[i], float(sizes[i]), i))
+            best = max(indices, key=preference.__getitem__)
             dropped |= set(indices) - {best}
     return PairwiseRedundancy(
         lengths=tables[0],

@@ -1,5 +1,6 @@
 """Which parameters the data can tell apart: rank, choice, dependencies in words, additions."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -51,7 +52,6 @@ class Redundancy:
         information: the condensed Jacobian.
         rank: how many independent combinations of them the data determine.
         tolerance: of the rank, as a share of the largest singular value.
-        singular_values: of the column-scaled Jacobian.
         kept: the parameters that were chosen, `rank` of them.
         removed: those that act like combinations of kept ones.
         no_effect: those that change no measured value at all.
@@ -60,7 +60,6 @@ class Redundancy:
     information: Information
     rank: int
     tolerance: float
-    singular_values: Float64[np.ndarray, " singular"]
     kept: tuple[str, ...]
     removed: tuple[str, ...]
     no_effect: tuple[str, ...]
@@ -69,6 +68,12 @@ class Redundancy:
     def names(self) -> tuple[str, ...]:
         """The parameters that were looked at."""
         return self.information.names
+
+    @cached_property
+    def singular_values(self) -> Float64[np.ndarray, " singular"]:
+        """Singular values of the column-scaled Jacobian."""
+        acting, lengths = _acting(self.information)
+        return _singular_values(self.information.jacobian[:, acting] / lengths[acting])
 
     @cached_property
     def dependencies(self) -> tuple[Dependency, ...]:
@@ -120,43 +125,76 @@ def find_redundancy(
             keeps the d that is a real offset).
         tolerance: see `RANK_TOLERANCE`.
     """
-    J = information.jacobian
-    lengths = np.linalg.norm(J, axis=0)
-    acting = np.flatnonzero(lengths > NO_EFFECT * max(lengths.max(initial=0.0), 1e-300))
-    unit = J[:, acting] / lengths[acting]
-    singular = np.linalg.svd(unit, compute_uv=False) if len(acting) else np.zeros(0)
-    rank = int((singular > tolerance * singular.max(initial=0.0)).sum())
-    preference = np.array(
-        [
-            preference_of(information.parameters[i], size, i)
-            for i, size in zip(acting.tolist(), sizes[acting].tolist(), strict=True)
-        ]
-    )
-    pivots = pivoted_columns(unit * preference, rank)
-    kept, removed = acting[np.sort(pivots)], np.delete(acting, pivots)
+    acting, lengths = _acting(information)
+    unit = information.jacobian[:, acting] / lengths[acting]
+    preference = preferences(information.parameters, sizes)[acting]
+    R, pivots = pivoted_triangle(unit * preference)
+    rank = _rank(R / preference[pivots], tolerance)
+    kept, removed = acting[np.sort(pivots[:rank])], np.delete(acting, pivots[:rank])
     names = information.names
     return Redundancy(
         information=information,
         rank=rank,
         tolerance=tolerance,
-        singular_values=singular,
         kept=tuple(names[i] for i in kept),
         removed=tuple(names[i] for i in removed),
-        no_effect=tuple(names[i] for i in range(len(names)) if i not in acting),
+        no_effect=tuple(name for name, length in zip(names, lengths, strict=True) if length == 0.0),
     )
 
 
-def preference_of(parameter: Parameter, size: float, index: int) -> float:
-    """How much a parameter is wanted among those that are kept; its place decides ties, the earlier wins."""
-    bonus = 1e-3 if abs(size) > 1e-9 else 0.0
-    return _WEIGHT[parameter.group] * (1 + bonus - 1e-6 * index)
+def _acting(information: Information) -> tuple[Int64[np.ndarray, " acting"], Float64[np.ndarray, " columns"]]:
+    """Return the columns that change any measured value, and the lengths of all, 0 of those that do not."""
+    lengths = np.linalg.norm(information.jacobian, axis=0)
+    lengths[lengths <= NO_EFFECT * lengths.max(initial=0.0)] = 0.0
+    return np.flatnonzero(lengths), lengths
 
 
-def pivoted_columns(A: Float64[np.ndarray, "rows columns"], count: int) -> Int64[np.ndarray, " pivots"]:
-    """Return the first pivots of a QR factorisation with column pivoting (LAPACK's `geqp3`)."""
+def _singular_values(A: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarray, " singular"]:
+    values: np.ndarray = np.linalg.svd(A, compute_uv=False) if A.shape[1] else np.zeros(0)
+    return values
+
+
+def _rank(R: Float64[np.ndarray, "rank columns"], tolerance: float) -> int:
+    """Count the singular values above a share of the largest, of a triangle whose columns have length one.
+
+    The largest lies between one and the root of the number of columns. So the rank is k where what is below the k-th
+    row is shorter than the tolerance, and the inverse of what is beside it is short enough; nearly always that shows
+    it, and the singular values need not be worked out.
+    """
+    below = np.sqrt(np.square(R).sum(1)[::-1].cumsum()[::-1])
+    rank = int((below > tolerance).sum())
+    inverse, singular = _inverse_triangle(R[:rank, :rank])
+    if not singular and np.square(inverse).sum() * R.shape[1] * tolerance**2 < 1:
+        return rank
+    singular_values = _singular_values(R)
+    return int((singular_values > tolerance * singular_values.max(initial=0.0)).sum())
+
+
+def preferences(
+    parameters: Sequence[Parameter], sizes: Float64[np.ndarray, " parameters"]
+) -> Float64[np.ndarray, " parameters"]:
+    """How much parameters are wanted among those that are kept; their order decides ties, the earlier wins."""
+    weights = np.array([_WEIGHT[parameter.group] for parameter in parameters])
+    result: np.ndarray = weights * (1 + 1e-3 * (np.abs(sizes) > 1e-9) - 1e-6 * np.arange(len(weights)))
+    return result
+
+
+def pivoted_triangle(
+    A: Float64[np.ndarray, "rows columns"],
+) -> tuple[Float64[np.ndarray, "rank columns"], Int64[np.ndarray, " columns"]]:
+    """Return R and the pivots of a QR factorisation with column pivoting (LAPACK's `geqp3`)."""
     from scipy.linalg.lapack import dgeqp3  # here, since models are loaded without scipy
 
-    return np.asarray(dgeqp3(A)[1][:count] - 1, dtype=np.int64)
+    R, pivots, *_ = dgeqp3(A)
+    return np.triu(R[: A.shape[1]]), np.asarray(pivots - 1, dtype=np.int64)
+
+
+def _inverse_triangle(R: Float64[np.ndarray, "size size"]) -> tuple[Float64[np.ndarray, "size size"], bool]:
+    """Invert an upper triangle (LAPACK's `trtri`), and say whether it is singular."""
+    from scipy.linalg.lapack import dtrtri
+
+    inverse, singular = dtrtri(R) if len(R) else (R, 0)
+    return inverse, singular != 0
 
 
 def _dependencies(

@@ -8,7 +8,7 @@ from testing.simulated_arm import BASE, TOOL, draw_joints
 
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.identifiability.pairwise import find_pairwise_redundancy
-from pisigma.identification.identifiability.redundancy import find_redundancy, pivoted_columns
+from pisigma.identification.identifiability.redundancy import find_redundancy, pivoted_triangle
 from pisigma.identification.problem.information import Information, information
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.parameter_jacobian import identification_jacobian
@@ -136,7 +136,7 @@ def test_correlations_are_pearsons() -> None:
 def test_pivots_span_the_columns(rank: int, seed: int) -> None:
     rng = np.random.default_rng(seed)
     A = rng.normal(size=(12, rank)) @ rng.normal(size=(rank, 8))
-    pivots = pivoted_columns(A, rank)
+    pivots = pivoted_triangle(A)[1][:rank]
     assert len(set(pivots.tolist())) == rank
     basis, _ = np.linalg.qr(A[:, pivots])
     assert_close(A - basis @ (basis.T @ A), 0.0, atol=1e-6 * float(np.abs(A).max()))
