@@ -1,7 +1,7 @@
 """The geometric calibrator."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TypeVar
 
@@ -38,8 +38,12 @@ from pisigma.identification.problem.loss import AbstractLoss, HampelLoss
 from pisigma.identification.problem.noise import view_of
 from pisigma.identification.problem.parameters import ParameterSpace, Prior
 from pisigma.identification.problem.problem import CalibrationProblem
-from pisigma.identification.problem.robots import of_robots
-from pisigma.identification.problem.setup import CalibrationSetup, SetupOptions
+from pisigma.identification.problem.robots import each_robot, of_robots
+from pisigma.identification.problem.setup import (
+    CalibrationSetup,
+    SetupOptions,
+    identified_geometries,
+)
 from pisigma.identification.problem.side_by_side import pattern_of, side_by_side
 from pisigma.identification.result import CalibrationResult, SolvedCalibration
 from pisigma.measurement.dataset import Measurements
@@ -47,7 +51,9 @@ from pisigma.robot.description import Robot
 from pisigma.robot.row import FRAME_COLUMNS
 from pisigma.sensors.socket import PairOfSockets
 
-Member = TypeVar("Member")
+Values = TypeVar("Values")
+TOGETHER = 512
+"""Robots that are calibrated side by side at most, which limits the memory."""
 ROUGH_ROWS = 4_096
 """Rows that the initial guess and the first steps are worked out from."""
 SEEN_AT_ALL = 1e-3
@@ -165,11 +171,14 @@ class GeometricCalibrator:
         """Calibrate several robots of one type, those whose data are alike side by side; see `fit_many` and `solve`."""
         robots = [_Robot(*pair) for pair in zip(data, self._build(data), strict=True)]
         patterns = [pattern_of(robot.setup.problem) if len(robots) > 1 else None for robot in robots]
-        for alike in _groups(robots, patterns):
-            self._choose(alike)
-            for group in _groups(alike, [tuple(robot.active) for robot in alike]):
-                self._solve(group)
-        return [robot.solved() for robot in robots]
+        for group in _groups(patterns):
+            for first in range(0, len(group), TOGETHER):
+                alike = [robots[number] for number in group[first : first + TOGETHER]]
+                problem, start = _side_by_side(alike)
+                self._choose(alike, problem, start)
+                for some in _groups_of(alike, problem, start, [tuple(robot.active) for robot in alike]):
+                    self._solve(*some)
+        return [robot.solved for robot in robots]
 
     def build(self, measurements: Measurements) -> CalibrationSetup:
         """The problem and its start, without solving it.
@@ -220,13 +229,12 @@ class GeometricCalibrator:
             chosen |= {index for name in self.free for index in space.indices(name)}
         return sorted(chosen)
 
-    def _choose(self, robots: "list[_Robot]") -> None:
+    def _choose(self, robots: "list[_Robot]", problem: CalibrationProblem, start: Tensor) -> None:
         """Choose the parameters that robots with alike data start with.
 
         Raises:
             IdentificationError: the measurements of one do not determine them.
         """
-        problem, start = _side_by_side(robots)
         space, unknowns = problem.space, robots[0].setup.free_unknowns
         candidates, explicit = self.candidates(space), not isinstance(self.free, str)
         for robot, every in zip(robots, information(problem, start, unknowns + candidates), strict=True):
@@ -275,13 +283,12 @@ class GeometricCalibrator:
             names = find_pairwise_redundancy(at_start, sizes).kept
         return [space.index(name) for name in names]
 
-    def _solve(self, robots: "list[_Robot]") -> None:
+    def _solve(self, robots: "list[_Robot]", problem: CalibrationProblem, start: Tensor) -> None:
         """Solve roughly without the prior, add what the data determine there, then solve with the prior.
 
         The rough steps show the noise that the prior is weighed against; a few thousand rows are enough for
         them. The robots have alike data, and start with the same free parameters.
         """
-        problem, start = _side_by_side(robots)
         problem = problem.with_active(robots[0].active)
         few = problem
         if problem.q.shape[0] > ROUGH_ROWS and not problem.robots:
@@ -292,12 +299,8 @@ class GeometricCalibrator:
         for robot, end in zip(robots, rough.ends, strict=True):
             robot.end = end
         self._extend(robots, few, here)
-        numbers = list(range(len(robots)))
-        for group in _groups(numbers, [tuple(robot.findings.extended) for robot in robots]):
-            some, there, members = problem, here, [robots[number] for number in group]
-            if len(group) < len(robots):
-                index = torch.tensor(group)
-                some, there = problem.of_robots(index), of_robots(here, index)
+        extended = [tuple(robot.findings.extended) for robot in robots]
+        for members, some, there in _groups_of(robots, problem, here, extended):
             if members[0].findings.extended:
                 some = some.with_active(members[0].active)
             if members[0].findings.extended or few.q is not problem.q:
@@ -306,27 +309,24 @@ class GeometricCalibrator:
                 there = some.combined(there.point, view_of(there))
             left = [self.maximum_iterations - robot.end.iterations for robot in members]
             fine = levenberg_marquardt(some, there, left, close_enough=SHORTEST_STEP)
-            for number, (robot, end) in enumerate(zip(members, fine.ends, strict=True)):
-                robot.end = robot.end.before(end)
-                robot.here = of_robots(fine.linearisation, number) if some.robots else fine.linearisation
+            _finish(members, some, fine)
 
     def _extend(
         self, robots: "list[_Robot]", problem: CalibrationProblem, here: Linearisation[Tensor]
     ) -> None:
         """Add parameters that the data determine after the rough steps, though not at the nominal geometry."""
-        candidates = robots[0].setup.free_unknowns + robots[0].candidates
-        kept = [candidates.index(i) for i in sorted(robots[0].active)]
-        if self.elimination != "exact" or len(kept) == len(candidates):
+        kept = sorted(robots[0].active)
+        others = [i for i in robots[0].candidates if i not in set(kept)]
+        if self.elimination != "exact" or not others:
             return
-        of_each = information(problem, here.point, candidates, view_of(here))
+        of_each = information(problem, here.point, kept + others, view_of(here))
         for robot, now in zip(robots, of_each, strict=True):
-            extended = [candidates[i] for i in rank_extension(now, kept)]
-            robot.active, robot.findings = (
-                [*robot.active, *extended],
-                replace(robot.findings, extended=extended),
-            )
+            extended = [(kept + others)[i] for i in rank_extension(now, len(kept))]
+            robot.active = [*robot.active, *extended]
+            robot.findings = replace(robot.findings, extended=extended)
 
 
+@dataclass(eq=False)
 class _Robot:
     """One of the robots that are calibrated, with what is found out about it from step to step.
 
@@ -336,29 +336,36 @@ class _Robot:
         candidates: indices of the parameters that may be estimated.
         active: those that are.
         findings: on them.
-        end: how the search ended.
-        here: the problem at its solution.
+        end: how the rough search ended.
+        solved: its calibration.
     """
 
-    candidates: list[int]
-    active: list[int]
-    findings: Findings
-    end: SearchEnd
-    here: Linearisation[Tensor]
+    measurements: Measurements
+    setup: CalibrationSetup
+    candidates: list[int] = field(init=False)
+    active: list[int] = field(init=False)
+    findings: Findings = field(init=False)
+    end: SearchEnd = field(init=False)
+    solved: SolvedCalibration = field(init=False)
 
-    def __init__(self, measurements: Measurements, setup: CalibrationSetup) -> None:
-        self.measurements, self.setup = measurements, setup
 
-    def solved(self) -> SolvedCalibration:
-        """Return the calibration.
+def _finish(robots: list[_Robot], problem: CalibrationProblem, fine: Solution[Tensor]) -> None:
+    """Put the calibrations of robots with one problem together.
 
-        Raises:
-            IdentificationError: no calibration error explains it.
-        """
-        problem = self.setup.problem.with_active(self.active)
-        refuse_implausible(problem, self.here, self.measurements.source)
-        solution = Solution(self.here, (self.end,))
-        return SolvedCalibration(self.measurements, self.setup, problem, solution, self.findings)
+    Raises:
+        IdentificationError: no calibration error explains one of them.
+    """
+    here, count = fine.linearisation, len(robots)
+    refuse_implausible(problem, here, [robot.measurements.source for robot in robots])
+    setups = [robot.setup for robot in robots]
+    geometries = identified_geometries(setups, here.point.reshape(count, -1))
+    of_each = zip(robots, each_robot(here, count) if problem.robots else [here], strict=True)
+    for (robot, its), end, geometry in zip(of_each, fine.ends, geometries, strict=True):
+        solution = Solution(its, (robot.end.before(end),))
+        alone = replace(robot.setup.problem, active=problem.active)
+        robot.solved = SolvedCalibration(
+            robot.measurements, robot.setup, alone, solution, robot.findings, geometry
+        )
 
 
 def _side_by_side(robots: list[_Robot]) -> tuple[CalibrationProblem, Float64[Tensor, "*robots parameters"]]:
@@ -370,9 +377,22 @@ def _side_by_side(robots: list[_Robot]) -> tuple[CalibrationProblem, Float64[Ten
     return problem, problem.nominal
 
 
-def _groups(members: list[Member], patterns: Sequence[object]) -> list[list[Member]]:
-    """Members with equal patterns, in their order; one without a pattern (None) is a group of its own."""
-    groups: dict[object, list[Member]] = {}
-    for number, (member, pattern) in enumerate(zip(members, patterns, strict=True)):
-        groups.setdefault(number if pattern is None else pattern, []).append(member)
+def _groups_of(
+    robots: list[_Robot], problem: CalibrationProblem, values: Values, patterns: Sequence[object]
+) -> Iterator[tuple[list[_Robot], CalibrationProblem, Values]]:
+    """Robots with equal patterns, with their problem and values; as they are where all patterns are equal."""
+    groups = _groups(patterns)
+    if len(groups) == 1:
+        yield robots, problem, values
+        return
+    for group in groups:
+        index = torch.tensor(group)
+        yield [robots[number] for number in group], problem.of_robots(index), of_robots(values, index)
+
+
+def _groups(patterns: Sequence[object]) -> list[list[int]]:
+    """Numbers of equal patterns, in their order; one that is None is a group of its own."""
+    groups: dict[object, list[int]] = {}
+    for number, pattern in enumerate(patterns):
+        groups.setdefault(number if pattern is None else pattern, []).append(number)
     return list(groups.values())

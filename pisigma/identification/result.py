@@ -32,7 +32,7 @@ from pisigma.identification.problem.least_squares import (
 from pisigma.identification.problem.noise import values_used, view_of
 from pisigma.identification.problem.prior_sizes import effective_parameters
 from pisigma.identification.problem.problem import CalibrationProblem
-from pisigma.identification.problem.setup import CalibrationSetup, IdentifiedGeometry, identified_geometry
+from pisigma.identification.problem.setup import CalibrationSetup, IdentifiedGeometry
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.sensors.registry import measured_errors
@@ -92,6 +92,7 @@ class SolvedCalibration:
         problem: with its free parameters.
         solution: of it.
         findings: on the parameters.
+        geometry: the solution in the user's coordinates.
     """
 
     measurements: Measurements
@@ -99,16 +100,12 @@ class SolvedCalibration:
     problem: CalibrationProblem
     solution: Solution[Tensor]
     findings: Findings
+    geometry: IdentifiedGeometry
 
     def result(self) -> "CalibrationResult":
         """Return the calibration in the user's coordinates."""
         geometry = self.geometry
         return CalibrationResult(geometry.robot, geometry.bases, geometry.tools, geometry.unknowns, self)
-
-    @cached_property
-    def geometry(self) -> IdentifiedGeometry:
-        """The solution in the user's coordinates."""
-        return identified_geometry(self.setup, self.solution.linearisation.point)
 
     @cached_property
     def refined(self) -> Linearisation[Tensor]:

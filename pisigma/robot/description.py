@@ -1,5 +1,6 @@
 """What a robot is: DH + Hayati rows, joints, base and tool, in SI units."""
 
+import math
 import os
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -63,16 +64,18 @@ class Robot:
         names = [row.name for row in self.rows]
         if len(names) > MOST_ROWS:
             raise RobotError(f"{robot}: it has {len(names):,} rows; {MOST_ROWS:,} at most were wanted.")
-        if twice := sorted({name for name in names if names.count(name) > 1}):
+        if len(set(names)) < len(names):
+            twice = sorted(name for name in names if names.count(name) > 1)
             raise RobotError(f"{robot}: the row name '{twice[0]}' stands twice; names must differ.")
+        types = get_args(JointType)
         for row in self.rows:
             place = f"{robot}, row '{row.name}'"
-            if row.type not in get_args(JointType):
-                hint = nearest_choice(row.type, get_args(JointType))
+            if row.type not in types:
+                hint = nearest_choice(row.type, types)
                 raise RobotError(f"{place}: the type cannot be '{row.type}'; {hint}")
             if row.direction not in (1, -1):
                 raise RobotError(f"{place}: direction is +1 or -1, got {row.direction}.")
-            stroke = [bound for bound in (row.lower, row.upper) if np.isfinite(bound)]
+            stroke = [bound for bound in (row.lower, row.upper) if math.isfinite(bound)]
             if row.type == "prismatic" and max(map(abs, stroke), default=0.0) > LARGEST / 1e3:
                 raise RobotError(
                     f"{place}: a limit is above {LARGEST / 1e3:.0e} m; correct it or leave both out."

@@ -237,7 +237,7 @@ def sentence_of(members: list[Parameter], coefficients: list[float]) -> str:
     return f"{text} is identified, the single values are not"
 
 
-def rank_extension(information: Information, kept: list[int]) -> list[int]:
+def rank_extension(information: Information, kept: int) -> list[int]:
     """Find columns that the data determine besides those kept.
 
     Nominal axes are parallel or meet exactly; real ones do not, so that dependencies of the nominal robot
@@ -246,36 +246,31 @@ def rank_extension(information: Information, kept: list[int]) -> list[int]:
 
     Args:
         information: of all candidates at about the solution, its rows in standard deviations.
-        kept: columns that are estimated anyway.
+        kept: so many columns, the first ones, are estimated anyway.
 
     Returns:
         Columns to add, the clearest first.
     """
-    J, r = information.jacobian, information.residual
-    basis, _ = np.linalg.qr(J[:, kept])
-    rest = J - basis @ (basis.T @ J)
-    rest -= basis @ (basis.T @ rest)
-    left = r - basis @ (basis.T @ r)
-    lengths = np.linalg.norm(J, axis=0)
-    pivots = _pivots(rest, VISIBLE * lengths, kept)
+    # below the rows of the kept columns, the triangle holds what the others and the residuals are beside them
+    rest, left = information.jacobian[kept:, kept:], information.residual[kept:]
+    pivots = _pivots(rest, VISIBLE * np.linalg.norm(information.jacobian[:, kept:], axis=0))
     clear = sum(size >= 1 / CLEARLY_SEEN for _, size in pivots)
-    if _needed(rest[:, [i for i, _ in pivots]], left, information.values - len(kept)):
+    if _needed(rest[:, [i for i, _ in pivots]], left, information.values - kept):
         clear = len(pivots)
-    return [i for i, _ in pivots[:clear]]
+    return [kept + i for i, _ in pivots[:clear]]
 
 
-def _pivots(rest: np.ndarray, rounding: np.ndarray, kept: list[int]) -> list[tuple[int, float]]:
+def _pivots(rest: np.ndarray, rounding: np.ndarray) -> list[tuple[int, float]]:
     """Pivots of a QR factorisation with column pivoting, with the length each has beside those before it."""
-    columns = np.delete(np.arange(rest.shape[1]), kept)
-    rest, rounding = rest[:, columns], rounding[columns]
+    rest = rest.copy()
     pivots: list[tuple[int, float]] = []
-    while len(columns):
+    while rest.shape[1]:
         lengths = np.sqrt(np.einsum("ij,ij->j", rest, rest))
         lengths[lengths <= rounding] = 0.0
         best = int(lengths.argmax())
         if lengths[best] == 0.0:
             break
-        pivots.append((int(columns[best]), float(lengths[best])))
+        pivots.append((best, float(lengths[best])))
         direction = rest[:, best] / lengths[best]
         rest -= direction[:, None] * (direction @ rest)
         rest[:, best] = 0.0

@@ -1,6 +1,7 @@
 """The identification Jacobian of a whole data set, condensed to a small triangular matrix."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -20,11 +21,11 @@ class Information:
     """What the data say of each parameter, in units of its usual error (1 mm, 1 mrad).
 
     With J the identification Jacobian of all rows (in mm and mrad, or in standard deviations) and r the
-    residuals, `[1 J r] = Q · root`.
+    residuals, `[J r 1] = Q · root`.
 
     Attributes:
         parameters: what the columns of J belong to.
-        root: upper triangular; its first column belongs to ones, its last to the residuals.
+        root: upper triangular; its last column belongs to ones, that before it to the residuals.
         values: number of rows of J.
         poses: number of measured rows.
     """
@@ -34,7 +35,7 @@ class Information:
     values: int
     poses: int
 
-    @property
+    @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the parameters."""
         return tuple(parameter.name for parameter in self.parameters)
@@ -42,23 +43,23 @@ class Information:
     @property
     def jacobian(self) -> Float64[np.ndarray, "rank parameters"]:
         """A small matrix with the same Gram matrix as J."""
-        return self.root[:, 1:-1]
+        return self.root[:, :-2]
 
     @property
     def residual(self) -> Float64[np.ndarray, " rank"]:
         """A small vector with the same products with `jacobian` and itself as r has with J and itself."""
-        return self.root[:, -1]
+        return self.root[:, -2]
 
     @property
     def centred(self) -> Float64[np.ndarray, "rank parameters"]:
         """The same after the mean of every column of J was taken off."""
-        return self.root[1:, 1:-1]
+        ones_first: np.ndarray = np.linalg.qr(np.roll(self.root, 1, axis=1), mode="r")  # type: ignore[assignment]
+        return ones_first[1:, 1:-1]
 
     def without(self, column: int) -> "Information":
         """The same without one parameter."""
-        kept = [i for i in range(len(self.parameters)) if i != column]
-        root = self.root[:, [0, *(i + 1 for i in kept), -1]]
-        return replace(self, parameters=tuple(self.parameters[i] for i in kept), root=root)
+        parameters = self.parameters[:column] + self.parameters[column + 1 :]
+        return replace(self, parameters=parameters, root=np.delete(self.root, column, 1))
 
     def after(self, nuisance: list[int]) -> "Information":
         """What is left for the other parameters when these columns may take any value.
@@ -73,7 +74,7 @@ class Information:
         U, singular, _ = np.linalg.svd(taken / np.where(lengths > 0, lengths, 1.0), full_matrices=False)
         U = U[:, singular > SEEN * singular.max(initial=0.0)]
         kept = [i for i in range(len(self.parameters)) if i not in set(nuisance)]
-        rest = self.root[:, [0, *(i + 1 for i in kept), -1]]
+        rest = np.delete(self.root, nuisance, 1)
         sizes = np.linalg.norm(rest, axis=0)
         for _ in range(2):
             rest = rest - U @ (U.T @ rest)
@@ -119,9 +120,9 @@ def information(
                 present = sensor.present[rows][: weight.shape[-1]]
                 J, r, weight = J[..., present], r[..., present], weight[..., present]
             block = r.new_empty((*r.shape[:-2], len(candidates) + 2, *r.shape[-2:]))
-            block[..., 0, :, :] = weight[..., None, :]
-            torch.mul(J, usual * weight[..., None, None, :], out=block[..., 1:-1, :, :])
-            torch.mul(r, weight[..., None, :], out=block[..., -1, :, :])
+            torch.mul(J, usual * weight[..., None, None, :], out=block[..., :-2, :, :])
+            torch.mul(r, weight[..., None, :], out=block[..., -2, :, :])
+            block[..., -1, :, :] = weight[..., None, :]
             blocks.append(block.flatten(-2))
         condensed = torch.linalg.qr((torch.cat(blocks, -1) if len(blocks) > 1 else blocks[0]).mT, mode="r").R
         if problem.robots:

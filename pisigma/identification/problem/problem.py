@@ -6,7 +6,7 @@ free parameters. Rows stand one robot behind the other; what is one a robot has 
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from jaxtyping import Float64, Int64
@@ -65,7 +65,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         stated: what rows state beside their joint values (see `JointState`), for corrections that depend on it.
         prior_sizes: "stated": the prior as it is; "widened": wider where the errors are larger than it says;
             "estimated": wider or narrower.
-        memory: the last motion; shared with problems that differ in their free parameters or prior only.
+        memory: the last motions; shared with problems that differ in their free parameters or prior only.
     """
 
     space: ParameterSpace
@@ -280,13 +280,11 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         The columns are 0 for base and tool in rows of other frames and targets, and for parameters that do not
         move the tool.
         """
-
-        def make() -> ToolMotion:
-            of_rows = (self.q[rows], self.frame[rows], self.target[rows])
-            return motion_at(self.space, self._of_rows(point, rows), *of_rows, self._turning)
-
-        made_from = (point, self.space, self.q, self.frame, self.target, self._turning)
-        motion = self.memory.motion(made_from, make) if self.chunks() == [rows] else make()
+        there, of_rows = self._of_rows(point, rows), (self.q[rows], self.frame[rows], self.target[rows])
+        make = partial(motion_at, self.space, there, *of_rows, self._turning)
+        made_from = (self.space, self.q, self.frame, self.target, self._turning)
+        kept = self.robots or rows.stop - rows.start == len(self.q)
+        motion = self.memory.motion(rows.start, there, made_from, make) if kept else make()
         columns = self.space.motion_columns.to(active.device)
         J = motion.derivative.index_select(0, columns[0, active])
         if not self.space.always_moving:

@@ -21,6 +21,24 @@ def of_robots(values: Values, robots: Int64[Tensor, " chosen"] | int) -> Values:
     return chosen
 
 
+def each_robot(values: Values, robots: int) -> list[Values]:
+    """Return the values of every robot without the axis of robots; see `of_robots`."""
+    result: list[Values] = _each(values, robots)
+    return result
+
+
+def _each(values: Any, robots: int) -> list[Any]:
+    if isinstance(values, Tensor):
+        return list(values.unbind(0))
+    if isinstance(values, tuple):
+        return list(zip(*(_each(item, robots) for item in values), strict=True))
+    if is_dataclass(values) and not isinstance(values, type):
+        names = [item.name for item in fields(values)]
+        items = zip(*(_each(getattr(values, name), robots) for name in names), strict=True)
+        return [replace(values, **dict(zip(names, item, strict=True))) for item in items]
+    return [values] * robots
+
+
 def with_robots(values: Values, robots: Int64[Tensor, " chosen"], others: Values) -> Values:
     """Return the values with those of some robots replaced by others, one behind the other."""
     changed: Values = _mapped(

@@ -1,7 +1,7 @@
 """The calibration problem with its initial guess, and points of the problem in the user's coordinates."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -298,34 +298,48 @@ class IdentifiedGeometry:
 
 def identified_geometry(setup: CalibrationSetup, point: Float64[Tensor, " parameters"]) -> IdentifiedGeometry:
     """Put the anchors back; as rotation vectors, small turns mean the same with and without them."""
-    space = setup.problem.space
-    dh, bases, tools = behind_anchors(setup, point)
-    unknowns = unknowns_in_frames(setup, point).values()
-    return IdentifiedGeometry(
-        robot=space.robot.with_geometry(dh=dh, base=bases[0], tool=tools[0]),
-        bases=dict(zip(space.frames, bases, strict=True)),
-        tools=dict(zip(space.targets, tools, strict=True)),
-        unknowns={
-            own.name: dict(zip(own.owners, values, strict=True))
-            for own, values in zip(space.unknowns, unknowns, strict=True)
-        },
-        setup=setup,
-        point=point,
-    )
+    return identified_geometries([setup], point[None])[0]
+
+
+def identified_geometries(
+    setups: Sequence[CalibrationSetup], points: Float64[Tensor, "robots parameters"]
+) -> list[IdentifiedGeometry]:
+    """Put the anchors back of robots of one type with the same frames and targets; see `identified_geometry`."""
+    space = setups[0].problem.space
+    blocks = zip(*behind_anchors(setups, points), strict=True)
+    return [
+        IdentifiedGeometry(
+            robot=space.robot.with_geometry(dh=dh, base=bases[0], tool=tools[0]),
+            bases=dict(zip(space.frames, bases, strict=True)),
+            tools=dict(zip(space.targets, tools, strict=True)),
+            unknowns={
+                own.name: dict(zip(own.owners, values, strict=True))
+                for own, values in zip(space.unknowns, unknowns_in_frames(setup, point).values(), strict=True)
+            },
+            setup=setup,
+            point=point,
+        )
+        for setup, point, (dh, bases, tools) in zip(setups, points, blocks, strict=True)
+    ]
 
 
 def behind_anchors(
-    setup: CalibrationSetup, point: Float64[Tensor, " parameters"]
-) -> tuple[Float64[np.ndarray, "rows 5"], Float64[np.ndarray, "frames 6"], Float64[np.ndarray, "targets 6"]]:
-    """Return rows, bases and tools at a point of the problem in the user's coordinates."""
-    anchors = setup.anchors
-    dh, bases, tools = (block.clone() for block in setup.problem.space.split(point.cpu()))
-    R_anchor = anchors.bases.cpu()[:, :3, :3]
-    turned = rotation_from_rpy(torch.cat([bases, tools])[:, 3:])
-    R = torch.cat([R_anchor @ turned[: len(bases)], turned[len(bases) :] @ anchors.tools.cpu()])
-    rpy = rpy_from_rotation(R)
-    bases[:, :3] = (R_anchor @ bases[:, :3, None])[..., 0] + anchors.bases.cpu()[:, :3, 3]
-    bases[:, 3:], tools[:, 3:] = rpy[: len(bases)], rpy[len(bases) :]
+    setups: Sequence[CalibrationSetup], points: Float64[Tensor, "robots parameters"]
+) -> tuple[
+    Float64[np.ndarray, "robots rows 5"],
+    Float64[np.ndarray, "robots frames 6"],
+    Float64[np.ndarray, "robots targets 6"],
+]:
+    """Return rows, bases and tools at points of problems with one space, in the user's coordinates."""
+    dh, bases, tools = (block.clone() for block in setups[0].problem.space.split(points.cpu()))
+    T_anchor, R_tool = (
+        torch.stack([getattr(setup.anchors, name) for setup in setups]).cpu() for name in ("bases", "tools")
+    )
+    R_anchor, frames = T_anchor[..., :3, :3], bases.shape[1]
+    turned = rotation_from_rpy(torch.cat([bases, tools], 1)[..., 3:])
+    rpy = rpy_from_rotation(torch.cat([R_anchor @ turned[:, :frames], turned[:, frames:] @ R_tool], 1))
+    bases[..., :3] = (R_anchor @ bases[..., :3, None])[..., 0] + T_anchor[..., :3, 3]
+    bases[..., 3:], tools[..., 3:] = rpy[:, :frames], rpy[:, frames:]
     return dh.numpy(), bases.numpy(), tools.numpy()
 
 
@@ -340,7 +354,7 @@ def coordinate_change(
     """
     space, anchors = setup.problem.space, setup.anchors
     _, bases, tools = space.split(point)
-    _, user_bases, user_tools = (torch.from_numpy(block) for block in behind_anchors(setup, point))
+    _, user_bases, user_tools = (torch.from_numpy(block[0]) for block in behind_anchors([setup], point[None]))
     change = torch.eye(len(point), dtype=point.dtype)
     for k, anchor in enumerate(anchors.bases.cpu()):
         first = space.of("base").start + 6 * k
