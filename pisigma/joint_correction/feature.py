@@ -63,6 +63,7 @@ class AbstractFeature(ABC):
         group_names: of the prior sizes.
         size: how large it is among those of its name that are tried in turn, such as its number of harmonics; 0
             where there is only one.
+        fastest: its highest harmonic of a joint's value.
     """
 
     name: ClassVar[str]
@@ -74,6 +75,7 @@ class AbstractFeature(ABC):
     group: Int64[Tensor, "dof columns"]
     group_names: tuple[str, ...]
     size: int = 0
+    fastest: int = 1
 
     @property
     def usual_sizes(self) -> tuple[float, ...]:

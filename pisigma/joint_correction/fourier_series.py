@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, no_type_check
 
 import numpy as np
 import torch
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float, Float64, Int64, Shaped
 from pydantic import Field
 from torch import Tensor
 
@@ -129,7 +129,7 @@ class FourierSeries(AbstractFeature):
         super().__init__(robot)
         if harmonics < 1:
             raise ValueError(f"a Fourier series needs at least one harmonic, got {harmonics}.")
-        self.harmonics = self.size = harmonics
+        self.harmonics = self.size = self.fastest = harmonics
         self._rate = torch.from_numpy(turning_rate(robot))
         k = torch.arange(1, harmonics + 1)
         band = torch.bucketize(k, torch.tensor(BAND_STARTS), right=True) - 1
@@ -155,10 +155,7 @@ class FourierSeries(AbstractFeature):
 
     def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
         """All sines, sin(q) first, and then all cosines."""
-        q = state.q
-        k = torch.arange(1, self.harmonics + 1, dtype=q.dtype, device=q.device)
-        angle = (q * self._rate.to(q))[..., None] * k
-        return torch.cat([angle.sin(), angle.cos()], -1)
+        return sines_cosines(state.q * self._rate.to(state.q), torch.arange(1, self.harmonics + 1))
 
     def columns_in(self, larger: AbstractFeature) -> Int64[Tensor, "dof columns"]:
         """The first sines and the first cosines."""
@@ -173,9 +170,42 @@ class FourierSeries(AbstractFeature):
 
     def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
         """See `AbstractFeature.add_onnx`."""
-        own = graph.reshape(graph.node("Mul", q, self._rate.numpy()), [len(weight), 1])
-        angle = graph.node("Mul", own, np.arange(1.0, self.harmonics + 1))
-        sines, cosines = np.split(weight, 2, axis=1)
-        sine = graph.total(graph.node("Mul", graph.node("Sin", angle), sines), 2)
-        cosine = graph.total(graph.node("Mul", graph.node("Cos", angle), cosines), 2)
-        return graph.node("Add", sine, cosine)
+        orders = np.arange(1.0, self.harmonics + 1)
+        return add_harmonics(graph, graph.node("Mul", q, self._rate.numpy()), orders, weight)
+
+
+def sines_cosines(
+    angle: Float[Tensor, "*batch dof"], orders: Shaped[Tensor, "*dof harmonics"]
+) -> Float[Tensor, "*batch dof columns"]:
+    """Sines of multiples of every joint's angle, and then the cosines.
+
+    Args:
+        angle: of the joints [rad].
+        orders: the multiples, of every joint or the same for all.
+    """
+    multiple = angle[..., None] * orders.to(angle)
+    return torch.cat([multiple.sin(), multiple.cos()], -1)
+
+
+def add_harmonics(
+    graph: OnnxGraph,
+    angle: str,
+    orders: Float64[np.ndarray, "*dof harmonics"],
+    weight: Float64[np.ndarray, "dof columns"],
+) -> str:
+    """Add the weighted sum of `sines_cosines` to an ONNX graph.
+
+    Args:
+        graph: to add to.
+        angle: `(batch, dof)` in the graph.
+        orders: see `sines_cosines`.
+        weight: of the columns.
+
+    Returns:
+        The sums `(batch, dof)` in the graph.
+    """
+    multiple = graph.node("Mul", graph.reshape(angle, [len(weight), 1]), orders)
+    sines, cosines = np.split(weight, 2, axis=1)
+    sine = graph.total(graph.node("Mul", graph.node("Sin", multiple), sines), 2)
+    cosine = graph.total(graph.node("Mul", graph.node("Cos", multiple), cosines), 2)
+    return graph.node("Add", sine, cosine)

@@ -8,6 +8,7 @@ from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.coupled_series import CoupledSeries
 from pisigma.joint_correction.feature import AbstractFeature, FeatureSection
 from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gear_lines import GearLines
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.shared_features import NominalPose, ScaledJoints, SinesCosines
 from pisigma.kernels.forms import register_compiled
@@ -78,6 +79,7 @@ for _feature in (
     ConditionFeatures,
     Backlash,
     CoupledSeries,
+    GearLines,
     ScaledJoints,
     SinesCosines,
     NominalPose,

@@ -17,7 +17,6 @@ from pisigma.errors import IdentificationError, ModelError
 from pisigma.files.model_files import model_hash
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.joint_correction.conditions import learned_conditions
-from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.judging.distillation_summary import (
     AbsoluteFigures,
     DistillationSummary,
@@ -266,11 +265,11 @@ def _limitations(
         "The errors that the parent itself has come on top."
     ]
     features = () if parent.hybrid is None else parent.hybrid.correction.features
-    harmonics = max((one.harmonics for one in features if isinstance(one, FourierSeries)), default=1)
+    harmonics = max((one.fastest for one in features), default=1)
     inputs = next(size.harmonics for size in sizes if size.kept)
     if harmonics > inputs:
         sentences.append(
-            f"Fast ripple: the parent corrects every joint by a series of up to {harmonics} cycles a turn, this "
+            f"Fast ripple: the parent corrects joints with up to {harmonics} cycles a turn, this "
             f"network sees {'sine and cosine' if inputs == 1 else f'up to {inputs} cycles'} of the joint's nominal "
             f"value and follows what is slower{_without_overtones(sizes)}."
         )

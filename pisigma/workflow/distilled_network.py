@@ -7,7 +7,6 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
-from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.judging.distillation_summary import SizeFigures
 from pisigma.judging.progress import Progress, stage
 from pisigma.model.calibrated_model import CalibratedModel
@@ -70,7 +69,7 @@ def sizes_for(model: CalibratedModel, poses: int) -> tuple[Size, ...]:
         IdentificationError: the poses are too few for any size.
     """
     learned = () if model.hybrid is None else model.hybrid.correction.features
-    rippled = any(isinstance(features, FourierSeries) and features.harmonics > 1 for features in learned)
+    rippled = any(features.fastest > 1 for features in learned)
     sizes = tuple(
         size
         for size in (RIPPLED if rippled else SMOOTH)

@@ -16,6 +16,7 @@ from pisigma.errors import MissingExtraError, ModelError
 from pisigma.export.onnx_model import FORWARD, INVERSE, export_onnx
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gear_lines import GearLines
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.shared_features import NominalPose, ScaledJoints, SinesCosines
 from pisigma.kinematics.forward import forward_kinematics
@@ -100,6 +101,7 @@ def test_angles_of_a_pose_at_their_ends(pitch):
 def features_of(robot: Robot, names: str):
     made = {
         "series": lambda: FourierSeries(robot, 110),
+        "lines": lambda: GearLines(robot, [(300, 2_020), *[()] * (robot.dof - 2), (101,)]),
         "gravity": lambda: GravityTorques(robot, (0.1, -0.3, -1.0)),
         "joints": lambda: ScaledJoints(robot),
         "sin_cos": lambda: SinesCosines(robot),
@@ -112,7 +114,9 @@ def features_of(robot: Robot, names: str):
 
 
 @pytest.mark.parametrize("rows", [0, 1, 1000])
-@pytest.mark.parametrize("names", ["series gravity", "gravity conditions", "joints", "sin_cos", "pose", ""])
+@pytest.mark.parametrize(
+    "names", ["series gravity", "gravity conditions", "lines joints", "sin_cos", "pose", ""]
+)
 @pytest.mark.parametrize("name", ["kiro3", "kiro4", "ur10"])
 def test_the_correction_of_a_hybrid_is_that_of_the_model(name, names, rows):
     robot = with_limits(Robot.load(name), 0, -2.0, 2.5)

@@ -11,6 +11,7 @@ from pisigma.joint_correction.backlash import Backlash
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.joint_correction.feature import scaled_joints, turning_rate, unit_inputs
 from pisigma.joint_correction.fourier_series import BAND_STARTS, FourierSeries
+from pisigma.joint_correction.gear_lines import GearLines
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.registry import FEATURES, feature_from, feature_section
@@ -53,6 +54,7 @@ def every_kind(robot: Robot) -> list:
         ConditionFeatures(robot, CONDITIONS, (3.0, 20.0), (1.5, 4.0), MEASURED, GRAVITY),
         *(FEATURES[name](robot) for name in SHARED),
         Backlash(robot),
+        GearLines(robot, [(40, 7), *[()] * (robot.dof - 2), (21,)]),
     ]
 
 
@@ -66,6 +68,22 @@ def test_the_series_is_sines_and_cosines_of_the_joints_own_value():
             assert_close(columns[:, joint, k - 1], torch.sin(k * q[:, joint]), atol=1e-14)
             assert_close(columns[:, joint, 2 + k], torch.cos(k * q[:, joint]), atol=1e-14)
     assert_close(columns[:, 2, 0], torch.sin(torch.pi / 0.4 * q[:, 2]), atol=1e-13)  # travel of 0.4 m
+
+
+def test_lines_are_sines_and_cosines_of_the_orders_of_each_joint():
+    robot = arm()
+    q = joints(robot, 7)
+    lines = GearLines(robot, [(2_020,), (), (3, 405), ()])
+    columns = lines.columns(JointState(q))
+    assert lines.used.tolist() == [[True, False] * 2, [False] * 4, [True] * 4, [False] * 4]
+    assert lines.fastest == 2_020
+    assert_close(columns[:, 0, 0], torch.sin(2_020 * q[:, 0]), atol=1e-12)
+    assert_close(columns[:, 0, 2], torch.cos(2_020 * q[:, 0]), atol=1e-12)
+    angle = torch.pi / 0.4 * q[:, 2]  # travel of 0.4 m
+    for place, values in enumerate(
+        ((3 * angle).sin(), (405 * angle).sin(), (3 * angle).cos(), (405 * angle).cos())
+    ):
+        assert_close(columns[:, 2, place], values, atol=1e-11)
 
 
 def test_a_slide_without_limits_turns_with_the_reach():
@@ -237,6 +255,9 @@ def test_only_scaled_joints_change_with_full_turns():
             "a lowest and a highest measured value about every mean",
         ),
         ({"name": "series", "harmonics": 0}, "greater than or equal to 1"),
+        ({"name": "lines", "orders": ((),) * 6}, "lines need orders for each of 6 joints"),
+        ({"name": "lines", "orders": ((256,),)}, "lines need orders for each of 6 joints"),
+        ({"name": "lines", "orders": ((0,), *((),) * 5)}, "greater than or equal to 1"),
         ({"name": "gravity", "gravity": (0.0, 0.0, 0.0)}, "needs a direction"),
         ({"name": "gravity", "gravity": (0.0, math.nan, 0.0)}, "finite number"),
     ],

@@ -12,6 +12,7 @@ from testing.models import no_type_checker
 from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.inverse.compiled_ik import CompiledIK
 from pisigma.joint_correction.fourier_series import FourierSeries
+from pisigma.joint_correction.gear_lines import GearLines
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.shared_features import ScaledJoints, SinesCosines
@@ -37,6 +38,7 @@ def draw_correction(robot: Robot, joints: bool, seed: int = 0) -> JointCorrectio
         FourierSeries(robot, 12),
         GravityTorques(robot, (0.1, -0.2, -1.0)),
         SinesCosines(robot),
+        GearLines(robot, [(), (30, 202), *[()] * (robot.dof - 3), (101,)]),
     ]
     features += [ScaledJoints(robot)] if joints else []
     correction = JointCorrection(robot, features, (2, 3))

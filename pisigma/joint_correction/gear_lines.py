@@ -1,0 +1,108 @@
+"""Single fast harmonics of a joint's own value: teeth of gears, poles of motors, lines of encoders."""
+
+import math
+from collections.abc import Sequence
+from typing import Annotated, Any, Literal, no_type_check
+
+import numpy as np
+import torch
+from jaxtyping import Float, Float64
+from pydantic import Field
+from torch import Tensor
+
+from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions, FeatureSection, turning_rate
+from pisigma.joint_correction.fourier_series import add_harmonics, sines_cosines
+from pisigma.kernels.forms import CompiledForm
+from pisigma.measurement.conditions import JointState
+from pisigma.onnx.graph import OnnxGraph
+from pisigma.robot.description import Robot
+
+
+class LinesSection(FeatureSection):
+    """Lines of every joint in the description of a model."""
+
+    name: Literal["lines"]
+    orders: tuple[tuple[Annotated[int, Field(ge=1, le=100_000)], ...], ...]
+
+
+@no_type_check
+def add_lines(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
+    """Add the lines: `correction.values` holds how many there are, and of each joint, order, and weights."""
+    for line in range(int(correction.values[first])):
+        start = first + 1 + 4 * line
+        j, order = int(correction.values[start]), correction.values[start + 1]
+        angle = order * correction.rate[j] * q[j]
+        sine, cosine = correction.values[start + 2], correction.values[start + 3]
+        memory.delta[j] += sine * math.sin(angle) + cosine * math.cos(angle)
+
+
+@no_type_check
+def add_lines_slope(arms: Any, correction: Any, first: int, memory: Any, q: Any) -> None:
+    """Add the slope of the lines by every joint's own value."""
+    for line in range(int(correction.values[first])):
+        start = first + 1 + 4 * line
+        j = int(correction.values[start])
+        rate = correction.values[start + 1] * correction.rate[j]
+        sine, cosine = correction.values[start + 2], correction.values[start + 3]
+        memory.slope[j] += rate * (sine * math.cos(rate * q[j]) - cosine * math.sin(rate * q[j]))
+
+
+class GearLines(AbstractFeature):
+    """sin(k q_j) and cos(k q_j) of the joint's own value for a few orders k, which may be in the thousands.
+
+    A strain wave gear of ratio N errs with 2N and 4N cycles a turn, the cogging of a motor of p pairs of poles behind
+    it with multiples of pN. Between these lines the spectrum is empty, and a series up to them would have to determine
+    thousands of weights. `hybrid.spectrum` says which orders stand out. All lines of a joint share a prior size.
+
+    Source: Tuttle and Seering, IEEE Transactions on Robotics and Automation 12(3), 1996, 368-374, of the transmission
+    errors of strain wave gears.
+
+    Attributes:
+        orders: of the lines of every joint [cycles a turn; of a prismatic joint in twice its travel].
+    """
+
+    name = "lines"
+    section = LinesSection
+    compiled = CompiledForm(add_lines, add_lines_slope)
+
+    def __init__(self, robot: Robot, orders: Sequence[Sequence[int]]) -> None:
+        """Take the lines of every joint.
+
+        Raises:
+            ValueError: there is none, or the number of joints is another one.
+        """
+        super().__init__(robot)
+        self.orders = tuple(tuple(of_joint) for of_joint in orders)
+        most = max((len(of_joint) for of_joint in self.orders), default=0)
+        if len(self.orders) != robot.dof or not most:
+            raise ValueError(f"lines need orders for each of {robot.dof} joints, got {self.orders}.")
+        self.fastest = max(map(max, filter(None, self.orders)))
+        self._rate = torch.from_numpy(turning_rate(robot))
+        padded = [[*of_joint, *[0] * (most - len(of_joint))] for of_joint in self.orders]
+        self._orders = torch.tensor(padded, dtype=torch.float64)
+        self.used = (self._orders > 0).repeat(1, 2)
+        self.group = torch.arange(robot.dof)[:, None].expand(self.used.shape)
+        self.group_names = tuple(f"lines, {row.name}" for row in robot.joints)
+
+    @classmethod
+    def candidates(cls, robot: Robot, options: FeatureOptions, state: JointState) -> tuple["GearLines", ...]:
+        """None: which orders stand out is seen in what a first model leaves (see `hybrid.spectrum`)."""
+        return ()
+
+    def columns(self, state: JointState) -> Float[Tensor, "*batch dof columns"]:
+        """The sines of all lines of a joint, and then the cosines."""
+        return sines_cosines(state.q * self._rate.to(state.q), self._orders)
+
+    def pack(self, weight: Float64[np.ndarray, "dof columns"]) -> Float64[np.ndarray, " values"]:
+        """How many lines there are, and of each its joint, its order, and the weights of sine and cosine."""
+        sines, cosines = np.split(weight, 2, axis=1)
+        lines = [
+            (j, order, sines[j, k], cosines[j, k])
+            for j, of_joint in enumerate(self.orders)
+            for k, order in enumerate(of_joint)
+        ]
+        return np.concatenate([[len(lines)], np.ravel(lines)])
+
+    def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
+        """See `AbstractFeature.add_onnx`."""
+        return add_harmonics(graph, graph.node("Mul", q, self._rate.numpy()), self._orders.numpy(), weight)
