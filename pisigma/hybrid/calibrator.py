@@ -18,8 +18,9 @@ from pisigma.hybrid.mini_batches import MANY_ROWS, MiniBatches, batch_checkpoint
 from pisigma.hybrid.refinement import Refined, linearised, refine, with_frames_of
 from pisigma.hybrid.regression import regression
 from pisigma.hybrid.result import HybridResult, LearnedPart
-from pisigma.hybrid.search import FIRST_MODEL_SIZES, Choice, Search
+from pisigma.hybrid.search import FIRST_MODEL_SIZES, Choice, Fitted, Search
 from pisigma.hybrid.sensor_values import sensor_values
+from pisigma.hybrid.spectrum import lines
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.initial_guess.initial_guess import chosen_rows
@@ -29,6 +30,8 @@ from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.setup import identified_geometry
 from pisigma.identification.result import SolvedCalibration
 from pisigma.joint_correction.feature import AbstractFeature, FeatureOptions
+from pisigma.joint_correction.fourier_series import USUAL_HARMONICS
+from pisigma.joint_correction.gear_lines import GearLines
 from pisigma.joint_correction.gravity_torques import Direction
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.registry import FEATURES, feature_named
@@ -63,7 +66,7 @@ class HybridCalibrator:
     """
 
     robot: Robot | GeometricCalibrator
-    features: tuple[str, ...] = ("gravity", "conditions", "backlash", "coupling", "series")
+    features: tuple[str, ...] = ("gravity", "conditions", "backlash", "coupling", "lines", "series")
     harmonics: tuple[int, ...] = (8, 24, 56, 110, 160)
     products: bool = True
     gravity: tuple[float, float, float] | None = None
@@ -198,7 +201,8 @@ class HybridCalibrator:
         pairs = zip(noise, values, strict=True)
         if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.certain):
             # The geometry leaves nothing to learn; features would fit the errors of the linearisation.
-            return Search(rows, noise, prior_scale, [], progress).best([], [])
+            search = Search(rows, noise, prior_scale, [], progress)
+            return search.added(search.geometry, [])
         robot = self.geometric.robot
         gravity = self.gravity or gravity_by_evidence(robot, rows, noise, prior_scale)
         directions = dict.fromkeys((gravity, self.gravity or USUAL))
@@ -210,10 +214,18 @@ class HybridCalibrator:
         products = [InputProducts(robot)] if self.products and robot.dof > 1 else []
         choices = []
         for growing, others in tried:
-            largest = [*others, *growing[-1:], *products]
-            search = Search(rows, noise, prior_scale, largest, progress)
-            choices.append(search.best(growing, others, products))
+            search = Search(rows, noise, prior_scale, [*others, *growing[-1:]], progress)
+            best = search.best(growing, others)
+            choices.append(search.added(best, [*products, *self._lines(rows, best)]))
         return max(choices, key=lambda choice: choice.best.posterior.log_evidence)
+
+    def _lines(self, rows: Rows, best: Fitted) -> list[GearLines]:
+        """The lines that stand out of what a fit leaves, beyond the harmonics of its series."""
+        if "lines" not in self.features:
+            return []
+        lowest = 1 + (max((one.size for one in best.design.features), default=0) or USUAL_HARMONICS)
+        orders = lines(best.design, rows, best.posterior, lowest)
+        return [GearLines(self.geometric.robot, orders)] if any(orders) else []
 
     def _features(
         self, solved: SolvedCalibration, problem: CalibrationProblem, gravity: Direction

@@ -119,7 +119,7 @@ class Search:
             rows: to fit to.
             noise: of the geometric calibration, per sensor.
             prior_scale: prior sizes of the geometric calibration.
-            largest: all features that may be tried, those that are tried in several sizes in the largest.
+            largest: all features that `best` may try, those that are tried in several sizes in the largest.
             progress: called with what is being tried.
         """
         self.noise, self.prior_scale = noise, prior_scale
@@ -162,8 +162,7 @@ class Search:
         self,
         growing: Sequence[AbstractFeature],
         others: Sequence[AbstractFeature],
-        last: Sequence[AbstractFeature] = (),
-    ) -> Choice:
+    ) -> Fitted:
         """Geometry alone, then other features, then ever larger ones, as long as it gets better.
 
         One after the other, features of few rows do not stand out from the noise that the others leave; so these are
@@ -172,7 +171,6 @@ class Search:
         Args:
             growing: of one name, ever larger.
             others: tried before them, and those that did not help once more after them.
-            last: tried when everything else is chosen.
         """
         best = self.geometry
         for chosen in others:
@@ -192,7 +190,16 @@ class Search:
             usual = tuple(max(scale, LEAST_USUAL_SCALE) for scale in self.prior_scale)
             for scale in dict.fromkeys((tuple(self.prior_scale), usual)):
                 best = self._from_usual_sizes(together, scale, best)
-        for chosen in last:
+        return best
+
+    def added(self, best: Fitted, features: Sequence[AbstractFeature]) -> Choice:
+        """The best so far, and features that are tried one after the other when everything else is chosen."""
+        if features:
+            largest = (*best.design.features, *features)
+            del self._regression  # one system of equations at a time: they are large
+            self._regression = regression(Design(self.rows.problem, largest), self.rows)
+            self._order = [one.name for one in largest]
+        for chosen in features:
             gain, sizes = self._regression.first_sizes(best.posterior, best.design, chosen)
             if gain > CLEARLY / 2:
                 best = self._tried([*best.design.features, chosen], best, sizes)

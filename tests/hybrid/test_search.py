@@ -62,7 +62,7 @@ def test_geometry_is_the_first_line_and_the_unit(series: LinearisedArm) -> None:
 def test_larger_series_are_tried_until_the_evidence_is_clearly_against_them(series: LinearisedArm) -> None:
     said: list[str] = []
     search = search_of(series, said)
-    best = search.best(SERIES, [SMALL], [PRODUCTS]).best
+    best = search.added(search.best(SERIES, [SMALL]), [PRODUCTS]).best
     assert best.name.endswith("series 4")
     kept = [line for line in search.trials if line.kept]
     assert kept[-1].name == best.name
@@ -73,7 +73,7 @@ def test_larger_series_are_tried_until_the_evidence_is_clearly_against_them(seri
 
 def test_products_come_last_and_stay_where_they_help(products: LinearisedArm) -> None:
     search = search_of(products)
-    best = search.best(SERIES[:1], [SMALL], [PRODUCTS]).best
+    best = search.added(search.best(SERIES[:1], [SMALL]), [PRODUCTS]).best
     assert best.name.endswith("products")
     assert search.trials[-1].kept
     assert search.trials[-1].left_out < 0.6
@@ -97,7 +97,7 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
     gravity = 2e-4 * (SMALL.columns(JointState(q)) * weights).sum(-1)
     gears = torch.stack([2e-4 * (k * q + torch.arange(6) * k).sin() for k in (1, 2, 6)]).sum(0)
     search = search_of(rows_of(gravity + gears, q))
-    best = search.best(SERIES, [SMALL]).best
+    best = search.best(SERIES, [SMALL])
     assert best.name == "gravity + series 6"
     assert best.largest_share == LARGEST_USUAL_SHARE
     *before, together, wider = search.trials
@@ -109,7 +109,7 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
 def test_what_does_not_help_leaves_the_geometry() -> None:
     q = drawn_joints(ROBOT, 80, 4)
     search = search_of(rows_of(torch.zeros_like(q), q))
-    best = search.best(SERIES, [SMALL], [PRODUCTS]).best
+    best = search.added(search.best(SERIES, [SMALL]), [PRODUCTS]).best
     assert best is search.geometry
     assert not any(line.kept for line in search.trials[1:])
 
@@ -129,8 +129,8 @@ def test_a_fit_starts_from_the_sizes_and_the_noise_of_another(series: Linearised
 def test_many_groups_are_held_out_in_few_folds(
     series: LinearisedArm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    every = search_of(series).best(SERIES[:2], [SMALL]).best
+    every = search_of(series).best(SERIES[:2], [SMALL])
     monkeypatch.setattr("pisigma.hybrid.search.FEW_GROUPS", 50)
     search = search_of(replace(series))
     assert [len(fold) for fold in search._folds] == [30] * 4
-    assert search.best(SERIES[:2], [SMALL]).best.name == every.name
+    assert search.best(SERIES[:2], [SMALL]).name == every.name
