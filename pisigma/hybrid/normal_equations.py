@@ -51,6 +51,7 @@ class NormalEquations(AbstractRegression):
         joints `X_j^T X_i = f_j^T diag(J_j^T J_i) f_i`: the components of a value are summed before the products.
         """
         size = design.unknowns
+        _return_free_memory(size)
         normal = design.problem.q.new_zeros((len(rows.values), size, size))
         descent, square = normal.new_zeros((len(rows.values), size)), []
         for k, sensor in enumerate(rows.values):
@@ -61,8 +62,7 @@ class NormalEquations(AbstractRegression):
         """See `AbstractRegression.select`."""
         if design.unknowns == self.design.unknowns and design.features == self.design.features:
             return self
-        if design.unknowns > MANY_UNKNOWNS:
-            _return_free_memory()
+        _return_free_memory(design.unknowns)
         columns = self.design.indices(design.features)
         normal = self.normal.new_empty((len(self.normal), len(columns), len(columns)))
         for whole, part in zip(self.normal, normal, strict=True):
@@ -84,23 +84,35 @@ class NormalEquations(AbstractRegression):
     def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]) -> LeftOut:
         """See `AbstractRegression.left_out`."""
         scale, factor, x = self._solved(posterior.prior, posterior.noise)
-        parts = []
-        for groups in folds:
-            X, r, number = [], [], []
-            test = self.rows.held_out(groups).values
-            for k, (sensor, sigma) in enumerate(zip(test, posterior.noise, strict=True)):
-                root = sensor.root[:, None] / sigma
-                columns = self.design.columns(sensor, slice(None))
-                r.append(((sensor.residual - columns @ x) * root).flatten())
-                X.append(columns.mul_(root[..., None]).flatten(0, 1))
-                number.append(torch.full(r[-1].shape, k, device=x.device))
-            whitened = torch.cat(X).mul_(scale)
-            del X, columns
-            S = torch.linalg.solve_triangular(factor, whitened.t(), upper=False)
-            M = -S.t() @ S
-            M.diagonal().add_(1.0)
-            parts.append(LeftOut.of(M, torch.cat(r), torch.cat(number), self.sensors))
-        return LeftOut.joined(parts)
+        return LeftOut.joined([self._left_out(groups, posterior.noise, scale, factor, x) for groups in folds])
+
+    def _left_out(
+        self,
+        groups: Int64[Tensor, " groups"],
+        noise: tuple[float, ...],
+        scale: Tensor,
+        factor: Tensor,
+        x: Tensor,
+    ) -> LeftOut:
+        """Leave out one fold, with what `_solved` gives."""
+        _return_free_memory(len(x))
+        test = self.rows.held_out(groups).values
+        whitened = x.new_empty((sum(sensor.residual.numel() for sensor in test), len(x)))
+        r, number, first = [], [], 0
+        for k, (sensor, sigma) in enumerate(zip(test, noise, strict=True)):
+            root = sensor.root[:, None] / sigma
+            columns = self.design.columns(sensor, slice(None))
+            r.append(((sensor.residual - columns @ x) * root).flatten())
+            number.append(torch.full(r[-1].shape, k, device=x.device))
+            block = whitened[first : first + len(r[-1])].view(columns.shape)
+            torch.mul(columns, root[..., None], out=block).mul_(scale)
+            first += len(r[-1])
+            del columns
+        S = torch.linalg.solve_triangular(factor, whitened.t(), upper=False)
+        del whitened, block
+        M = (S.t() @ S).neg_()
+        M.diagonal().add_(1.0)
+        return LeftOut.of(M, torch.cat(r), torch.cat(number), self.sensors)
 
     def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
         """Solve `(Σ_s N_s / noise_s² + precision) x = Σ_s b_s / noise_s²` by Cholesky with column scaling."""
@@ -156,7 +168,9 @@ class NormalEquations(AbstractRegression):
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
         """See `AbstractRegression.covariance_root`; with `N = L L^T` it is `L^-T`."""
         scale, factor, _ = self._solved(posterior.prior, posterior.noise)
+        _return_free_memory(len(factor))
         _invert_triangle(factor)
+        _return_free_memory(len(factor))
         return CovarianceRoot(factor.t().mul_(scale[:, None]))
 
     def _solved(self, prior: GaussianPrior, noise: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
@@ -238,7 +252,7 @@ def _invert_triangle(factor: Tensor) -> None:
     first, last = slice(0, size // 2), slice(size // 2, size)
     for block in (first, last):
         _invert_triangle(factor[block, block])
-    factor[last, first] = -(factor[last, last] @ factor[last, first]) @ factor[first, first]
+    factor[last, first] = (factor[last, last] @ factor[last, first]).neg_() @ factor[first, first]
 
 
 def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> float:
@@ -300,13 +314,13 @@ def _places(design: Design, dof: int, count: int) -> Int64[Tensor, " weights"]:
     return torch.cat(places)
 
 
-def _return_free_memory() -> None:
+def _return_free_memory(unknowns: int) -> None:
     """Give free memory back to the system where the C library offers that (`malloc_trim` of glibc); else do nothing.
 
     After fits of thousands of unknowns more than 100 MB are free in pieces between what is in use, and the matrices of
     the next fit would come on top of them.
     """
-    if sys.platform == "linux":
+    if unknowns > MANY_UNKNOWNS and sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
             trim(0)

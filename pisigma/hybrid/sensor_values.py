@@ -67,7 +67,7 @@ class SensorValues:
             rows: which of the rows of this sensor.
         """
         blocks = [weight_columns(joints[rows], chosen, state[row[rows]]) for row, joints in self.sides]
-        return torch.stack(blocks).sum(0)
+        return blocks[0] if len(blocks) == 1 else blocks[0] + blocks[1]
 
     @property
     def components(self) -> int:
