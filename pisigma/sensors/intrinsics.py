@@ -158,9 +158,14 @@ def cameras(measurements: Measurements) -> tuple[str, ...] | None:
 
 
 def boards(measurements: Measurements) -> tuple[str, ...] | None:
-    """Name per row the board of an image, which is its frame or its target, whichever is not the camera."""
+    """Name per row the board of an image, which is its frame or its target, whichever is not the camera.
+
+    Where a model names neither, it is called "board".
+    """
     cells = zip(texts_of(measurements, CAMERA_COLUMN), measurements.frame, measurements.target, strict=True)
-    names = tuple((target if frame == camera else frame) if camera else "" for camera, frame, target in cells)
+    names = tuple(
+        (target if frame == camera else frame) or "board" if camera else "" for camera, frame, target in cells
+    )
     return names if any(names) else None
 
 

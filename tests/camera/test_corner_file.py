@@ -16,6 +16,7 @@ from pisigma.camera.image_rows import Repeatability
 from pisigma.errors import MeasurementError
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
+from pisigma.sensors.intrinsics import boards, without_stated
 from pisigma.simulation.camera.images import ImageNoise
 
 EXACT = ImageNoise(0.0, Repeatability(0.0, 0.0))
@@ -56,6 +57,15 @@ def test_exact_corners_give_the_poses_of_the_target(tmp_path: Path, is_fixed: bo
     again = Measurements.read_csv(tmp_path / "rows.csv", cell.nominal)
     assert again.kinds == {"pose", "corner"}
     assert again.image == rows.image
+
+
+def test_a_model_that_names_neither_frame_nor_target_takes_images(tmp_path: Path) -> None:
+    cell = camera_cell(3, 0, EXACT)
+    (tmp_path / "corners.csv").write_text("\n".join(corner_lines(cell.images)) + "\n")
+    rows = read_rows(tmp_path / "corners.csv", cell.nominal, camera_files(tmp_path))
+    renamed = replace(rows, frame=("",) * 3, target=("",) * 3)
+    assert boards(rows) == boards(renamed) == ("board",) * 3
+    assert without_stated(renamed, {}).rows == 3
 
 
 def test_several_cameras_and_other_sensors_in_one_file(tmp_path: Path) -> None:

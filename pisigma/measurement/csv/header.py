@@ -80,7 +80,7 @@ def read_header(table: Table, robot: Robot | None) -> Layout:
     if set(CORNERS) <= set(table.header):
         raise MeasurementError(
             f"{place}: these are corners of a board in images; state what they mean with --camera camera.yaml --board "
-            "board.yaml, which the commands have that read such files."
+            "board.yaml, which pisigma calibrate, recalibrate, evaluate, verify, monitor, compare and report read."
         )
     columns = tuple(_find(place, name, number) for number, name in enumerate(table.header, start=1))
     index: dict[str, int] = {}
