@@ -6,11 +6,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from pisigma.camera.corner_file import CameraFiles
 from pisigma.errors import FleetError, nearest_choice
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.rules import is_date
 
-COLUMNS = ("id", "robot", "data", "date", "model", "options")
+COLUMNS = ("id", "robot", "data", "date", "model", "options", "camera", "board")
 """Of a manifest; the first three are needed."""
 ROBOT_FILES = ("robot.yaml", "robot.yml", "robot.urdf")
 """The description of a robot in its folder."""
@@ -43,6 +44,7 @@ class Member:
         sessions: what was measured, by date.
         model: folder of the model that the first session meets; None where the first session is calibrated.
         options: names and texts of settings that only this robot has.
+        cameras: what the pixels mean where its files hold corners of boards in images.
     """
 
     id: str
@@ -50,14 +52,16 @@ class Member:
     sessions: tuple[SessionFile, ...]
     model: Path | None = None
     options: tuple[tuple[str, str], ...] = ()
+    cameras: CameraFiles | None = None
 
 
 def read_fleet(source: str | os.PathLike[str], robot: str | None = None) -> tuple[Member, ...]:
     """Read which robots there are.
 
     A manifest has the columns `id`, `robot` and `data`, and may have `date`, `model` and `options` (such as
-    `free=joint_offsets; model=geometric`); several rows of one id are several sessions. Its paths are relative to its
-    own folder. In a folder, every folder in it is a robot with its measurements (`*.csv`) and its description
+    `free=joint_offsets; model=geometric`), and `camera` and `board` where the data are corners in images (`a.yaml;
+    b.yaml` of several); several rows of one id are several sessions. Its paths are relative to its own folder. In a
+    folder, every folder in it is a robot with its measurements (`*.csv`) and its description
     (`robot.yaml` or `robot.urdf`), and every `*.csv` in it a robot that was measured once.
 
     Args:
@@ -121,9 +125,7 @@ def _member(path: Path, name: str, rows: Sequence[tuple[int, dict[str, str]]], r
         if date and not is_date(date):
             raise FleetError(f"{path}, line {line}: a date such as 2026-11-22 was wanted, got '{date}'.")
         sessions.append(_session(path.parent / data, date))
-    stated = {
-        key: {fields.get(key, "") for _, fields in rows} - {""} for key in ("robot", "model", "options")
-    }
+    stated = {key: {fields.get(key, "") for _, fields in rows} - {""} for key in ("robot", *COLUMNS[4:])}
     for key, values in stated.items():
         if len(values) > 1:
             raise FleetError(
@@ -139,7 +141,17 @@ def _member(path: Path, name: str, rows: Sequence[tuple[int, dict[str, str]]], r
         sessions=_ordered(sessions, f"{path}, line {first}: robot '{name}'"),
         model=next((path.parent / model for model in stated["model"]), None),
         options=_options(next(iter(stated["options"]), ""), f"{path}, line {first}"),
+        cameras=_cameras(path, first, *(next(iter(stated[key]), "") for key in ("camera", "board"))),
     )
+
+
+def _cameras(path: Path, line: int, *stated: str) -> CameraFiles | None:
+    """Cameras and boards of a robot, from the files of each with `;` between them."""
+    files = [[str(path.parent / file.strip()) for file in text.split(";") if file.strip()] for text in stated]
+    cameras, boards = map(tuple, files)
+    if bool(cameras) != bool(boards):
+        raise FleetError(f"{path}, line {line}: the columns 'camera' and 'board' belong together; fill both.")
+    return CameraFiles(cameras, boards) if cameras else None
 
 
 def _options(text: str, where: str) -> tuple[tuple[str, str], ...]:

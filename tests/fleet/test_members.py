@@ -4,6 +4,7 @@ import pytest
 
 from pisigma.errors import FleetError
 from pisigma.fleet.members import read_fleet
+from pisigma.workflow.fleet.one_robot import FleetSettings
 
 
 def write(folder, text):
@@ -26,6 +27,20 @@ def test_rows_of_one_id_are_sessions_of_one_robot(tmp_path):
     assert a.sessions[0].data == tmp_path / "data" / "a_20260301.csv"
     assert [one.name for one in b.sessions] == ["2026-04-01", "2026-05-01"]
     assert b.options == (("free", "joint_offsets"), ("model", "geometric"))
+
+
+def test_cameras_and_boards_of_corners(tmp_path):
+    header = "id,robot,data,camera,board\n"
+    a, b = read_fleet(
+        write(tmp_path, f"{header}a,ur5,a.csv,wrist.yaml; beside.yaml,board.yaml\nb,ur5,b.csv,,\n")
+    )
+    assert a.cameras is not None
+    wrist, beside, board = (str(tmp_path / name) for name in ("wrist.yaml", "beside.yaml", "board.yaml"))
+    assert a.cameras.files == (wrist, beside, board)
+    assert FleetSettings().of(a).cameras == a.cameras
+    assert b.cameras is None
+    with pytest.raises(FleetError, match="line 2: the columns 'camera' and 'board' belong together"):
+        read_fleet(write(tmp_path, f"{header}a,ur5,a.csv,wrist.yaml,\n"))
 
 
 def test_a_tree_of_folders_is_a_fleet(tmp_path):

@@ -22,7 +22,8 @@ Source = Annotated[
     Path,
     typer.Argument(
         metavar="FLEET",
-        help="Manifest (CSV) with the columns id, robot and data, or a folder with one folder per robot.",
+        help="Manifest (CSV) with the columns id, robot and data (and camera and board, where data are corners of "
+        "images), or a folder with one folder per robot.",
     ),
 ]
 Out = Annotated[Path, typer.Option(help="Folder of the fleet; one that is there already is gone on with.")]

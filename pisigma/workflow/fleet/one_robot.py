@@ -7,6 +7,7 @@ from typing import Literal, get_args
 
 from pydantic import TypeAdapter, ValidationError
 
+from pisigma.camera.corner_file import CameraFiles
 from pisigma.errors import FleetError, OutputError, PisigmaError, nearest_choice
 from pisigma.fleet.members import Member, SessionFile
 from pisigma.fleet.record import REFUSED, ParameterValue, RobotRecord, SessionRecord, write_record
@@ -16,7 +17,7 @@ from pisigma.robot.description import Robot
 from pisigma.sensors.sensor import SHOWN_UNITS
 from pisigma.workflow.calibrate import Calibration, CalibrationSettings, calibrate
 from pisigma.workflow.monitor import MonitorSettings, monitor
-from pisigma.workflow.recalibrate import Recalibration, recalibrate
+from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate
 
 Task = Literal["calibrate", "recalibrate", "monitor"]
 EngineName = Literal["processes", "ray"]
@@ -77,6 +78,7 @@ class FleetSettings:
                 )
         stated = {name: getattr(self.calibration, name) for name in self.calibration.__dataclass_fields__}
         stated |= {name: _free(value) if name == "free" else value for name, value in member.options}
+        stated["cameras"] = member.cameras
         stated |= {} if self.validate else {"folds": 0, "hold_out": None, "repeats": None}
         try:
             return TypeAdapter(CalibrationSettings).validate_python(stated)
@@ -130,22 +132,24 @@ def _worked_out(
     Raises:
         OutputError: a model cannot be written.
     """
-    parent = member.model
+    parent, again = member.model, RecalibrationSettings(cameras=member.cameras)
     result: Calibration | Recalibration
     for number, session in enumerate(member.sessions):
         folder = out / "models" / member.id / session.name
         try:
             if settings.prior is not None and (parent is None or settings.task == "calibrate"):
-                recalibration = recalibrate(settings.prior, session.data, drawn=Robot.load(member.robot))
+                recalibration = recalibrate(
+                    settings.prior, session.data, again, drawn=Robot.load(member.robot)
+                )
                 record, result = _recalibrated(recalibration, session), recalibration
             elif parent is None or settings.task == "calibrate":
                 calibration = replace(calibrate(member.robot, session.data, plan), figures=settings.validate)
                 record, result = _calibrated(calibration, session), calibration
             elif settings.task == "recalibrate":
-                recalibration = recalibrate(parent, session.data)
+                recalibration = recalibrate(parent, session.data, again)
                 record, result = _recalibrated(recalibration, session), recalibration
             else:
-                yield from _monitored(parent, member.sessions[number:])
+                yield from _monitored(parent, member.sessions[number:], member.cameras)
                 return
         except OutputError:
             raise
@@ -219,11 +223,13 @@ def _parameters_of(model: CalibratedModel) -> tuple[ParameterValue, ...]:
     return tuple(parameters)
 
 
-def _monitored(model: Path, sessions: tuple[SessionFile, ...]) -> Iterator[SessionRecord]:
+def _monitored(
+    model: Path, sessions: tuple[SessionFile, ...], cameras: CameraFiles | None
+) -> Iterator[SessionRecord]:
     """What the sessions say of the robot of a model, as one chart of all of them."""
     files = [one.data for one in sessions]
     dates = tuple(one.date for one in sessions) if all(one.date for one in sessions) else ()
-    monitoring = monitor(model, files, MonitorSettings(dates=dates, history=False))
+    monitoring = monitor(model, files, MonitorSettings(dates=dates, history=False, cameras=cameras))
     for session, judged in zip(sessions, monitoring.sessions, strict=True):
         yield SessionRecord(
             session=session.name,

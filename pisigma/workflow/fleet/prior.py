@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from pisigma.camera.corner_file import read_rows
 from pisigma.errors import FleetError
 from pisigma.fleet.members import Member, read_fleet
 from pisigma.fleet.prior import FleetPrior, fleet_prior
 from pisigma.fleet.prior_summary import FleetPriorSummary, summarise_prior
 from pisigma.judging.progress import Progress
-from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.fleet_prior_card import write_fleet_prior_card
 from pisigma.robot.description import Robot
@@ -61,7 +61,7 @@ def estimate_fleet_prior(
     members = read_fleet(source, robot)
     drawn = _common_robot(members)
     progress(f"{len(members)} robots")
-    rows = [Measurements.read_csv(member.sessions[0].data, drawn).split_sets()[0] for member in members]
+    rows = [read_rows(one.sessions[0].data, drawn, one.cameras).split_sets()[0] for one in members]
     name = Path(source).resolve().stem
     prior = fleet_prior(name, drawn, rows)
     summary = summarise_prior(prior, [member.id for member in members])

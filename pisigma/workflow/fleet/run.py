@@ -149,6 +149,7 @@ def _prepare(folder: Path, source: Path, members: tuple[Member, ...]) -> None:
     """
     inputs = [source, *(one.data for member in members for one in member.sessions)]
     inputs += [member.model for member in members if member.model is not None]
+    inputs += [Path(file) for member in members if member.cameras for file in member.cameras.files]
     mark = folder / MARK
     try:
         check_apart(folder, inputs)
@@ -187,6 +188,7 @@ def _key(member: Member, settings: FleetSettings, plan: CalibrationSettings) -> 
         "plan": repr(plan),
         "robot": _hash_of(drawn) if drawn.is_file() else member.robot,
         "model": None if model is None else model_hash(model) if is_model(model) else str(model),
+        "cameras": [_hash_of(Path(file)) for file in (member.cameras.files if member.cameras else ())],
         "sessions": [(one.name, one.date, one.data.name, _hash_of(one.data)) for one in member.sessions],
     }
     return hashlib.sha256(json.dumps(stated, sort_keys=True).encode()).hexdigest()
