@@ -31,6 +31,8 @@ FEWEST_ROBOTS = 5
 """Below, scatter between robots cannot be told from what each is uncertain by."""
 LINEARISATIONS = 2
 EM_STEPS = 60
+SEARCH_STEPS = 25
+"""So few do while odd robots are searched for."""
 CLASS_ROBOTS = 0.02
 """The class of the robot counts like so many robots in the variances of the fleet: hardly, as robots of one type are
 more alike, and only so much that what no rows determine stays as uncertain as in the class."""
@@ -277,7 +279,7 @@ def without_odd(
     population = start
     for _ in range(CONCENTRATIONS):
         chosen = [evidence[number] for number in alike]
-        population = expectation_maximisation(chosen, start, usual, SEARCH_CLASS_ROBOTS)
+        population = expectation_maximisation(chosen, start, usual, SEARCH_CLASS_ROBOTS, SEARCH_STEPS)
         surprises = [population.surprise(one) for one in evidence]
         ratios = sorted(square / max(count, 1) for square, count in surprises)
         unit = max(ratios[len(ratios) // 2], 1.0)
@@ -311,6 +313,7 @@ def expectation_maximisation(
     start: Population,
     usual: Float64[Tensor, " unknowns"],
     class_robots: float = CLASS_ROBOTS,
+    steps: int = EM_STEPS,
 ) -> Population:
     """Mean and covariance of the robots' errors.
 
@@ -319,9 +322,10 @@ def expectation_maximisation(
         start: to begin with.
         usual: variances of the class of the robots.
         class_robots: so many robots the class counts like.
+        steps: how many.
     """
     population = start
-    for _ in range(EM_STEPS):
+    for _ in range(steps):
         population = _maximised(evidence, population, class_robots * usual, class_robots + len(evidence))
     return population
 
@@ -341,16 +345,19 @@ def _maximised(
     """
     size, count = now.geometric, len(evidence)
     precision = torch.linalg.inv(now.covariance)
-    inverses = torch.linalg.inv(torch.stack([one.normal for one in evidence]) + precision)
-    right = torch.stack([one.descent for one in evidence]) + precision @ now.mean
-    x = torch.einsum("rij,rj->ri", inverses, right)
-    off = x - x.mean(0)
-    scatter = inverses.sum(0) + off.t() @ off
+    at_mean, x, scatter = precision @ now.mean, [], torch.zeros_like(precision)
+    for one in evidence:  # one by one: all at once need hundreds of megabytes for hundreds of robots
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky(one.normal + precision))
+        x.append(inverse @ (one.descent + at_mean))
+        scatter += inverse
+    mean = torch.stack(x).mean(0)
+    off = torch.stack(x) - mean
+    scatter += off.t() @ off
     diagonal = (of_class + scatter.diagonal()) / robots
     covariance = diagonal.diag()
     covariance[:size, :size] = count / (count + size) * scatter[:size, :size] / robots
     covariance.diagonal().copy_(diagonal)
-    return Population(x.mean(0), covariance, size)
+    return Population(mean, covariance, size)
 
 
 def _medians(noises: Sequence[Mapping[str, float]]) -> dict[str, float]:
