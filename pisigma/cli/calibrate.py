@@ -104,8 +104,8 @@ Tip = Annotated[
 Prior = Annotated[
     Path | None,
     typer.Option(
-        help="Model folder of `pisigma fleet prior` to begin with; left-out rows decide whether it helps. Then only "
-        "--out, --overwrite, --accept-implausible, --json and cameras count.",
+        help="Model folder of `pisigma fleet prior` to begin with; left-out rows decide whether it helps. "
+        "Options that say how to calibrate or to validate do not go with it.",
         autocompletion=complete_model,
     ),
 ]
@@ -156,6 +156,7 @@ def calibrate(
     check_folder(out, overwrite, inputs=(robot_file(robot), prior, *data, *stated))
     settings, nominal = _settings(context.params, cameras), Robot.load(robot, base, tip)
     if prior is not None:
+        settings.check_unused()
         return recalibrate_into(
             context, prior, data, out, accept_implausible, overwrite, as_json, cameras, drawn=nominal
         )

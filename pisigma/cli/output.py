@@ -135,7 +135,9 @@ def command_line(context: typer.Context, files: Collection[str] = ("out",)) -> s
         context: of the command.
         files: names of the options whose values are files or folders; arguments may all be.
     """
-    words = ["pisigma", str(context.info_name)]
+    above: Any = context.parent
+    groups = [] if above is None or above.parent is None else [str(above.info_name)]
+    words = ["pisigma", *groups, str(context.info_name)]
     for parameter in context.command.params:
         value = context.params.get(str(parameter.name))
         if parameter.param_type_name == "argument":

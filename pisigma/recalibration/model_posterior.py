@@ -22,6 +22,20 @@ FLEET_PRIOR = "fleet_prior"
 """Kind of a model of what robots of one type have in common; each robot stands elsewhere."""
 
 
+def check_fleet_prior(model: CalibratedModel) -> None:
+    """Refuse a model that is not what robots of one type have in common.
+
+    Raises:
+        ModelError: it is of another kind.
+    """
+    if model.kind != FLEET_PRIOR:
+        raise ModelError(
+            f"model '{model.name}' is a model of one robot ({model.kind.replace('_', ' ')}), while what the robots of "
+            "a fleet have in common was wanted as the prior; estimate that with `pisigma fleet prior FLEET --out DIR`, "
+            "or add rows of the same robot with `pisigma recalibrate MODEL ROWS --out DIR`."
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class ModelPosterior:
     """Normal distribution of geometry, bases, tools, sensors' unknowns and weights of the joint correction.

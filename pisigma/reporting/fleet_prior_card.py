@@ -7,6 +7,11 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.rendering import write_card
 from pisigma.reporting.tables import Table
 
+UNDETERMINED = (
+    "A parameter that the rows do not determine, such as where the first axis stands in the base, has mean 0 and the "
+    "usual deviation of the robot's class."
+)
+
 
 def write_fleet_prior_card(model: CalibratedModel, summary: FleetPriorSummary, folder: Path) -> None:
     """Write the card into a model folder.
@@ -22,13 +27,14 @@ def write_fleet_prior_card(model: CalibratedModel, summary: FleetPriorSummary, f
         model=model,
         summary=summary,
         parameters=common_table(summary),
+        undetermined=UNDETERMINED,
         spectrum=spectrum_table(summary),
     )
 
 
 def common_table(summary: FleetPriorSummary) -> Table:
     """Mean and standard deviation between robots of every geometric parameter."""
-    rows = ((one.name, one.unit, f"{one.mean:.4f}", f"{one.deviation:.4f}") for one in summary.parameters)
+    rows = ((one.name, one.unit, f"{one.mean:z.4f}", f"{one.deviation:.4f}") for one in summary.parameters)
     return Table(("parameter", "unit", "mean", "between robots"), tuple(rows))
 
 

@@ -132,6 +132,21 @@ class CalibrationSettings:
                 f"and {prior[1] * 1e3:g} mrad."
             )
 
+    def check_unused(self) -> None:
+        """Refuse what says how to calibrate or to validate: with the prior of a fleet it would not count.
+
+        Raises:
+            IdentificationError: something is stated besides cameras and jobs.
+        """
+        usual = CalibrationSettings(cameras=self.cameras, jobs=self.jobs)
+        stated = [name for name in self.__dataclass_fields__ if getattr(self, name) != getattr(usual, name)]
+        if stated:
+            raise IdentificationError(
+                f"{', '.join(name.replace('_', ' ') for name in stated)}: a calibration that begins with the prior of "
+                "a fleet is a hybrid of all its parameters, and every row is left out in turn; leave this out, or "
+                "the prior."
+            )
+
     def calibrator(self, robot: Robot, sockets: Iterable[str] = ()) -> Calibrator:
         """Give the calibrator of a robot.
 

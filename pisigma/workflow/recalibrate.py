@@ -32,7 +32,7 @@ from pisigma.model.stated_conditions import condition_warnings
 from pisigma.recalibration.adaptation import Adaptation, adapt
 from pisigma.recalibration.candidates import FAR_BETTER, Gate, gate
 from pisigma.recalibration.elsewhere import owners_elsewhere
-from pisigma.recalibration.model_posterior import FLEET_PRIOR, ModelPosterior
+from pisigma.recalibration.model_posterior import FLEET_PRIOR, ModelPosterior, check_fleet_prior
 from pisigma.recalibration.moved import Moved, moved_by, what_moved
 from pisigma.recalibration.recalibrated_model import KIND, recalibrated_model
 from pisigma.recalibration.recalibration_problem import Owner, owners_in, recalibration_problem
@@ -134,10 +134,10 @@ def recalibrate(
         data: new rows of any sensors, or CSV files of them; those of the set "test" are left out.
         settings: see `RecalibrationSettings`.
         progress: called with what is being done.
-        drawn: the robot that the model has to be of; None for any.
+        drawn: the robot whose fleet the model has to be the prior of; None for any model.
 
     Raises:
-        ModelError: the folder holds no model, it is of another robot, or holds no posterior.
+        ModelError: the folder holds no model, it is of another robot or no fleet prior, or holds no posterior.
         MeasurementError: the data cannot be read.
         IdentificationError: the rows do not determine where something stands.
         PoseError: the joint values do not fit the robot.
@@ -146,6 +146,8 @@ def recalibrate(
     source = model_or_folder(model)
     parent = source if isinstance(source, CalibratedModel) else load_model(source)
     sha256 = "" if isinstance(source, CalibratedModel) else model_hash(source)
+    if drawn is not None:
+        check_fleet_prior(parent)
     posterior = ModelPosterior.of(parent)
     if drawn is not None and not np.array_equal(drawn.dh, posterior.space.robot.dh):
         raise ModelError(
@@ -330,7 +332,7 @@ def _warnings(
     """What to heed, a sentence each; `noise` is that of the calibration, per sensor."""
     warnings = list(condition_warnings(model, rows))
     error, usual = judged.rms[judged.kept], math.sqrt(3) * noise.get("position", math.inf)
-    if error is not None and error > SUSPICIOUS * usual:
+    if error is not None and error > SUSPICIOUS * usual and model.kind != FLEET_PRIOR:
         warnings.append(
             f"Left-out rows are missed by {error * 1e3:.3g} mm, while single positions scattered by "
             f"{usual * 1e3:.2g} mm when the model was made, so that what is said to have moved may be wrong: rows "

@@ -82,10 +82,10 @@ def recalibrate_into(
         as_json: print one JSON object.
         cameras: what the pixels mean where files of rows hold corners.
         moved: what is stated to stand elsewhere.
-        drawn: the robot that the model has to be of; None for any.
+        drawn: the robot whose fleet the model has to be the prior of; None for any model.
 
     Raises:
-        ModelError: the model is of another robot.
+        ModelError: the model is of another robot, or no fleet prior.
     """
     from pisigma.workflow import recalibrate as workflow
 

@@ -21,6 +21,8 @@ from pisigma.fleet.members import Member, read_fleet
 from pisigma.fleet.record import MARK, RobotRecord, expect_robots, read_record, read_records, record_path
 from pisigma.fleet.results_table import RESULTS, write_results
 from pisigma.judging.progress import Progress
+from pisigma.model.folder.model_folder import load_model
+from pisigma.recalibration.model_posterior import check_fleet_prior
 from pisigma.workflow.calibrate import CalibrationSettings
 from pisigma.workflow.fleet.one_robot import FleetSettings, work_out
 
@@ -86,6 +88,7 @@ def run_fleet(
     Raises:
         FleetError: the fleet or a robot's options cannot be used.
         MeasurementError: the manifest is no CSV file.
+        ModelError: the prior is no model of `pisigma fleet prior`.
         OutputError: the folder is not that of a fleet, or cannot be written to.
         ImportError: the extra of the engine or of the table is not installed.
     """
@@ -94,8 +97,10 @@ def run_fleet(
     members = read_fleet(source, robot)
     plans = {member.id: settings.of(member) for member in members}
     folder = Path(out)
-    _prepare(folder, Path(source), members)
+    if settings.prior is not None:
+        check_fleet_prior(load_model(settings.prior))
     keys = {member.id: _key(member, settings, plans[member.id]) for member in members}
+    _prepare(folder, Path(source), members)
     records = {
         member.id: record
         for member in members

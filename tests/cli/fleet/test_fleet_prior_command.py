@@ -4,8 +4,11 @@ import json
 
 import pytest
 from testing.fleet_robots import DRAWN, rows_of
+from testing.models import REPOSITORY
 
 pytest.importorskip("pyarrow", reason="Parquet comes with the extra fleet")
+
+MODEL = REPOSITORY / "models" / "kiro3"
 
 
 @pytest.fixture(scope="module")
@@ -28,6 +31,7 @@ def test_what_the_robots_have_in_common_is_printed_and_kept(prior):
     card = (folder / "prior" / "README.md").read_text(encoding="utf-8")
     assert "What 5 robots of the type rb5" in card
     assert "| a_2 | mm |" in card
+    assert "Made by `pisigma fleet prior in " in card
 
 
 def test_a_calibration_of_ten_poses_begins_with_it(prior, run):
@@ -43,9 +47,20 @@ def test_a_calibration_of_ten_poses_begins_with_it(prior, run):
     assert (folder / "m" / "model.yaml").is_file()
 
 
-def test_the_prior_of_another_robot_is_refused(prior, run):
+def test_what_does_not_go_with_a_prior_is_refused(prior, run, tmp_path):
     folder, _ = prior
-    done = run("calibrate", "ur5", folder / "few.csv", "--prior", folder / "prior", "--out", folder / "x")
-    assert done.exit_code == 2
-    assert "is of robot 'rb5' and not of 'ur5'" in " ".join(done.output.split())
-    assert not (folder / "x").exists()
+    one = "--prior", folder / "prior"
+    for command, complaint in (
+        (("calibrate", "ur5", folder / "few.csv", *one), "is of robot 'rb5' and not of 'ur5'"),
+        (
+            ("calibrate", "rb5", folder / "few.csv", *one, "--model", "geometric"),
+            "model: a calibration that begins",
+        ),
+        (("calibrate", "rb5", folder / "few.csv", "--prior", MODEL), "is a model of one robot"),
+        (("fleet", "run", folder / "in", "--robot", "rb5", "--prior", MODEL), "is a model of one robot"),
+        (("fleet", "run", folder / "in", "--robot", "rb5", *one, "--model", "geometric"), "leave this out"),
+    ):
+        done = run(*command, "--out", tmp_path / "x")
+        assert done.exit_code == 2, done.output
+        assert complaint in " ".join(done.output.split())
+        assert not (tmp_path / "x").exists()
