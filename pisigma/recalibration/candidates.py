@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Set
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Literal, get_args
 
@@ -19,6 +19,7 @@ from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.measurement.splits import k_folds
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.recalibration.adaptation import Adaptation, adapt
+from pisigma.recalibration.model_posterior import FLEET_PRIOR
 from pisigma.recalibration.recalibration_problem import Owner, recalibration_problem
 
 Kept = Literal["recalibrated", "old", "scratch"]
@@ -27,6 +28,11 @@ NAMES: dict[Kept, str] = {
     "old": "The old model with the frames of the new rows",
     "scratch": "A calibration from scratch",
 }
+OF_FLEET: dict[Kept, str] = NAMES | {
+    "recalibrated": "The calibration that begins with the fleet",
+    "old": "The mean robot of the fleet with the base and the tool of the rows",
+}
+"""The same where the model is the prior of a fleet."""
 FOLDS = 5
 ABOUT_AS_GOOD = 1.05
 """The recalibrated model is kept where left-out errors of others are smaller by no more than this factor."""
@@ -44,11 +50,13 @@ class Gate:
         kept: recalibrated, unless another one is better by more than 5 % and more than chance.
         rms: by candidate the root mean square of the errors of left-out rows [m]; None where the rows are too few.
         rows: number of rows that count.
+        names: of the candidates, as sentences begin with them.
     """
 
     kept: Kept
     rms: Mapping[Kept, float | None]
     rows: int
+    names: Mapping[Kept, str] = field(default_factory=lambda: NAMES)
 
     @property
     def with_least_error(self) -> "Gate":
@@ -60,18 +68,18 @@ class Gate:
     def sentence(self) -> str:
         """Which candidate won, and by how much."""
         if not self.rows:
-            return f"{NAMES[self.kept]} is kept: the rows are too few to leave any out."
+            return f"{self.names[self.kept]} is kept: the rows are too few to leave any out."
         sizes = {name: size * 1e3 for name, size in self.rms.items() if size is not None}
         if self.kept not in sizes:
-            return f"{NAMES[self.kept]} is kept: the rows are too few to predict left-out ones with it."
+            return f"{self.names[self.kept]} is kept: the rows are too few to predict left-out ones with it."
         others = " and ".join(
-            f"{size:.3g} mm under {NAMES[name][:1].lower()}{NAMES[name][1:]}"
+            f"{size:.3g} mm under {self.names[name][:1].lower()}{self.names[name][1:]}"
             for name, size in sizes.items()
             if name != self.kept
         )
         return (
-            f"{NAMES[self.kept]} is kept: the RMS error of {self.rows} left-out rows is {sizes[self.kept]:.3g} mm"
-            f"{f', against {others}' if others else ''}."
+            f"{self.names[self.kept]} is kept: the RMS error of {self.rows} left-out rows is "
+            f"{sizes[self.kept]:.3g} mm{f', against {others}' if others else ''}."
         )
 
 
@@ -112,7 +120,7 @@ def gate(
                 errors[name][test] = errors_under(candidate(), rows.select(test)).position
             except IdentificationError:  # so few rows do not determine it
                 errors[name][test] = torch.inf
-    return _decided(errors)
+    return replace(_decided(errors), names=OF_FLEET if model.kind == FLEET_PRIOR else NAMES)
 
 
 def _decided(errors: Mapping[Kept, Float64[Tensor, " rows"]]) -> Gate:

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.recalibration.model_posterior import FLEET_PRIOR
 from pisigma.recalibration.summary import RecalibrationSummary
 from pisigma.reporting.rendering import write_card
 from pisigma.reporting.tables import Table, figure_text
@@ -12,6 +13,7 @@ CANDIDATES = {
     "old": "old, frames of these rows",
     "scratch": "from scratch",
 }
+OF_FLEET = CANDIDATES | {"recalibrated": "fleet and these rows", "old": "mean robot of the fleet"}
 
 
 def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSummary, folder: Path) -> None:
@@ -29,9 +31,10 @@ def write_recalibration_card(model: CalibratedModel, summary: RecalibrationSumma
 
 def candidate_table(summary: RecalibrationSummary) -> Table:
     """One row per candidate: the RMS error of left-out rows, and whether it was kept."""
+    names = OF_FLEET if summary.parent.kind == FLEET_PRIOR else CANDIDATES
     rows = (
         (
-            CANDIDATES[name],
+            names[name],
             "too few rows" if errors.rms_mm is None else figure_text(errors.rms_mm),
             "yes" if name == summary.kept else "no",
         )
