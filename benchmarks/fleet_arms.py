@@ -1,0 +1,150 @@
+"""Ten poses of a simulated arm with what its fleet has in common, beside ten and thirty poses without.
+
+Run `OMP_NUM_THREADS=1 python benchmarks/fleet_arms.py [--fleets 15] [--robots 50] [--judged 10]` with the simulator of
+arms (`sim.py`) in `PISIGMA_SIMULATED`. Every arm is a kr10 with errors that all share and individual ones; 60 positions
+of each make the prior. All figures are root mean squares of position errors of 300 other poses without noise [mm].
+"""
+
+import argparse
+import contextlib
+import os
+import sys
+from dataclasses import dataclass
+from functools import cached_property
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+import torch
+from fleet_prior import begun_with, rms
+from torch import Tensor
+
+from pisigma.fleet.prior import fleet_prior
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.planning.choice import choose
+from pisigma.planning.knowledge import Instrument, Knowledge
+from pisigma.robot import Robot
+from pisigma.se3 import rotation_from_vector
+from pisigma.workflow.calibrate import CalibrationSettings, calibrate
+
+sys.path.insert(0, os.environ.get("PISIGMA_SIMULATED", "../shared/simulated"))
+import sim  # type: ignore[import-not-found]
+
+USUAL_NOISE = 3.6e-5
+"""[m] Of a coordinate: that of the tracker and the repeatability of the simulated arms."""
+SHARED_SEED = 777
+
+
+@dataclass(frozen=True)
+class Fleet:
+    """Arms of one type.
+
+    Attributes:
+        errors: size of the individual errors of the geometry and of joint offsets, as a share of the common ones.
+        gears: share of the amplitudes of harmonics that is individual; the rest is common with its phase.
+        noise: of a coordinate [m].
+        kind: "position" or "pose", what is measured.
+    """
+
+    errors: float
+    gears: float
+    noise: float = USUAL_NOISE
+    kind: Any = "position"
+
+    @cached_property
+    def drawn(self) -> Robot:
+        """The robot of the drawing."""
+        with TemporaryDirectory() as folder:
+            with contextlib.chdir(folder):
+                sim.write_urdf("kr10")
+            return Robot.load(f"{folder}/kr10.urdf")
+
+    @property
+    def instrument(self) -> Instrument:
+        """What measures."""
+        usual = Instrument()
+        return Instrument(self.kind, self.noise, usual.sigma_rotation * self.noise / usual.sigma)
+
+    def arm(self, number: int) -> Any:
+        """One of the true arms."""
+        arm, individual = sim.True_("kr10", SHARED_SEED), sim.True_("kr10", number)
+        for name in ("do", "dr", "off"):
+            setattr(arm, name, getattr(arm, name) + self.errors * getattr(individual, name))
+        common, other = (one.amp * np.exp(1j * one.ph) for one in (arm, individual))
+        weights = np.sqrt(1 - self.gears**2) * common + self.gears * other
+        arm.amp, arm.ph = np.abs(weights), np.angle(weights)
+        return arm
+
+    def rows(self, arm: Any, q: np.ndarray, seed: int, exact: bool = False) -> Measurements:
+        """What is measured at joint values [rad]."""
+        rng = np.random.default_rng(seed)
+        position, rotation = arm.measure(q, noise=0.0 if exact else self.noise, rng=rng, rep=0.0)
+        turned = None
+        if self.kind == "pose":
+            noise = torch.from_numpy(rng.normal(0, self.instrument.sigma_rotation, position.shape))
+            turned = rotation_from_vector(noise) @ torch.from_numpy(rotation)
+        return Measurements(torch.from_numpy(q), torch.from_numpy(position), turned)
+
+    def alone(self, rows: Measurements) -> Any:
+        """The calibration of an arm without a prior."""
+        return calibrate(self.drawn, rows, CalibrationSettings(folds=0)).result
+
+    def planned(self, prior: CalibratedModel, count: int) -> np.ndarray:
+        """Poses chosen by what the prior leaves open [rad]."""
+        arm = self.arm(0)
+        q, task = (torch.from_numpy(arm.sample(many, 4242 + many)) for many in (1000, 200))
+        base = np.array([*arm.base[1], *np.deg2rad([130.0, 2.0, 1.0])])
+        tool = np.array([*arm.tool, 0.0, 0.0, 0.0])
+        knowledge = Knowledge.of_model(prior, self.instrument).seen_anew(base, tool)
+        chosen: Tensor = q[choose(knowledge, q, count, task)]
+        return chosen.numpy()
+
+    def figures(self, robots: int, judged: int) -> np.ndarray:
+        """Errors after 10 poses with the prior, 10 planned ones, 10 and 30 without it, and 30 with it [mm]."""
+        arms = [self.arm(number) for number in range(robots)]
+        rows = [self.rows(arm, arm.sample(60, number), number) for number, arm in enumerate(arms)]
+        prior = fleet_prior("fleet", self.drawn, rows).model
+        chosen, figures = self.planned(prior, 10), []
+        for number in range(500, 500 + judged):
+            arm = self.arm(number)
+            test = self.rows(arm, arm.sample(300, 9000 + number), 0, exact=True)
+            few, more = (self.rows(arm, arm.sample(count, 7000 + number), number) for count in (10, 30))
+            models = (
+                begun_with(prior, few),
+                begun_with(prior, self.rows(arm, chosen, number)),
+                self.alone(few),
+                self.alone(more),
+                begun_with(prior, more),
+            )
+            figures.append([rms(model, test) for model in models])
+        return np.array(figures).mean(0)
+
+
+FLEETS = (
+    *(Fleet(share, share, noise) for noise in (USUAL_NOISE, 1e-4, 2e-4) for share in (0.1, 0.2, 0.3, 0.5)),
+    *(Fleet(share, 1.0) for share in (0.1, 0.3)),
+    Fleet(0.2, 0.2, kind="pose"),
+)
+
+
+def main() -> None:
+    """Print a line for every fleet."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--fleets", type=int, default=len(FLEETS), help="so many lines of the table")
+    parser.add_argument("--robots", type=int, default=50)
+    parser.add_argument("--judged", type=int, default=10)
+    wanted = parser.parse_args()
+    torch.set_num_threads(1)
+    print("noise  errors gears kind     | 10 with, planned, without | 30 without, with")
+    for fleet in FLEETS[: wanted.fleets]:
+        few, planned, alone, more, both = fleet.figures(wanted.robots, wanted.judged)
+        print(
+            f"{fleet.noise * 1e3:5.3f} {fleet.errors:7.2f} {fleet.gears:5.2f} {fleet.kind:8s} | {few:7.3f} "
+            f"{planned:8.3f} {alone:8.3f} | {more:10.3f} {both:5.3f}",
+            flush=True,
+        )
+
+
+if __name__ == "__main__":
+    main()
