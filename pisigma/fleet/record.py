@@ -51,6 +51,7 @@ class SessionRecord:
             recalibration, or of the monitored rows under the model.
         held_out_rms_mm: of the cross-validation [mm]; None without one.
         recalibrate: whether recalibrating pays.
+        moved: whether something has clearly moved since the session before.
         parameters: that were estimated.
         warnings: what to heed, a sentence each.
     """
@@ -65,6 +66,7 @@ class SessionRecord:
     rms_mm: float | None = None
     held_out_rms_mm: float | None = None
     recalibrate: bool = False
+    moved: bool = False
     parameters: tuple[ParameterValue, ...] = ()
     warnings: tuple[str, ...] = ()
 
@@ -72,6 +74,11 @@ class SessionRecord:
     def refused(self) -> bool:
         """Whether nothing came of it."""
         return self.verdict == REFUSED
+
+    @property
+    def error_mm(self) -> float | None:
+        """RMS error of the position [mm], of the cross-validation where there was one."""
+        return self.rms_mm if self.held_out_rms_mm is None else self.held_out_rms_mm
 
 
 @dataclass(frozen=True)

@@ -33,7 +33,7 @@ def write_results(path: Path, records: Sequence[RobotRecord]) -> None:
             ("rows", pyarrow.int64()),
             *((name, text) for name in ("verdict", "sentence", "model")),
             *((name, number) for name in ("rms_mm", "held_out_rms_mm")),
-            ("recalibrate", pyarrow.bool_()),
+            *((name, pyarrow.bool_()) for name in ("recalibrate", "moved")),
             ("parameters", pyarrow.list_(pyarrow.struct(parameter))),
             ("warnings", pyarrow.list_(text)),
         ]

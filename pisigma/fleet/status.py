@@ -18,18 +18,21 @@ class RobotStatus:
         refused: its session that was refused; None where none was.
         days: since its last session [days]; None where that has no date.
         overdue: whether that is too long.
+        compared: whether its last session was compared with one before it, or there is none before.
     """
 
     robot: str
     last: SessionRecord | None
     refused: SessionRecord | None
-    days: int | None
-    overdue: bool
+    days: int | None = None
+    overdue: bool = False
+    compared: bool = True
 
     @property
     def drifting(self) -> bool:
-        """Whether something has moved, or recalibrating pays."""
-        return self.last is not None and (self.last.recalibrate or self.last.verdict in ("moved", "unclear"))
+        """Whether something has moved since the session before, or recalibrating pays."""
+        last = self.last
+        return last is not None and (last.recalibrate or last.moved or last.verdict in ("moved", "unclear"))
 
     @property
     def state(self) -> str:
@@ -69,13 +72,13 @@ class FleetStatus:
         """
         robots = [_status(one, today, overdue_days) for one in records]
         missing = set(expected) - {one.robot for one in records}
-        robots += [RobotStatus(robot, None, None, None, False) for robot in missing]
+        robots += [RobotStatus(robot, None, None) for robot in missing]
         return FleetStatus(tuple(sorted(robots, key=lambda one: one.robot)), today, overdue_days)
 
     @property
     def worst_first(self) -> tuple[RobotStatus, ...]:
         """The robots with an error, the largest first."""
-        judged = [one for one in self.robots if one.last is not None and one.last.rms_mm is not None]
+        judged = [one for one in self.robots if one.last is not None and one.last.error_mm is not None]
         return tuple(sorted(judged, key=lambda one: -_rms(one)))
 
     @property
@@ -95,6 +98,7 @@ class FleetStatus:
             "worst": [{"robot": one.robot, "rms_mm": _rms(one)} for one in self.worst_first],
             "drifting": [one.robot for one in self.robots if one.drifting],
             "overdue": [{"robot": one.robot, "days": one.days} for one in self.robots if one.overdue],
+            "not_compared": [one.robot for one in self.robots if not one.compared],
             "missing": [one.robot for one in self.in_state("missing")],
             "refused": [
                 {"robot": one.robot, "reason": one.refused.sentence}
@@ -106,7 +110,7 @@ class FleetStatus:
 
 def _rms(one: RobotStatus) -> float:
     assert one.last is not None
-    return one.last.rms_mm or 0.0
+    return one.last.error_mm or 0.0
 
 
 def _status(record: RobotRecord, today: datetime.date, overdue_days: int) -> RobotStatus:
@@ -120,4 +124,5 @@ def _status(record: RobotRecord, today: datetime.date, overdue_days: int) -> Rob
         refused=next((one for one in record.sessions if one.refused), None),
         days=days,
         overdue=days is not None and days > overdue_days,
+        compared=len(done) < 2 or done[-1].verdict != "calibrated",
     )

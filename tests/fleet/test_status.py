@@ -4,15 +4,15 @@ import datetime
 
 from pisigma.fleet.record import RobotRecord, SessionRecord
 from pisigma.fleet.status import FleetStatus
-from pisigma.reporting.fleet_tables import robot_table, state_table
+from pisigma.reporting.fleet_tables import not_compared, robot_table, state_table
 
 TODAY = datetime.date(2026, 11, 22)
 
 
-def session(date, verdict, rms=None, recalibrate=False):
+def session(date, verdict, rms=None, **more):
     return SessionRecord(
         session=date, date=date, file="x.csv", rows=10, verdict=verdict, sentence=f"It is {verdict}.", rms_mm=rms,
-        recalibrate=recalibrate,
+        **more,
     )  # fmt: skip
 
 
@@ -24,7 +24,7 @@ STATUS = FleetStatus.of(
         RobotRecord("fine", "", (session("2026-11-01", "calibrated", 0.05),)),
         RobotRecord("old", "", (session("2025-11-01", "calibrated", 0.2),)),
         RobotRecord("bad", "", (session("2026-01-01", "refused"),)),
-        RobotRecord("pays", "", (session("2026-11-01", "unchanged", 0.3, True),)),
+        RobotRecord("pays", "", (session("2026-11-01", "unchanged", 0.3, recalibrate=True),)),
     ],
     TODAY,
     180,
@@ -62,3 +62,23 @@ def test_tables_have_all_robots():
     rows = {row[0]: row[1:] for row in robot_table(STATUS.robots).rows}
     assert rows["moved"] == ("2026-11-01", "10", "moved", "0.900", "21", "drifting")
     assert rows["bad"] == ("2026-01-01", "", "", "", "", "refused")
+
+
+def test_a_joint_that_moved_drifts_though_its_model_is_up_to_date():
+    sessions = session("2026-01-01", "calibrated"), session("2026-11-01", "recalibrated", 0.1, moved=True)
+    status = FleetStatus.of([RobotRecord("r", "", sessions)], TODAY, 180)
+    assert status.robots[0].state == "drifting"
+    assert status.robots[0].compared
+
+
+def test_sessions_that_were_calibrated_each_by_itself_say_nothing_of_drift():
+    sessions = session("2026-01-01", "calibrated"), session("2026-11-01", "calibrated")
+    status = FleetStatus.of([RobotRecord(name, "", sessions) for name in "ab"], TODAY, 180)
+    assert status.to_json()["not_compared"] == ["a", "b"]
+    assert not_compared(status).startswith("2 robots have several sessions")
+    assert not_compared(STATUS) == ""
+
+
+def test_the_error_of_a_cross_validation_counts():
+    figures = RobotRecord("r", "", (session("2026-11-01", "calibrated", 0.04, held_out_rms_mm=0.11),))
+    assert robot_table(FleetStatus.of([figures], TODAY, 180).robots).rows[0][4] == "0.110"

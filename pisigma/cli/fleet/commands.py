@@ -124,9 +124,10 @@ def estimate_prior(
     if as_json:
         print_json({"model": str(out), **result.to_json()})
         return
-    from pisigma.reporting.fleet_prior_card import common_table, spectrum_table
+    from pisigma.reporting.fleet_prior_card import UNDETERMINED, common_table, spectrum_table
 
     print_table(f"what {result.summary.robots} robots have in common", *common_table(result.summary))
+    print_lines([UNDETERMINED])
     print_table("joint correction", *spectrum_table(result.summary))
     print_lines(f"Warning: {sentence}" for sentence in result.summary.warnings)
     print_lines([f"Model written to {out} in {result.seconds:.1f} s; calibrate with --prior {out}."])
@@ -174,8 +175,9 @@ def _day(stated: str | None) -> datetime.date:
 
 def _print_run(result: "FleetRun") -> None:
     """Print how many robots are done, and why others are not."""
-    again = f", {result.resumed} of them by an earlier call" if result.resumed else ""
-    print_lines([f"{result.done} of {len(result.records)} robots are done{again}; {result.seconds:.1f} s."])
+    count = len(result.records)
+    again = f"; an earlier call had worked out {result.resumed} of the {count}" if result.resumed else ""
+    print_lines([f"{result.done} of {count} robots are done{again}; {result.seconds:.1f} s."])
     print_lines((f"Refused: {robot}, {reason}" for robot, reason in result.refused), indent="  ")
     print_lines(
         [f"Results written to {result.results}; `pisigma fleet status {result.results.parent}` sums them up."]
@@ -184,19 +186,24 @@ def _print_run(result: "FleetRun") -> None:
 
 def _print_status(seen: "FleetStatus", page: Path | None) -> None:
     """Print how many robots are in each state, the worst, and what is to be done."""
-    from pisigma.reporting.fleet_tables import robot_table, state_table
+    from pisigma.reporting.fleet_tables import WHOSE_ERRORS, not_compared, robot_table, state_table
 
     count = len(seen.robots)
     print_table(f"{count} robot{'' if count == 1 else 's'}, seen on {seen.today}", *state_table(seen))
     if worst := seen.worst_first[:SHOWN]:
         print_table("largest errors", *robot_table(worst))
-    for state, title in (("drifting", "Drifting"), ("overdue", "Overdue"), ("refused", "Refused")):
+        print_lines([WHOSE_ERRORS])
+    for state, title in (("drifting", "Drifting"), ("refused", "Refused")):
         for one in seen.in_state(state):
             said = one.refused or one.last
             assert said is not None
-            words = f"{one.days} days since its last session." if state == "overdue" else said.sentence
-            print_lines([f"{title}: {one.robot}, {said.session}: {words}"], indent="  ")
+            print_lines([f"{title}: {one.robot}, {said.session}: {said.sentence}"], indent="  ")
+    if overdue := sorted(seen.in_state("overdue"), key=lambda one: -(one.days or 0)):
+        longest = ", ".join(f"{one.robot} ({one.days} days)" for one in overdue[:SHOWN])
+        more = f", and {len(overdue) - SHOWN} more" if len(overdue) > SHOWN else ""
+        print_lines([f"Overdue: {longest}{more}."], indent="  ")
     if missing := [one.robot for one in seen.in_state("missing")]:
         print_lines([f"Missing: {', '.join(missing)}; give the same `pisigma fleet run` again."], indent="  ")
+    print_lines(filter(None, [not_compared(seen)]), indent="  ")
     if page is not None:
         print_lines([f"Page written to {page}."])

@@ -3,7 +3,7 @@
 from markupsafe import Markup
 
 from pisigma.fleet.status import FleetStatus
-from pisigma.reporting.fleet_tables import STATES, robot_table, state_table
+from pisigma.reporting.fleet_tables import STATES, WHOSE_ERRORS, not_compared, robot_table, state_table
 from pisigma.reporting.page.page import resource
 from pisigma.reporting.rendering import render
 
@@ -26,5 +26,6 @@ def fleet_page(status: FleetStatus, name: str) -> str:
         states=state_table(status),
         robots=robots,
         table=robot_table(robots),
+        notes=(WHOSE_ERRORS, *filter(None, [not_compared(status)])),
         style=Markup(resource("style.css")),  # ours
     )

@@ -38,7 +38,8 @@ class FleetSettings:
         engine: "processes" on this machine, or "ray".
         jobs: processes that work side by side; None for one per core.
         address: of a Ray cluster; None for Ray on this machine.
-        prior: folder of a model of `pisigma fleet prior` that calibrations begin with.
+        prior: folder of a model of `pisigma fleet prior` that calibrations begin with, which have no use for the
+            settings of a calibration and whose rows are left out in turn anyway.
 
     Raises:
         FleetError: something is no choice, or there are no jobs.
@@ -79,15 +80,17 @@ class FleetSettings:
         stated = {name: getattr(self.calibration, name) for name in self.calibration.__dataclass_fields__}
         stated |= {name: _free(value) if name == "free" else value for name, value in member.options}
         stated["cameras"] = member.cameras
-        stated |= {} if self.validate else {"folds": 0, "hold_out": None, "repeats": None}
         try:
-            return TypeAdapter(CalibrationSettings).validate_python(stated)
+            settings = TypeAdapter(CalibrationSettings).validate_python(stated)
         except ValidationError as problem:
             where = problem.errors()[0]
             name = ".".join(map(str, where["loc"]))
             raise FleetError(
                 f"robot '{member.id}': option '{name}': {where['msg']}, got '{where['input']}'."
             ) from None
+        if self.prior is not None:
+            settings.check_unused()
+        return settings if self.validate else replace(settings, folds=0, hold_out=None, repeats=None)
 
 
 def work_out(
@@ -203,6 +206,7 @@ def _recalibrated(recalibration: Recalibration, session: SessionFile) -> Session
         verdict=summary.kept,
         sentence=f"{summary.changed} {summary.verdict}",
         rms_mm=summary.cross_validation[summary.kept].rms_mm,
+        moved=bool(summary.moved),
         parameters=_parameters_of(recalibration.model),
         warnings=recalibration.warnings,
     )

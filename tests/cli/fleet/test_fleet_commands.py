@@ -35,7 +35,7 @@ def test_status_prints_and_writes_a_page(plant, run):
     page = folder / "page.html"
     shown = run("fleet", "status", folder / "out", "--page", page, "--today", "2027-10-01")
     assert shown.exit_code == 3, shown.output
-    assert "Overdue: cell1, 2026-10-01: 365 days since its last session." in shown.stdout
+    assert "Overdue: cell1 (365 days)." in shown.stdout
     assert "Refused: cell2, 2026-10-02" in shown.stdout
     assert all(len(line) <= 80 for line in shown.stdout.splitlines())
     text = page.read_text(encoding="utf-8")
