@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from pisigma.kernels import arrays
 from pisigma.kernels.array_kinematics import address_of
 from pisigma.kernels.description_file import read_description
 from pisigma.kernels.layout import make_memory, pack
-from pisigma.kernels.machine_code import kernel_forms, load_kernels
+from pisigma.kernels.machine_code import IGNORED, Said, kernel_forms, load_kernels
 from pisigma.kinematics.task_axes import WHOLE, TaskAxes, default_axes
 
 if TYPE_CHECKING:  # names in full, which type checkers at run time find without these imports
@@ -146,8 +147,15 @@ class CompiledIK:
             Corrected and nominal joint values, residuals of position [m] and rotation [rad], domain measure, status
             (INVALID_POSE for what is no pose) and branch, see `Solution`.
         """
-        _, row = self._solve_bytes(T_base_tool, near, b"", self.axes, arrays.ANY_BRANCH, True)
-        return row[:]
+        try:
+            solve, rest, out = self._threads.packed
+        except AttributeError:
+            out, axes = self._row(), self.axes.row.tobytes()
+            solve = partial(self._kernels, IGNORED, IGNORED, self._address, self._memory(), arrays.SOLVE, 1)
+            rest = b"", 0, axes, bool(axes), arrays.ANY_BRANCH, True, False, out, 1
+            self._threads.packed = solve, rest, out
+        solve(T_base_tool, near, bool(near), *rest)
+        return out[:]  # type: ignore[no-any-return]
 
     def solve_batch(
         self,
@@ -291,10 +299,11 @@ class CompiledIK:
 
         ctypes passes the address of bytes in a fraction of the time in which NumPy states that of an array.
         """
-        out = self._row()
-        rows = near, bool(near), approach, bool(approach), axes.row.tobytes(), len(axes.row)
-        memory, settings = self._memory(), (branch, mark, False, out, 1)
-        return self._kernels(self._address, memory, arrays.SOLVE, 1, T, *rows, *settings), out
+        said, out = Said(), self._row()
+        arm = self._address, self._memory(), arrays.SOLVE, 1
+        rows = T, near, bool(near), approach, bool(approach), axes.row.tobytes(), len(axes.row)
+        self._kernels(said, IGNORED, *arm, *rows, branch, mark, False, out, 1)
+        return said[0], out
 
     def _run(
         self,
@@ -315,7 +324,10 @@ class CompiledIK:
         for values in (near, approach):
             beside, rows = address_of(values), len(values)
             pairs += [beside, rows] if rows < 2 else [beside + start * values.strides[0], stop - start]
-        said = self._kernels(
+        said = Said()
+        self._kernels(
+            said,
+            IGNORED,
             self._address,
             self._memory(),
             task,
@@ -330,7 +342,7 @@ class CompiledIK:
             address_of(out) + start * out.strides[0],
             out.shape[1],
         )
-        return int(said) if said < 0 else int(said) + 8 * start
+        return said[0] if said[0] < 0 else said[0] + 8 * start
 
     def _memory(self) -> int:
         """Address of memory to work in that no other thread uses."""

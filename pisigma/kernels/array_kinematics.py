@@ -102,7 +102,7 @@ class _Chain:
         Raises:
             ModelError: the robot is larger than the kernels allow, or there are no kernels for this machine.
         """
-        from pisigma.kernels.machine_code import load_kernels  # here: LLVM takes 40 MB from the fits
+        from pisigma.kernels.machine_code import IGNORED, load_kernels  # here: LLVM takes 40 MB from the fits
 
         if len(robot.rows) > ROWS or robot.dof > DOF:
             raise ModelError(
@@ -117,7 +117,8 @@ class _Chain:
         arms["direction"][0, : robot.dof] = robot.directions
         arms["revolute"][0, : robot.dof] = robot.revolute
         self._dof, self._check = robot.dof, robot.check_joint_count
-        self._address, self._run, self._memory = address_of(self._packed), load_kernels(), threading.local()
+        self._address, self._memory = address_of(self._packed), threading.local()
+        self._run = functools.partial(load_kernels(), IGNORED, IGNORED, self._address)
 
     def move(self, q: Any, with_jacobian: bool) -> tuple[Any, Any]:
         """Poses `(*batch, 4, 4)` [m], and Jacobians `(*batch, 6, dof)` where these are wanted."""
@@ -134,7 +135,6 @@ class _Chain:
         at, poses, rows = address_of(values), address_of(T), math.prod(batch)
         jacobians = address_of(J) if with_jacobian else 0
         self._run(
-            self._address,
             memory,
             FORWARD,
             rows,

@@ -31,9 +31,10 @@ _OPTIONS = "speed 3, vectors up to 256 bits, internal linkage"
 _PATIENCE = 2.0
 """[s] Kernels that are on disk are loaded in far less."""
 _COMPILING = "pisigma: preparing the inverse kinematics for this processor, once, in some seconds ...\n"
-_Result = ctypes.c_int64 * 1
-_RAISED = _Result()
-"""What a compiled function would say of an exception; the kernels raise none."""
+Said = ctypes.c_int64 * 1
+"""What a call of the kernels says."""
+IGNORED = Said()
+"""Where nobody asks for that."""
 _lock = threading.Lock()
 _kept: list[Any] = []
 
@@ -57,9 +58,10 @@ def kernel_forms(wanted: KernelForms = _NOTHING) -> KernelForms:
 
 
 def load_kernels(wanted: KernelForms = _NOTHING) -> Callable[..., int]:
-    """The function `kernels.run`, on addresses and numbers; -1, or what `kernels.solve_poses` says.
+    """The function `kernels.run`, on addresses and numbers; bytes and ctypes arrays count as their addresses.
 
-    Bytes and ctypes arrays count as their addresses.
+    Two arguments come before those of `run`: a `Said`, into which -1 is written, or what `kernels.solve_poses` says;
+    and `IGNORED`, for what was raised: nothing ever is.
 
     Machine code is made when it is first wanted on a machine, in some seconds, and read from a file afterwards.
     Somebody at a terminal reads why that takes so long.
@@ -92,7 +94,7 @@ def _load(forms: KernelForms) -> Callable[..., int]:
     _kept.append(engine)
     kinds = [ctypes.c_void_p if kind == "p" else ctypes.c_int64 for kind in ARGUMENTS]
     prototype = ctypes.CFUNCTYPE(ctypes.c_int32, ctypes.c_void_p, ctypes.c_void_p, *kinds)
-    return functools.partial(_call, prototype(engine.get_function_address(ENTRY)))
+    return prototype(engine.get_function_address(ENTRY))
 
 
 def _code(forms: KernelForms, machine: Any, use: str) -> bytes:
@@ -122,13 +124,6 @@ def library_object(wanted: KernelForms) -> bytes:
             opt=3, reloc="pic", codemodel="default"
         )
         return _code(kernel_forms(wanted), machine, "library")
-
-
-def _call(native: Any, *arguments: Any) -> int:
-    """Call the compiled function, which writes its result, and what was raised: nothing ever is."""
-    result = _Result()
-    native(result, _RAISED, *arguments)
-    return result[0]
 
 
 def _key(forms: KernelForms) -> str:

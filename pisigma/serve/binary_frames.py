@@ -38,7 +38,8 @@ class Refusal(enum.IntEnum):
     DEFECT = 104
 
 
-_NAMES = {int(status): status.name.lower() for status in Status}
+_NO_JOINTS = (math.nan,) * JOINTS
+_NAMES = {float(status): status.name.lower() for status in Status}
 
 
 class BinaryFrames(AbstractProtocol):
@@ -54,7 +55,7 @@ class BinaryFrames(AbstractProtocol):
             BrokenStreamError: the magic or the length is wrong.
         """
         count = len(received)
-        if not MAGIC.startswith(received[:4]):
+        if not received.startswith(MAGIC[:count]):
             raise BrokenStreamError(self.broken())
         if count < HEAD.size:
             return 0
@@ -93,13 +94,13 @@ class BinaryFrames(AbstractProtocol):
     def _solve(self, model: ServedModel, message: bytes, name: int, begun: int) -> bytes:
         try:
             dof = len(model.ik.joints)
-            solved = model.solve(message[_POSE:_NEAR], message[_NEAR : _NEAR + 8 * dof])
-            q = solved.q + [math.nan] * (JOINTS - dof)
-            residuals = solved.position_residual, solved.rotation_residual
-            reply = ANSWER.pack(MAGIC, ANSWER.size, name, solved.status, dof, *q, *residuals)
+            row = model.solve(message[_POSE:_NEAR], message[_NEAR : _NEAR + 8 * dof])
+            position, rotation, _, status, _ = row[2 * dof :]
+            q = *row[:dof], *_NO_JOINTS[dof:]
+            reply = ANSWER.pack(MAGIC, ANSWER.size, name, int(status), dof, *q, position, rotation)
         except Exception:
             return self._refuse(name, Refusal.DEFECT, begun)
-        self._metrics.count(_NAMES[solved.status], begun)
+        self._metrics.count(_NAMES[status], begun)
         return reply
 
     def _refuse(self, name: int, why: Refusal, begun: int) -> bytes:
@@ -108,4 +109,4 @@ class BinaryFrames(AbstractProtocol):
 
 
 def _refusal(name: int, status: int) -> bytes:
-    return ANSWER.pack(MAGIC, ANSWER.size, name, status, 0, *[math.nan] * (JOINTS + 2))
+    return ANSWER.pack(MAGIC, ANSWER.size, name, status, 0, *_NO_JOINTS, math.nan, math.nan)

@@ -5,7 +5,7 @@ import socket
 import time
 from collections.abc import Callable
 
-from pisigma.serve.protocol import AbstractProtocol, BrokenStreamError, Reply, is_token
+from pisigma.serve.protocol import AbstractProtocol, BrokenStreamError, is_token
 
 CHUNK = 4096
 """[bytes] Are read at a time, so that no client keeps the others waiting with what it sends at once."""
@@ -106,7 +106,13 @@ class Connection:
                 message = bytes(memoryview(self._received)[:length])
                 del self._received[:length]
                 answered = True
-                self._answer(message)
+                if self._token is not None:
+                    self._admit(message, self._token)
+                elif isinstance(reply := self._protocol.answer(message), bytes):
+                    self._send(reply)
+                else:
+                    self.busy = True
+                    self._submit(self, reply)
             if self._token is not None and len(self._received) >= CHUNK:
                 raise BrokenStreamError(self._protocol.admission(False))
         except BrokenStreamError as problem:
@@ -118,21 +124,13 @@ class Connection:
         else:
             self._watch(answered)
 
-    def _answer(self, message: bytes) -> None:
-        if self._token is not None:
-            admitted = is_token(self._protocol.token_of(message), self._token)
-            words = self._protocol.admission(admitted)
-            if not admitted:
-                raise BrokenStreamError(words)
-            self._token = None
-            self._send(words)
-            return
-        reply: Reply = self._protocol.answer(message)
-        if isinstance(reply, bytes):
-            self._send(reply)
-        else:
-            self.busy = True
-            self._submit(self, reply)
+    def _admit(self, message: bytes, token: bytes) -> None:
+        admitted = is_token(self._protocol.token_of(message), token)
+        words = self._protocol.admission(admitted)
+        if not admitted:
+            raise BrokenStreamError(words)
+        self._token = None
+        self._send(words)
 
     def _send(self, reply: bytes) -> None:
         unsent = self._unsent + reply

@@ -16,7 +16,7 @@ from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.kernels.array_kinematics import transform_entries, xyzrpy_of
 from pisigma.kinematics.status import Status
 from pisigma.serve.metrics import Metrics
-from pisigma.serve.models import ServedModel, ServedModels, SolvedPose
+from pisigma.serve.models import ServedModel, ServedModels, solution_row
 from pisigma.serve.protocol import AbstractProtocol, BrokenStreamError, Reply
 
 LONGEST_LINE = 2**20
@@ -44,8 +44,8 @@ _PLAIN = {"id", "model", "pose", *_NEAR, "brief"}
 """Keys of requests for poses that state no task of their own."""
 _POSE = struct.Struct("<16d")
 
-_NAMES = {int(status): status.name.lower() for status in Status}
-_REACHING = frozenset(int(status) for status in Status if status.reaches)
+_NAMES = {float(status): status.name.lower() for status in Status}
+_REACHING = frozenset(float(status) for status in Status if status.reaches)
 _encode = json.JSONEncoder(allow_nan=False, separators=(", ", ": ")).encode
 
 
@@ -218,35 +218,39 @@ def _read(message: bytes) -> dict[str, Any]:
 def _solve(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Solve one pose."""
     entries, near = _entries(request["pose"], "pose"), _near(model, request)
-    solved = None
-    if request.keys() <= _PLAIN:
-        beside = near or [math.nan] * len(model.ik.joints)
-        solved = model.solve(_POSE.pack(*entries), struct.pack(f"<{len(beside)}d", *beside))
-    if solved is None or solved.status == Status.INVALID_POSE:  # it can state a task, and says what is wrong
+    if (
+        model.direct is not None
+        and request.keys() <= _PLAIN
+        and (near is None or model.ik.postures.hold(near))
+    ):
+        beside = b"" if near is None else struct.pack(f"<{len(near)}d", *near)
+        row = model.direct.solve_packed(_POSE.pack(*entries), beside)
+        values = _record(model, row, model.ik.axes.ignored)
+    else:
         approach = _numbers(request, "approach", len(model.ik.joints)) if "approach" in request else None
         ik, T = _for_task(model, request), np.reshape(entries, (4, 4))
-        solved = SolvedPose.of(ik(T, near=near, branch=_branch(request), approach=approach))
-    values = _record(model, solved)
-    if _flag(request, "brief"):
-        return values["status"], _brief(model, values)
-    if _flag(request, "accuracy"):
-        values["accuracy_mm"] = _millimetres(model.ik.accuracy(np.array(solved.q)))
-    return values["status"], values
+        solution = ik(T, near=near, branch=_branch(request), approach=approach)
+        values = _record(model, solution_row(solution), solution.ignored_axes)
+        if _flag(request, "accuracy"):
+            values["accuracy_mm"] = _millimetres(solution.accuracy)
+    return values["status"], _brief(model, values) if _flag(request, "brief") else values
 
 
-def _record(model: ServedModel, solved: SolvedPose) -> dict[str, Any]:
-    """The values of an answer to one pose."""
-    values: dict[str, Any] = {model.joints_key: None, "status": _NAMES[solved.status]}
-    if solved.status in _REACHING:
-        values[model.joints_key] = [q * unit for q, unit in zip(solved.q, model.per_file_unit, strict=True)]
-        values["branch"] = model.ik.branches[solved.branch]
-        values["position_residual_mm"] = _millimetres(solved.position_residual)
-        values["rotation_residual_deg"] = math.degrees(solved.rotation_residual)
-        values["domain_measure"] = _or_none(solved.domain_measure)
-    if solved.ignored_axes:
-        values["ignored_axes"] = solved.ignored_axes
-    if solved.status != Status.REACHED:
-        values["sentence"] = Status(solved.status).sentence
+def _record(model: ServedModel, row: list[float], ignored_axes: tuple[str, ...]) -> dict[str, Any]:
+    """The values of an answer to one pose, from what `CompiledIK.solve_packed` gives."""
+    units = model.per_file_unit
+    position, rotation, measure, status, branch = row[2 * len(units) :]
+    values: dict[str, Any] = {model.joints_key: None, "status": _NAMES[status]}
+    if status in _REACHING:
+        values[model.joints_key] = [q * unit for q, unit in zip(row, units, strict=False)]
+        values["branch"] = model.ik.branches[int(branch)]
+        values["position_residual_mm"] = _millimetres(position)
+        values["rotation_residual_deg"] = math.degrees(rotation)
+        values["domain_measure"] = _or_none(measure)
+    if ignored_axes:
+        values["ignored_axes"] = ignored_axes
+    if status != Status.REACHED:
+        values["sentence"] = Status(int(status)).sentence
     return values
 
 

@@ -8,49 +8,14 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
 from pisigma.errors import ModelError, PisigmaError, RequestError, nearest_choice
 from pisigma.files.model_files import is_model, model_hash
+from pisigma.inverse.compiled_ik import CompiledIK
 from pisigma.inverse.corrected_ik import CorrectedIK, load
 from pisigma.inverse.solution import Solution
-
-
-class SolvedPose(NamedTuple):
-    """What a model gives for one pose; see `inverse.solution.Solution`, whose numbers these are.
-
-    Attributes:
-        q: joint values [rad or m].
-        position_residual: [m].
-        rotation_residual: [rad].
-        domain_measure: see there.
-        status: a `Status` as a number.
-        branch: index of the branch.
-        ignored_axes: axes of the tool that do not count.
-    """
-
-    q: list[float]
-    position_residual: float
-    rotation_residual: float
-    domain_measure: float
-    status: int
-    branch: int
-    ignored_axes: tuple[str, ...]
-
-    @staticmethod
-    def of(solution: Solution) -> "SolvedPose":
-        """Take the solution of one pose."""
-        return SolvedPose(
-            solution.q.tolist(),
-            float(solution.position_residual),
-            float(solution.rotation_residual),
-            float(solution.domain_measure),
-            int(solution.status),
-            int(solution.branch),
-            solution.ignored_axes,
-        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,25 +74,38 @@ class ServedModel:
         """How joint values stand in bytes."""
         return struct.Struct(f"<{len(self.ik.joints)}d")
 
-    def solve(self, T_base_tool: bytes, near: bytes) -> SolvedPose:
+    @cached_property
+    def direct(self) -> CompiledIK | None:
+        """The kernels, where they solve its poses from numbers as they stand in a message."""
+        return self.ik.compiled if self.ik.controller is None and sys.byteorder == "little" else None
+
+    def solve(self, T_base_tool: bytes, near: bytes) -> list[float]:
         """Solve a pose whose numbers stand in bytes, little-endian; what is no pose gets INVALID_POSE.
 
         Args:
             T_base_tool: 16 doubles, row by row [m].
             near: a double for every joint [rad or m]; all NaN for none.
+
+        Returns:
+            What `CompiledIK.solve_packed` gives.
         """
-        ik, values = self.ik, self._near.unpack(near)
-        dof = len(values)
-        if not self.quick or ik.controller is not None or sys.byteorder != "little":
-            T, none = np.frombuffer(T_base_tool, "<f8").reshape(4, 4), all(map(math.isnan, values))
-            return SolvedPose.of(ik(T, near=None if none else np.array(values), throw=False))
-        assert ik.compiled is not None
-        if not ik.postures.hold(values):
-            near = b"" if all(map(math.isnan, values)) else self._near.pack(*[math.nan] * dof)
-        row = ik.compiled.solve_packed(T_base_tool, near)
-        position, rotation, measure, status, branch = row[2 * dof :]
-        axes = ik.axes.ignored
-        return SolvedPose(row[:dof], position, rotation, measure, int(status), int(branch), axes)
+        values, kernels = self._near.unpack(near), self.direct
+        if kernels is not None and self.ik.postures.hold(values):
+            return kernels.solve_packed(T_base_tool, near)
+        none = all(map(math.isnan, values))
+        if kernels is not None:
+            return kernels.solve_packed(
+                T_base_tool, b"" if none else self._near.pack(*[math.nan] * len(values))
+            )
+        T = np.frombuffer(T_base_tool, "<f8").reshape(4, 4)
+        return solution_row(self.ik(T, near=None if none else np.array(values), throw=False))
+
+
+def solution_row(solution: Solution) -> list[float]:
+    """The solution of one pose as `CompiledIK.solve_packed` gives it."""
+    residuals = float(solution.position_residual), float(solution.rotation_residual)
+    numbers = *residuals, float(solution.domain_measure), float(solution.status), float(solution.branch)
+    return [*solution.q.tolist(), *solution.q_nominal.tolist(), *numbers]
 
 
 def model_folders(folder: Path) -> list[Path]:
