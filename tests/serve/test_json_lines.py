@@ -14,6 +14,7 @@ from testing.serving import json_client, running
 import pisigma
 from pisigma.kernels.array_kinematics import transform_of, xyzrpy_of
 from pisigma.model.folder.model_folder import save_model
+from pisigma.serve import json_lines
 
 POSE = [800.0, 200.0, 600.0, 10.0, -80.0, 170.0]
 NEAR = [15.0, 3.0, -1.0, -85.0, 19.0, 92.0]
@@ -61,6 +62,27 @@ def test_a_pose_that_is_not_reached_has_no_joint_values(ask):
     answer = ask(pose=[9000, *POSE[1:]], model=0)
     assert (answer["status"], answer["q_deg"]) == ("unreachable", None)
     assert "sentence" in answer
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        b'{"id": 1e3, "pose": [1, -0.0, 5e-324, 0.1]}',
+        b'{"id": "a:b", "pose": "\\ud800"}',
+        b'{"id" : 1, "pose": {"id": [1]}}',
+        b"12345678901234567890",
+    ],
+)
+def test_lines_are_read_as_python_reads_them(line):
+    assert json_lines._decode(line) == json.loads(line)
+
+
+@pytest.mark.parametrize(
+    "line", [b'{"id" : 1, "i\\u0064":2}', b'{"id": Infinity}', b'{"id": 01}', b"\xef\xbb\xbf{}", b"[" * 9999]
+)
+def test_what_is_no_json_is_refused_with_a_reason(line):
+    with pytest.raises((ValueError, RecursionError)):
+        json_lines._decode(line)
 
 
 def test_forward_is_the_inverse_of_a_pose(ask):
