@@ -324,14 +324,11 @@ class CompiledIK:
         for values in (near, approach):
             beside, rows = address_of(values), len(values)
             pairs += [beside, rows] if rows < 2 else [beside + start * values.strides[0], stop - start]
-        said = Said()
+        said, arm = Said(), (self._address, self._memory(), task, stop - start)
         self._kernels(
             said,
             IGNORED,
-            self._address,
-            self._memory(),
-            task,
-            stop - start,
+            *arm,
             address_of(T) + start * 128,
             *pairs,
             address_of(axes) if len(axes) else 0,
