@@ -22,9 +22,10 @@ import torch
 from torch import Tensor
 
 from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.judging.few_rows import fit_where_it_helps
-from pisigma.judging.trained_calibrations import Calibrator
+from pisigma.judging.trained_calibrations import Calibrator, Result
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.choice import Criterion, choose
 from pisigma.planning.expected_accuracy import rms_of
@@ -44,15 +45,15 @@ STEPS = (14, 18, 22, 26, 30, 34, 38, 42, 46, 50, 56, 62, 70, 80)
 
 @dataclass(frozen=True)
 class Figures:
-    """Of one choice: true and predicted RMS [mm]."""
+    """Of one choice: true RMS, the one predicted before anything is measured, and the calibration's [mm]."""
 
     true: float
     predicted: float
+    after: float
 
 
-def judged(calibrator: Calibrator, rows: Measurements, test: Measurements) -> float:
-    """True RMS of what is calibrated from some rows [mm]."""
-    result = fit_where_it_helps(calibrator, rows, lambda what: None)
+def rms_mm(result: Result, test: Measurements) -> float:
+    """Root mean square of the position errors of a calibration [mm]."""
     return float(result.errors_of(test)["position"].square().sum(1).mean().sqrt()) * 1e3
 
 
@@ -78,12 +79,34 @@ def measured(
             rows: dict[str, Tensor] = {"random": torch.arange(count)}
             rows |= {one: choose(knowledge, pool.q, count, pool.q[:300], one) for one in criteria}
             for how, chosen in rows.items():
-                result = calibrator.fit(pool.select(chosen))
-                rms = float(result.errors_of(test)["position"].square().sum(1).mean().sqrt()) * 1e3
+                rms = rms_mm(calibrator.fit(pool.select(chosen)), test)
                 table.setdefault((count, how), []).append(rms)
+    show(name, table)
+
+
+def sequential(name: str, counts: tuple[int, ...], draws: range) -> None:
+    """Poses chosen in rounds, with what a hybrid of those before them knows: the first by D, the others by I."""
+    robot = Robot.load(name)
+    table: dict[tuple[int, str], list[float]] = {}
+    for pool, test in pools(name, draws):
+        knowledge, chosen = Knowledge.of_robot(robot), torch.arange(0)
+        for count in counts:
+            free = torch.arange(POOL)[~torch.isin(torch.arange(POOL), chosen)]
+            criterion: Criterion = "I" if len(chosen) else "D"
+            more = choose(knowledge, pool.q[free], count - len(chosen), pool.q[:300], criterion)
+            chosen = torch.cat([chosen, free[more]])
+            result = HybridCalibrator(robot).fit(pool.select(chosen))
+            knowledge = Knowledge.of_result(result, knowledge.instrument)
+            table.setdefault((count, "rounds"), []).append(rms_mm(result, test))
+    show(name, table)
+
+
+def show(name: str, table: dict[tuple[int, str], list[float]]) -> None:
+    """Print the mean over the pools, its standard error, and the range."""
     for (count, how), values in table.items():
+        error = np.std(values) / max(len(values) - 1, 1) ** 0.5
         spread = f"{min(values):.3f} to {max(values):.3f}"
-        print(f"{name} {count:3d} poses {how:6s} {np.mean(values):.4f}  ({spread})", flush=True)
+        print(f"{name} {count:3d} poses {how:6s} {np.mean(values):.4f} ± {error:.4f}  ({spread})", flush=True)
 
 
 class Arm:
@@ -115,24 +138,27 @@ class Arm:
 
     def figures(self, q: Tensor, knowledge: Knowledge) -> Figures:
         """Of poses that are measured."""
-        predicted = rms_of(knowledge.informed(q).tool(self.test.q)) * 1e3
-        return Figures(judged(HybridCalibrator(self.drawn), self.rows(q), self.test), predicted)
+        result = fit_where_it_helps(HybridCalibrator(self.drawn), self.rows(q), lambda what: None)
+        assert isinstance(result, HybridResult)
+        both = knowledge.informed(q), Knowledge.of_result(result, knowledge.instrument)
+        return Figures(rms_mm(result, self.test), *(rms_of(one.tool(self.test.q)) * 1e3 for one in both))
 
 
 def predicted(seeds: range) -> None:
-    """Predicted over true RMS at 15, 30 and 60 chosen poses."""
-    ratios: dict[int, list[float]] = {}
+    """Predicted over true RMS at 15, 30 and 60 chosen poses, of the plan and of the calibration."""
+    ratios: dict[tuple[int, str], list[float]] = {}
     for seed in seeds:
         arm = Arm(ARMS[seed % len(ARMS)], seed)
         knowledge, q = Knowledge.of_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
         for count in (15, 30, 60):
             chosen = q[choose(knowledge, q, count, q[:300], "D")]
             one = arm.figures(chosen, knowledge)
-            ratios.setdefault(count, []).append(one.predicted / one.true)
-    for count, values in ratios.items():
+            ratios.setdefault((count, "plan"), []).append(one.predicted / one.true)
+            ratios.setdefault((count, "calibration"), []).append(one.after / one.true)
+    for (count, who), values in ratios.items():
         print(
-            f"predicted over true RMS, {count} chosen poses, {len(values)} arms: median {np.median(values):.2f}, "
-            f"{min(values):.2f} to {max(values):.2f}",
+            f"{who}: predicted over true RMS, {count} chosen poses, {len(values)} arms: "
+            f"median {np.median(values):.2f}, {min(values):.2f} to {max(values):.2f}",
             flush=True,
         )
 
@@ -185,7 +211,7 @@ def speed() -> None:
 def main() -> None:
     """Print the figures of the parts that are asked for."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parts = ("ur10", "ur5", "predicted", "needed", "speed")
+    parts = ("ur10", "rounds", "ur5", "predicted", "needed", "speed")
     parser.add_argument("parts", nargs="*", default=list(parts), metavar="PART", help=", ".join(parts))
     parser.add_argument("--draws", type=int, default=10, help="pools, or simulated arms of a kind")
     parser.add_argument("--first", type=int, default=0, help="seed of the first of them")
@@ -194,6 +220,7 @@ def main() -> None:
     both: tuple[Criterion, ...] = ("D", "I")
     run: dict[str, Callable[[], None]] = {
         "ur10": lambda: measured("ur10", (15, 30, 50, 100), True, seeds, both),
+        "rounds": lambda: sequential("ur10", (20, 30, 40, 50), seeds),
         "ur5": lambda: measured("ur5", (10, 15), False, seeds, both),
         "predicted": lambda: predicted(seeds),
         "needed": lambda: needed(seeds),
