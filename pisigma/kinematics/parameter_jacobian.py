@@ -15,6 +15,7 @@ cache lines for large ones.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -182,10 +183,8 @@ def _walk_rows(
     count, poses = len(robot.rows), q.shape[0]
     frames = q.new_empty((count + 1, 7, 3, poses))
     frames[0, 2:] = _spread(base_axes[FRAME, :3], poses)
-    turning = np.zeros((count, robot.dof))
-    turning[robot.joint_rows, range(robot.dof)] = robot.directions * robot.revolute
-    offsets = q.new_tensor(np.atleast_2d(dh[..., 0]).T)
-    angles = torch.addmm(_spread(offsets, poses), q.new_tensor(turning), q.t())
+    offsets = torch.from_numpy(np.atleast_2d(dh[..., 0]).T.copy()).to(q)
+    angles = torch.addmm(_spread(offsets, poses), torch.from_numpy(_turning(robot)).to(q), q.t())
     before, flat, matrices = frames[:-1], frames.flatten(2), _row_matrices(dh, q)
     turns = zip(
         *(block.unbind(0) for block in (before[:, :2], before[:, 4:6], before[:, 5:])),
@@ -217,18 +216,24 @@ def _row_matrices(
 
     `Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; a joint that slides comes on top.
     """
-    _, d, a, alpha, beta = dh.T
+    theta, d, a, alpha, beta = dh.T
     ca, cb, sa, sb = np.cos(alpha), np.cos(beta), np.sin(alpha), np.sin(beta)
-    zero, one = np.zeros_like(d), np.ones_like(d)
-    x, y, z, w = cb, sa * sb, -ca * sb, zero
-    columns = [
-        [sb, a, x, zero, -x],
-        [-sa * cb, zero, y, ca, -y],
-        [ca * cb, d, z, sa, -z],
-        [zero, one, w, w, w],
-    ]
-    matrices = np.array(columns)  # column, line, row and, where there are several, robot
-    return like.new_tensor(np.ascontiguousarray(matrices.transpose(2, *range(3, matrices.ndim), 1, 0)))
+    matrices = np.zeros((*theta.shape, 5, 4))
+    z, origin, x, y, minus_x = np.moveaxis(matrices, -2, 0)
+    z[..., 0], z[..., 1], z[..., 2] = sb, -sa * cb, ca * cb
+    origin[..., 0], origin[..., 2], origin[..., 3] = a, d, 1
+    x[..., 0], x[..., 1], x[..., 2] = cb, sa * sb, -ca * sb
+    y[..., 1], y[..., 2] = ca, sa
+    np.negative(x, out=minus_x)
+    return torch.from_numpy(matrices).to(like)
+
+
+@lru_cache(maxsize=16)
+def _turning(robot: Robot) -> Float64[np.ndarray, "rows dof"]:
+    """By how much every row turns with the joints; remembered, as every step of a search asks for it."""
+    turning = np.zeros((len(robot.rows), robot.dof))
+    turning[robot.joint_rows, range(robot.dof)] = robot.directions * robot.revolute
+    return turning
 
 
 def _frame_axes(xyzrpy: Float[Tensor, "6 frames"], like: Tensor) -> Float[Tensor, "13 4 frames"]:
@@ -237,16 +242,19 @@ def _frame_axes(xyzrpy: Float[Tensor, "6 frames"], like: Tensor) -> Float[Tensor
     The end is x, y, z, the origin, x, y, -x, so that `AXES` and `FRAME` are stretches of it. All are given by
     the axes x, y, z and the origin before `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
     """
-    x, y, z, *angles = values = xyzrpy.cpu().numpy()
-    (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
+    values = xyzrpy.cpu().numpy()
+    (cr, cp, cy), (sr, sp, sy) = np.cos(values[3:]), np.sin(values[3:])
+    spsy, spcy = sp * sy, sp * cy
+    x = (cr * cp, sr * cp, -sp)
+    y = (cr * spsy - sr * cy, sr * spsy + cr * cy, cp * sy)
+    z = (cr * spcy + sr * sy, sr * spcy - cr * sy, cp * cy)
     axes = np.zeros((13, 4, values.shape[1]))
-    axes[[0, 3, 4, 5, 9], [2, 0, 1, 2, 3]] = 1
+    axes[0, 2] = axes[3, 0] = axes[4, 1] = axes[5, 2] = axes[9, 3] = 1
     axes[1, 0], axes[1, 1] = -sr, cr
-    axes[6, :3] = axes[2, :3] = axes[10, :3] = cr * cp, sr * cp, -sp
-    axes[7, :3] = axes[11, :3] = cr * sp * sy - sr * cy, sr * sp * sy + cr * cy, cp * sy
-    axes[8, :3] = cr * sp * cy + sr * sy, sr * sp * cy - cr * sy, cp * cy
-    axes[9, :3], axes[12] = (x, y, z), -axes[6]
-    return like.new_tensor(axes)
+    axes[6:9, :3] = np.array((*x, *y, *z)).reshape(3, 3, -1)
+    axes[2], axes[10:12], axes[12] = axes[6], axes[6:8], -axes[6]
+    axes[9, :3] = values[:3]
+    return torch.from_numpy(axes).to(like)
 
 
 def _spread(values: Float[Tensor, "*shape ways"], poses: int) -> Float[Tensor, "*shape poses"]:
