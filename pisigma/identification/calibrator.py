@@ -52,8 +52,6 @@ from pisigma.robot.row import FRAME_COLUMNS
 from pisigma.sensors.socket import PairOfSockets
 
 Values = TypeVar("Values")
-TOGETHER = 512
-"""Robots that are calibrated side by side at most, which limits the memory."""
 ROUGH_ROWS = 4_096
 """Rows that the initial guess and the first steps are worked out from."""
 SEEN_AT_ALL = 1e-3
@@ -172,12 +170,11 @@ class GeometricCalibrator:
         robots = [_Robot(*pair) for pair in zip(data, self._build(data), strict=True)]
         patterns = [pattern_of(robot.setup.problem) if len(robots) > 1 else None for robot in robots]
         for group in _groups(patterns):
-            for first in range(0, len(group), TOGETHER):
-                alike = [robots[number] for number in group[first : first + TOGETHER]]
-                problem, start = _side_by_side(alike)
-                self._choose(alike, problem, start)
-                for some in _groups_of(alike, problem, start, [tuple(robot.active) for robot in alike]):
-                    self._solve(*some)
+            alike = [robots[number] for number in group]
+            problem, start = _side_by_side(alike)
+            self._choose(alike, problem, start)
+            for some in _groups_of(alike, problem, start, [tuple(robot.active) for robot in alike]):
+                self._solve(*some)
         return [robot.solved for robot in robots]
 
     def build(self, measurements: Measurements) -> CalibrationSetup:

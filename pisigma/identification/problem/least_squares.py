@@ -219,7 +219,7 @@ class _Search(Generic[Point]):
 
     def propose(self) -> None:
         """Work out the next steps."""
-        damping = self.best.cost.new_tensor(self.damping).view_as(self.best.cost)
+        damping = torch.from_numpy(self.damping).to(self.best.cost).view_as(self.best.cost)
         self.step = solve_damped(self.here, self.problem.step_scale, damping)
         self.decrement = _array(_product(self.here.normal, self.step).mul_(self.step).sum(-1))
 
@@ -374,7 +374,7 @@ def covariance_of(
 ) -> Float64[Tensor, "*robots active active"]:
     """Invert a normal matrix, with column scaling; directions that it does not hold get no variance."""
     diagonal = normal.diagonal(dim1=-2, dim2=-1)
-    scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
+    scale = diagonal.masked_fill(diagonal <= 0, 1.0).rsqrt_()
     scales = scale[..., None, :] * scale[..., None]
     scaled = normal * scales
     factor, failed = torch.linalg.cholesky_ex(scaled)

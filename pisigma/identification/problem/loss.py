@@ -96,15 +96,16 @@ class HampelLoss(AbstractLoss):
         """Square, line, parabola, constant."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
-        straight, bent = distance.clamp(a, c) - a, distance.clamp(b, c) - b
-        cost: Tensor = distance.clamp(max=a).square().add_(straight, alpha=2 * a)
-        return cost.add_(bent.square(), alpha=-a / (c - b))
+        straight, bent = distance.clamp(a, c).sub_(a), distance.clamp(b, c).sub_(b)
+        cost: Tensor = distance.clamp(max=a).square_().add_(straight, alpha=2 * a)
+        return cost.addcmul_(bent, bent, value=-a / (c - b))
 
     def weight(self, distance: Float[Tensor, "*batch rows"], components: int) -> Float[Tensor, "*batch rows"]:
         """One, a / distance, falling, zero."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
-        return (a / distance.clamp(min=a)) * ((c - distance) / (c - b)).clamp(0, 1)
+        falling: Tensor = (c - distance).div_(c - b).clamp_(0, 1)
+        return falling.mul_(a).div_(distance.clamp(min=a))
 
     def scale(
         self, distance: Float[Tensor, "*batch rows"], components: int, used: Figure

@@ -1,6 +1,5 @@
 """How the tool moves with the parameters in the rows of a problem, and the memory of the last such motion."""
 
-import operator
 from collections.abc import Callable
 
 import torch
@@ -12,28 +11,23 @@ from pisigma.kinematics.parameter_jacobian import ToolMotion, tool_motion
 
 
 class MotionMemory:
-    """The last motion in every chunk of rows, which the rank analysis, the search and its next stage ask for.
+    """The motion at the last point, which the rank analysis, the search and its next stage all ask for.
 
-    What a motion was made from besides the point is compared by identity.
+    What the motion was made from is compared by identity; so points are replaced and never changed in place.
     """
 
     def __init__(self) -> None:
-        self._motions: dict[int, tuple[Tensor, tuple[object, ...], ToolMotion]] = {}
+        self._made_from: tuple[object, ...] = ()
+        self._motion: ToolMotion | None = None
 
-    def motion(
-        self, chunk: int, point: Tensor, made_from: tuple[object, ...], make: Callable[[], ToolMotion]
-    ) -> ToolMotion:
-        """Return the motion of the chunk that was made from the same, or else a new one."""
-        before = self._motions.get(chunk)
-        if (
-            before is not None
-            and all(map(operator.is_, made_from, before[1]))
-            and torch.equal(point, before[0])
-        ):
-            return before[2]
-        motion = make()
-        self._motions[chunk] = point, made_from, motion
-        return motion
+    def motion(self, made_from: tuple[object, ...], make: Callable[[], ToolMotion]) -> ToolMotion:
+        """Return the motion that was made from the same objects, or else a new one."""
+        same = len(made_from) == len(self._made_from) and all(
+            one is other for one, other in zip(made_from, self._made_from, strict=True)
+        )
+        if not same or self._motion is None:
+            self._made_from, self._motion = made_from, make()
+        return self._motion
 
 
 def motion_at(

@@ -65,7 +65,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         stated: what rows state beside their joint values (see `JointState`), for corrections that depend on it.
         prior_sizes: "stated": the prior as it is; "widened": wider where the errors are larger than it says;
             "estimated": wider or narrower.
-        memory: the last motions; shared with problems that differ in their free parameters or prior only.
+        memory: the last motion; shared with problems that differ in their free parameters or prior only.
     """
 
     space: ParameterSpace
@@ -262,8 +262,8 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
 
     def chunks(self) -> list[slice]:
         """Rows that are worked on together; all or none of a robot where there are several."""
-        whole = self.rows if self.robots else 1
-        size = max(JACOBIAN_CHUNK // whole, 1) * whole
+        # several robots take more operations a chunk, which larger chunks make up for
+        size = JACOBIAN_CHUNK if not self.robots else max(2 * JACOBIAN_CHUNK // self.rows, 1) * self.rows
         return [slice(start, min(start + size, len(self.q))) for start in range(0, len(self.q), size)]
 
     def _of_rows(self, values: Float64[Tensor, "*robots size"], rows: slice) -> Float64[Tensor, "*some size"]:
@@ -280,11 +280,10 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         The columns are 0 for base and tool in rows of other frames and targets, and for parameters that do not
         move the tool.
         """
-        there, of_rows = self._of_rows(point, rows), (self.q[rows], self.frame[rows], self.target[rows])
-        make = partial(motion_at, self.space, there, *of_rows, self._turning)
-        made_from = (self.space, self.q, self.frame, self.target, self._turning)
-        kept = self.robots or rows.stop - rows.start == len(self.q)
-        motion = self.memory.motion(rows.start, there, made_from, make) if kept else make()
+        of_rows = (self._of_rows(point, rows), self.q[rows], self.frame[rows], self.target[rows])
+        make = partial(motion_at, self.space, *of_rows, self._turning)
+        made_from = (point, self.space, self.q, self.frame, self.target, self._turning)
+        motion = self.memory.motion(made_from, make) if self.chunks() == [rows] else make()
         columns = self.space.motion_columns.to(active.device)
         J = motion.derivative.index_select(0, columns[0, active])
         if not self.space.always_moving:
@@ -328,10 +327,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         self, view: SensorView
     ) -> tuple[Float64[Tensor, "*robots active active"], Float64[Tensor, "*robots active"]]:
         """Divide the sums by their variances; the prior is not in it."""
-        variance = view.variances[..., None]
         terms = [
-            (sums.normal / variance[..., k, :, None], sums.descent / variance[..., k, :])
-            for k, sums in enumerate(view.sums)
+            (sums.normal / variance[..., None, None], sums.descent / variance[..., None])
+            for sums, variance in zip(view.sums, view.variances.unbind(-1), strict=True)
         ]
         normal, descent = terms[0]
         for more_normal, more_descent in terms[1:]:
