@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pisigma.camera.corner_file import CameraFiles
 from pisigma.errors import FleetError, nearest_choice
+from pisigma.measurement.csv.header import check_separators
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.rules import is_date
 
@@ -73,7 +74,7 @@ def read_fleet(source: str | os.PathLike[str], robot: str | None = None) -> tupl
 
     Raises:
         FleetError: there is none, or one that cannot be named or is described twice; the message names file and line.
-        MeasurementError: the manifest is no CSV file.
+        MeasurementError: the manifest is no CSV file, or has no commas between its fields.
     """
     path = Path(source)
     members = _in_folder(path, robot) if path.is_dir() else _in_manifest(path, robot)
@@ -89,6 +90,7 @@ def _in_manifest(path: Path, robot: str | None) -> list[Member]:
     """The robots of a manifest."""
     table = read_table(path)
     for name in table.header:
+        check_separators(name, f"{path}, line {table.header_line}")
         if name not in COLUMNS:
             raise FleetError(
                 f"{path}, line {table.header_line}: column '{name}' is unknown; {nearest_choice(name, COLUMNS)}"

@@ -2,7 +2,7 @@
 
 import pytest
 
-from pisigma.errors import FleetError
+from pisigma.errors import FleetError, MeasurementError
 from pisigma.fleet.members import read_fleet
 from pisigma.workflow.fleet.one_robot import FleetSettings
 
@@ -65,6 +65,10 @@ def test_a_tree_of_folders_is_a_fleet(tmp_path):
     [
         ("id,robot,date\na,ur5,\n", "line 1: column 'data' is missing"),
         ("id,robot,data,dats\na,ur5,a.csv,\n", "line 1: column 'dats' is unknown; did you mean 'date'"),
+        (
+            "id;robot;data\na;ur5;a.csv\n",
+            "line 1, column 'id;robot;data': fields are separated by semicolons",
+        ),
         ("id,robot,data\n../a,ur5,a.csv\n", "line 2: '../a' cannot be the id of a robot"),
         ("id,robot,data\na,,a.csv\n", "line 2: the field 'robot' is empty"),
         ("id,robot,data\na,ur5,\n", "line 2: the field 'data' is empty"),
@@ -77,7 +81,7 @@ def test_a_tree_of_folders_is_a_fleet(tmp_path):
     ],
 )
 def test_what_is_wrong_with_a_manifest_is_said_with_its_line(tmp_path, text, complaint):
-    with pytest.raises(FleetError) as raised:
+    with pytest.raises((FleetError, MeasurementError)) as raised:
         read_fleet(write(tmp_path, text))
     assert complaint in str(raised.value)
 
