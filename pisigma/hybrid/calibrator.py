@@ -202,7 +202,7 @@ class HybridCalibrator:
         if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.certain):
             # The geometry leaves nothing to learn; features would fit the errors of the linearisation.
             search = Search(rows, noise, prior_scale, [], progress)
-            return search.added(search.geometry, [])
+            return search.extended(search.geometry, [])
         robot = self.geometric.robot
         gravity = self.gravity or gravity_by_evidence(robot, rows, noise, prior_scale)
         directions = dict.fromkeys((gravity, self.gravity or USUAL))
@@ -214,9 +214,10 @@ class HybridCalibrator:
         products = [InputProducts(robot)] if self.products and robot.dof > 1 else []
         choices = []
         for growing, others in tried:
-            search = Search(rows, noise, prior_scale, [*others, *growing[-1:]], progress)
-            best = search.best(growing, others)
-            choices.append(search.added(best, [*products, *self._lines(rows, best)]))
+            largest = [*others, *growing[-1:], *products]
+            search = Search(rows, noise, prior_scale, largest, progress)
+            best = search.best(growing, others, products)
+            choices.append(search.extended(best, self._lines(rows, best)))
         return max(choices, key=lambda choice: choice.best.posterior.log_evidence)
 
     def _lines(self, rows: Rows, best: Fitted) -> list[GearLines]:

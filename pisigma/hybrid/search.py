@@ -162,6 +162,7 @@ class Search:
         self,
         growing: Sequence[AbstractFeature],
         others: Sequence[AbstractFeature],
+        last: Sequence[AbstractFeature] = (),
     ) -> Fitted:
         """Geometry alone, then other features, then ever larger ones, as long as it gets better.
 
@@ -171,6 +172,7 @@ class Search:
         Args:
             growing: of one name, ever larger.
             others: tried before them, and those that did not help once more after them.
+            last: tried when everything else is chosen.
         """
         best = self.geometry
         for chosen in others:
@@ -190,20 +192,24 @@ class Search:
             usual = tuple(max(scale, LEAST_USUAL_SCALE) for scale in self.prior_scale)
             for scale in dict.fromkeys((tuple(self.prior_scale), usual)):
                 best = self._from_usual_sizes(together, scale, best)
-        return best
+        return self._added(best, last)
 
-    def added(self, best: Fitted, features: Sequence[AbstractFeature]) -> Choice:
-        """The best so far, and features that are tried one after the other when everything else is chosen."""
+    def extended(self, best: Fitted, features: Sequence[AbstractFeature]) -> Choice:
+        """The best so far, or that with features that came out of it, which need a regression of their own."""
         if features:
             largest = (*best.design.features, *features)
             del self._regression  # one system of equations at a time: they are large
             self._regression = regression(Design(self.rows.problem, largest), self.rows)
             self._order = [one.name for one in largest]
+        return Choice(self.rows, self.geometry, self._added(best, features), tuple(self.trials))
+
+    def _added(self, best: Fitted, features: Sequence[AbstractFeature]) -> Fitted:
+        """The best so far, and features that are tried one after the other."""
         for chosen in features:
             gain, sizes = self._regression.first_sizes(best.posterior, best.design, chosen)
             if gain > CLEARLY / 2:
                 best = self._tried([*best.design.features, chosen], best, sizes)
-        return Choice(self.rows, self.geometry, best, tuple(self.trials))
+        return best
 
     def _tried(
         self, features: Sequence[AbstractFeature], best: Fitted, sizes: Tensor | None = None

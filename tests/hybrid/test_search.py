@@ -62,7 +62,7 @@ def test_geometry_is_the_first_line_and_the_unit(series: LinearisedArm) -> None:
 def test_larger_series_are_tried_until_the_evidence_is_clearly_against_them(series: LinearisedArm) -> None:
     said: list[str] = []
     search = search_of(series, said)
-    best = search.added(search.best(SERIES, [SMALL]), [PRODUCTS]).best
+    best = search.best(SERIES, [SMALL], [PRODUCTS])
     assert best.name.endswith("series 4")
     kept = [line for line in search.trials if line.kept]
     assert kept[-1].name == best.name
@@ -73,7 +73,7 @@ def test_larger_series_are_tried_until_the_evidence_is_clearly_against_them(seri
 
 def test_products_come_last_and_stay_where_they_help(products: LinearisedArm) -> None:
     search = search_of(products)
-    best = search.added(search.best(SERIES[:1], [SMALL]), [PRODUCTS]).best
+    best = search.best(SERIES[:1], [SMALL], [PRODUCTS])
     assert best.name.endswith("products")
     assert search.trials[-1].kept
     assert search.trials[-1].left_out < 0.6
@@ -109,7 +109,7 @@ def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:
 def test_what_does_not_help_leaves_the_geometry() -> None:
     q = drawn_joints(ROBOT, 80, 4)
     search = search_of(rows_of(torch.zeros_like(q), q))
-    best = search.added(search.best(SERIES, [SMALL]), [PRODUCTS]).best
+    best = search.best(SERIES, [SMALL], [PRODUCTS])
     assert best is search.geometry
     assert not any(line.kept for line in search.trials[1:])
 
