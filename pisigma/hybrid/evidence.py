@@ -176,9 +176,11 @@ class AbstractRegression(ABC):
     """Weighted linear regression `y = X x + e` of all measured values on the unknowns.
 
     Attributes:
+        design: the unknowns.
         sensors: how many values there are of every sensor.
     """
 
+    design: "Design"
     sensors: tuple[SensorCount, ...]
 
     @abstractmethod

@@ -61,7 +61,7 @@ def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: C
         choice: of the features, as fitted to some of the rows or all.
     """
     design, posterior = Design(problem, choice.best.design.features), choice.best.posterior
-    rows, fit, rounds = choice.rows, None, 1
+    rows, fit, rounds = choice.rows, choice.regression, 1
     while rounds < MOST_ROUNDS:
         there = linearised(design, posterior.x, posterior.effective, group)
         differs = there.difference(rows, posterior.x, design, posterior.noise)

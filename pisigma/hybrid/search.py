@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pisigma.hybrid.design import FOLDS, FOLDS_OF_FEW, Design, Rows
-from pisigma.hybrid.evidence import Posterior
+from pisigma.hybrid.evidence import AbstractRegression, Posterior
 from pisigma.hybrid.regression import regression
 from pisigma.joint_correction.feature import AbstractFeature
 
@@ -94,12 +94,14 @@ class Choice:
         geometry: without features.
         best: with the features that were kept.
         trials: what was tried, in order.
+        regression: of the rows on the best, where it is at hand.
     """
 
     rows: Rows
     geometry: Fitted
     best: Fitted
     trials: tuple[Trial, ...]
+    regression: AbstractRegression | None = None
 
 
 class Search:
@@ -192,24 +194,22 @@ class Search:
             usual = tuple(max(scale, LEAST_USUAL_SCALE) for scale in self.prior_scale)
             for scale in dict.fromkeys((tuple(self.prior_scale), usual)):
                 best = self._from_usual_sizes(together, scale, best)
-        return self._added(best, last)
-
-    def extended(self, best: Fitted, features: Sequence[AbstractFeature]) -> Choice:
-        """The best so far, or that with features that came out of it, which need a regression of their own."""
-        if features:
-            largest = (*best.design.features, *features)
-            del self._regression  # one system of equations at a time: they are large
-            self._regression = regression(Design(self.rows.problem, largest), self.rows)
-            self._order = [one.name for one in largest]
-        return Choice(self.rows, self.geometry, self._added(best, features), tuple(self.trials))
-
-    def _added(self, best: Fitted, features: Sequence[AbstractFeature]) -> Fitted:
-        """The best so far, and features that are tried one after the other."""
-        for chosen in features:
+        for chosen in last:
             gain, sizes = self._regression.first_sizes(best.posterior, best.design, chosen)
             if gain > CLEARLY / 2:
                 best = self._tried([*best.design.features, chosen], best, sizes)
         return best
+
+    def extended(self, best: Fitted, features: Sequence[AbstractFeature]) -> Choice:
+        """The best so far, or that with features that come out of it, which need a regression of their own."""
+        if features:
+            largest = [*best.design.features, *features]
+            del self._regression  # one system of equations at a time: they are large
+            self._regression = regression(Design(self.rows.problem, tuple(largest)), self.rows)
+            self._order = [one.name for one in largest]
+            best = self._tried(largest, best)
+        same = self._regression.design.features == best.design.features
+        return Choice(self.rows, self.geometry, best, tuple(self.trials), self._regression if same else None)
 
     def _tried(
         self, features: Sequence[AbstractFeature], best: Fitted, sizes: Tensor | None = None
