@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -140,6 +142,23 @@ def test_pivots_span_the_columns(rank: int, seed: int) -> None:
     assert len(set(pivots.tolist())) == rank
     basis, _ = np.linalg.qr(A[:, pivots])
     assert_close(A - basis @ (basis.T @ A), 0.0, atol=1e-6 * float(np.abs(A).max()))
+
+
+@pytest.mark.parametrize("smallest", [1.0, 1e-3, 3e-6, 1e-6, 3e-7, 1e-9, 0.0])
+def test_the_rank_counts_the_singular_values_above_the_tolerance(smallest: float) -> None:
+    seen, sizes = condensed(Robot.load("rb5"), 3, rows=40, poses=False, arm_only=True)
+    redundancy = find_redundancy(seen, sizes)
+    kept, removed = (
+        [seen.names.index(name) for name in names] for names in (redundancy.kept, redundancy.removed)
+    )
+    root = seen.root.copy()
+    beside = np.linalg.qr(np.column_stack([root[:, kept], np.ones(len(root))]))[0][:, -1]
+    length = np.linalg.norm(root[:, removed[0]])
+    root[:, removed[0]] += smallest * length * beside
+    changed = find_redundancy(replace(seen, root=root), sizes)
+    values = changed.singular_values
+    assert changed.rank == int((values > changed.tolerance * values[0]).sum())
+    assert changed.rank == len(changed.kept)
 
 
 def test_joint_values_come_from_the_limits() -> None:
