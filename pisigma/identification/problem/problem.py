@@ -383,9 +383,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         if not everywhere:
             root = torch.where(self.by_robot(sensor.present[rows]), root, 0.0)
         J = self.by_robot(self.derivative(sensor, motion, unknowns, rows, self.active))
-        A = J.new_empty(J.shape)
-        torch.mul(J, root[..., None, None, :], out=A)
+        A = J.new_empty((*J.shape[:-3], J.shape[-3] + 1, *J.shape[-2:]))  # the residual is its last row
+        torch.mul(J, root[..., None, None, :], out=A[..., :-1, :, :])
+        torch.mul(residual, root[..., None, :], out=A[..., -1, :, :])
         A = A.flatten(-2)
-        measured = self.values_measured[number] // sensor.components
-        r = (residual * root[..., None, :]).flatten(-2)[..., None]
-        return SensorSums(A @ A.mT, (A @ r)[..., 0], residual, distance, measured)
+        sums, measured = A @ A.mT, self.values_measured[number] // sensor.components
+        return SensorSums(sums[..., :-1, :-1], sums[..., :-1, -1], residual, distance, measured)
