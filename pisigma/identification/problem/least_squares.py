@@ -13,7 +13,7 @@ from jaxtyping import Float, Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import IdentificationError
-from pisigma.identification.problem.robots import of_robots, with_robots
+from pisigma.identification.problem.robots import in_order, of_robots, with_robots
 
 Point = TypeVar("Point")
 START_DAMPING = 1e-3
@@ -192,7 +192,7 @@ def levenberg_marquardt(
             search.end(near, SolutionStatus.CONVERGED)
         if len(search.robots):
             search.go()
-    return Solution(search.last, tuple(search.ends))
+    return Solution(in_order(*zip(*search.ended, strict=True)), tuple(search.ends))
 
 
 class _Search(Generic[Point]):
@@ -200,7 +200,7 @@ class _Search(Generic[Point]):
 
     Attributes:
         robots: whose searches they are, their numbers among all.
-        last: the best points, of the robots whose search has ended too.
+        ended: the best points where searches have ended, and the numbers of their robots.
         ends: how the searches have ended.
         best: the best points.
         here: where the next steps start.
@@ -210,7 +210,8 @@ class _Search(Generic[Point]):
     """
 
     def __init__(self, problem: AbstractLeastSquares[Point], best: Linearisation[Point]) -> None:
-        self.problem, self.here, self.best, self.last = problem, best, best, best
+        self.problem, self.here, self.best = problem, best, best
+        self.ended: list[tuple[Linearisation[Point], Tensor]] = []
         count = best.cost.numel()
         self.robots, self.iterations = np.arange(count), 0
         self.at_best, self.uphill = np.ones(count, dtype=bool), np.zeros(count, dtype=np.int64)
@@ -273,14 +274,14 @@ class _Search(Generic[Point]):
         reasons = np.broadcast_to(np.array(status, dtype=object), len(ended))
         for robot, reason in zip(self.robots[ended], reasons[ended], strict=True):
             self.ends[robot] = replace(self.ends[robot], iterations=self.iterations, status=reason)
-        everyone = np.zeros(len(self.ends), dtype=bool)
-        everyone[self.robots[ended]] = True
-        self.last = _where(everyone, self.best, self.last, ended)
+        numbers, left = torch.from_numpy(np.flatnonzero(ended)), torch.from_numpy(np.flatnonzero(~ended))
+        best = of_robots(self.best, numbers) if len(left) else self.best
+        self.ended.append((best, torch.from_numpy(self.robots[ended])))
         self.robots = self.robots[~ended]
-        if len(self.robots):
-            left = torch.from_numpy(np.flatnonzero(~ended))
-            self.problem = self.problem.of_robots(left)
-            self.best, self.here, self.step = of_robots((self.best, self.here, self.step), left)
+        if len(left):
+            self.problem, same = self.problem.of_robots(left), self.here is self.best
+            self.best, self.step = of_robots((self.best, self.step), left)
+            self.here = self.best if same else of_robots(self.here, left)
             for name in ("at_best", "uphill", "damping", "decrement"):
                 setattr(self, name, getattr(self, name)[~ended])
 
@@ -319,26 +320,15 @@ def _product(
 
 
 def _where(
-    chosen: np.ndarray,
-    these: Linearisation[Point],
-    those: Linearisation[Point],
-    of_these: np.ndarray | None = None,
+    chosen: np.ndarray, these: Linearisation[Point], those: Linearisation[Point]
 ) -> Linearisation[Point]:
-    """Return these linearisations for the chosen robots, and those for all others.
-
-    Args:
-        chosen: per robot of those, whether it is one.
-        these: of the chosen and others.
-        those: of all robots.
-        of_these: per robot of these, whether it is chosen; None where they are of the same robots.
-    """
-    of_these = chosen if of_these is None else of_these
-    if chosen.all() and of_these.all():
+    """Return these linearisations for the chosen robots, and those for all others."""
+    if chosen.all():
         return these
     if not chosen.any():
         return those
-    theirs = of_robots(these, torch.from_numpy(np.flatnonzero(of_these)))
-    return with_robots(those, torch.from_numpy(np.flatnonzero(chosen)), theirs)
+    robots = torch.from_numpy(np.flatnonzero(chosen))
+    return with_robots(those, robots, of_robots(these, robots))
 
 
 def solve_damped(

@@ -1,9 +1,10 @@
 """Values of several robots side by side: some of them, and theirs put in the place of others."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, TypeVar
 
+import torch
 from jaxtyping import Int64
 from torch import Tensor
 
@@ -45,6 +46,14 @@ def with_robots(values: Values, robots: Int64[Tensor, " chosen"], others: Values
         lambda value, other: value.index_copy(0, robots.to(value.device), other), values, others
     )
     return changed
+
+
+def in_order(values: Sequence[Values], robots: Sequence[Int64[Tensor, " some"]]) -> Values:
+    """Return the values of all robots in the order of their numbers, of those of some robots each."""
+    if len(values) == 1:
+        return values[0]
+    joined: Values = _mapped(lambda *several: torch.cat(several), *values)
+    return of_robots(joined, torch.cat(list(robots)).argsort())
 
 
 def _mapped(function: Callable[..., Tensor], *values: Any) -> Any:
