@@ -92,16 +92,23 @@ def predicted_spread(result: HybridResult, measurements: Measurements) -> Predic
     return spread
 
 
-def image_remark(measurements: Measurements) -> tuple[str, ...]:
-    """Say how uncertain the poses of images are by themselves; nothing where there are no images."""
+def image_deviation(measurements: Measurements) -> float:
+    """Root mean square error of the positions that images give by themselves [m]; 0 without images."""
     noise = measurements.readings.get(NOISE_COLUMN)
     if not isinstance(noise, Tensor):
-        return ()
+        return 0.0
     by_image = position_deviations(measurements) * noise[:, None]
-    own = float(by_image.square().sum(1).nanmean().sqrt())
+    return float(by_image.square().sum(1).nanmean().sqrt())
+
+
+def image_remark(measurements: Measurements) -> tuple[str, ...]:
+    """Say how uncertain the positions of images are by themselves; nothing where there are no images."""
+    deviation = image_deviation(measurements)
+    if not deviation:
+        return ()
     return (
-        f"The position that an image gives is itself uncertain by {own * 1e3:.2g} mm (RMS), which the errors contain: "
-        "the robot is more accurate than they say.",
+        f"The position that an image gives is itself uncertain by {deviation * 1e3:.2g} mm (RMS), which the errors "
+        "contain: the robot is more accurate than they say.",
     )
 
 

@@ -21,6 +21,7 @@ from pisigma.judging.calibration_validation import errors_under
 from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.distillation_summary import ParentFigures
 from pisigma.judging.few_rows import fit_where_it_helps
+from pisigma.judging.predicted_spread import image_deviation
 from pisigma.judging.progress import Progress, stage
 from pisigma.judging.trained_calibrations import fit
 from pisigma.measurement.dataset import Measurements
@@ -331,8 +332,9 @@ def _warnings(
 ) -> tuple[str, ...]:
     """What to heed, a sentence each; `noise` is that of the calibration, per sensor."""
     warnings = list(condition_warnings(model, rows))
-    error, usual = judged.rms[judged.kept], math.sqrt(3) * noise.get("position", math.inf)
-    if error is not None and error > SUSPICIOUS * usual and model.kind != FLEET_PRIOR:
+    error = judged.rms[judged.kept]
+    usual = max(math.sqrt(3) * noise.get("position", 0.0), image_deviation(rows))
+    if error is not None and error > SUSPICIOUS * usual > 0 and model.kind != FLEET_PRIOR:
         warnings.append(
             f"Left-out rows are missed by {error * 1e3:.3g} mm, while single positions scattered by "
             f"{usual * 1e3:.2g} mm when the model was made, so that what is said to have moved may be wrong: rows "
