@@ -8,6 +8,8 @@ from jaxtyping import Float64, Int64, UInt8
 from scipy.ndimage import map_coordinates
 
 from pisigma.camera.board import Board
+from pisigma.camera.board_pose import FEWEST_CORNERS
+from pisigma.camera.detection.saddle import fit_saddles
 
 Image = UInt8[np.ndarray, "height width"]
 """Gray values; the centre of the first pixel is at u = v = 0."""
@@ -23,6 +25,8 @@ SMOOTHING = 1.5
 """[px] Standard deviation of the blur before gradients are taken, less in small windows; best on rendered images."""
 WINDOW = 0.8
 """Half of the side of the window around a corner, as share of the clearance."""
+SMALLEST_SQUARE = 16.0
+"""[px²] Squares that appear smaller hold no window."""
 _STOP = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-4)
 
 
@@ -60,10 +64,10 @@ def shown_edges(detected: DetectedBoard, board: Board) -> Float64[np.ndarray, "e
 
 
 def refined(image: Image, detected: DetectedBoard, board: Board) -> DetectedBoard:
-    """Move the corners of squares to where the gradients around them point past (Förstner & Gülch 1987).
+    """Move the corners of squares to where the gradients around them point past (Förstner & Gülch 1987), and fit them.
 
     The window around each is as large as it can be without other edges in it; corners whose window leaves the image are
-    left out.
+    left out. From there the gray values are fitted, see `fit_saddles`.
 
     Args:
         image: that shows them.
@@ -81,7 +85,23 @@ def refined(image: Image, detected: DetectedBoard, board: Board) -> DetectedBoar
     inside = (np.abs(pixels - np.array(image.shape[::-1]) / 2) < np.array(image.shape[::-1]) / 2 - half).all(
         1
     )
-    return DetectedBoard(detected.corners[inside], pixels[inside])
+    corners, pixels = detected.corners[inside], pixels[inside]
+    axes = _axes_of_squares(board.corners[corners, :2] / board.square, pixels)
+    if axes is not None:
+        pixels = fit_saddles(image.astype(np.float64), pixels, axes, WINDOW * board.clearance)
+    return DetectedBoard(corners, pixels)
+
+
+def _axes_of_squares(
+    grid: Float64[np.ndarray, "corners 2"], pixels: Float64[np.ndarray, "corners 2"]
+) -> Float64[np.ndarray, "corners 2 2"] | None:
+    """Derivatives of pixels by steps along rows and columns of squares, by their homography; None without one."""
+    H = cv2.findHomography(grid, pixels)[0] if len(grid) > FEWEST_CORNERS and np.ptp(grid, 0).all() else None
+    if H is None:
+        return None
+    projected = grid @ H[:, :2].T + H[:, 2]
+    axes = (H[:2, :2] - (projected[:, :2] / projected[:, 2:])[..., None] * H[2, :2]) / projected[:, 2:, None]
+    return axes if (np.abs(np.linalg.det(axes)) > SMALLEST_SQUARE).all() else None
 
 
 @dataclass(frozen=True, eq=False)
