@@ -38,6 +38,8 @@ CLASS_ROBOTS = 0.02
 more alike, and only so much that what no rows determine stays as uncertain as in the class."""
 SEARCH_CLASS_ROBOTS = 0.2
 """The same while odd robots are searched for: a fleet that a few robots make too narrow calls the others odd."""
+ROBOTS_AT_ONCE = 100
+"""Inverses of so many robots are kept at a time, 40 MB."""
 CONCENTRATIONS = 10
 ODD = 1e-3
 """Probability that any robot of a fleet without odd ones is called odd."""
@@ -72,6 +74,17 @@ class Population:
     covariance: Float64[Tensor, "unknowns unknowns"]
     geometric: int
 
+    def of_another(self, robots: int) -> "Population":
+        """Give what is known of a robot besides those that the population was estimated from.
+
+        With n of them the mean scatters by `Σ / n`, and the estimate of Σ is too small by `(n - 1) / n`: together
+        `(n + 1) / (n - 1)`.
+
+        Args:
+            robots: how many there were.
+        """
+        return replace(self, covariance=(robots + 1) / (robots - 1) * self.covariance)
+
     def surprise(self, robot: RobotEvidence) -> tuple[float, int]:
         """How far a robot is from the fleet: a sum of squares that is chi-squared for a robot of it, and of how many.
 
@@ -102,8 +115,8 @@ class FleetPrior:
     """What a fleet has in common.
 
     Attributes:
-        model: the mean robot; its uncertainty is the scatter between robots.
-        population: the same in numbers.
+        model: the mean robot, as uncertain as another robot of the fleet.
+        population: the scatter between robots.
         names: of the geometric parameters.
         odd: numbers of the robots that are unlike the others and did not count.
     """
@@ -147,7 +160,7 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
         evidence = [evidence_of(model, population.mean, rows) for rows in fleet]
         population, odd = without_odd(evidence, first, usual)
         noise = _medians([one.noise for one in evidence])
-    model = mean_robot(name, knowledge, population, fleet, noise)
+    model = mean_robot(name, knowledge, population.of_another(len(fleet) - len(odd)), fleet, noise)
     return FleetPrior(model, population, space.names[: space.arm_size], odd)
 
 
@@ -346,12 +359,15 @@ def _maximised(
     size, count = now.geometric, len(evidence)
     precision = torch.linalg.inv(now.covariance)
     at_mean, x, scatter = precision @ now.mean, [], torch.zeros_like(precision)
-    for one in evidence:  # one by one: all at once need hundreds of megabytes for hundreds of robots
-        inverse = torch.cholesky_inverse(torch.linalg.cholesky(one.normal + precision))
-        x.append(inverse @ (one.descent + at_mean))
-        scatter += inverse
-    mean = torch.stack(x).mean(0)
-    off = torch.stack(x) - mean
+    for first in range(0, count, ROBOTS_AT_ONCE):
+        some = evidence[first : first + ROBOTS_AT_ONCE]
+        factors = torch.linalg.cholesky(torch.stack([one.normal for one in some]) + precision)
+        inverses = torch.cholesky_inverse(factors)
+        right = torch.stack([one.descent for one in some]) + at_mean
+        x.append(torch.einsum("rij,rj->ri", inverses, right))
+        scatter += inverses.sum(0)
+    mean = torch.cat(x).mean(0)
+    off = torch.cat(x) - mean
     scatter += off.t() @ off
     diagonal = (of_class + scatter.diagonal()) / robots
     covariance = diagonal.diag()

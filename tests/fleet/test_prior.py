@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import torch
+from scipy.stats import chi2
 from testing.fleet_robots import DRAWN, common_errors, rows_of
 from testing.models import no_type_checker
 
@@ -84,6 +85,20 @@ def test_expectation_maximisation_finds_a_population():
     found = expectation_maximisation(evidence, start, torch.ones(2).double())
     assert (found.mean - mean).abs().max() < 0.03
     assert (found.covariance.diagonal().sqrt() / deviation - 1).abs().max() < 0.05
+
+
+def test_what_few_robots_say_of_another_one_allows_for_their_number():
+    """One more than five is beyond their 95 % point in 19 %, as their scatter is uncertain, too; else in 31 %."""
+    g = torch.Generator().manual_seed(0)
+    beyond = []
+    for _ in range(200):
+        x = torch.randn(6, 2, generator=g, dtype=torch.float64)
+        robots = [RobotEvidence(1e8 * torch.eye(2).double(), 1e8 * one, {}) for one in x]
+        off = x[:5] - x[:5].mean(0)
+        population = Population(x[:5].mean(0), off.square().mean(0).diag(), 0).of_another(5)
+        square, count = population.surprise(robots[5])
+        beyond.append(chi2.sf(square, count) < 0.05)
+    assert sum(beyond) < 0.2 * len(beyond)
 
 
 def test_a_robot_without_information_does_not_count():
