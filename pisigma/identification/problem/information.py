@@ -103,12 +103,11 @@ def information(
         One of every robot.
     """
     index = torch.tensor(candidates, dtype=torch.int64, device=point.device)
-    usual = torch.from_numpy(problem.space.usual_errors).to(point)[index, None, None]
-    root, roots = point.new_zeros((0, len(candidates) + 2)), []
+    roots: list[Tensor] = []
     unknowns = problem.space.sensor_unknowns(point)
     for rows in problem.chunks():
         motion = problem.motion(point, rows, index)
-        blocks = [root.t()] if len(root) else []
+        blocks = [roots.pop().t()] if roots and not problem.robots else []
         for k, sensor in enumerate(problem.sensors):
             J, r = (
                 problem.derivative(sensor, motion, unknowns, rows, index),
@@ -120,19 +119,19 @@ def information(
                 present = sensor.present[rows][: weight.shape[-1]]
                 J, r, weight = J[..., present], r[..., present], weight[..., present]
             block = r.new_empty((*r.shape[:-2], len(candidates) + 2, *r.shape[-2:]))
-            torch.mul(J, usual * weight[..., None, None, :], out=block[..., :-2, :, :])
+            torch.mul(J, weight[..., None, None, :], out=block[..., :-2, :, :])
             torch.mul(r, weight[..., None, :], out=block[..., -2, :, :])
             block[..., -1, :, :] = weight[..., None, :]
             blocks.append(block.flatten(-2))
-        condensed = torch.linalg.qr((torch.cat(blocks, -1) if len(blocks) > 1 else blocks[0]).mT, mode="r").R
-        if problem.robots:
-            roots += list(condensed.cpu().numpy())
-        else:
-            root = condensed
+        roots.append(
+            torch.linalg.qr((torch.cat(blocks, -1) if len(blocks) > 1 else blocks[0]).mT, mode="r").R
+        )
+    usual = np.append(problem.space.usual_errors[candidates], (1.0, 1.0))
     present = torch.stack([sensor.present for sensor in problem.sensors]).any(0)
     poses, values = int(present[: problem.rows].sum()), sum(problem.values_measured)
     parameters = tuple(problem.space.parameters[i] for i in candidates)
-    return [Information(parameters, one, values, poses) for one in roots or [root.cpu().numpy()]]
+    of_each = (one for some in roots for one in some.view(-1, *some.shape[-2:]).cpu().numpy())
+    return [Information(parameters, one * usual, values, poses) for one in of_each]
 
 
 def _row_weights(
