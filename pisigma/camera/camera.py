@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from pisigma.errors import MeasurementError
 from pisigma.files.input_file import read_text
@@ -19,15 +19,14 @@ USUAL_DEVIATIONS = (0.5, 0.5, 1.0, 1.0, 0.002, 0.01, 2e-4, 2e-4, 0.0)
 """Standard deviations of the intrinsics that a usual calibration leaves, with 0 for k3, which it seldom frees."""
 
 Positive = Annotated[float, Field(gt=0)]
-Deviation = Annotated[float, Field(ge=0)]
 UNDISTORTED = 1e-14
 """A shorter Newton step to the undistorted point is rounding."""
 UNDISTORT_STEPS = 20
 """Newton steps from a distorted to the undistorted point; ordinary lenses take four."""
 
 
-class DeviationsSection(Section):
-    """Standard deviations of a camera's intrinsics; those that are not stated are 0.
+class IntrinsicsSection(Section):
+    """A number for each of a camera's intrinsics, such as its standard deviation; those that are not stated are 0.
 
     Attributes:
         fx: of the focal length along u [px].
@@ -41,15 +40,20 @@ class DeviationsSection(Section):
         k3: see k1.
     """
 
-    fx: Deviation = 0.0
-    fy: Deviation = 0.0
-    cx: Deviation = 0.0
-    cy: Deviation = 0.0
-    k1: Deviation = 0.0
-    k2: Deviation = 0.0
-    p1: Deviation = 0.0
-    p2: Deviation = 0.0
-    k3: Deviation = 0.0
+    fx: float = 0.0
+    fy: float = 0.0
+    cx: float = 0.0
+    cy: float = 0.0
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    @property
+    def numbers(self) -> tuple[float, ...]:
+        """All of them, in the order of `INTRINSICS`."""
+        return tuple(self.model_dump().values())
 
 
 class CameraDocument(Section):
@@ -84,12 +88,21 @@ class CameraDocument(Section):
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
-    sigma: DeviationsSection | None = None
+    sigma: IntrinsicsSection | None = None
     is_fixed: bool = False
+
+    @field_validator("sigma")
+    @classmethod
+    def _not_negative(cls, sigma: IntrinsicsSection | None) -> IntrinsicsSection | None:
+        """Refuse a standard deviation below 0."""
+        for name, number in () if sigma is None else sigma:
+            if number < 0:
+                raise ValueError(f"{name} is {number:g}, but a standard deviation of 0 or more was wanted")
+        return sigma
 
     def camera(self) -> "Camera":
         """The camera that it states."""
-        sigma = None if self.sigma is None else tuple(self.sigma.model_dump().values())
+        sigma = None if self.sigma is None else self.sigma.numbers
         return Camera(**self.model_dump(exclude={"sigma"}), sigma=sigma)
 
 

@@ -89,7 +89,7 @@ def test_deviations_of_the_intrinsics_are_read(tmp_path: Path) -> None:
     ("text", "message"),
     [
         (OWN.replace("fx", "f_x"), r"camera\.yaml, line 3: unknown key 'f_x'.*did you mean 'fx'"),
-        (OWN + "sigma: {fx: -1}\n", r"'sigma\.fx': input should be greater than or equal to 0"),
+        (OWN + "sigma: {fx: -1}\n", "'sigma': fx is -1, but a standard deviation of 0 or more was wanted"),
         (OWN.replace("fx: 1400", "fx: -1400"), r"line 3: 'fx': input should be greater than 0"),
         (ROS.replace("plumb_bob", "equidistant"), r"'distortion_model' cannot be 'equidistant'"),
         (

@@ -11,7 +11,7 @@ from pydantic import Field
 from torch import Tensor
 
 from pisigma.camera.board import BoardDocument
-from pisigma.camera.camera import Camera, CameraDocument
+from pisigma.camera.camera import Camera, CameraDocument, IntrinsicsSection
 from pisigma.camera.image_rows import Repeatability, image_measurements
 from pisigma.measurement.dataset import Measurements
 from pisigma.simulation.camera.images import ImageNoise, draw_board_poses, simulate_images
@@ -41,32 +41,6 @@ class CornerNoise(Section):
     def repeatability(self) -> Repeatability:
         """Of the robot, in SI units."""
         return Repeatability(self.repeatability_mm / 1e3, float(np.deg2rad(self.repeatability_deg)))
-
-
-class CameraErrors(Section):
-    """True minus stated intrinsics.
-
-    Attributes:
-        fx: of the focal length along u [px].
-        fy: of the focal length along v [px].
-        cx: of the principal point, u [px].
-        cy: of the principal point, v [px].
-        k1: of the radial distortion, as k2 and k3.
-        k2: see k1.
-        p1: of the tangential distortion, as p2.
-        p2: see p1.
-        k3: see k1.
-    """
-
-    fx: float = 0.0
-    fy: float = 0.0
-    cx: float = 0.0
-    cy: float = 0.0
-    k1: float = 0.0
-    k2: float = 0.0
-    p1: float = 0.0
-    p2: float = 0.0
-    k3: float = 0.0
 
 
 class BoardErrors(Section):
@@ -116,7 +90,7 @@ class SimulatedImages(Section):
     camera: CameraDocument
     board: BoardDocument
     noise: CornerNoise
-    camera_errors: CameraErrors = CameraErrors()
+    camera_errors: IntrinsicsSection = IntrinsicsSection()
     board_errors: BoardErrors = BoardErrors()
     late_joints: LateJoints | None = None
 
@@ -172,8 +146,6 @@ class SimulatedImages(Section):
     def _true(self) -> tuple[Camera, TrueBoard]:
         """The camera and the board as they really are."""
         stated = self.camera.camera()
-        camera = stated.with_intrinsics(
-            stated.intrinsics + np.array(list(self.camera_errors.model_dump().values()))
-        )
+        camera = stated.with_intrinsics(stated.intrinsics + np.array(self.camera_errors.numbers))
         errors = self.board_errors
         return camera, TrueBoard(self.board.board(), 1 + errors.scale_percent / 100, errors.bow_mm / 1e3)
