@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from pisigma.camera.corner_file import CameraFiles, read_rows
-from pisigma.errors import IdentificationError, MeasurementError
+from pisigma.errors import IdentificationError, MeasurementError, ModelError
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.judging.progress import Progress
@@ -26,7 +26,7 @@ from pisigma.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, 
 from pisigma.monitoring.history import Record, history_path, in_order, remember
 from pisigma.monitoring.session import judge_session
 from pisigma.monitoring.trends import Forecast, Trend, charts_of, forecast_of, trends_of
-from pisigma.recalibration.model_posterior import ModelPosterior
+from pisigma.recalibration.model_posterior import FLEET_PRIOR, ModelPosterior
 from pisigma.recalibration.recalibration_problem import owners_in
 from pisigma.verification.explanations import PLAUSIBLE_SHARE
 from pisigma.workflow.recalibrate import RecalibrationSettings
@@ -181,7 +181,7 @@ def monitor(
         progress: called with what is being done.
 
     Raises:
-        ModelError: the folder holds no model, or the model holds no posterior.
+        ModelError: the folder holds no model, or the model holds no posterior, or is the prior of a fleet.
         MeasurementError: the rows cannot be read, or there are more or fewer dates than sessions.
         IdentificationError: the rows do not determine where something stands, or no motion explains errors of more
             than 1 % of the reach.
@@ -191,6 +191,11 @@ def monitor(
     started = time.perf_counter()
     source = model_or_folder(model)
     loaded = source if isinstance(source, CalibratedModel) else load_model(source)
+    if loaded.kind == FLEET_PRIOR:
+        raise ModelError(
+            f"model '{loaded.name}' is what the robots of a fleet have in common, and a model of one robot was wanted; "
+            "make it with `pisigma calibrate ROBOT ROWS --prior MODEL --out DIR`."
+        )
     posterior = ModelPosterior.of(loaded)
     rows = [read_rows(one, posterior.space.robot, settings.cameras) for one in sessions]
     warnings: list[str] = []

@@ -47,6 +47,13 @@ def test_a_calibration_of_ten_poses_begins_with_it(prior, run):
     assert (folder / "m" / "model.yaml").is_file()
 
 
+def test_a_prior_is_not_monitored(prior, run):
+    folder, _ = prior
+    done = run("monitor", folder / "prior", folder / "few.csv")
+    assert done.exit_code == 2, done.output
+    assert "a model of one robot was wanted" in " ".join(done.output.split())
+
+
 def test_what_does_not_go_with_a_prior_is_refused(prior, run, tmp_path):
     folder, _ = prior
     one = "--prior", folder / "prior"
