@@ -79,8 +79,10 @@ def known_names(
         return tuple(known) * len(names)
     for row, name in enumerate(names):
         if name not in known:
+            crossed = (measurements.target if what == "frame" else measurements.frame)[row] in known
+            hint = " (of a camera, check --fixed-camera)" if name and crossed else ""
             raise MeasurementError(
-                f"{measurements.place(row)}: the model was not fitted to {what} '{name}'; "
+                f"{measurements.place(row)}: the model was not fitted to {what} '{name}'{hint}; "
                 f"{nearest_choice(name, known)}"
             )
     return names

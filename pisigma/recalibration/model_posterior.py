@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import ModelError
+from pisigma.errors import MeasurementError, ModelError
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.identification.problem.setup import IdentifiedGeometry
 from pisigma.joint_correction.feature import AbstractFeature
@@ -92,7 +92,17 @@ class ModelPosterior:
         return mean.sqrt()[number]
 
     def renamed(self, rows: Measurements) -> Measurements:
-        """Name the frame and the target of rows as the model does where one of them has no name for its only one."""
+        """Name the frame and the target of rows as the model does where one of them has no name for its only one.
+
+        Raises:
+            MeasurementError: the rows have the model's target for their frame, as where a camera is taken for fixed.
+        """
+        crossed = {*rows.frame} & {*self.geometry.tools} - {"", *self.geometry.bases}
+        if crossed:
+            raise MeasurementError(
+                f"{rows.source}: '{crossed.pop()}' is the frame of rows, but in the model it is on the flange; of a "
+                "camera, check --fixed-camera."
+            )
         for field, stated, known in (
             ("frame", rows.frame, tuple(self.geometry.bases)),
             ("target", rows.target, tuple(self.geometry.tools)),
