@@ -9,8 +9,10 @@ from scipy.spatial.transform import Rotation
 
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measuring.state import RowsSoFar, SessionState
+from pisigma.planning.board_sight import BoardSight
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.se3 import invert
+from pisigma.viewing.board import draw_board
 from pisigma.viewing.body import AbstractBody
 from pisigma.viewing.cell import draw_cell, draw_sight
 from pisigma.viewing.colors import ALARM, LINKS, NEXT, PLANNED, Color, shades
@@ -29,14 +31,18 @@ and the axes of the base."""
 class SessionScene:
     """Draws the robot and the rows; every call replaces what the call before has drawn."""
 
-    def __init__(self, scene: "viser.SceneApi", arm: ArmInCell, body: AbstractBody) -> None:
+    def __init__(
+        self, scene: "viser.SceneApi", arm: ArmInCell, body: AbstractBody, sight: BoardSight | None = None
+    ) -> None:
         """Draw the cell.
 
         Args:
             scene: where to.
             arm: the robot in its cell.
             body: what the robot looks like.
+            sight: camera and board; None without a camera.
         """
+        self._sight = sight
         self._scene, self._arm, self._robot, self._body = scene, arm, arm.robot, body
         self._groups: dict[str, viser.FrameHandle] = {}
         self._ghost = scene.add_frame("/ghost", show_axes=False)
@@ -56,6 +62,9 @@ class SessionScene:
             self._body.draw(self._scene, "/ghost/robot", pose.q, NEXT, GHOST)
             self._label("/next/label", f"next: pose {pose.number}", T[:3, 3])
             draw_sight(self._scene, "/next", self._arm.cell, T, self._robot.reach)
+            if self._sight is not None and self._sight.is_fixed:
+                self._scene.add_frame("/next/board", show_axes=False, wxyz=_quaternion(T), position=T[:3, 3])
+                draw_board(self._scene, "/next/board", self._sight.board)
         if len(state.remaining):
             self._dots("/next/remaining", self._poses(state.remaining)[:, :3, 3], PLANNED, 0.5)
 
@@ -63,11 +72,14 @@ class SessionScene:
         """Draw the axes of the frame that was measured in, as the rows determine it."""
         T = invert(torch.from_numpy(T_sensor_base)).numpy()
         axes = AXES * self._robot.reach
-        wxyz = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
         self._scene.add_frame(
-            "/sensor", axes_length=axes, axes_radius=axes / 20, wxyz=wxyz, position=T[:3, 3]
+            "/sensor", axes_length=axes, axes_radius=axes / 20, wxyz=_quaternion(T), position=T[:3, 3]
         )
-        if self._arm.cell.tracker is None:
+        if self._sight is not None:
+            self._label("/sensor/label", "camera" if self._sight.is_fixed else "board", np.zeros(3))
+            if not self._sight.is_fixed:
+                draw_board(self._scene, "/sensor", self._sight.board)
+        elif self._arm.cell.tracker is None:
             self._label("/sensor/label", "frame of the sensor", np.zeros(3))
 
     def show_rows(self, rows: RowsSoFar, top: float, magnification: float) -> None:
@@ -141,3 +153,9 @@ class SessionScene:
         self._scene.add_point_cloud(
             name, position, colors, point_size=diameter, point_shape=shape, precision="float32"
         )
+
+
+def _quaternion(T: Float64[np.ndarray, "4 4"]) -> Float64[np.ndarray, " 4"]:
+    """The rotation of a pose as viser wants it, w first."""
+    wxyz: Float64[np.ndarray, " 4"] = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
+    return wxyz

@@ -11,6 +11,7 @@ from jaxtyping import Float64
 
 from pisigma.errors import OutputError
 from pisigma.measuring.state import RowsSoFar, SessionState
+from pisigma.planning.board_sight import BoardSight
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.viewing.body import AbstractBody, CapsuleBody
 from pisigma.viewing.colors import round_up
@@ -43,6 +44,7 @@ class SessionView:
         limit: float | None = None,
         host: str = "127.0.0.1",
         port: int = 8080,
+        sight: BoardSight | None = None,
     ) -> None:
         """Start serving.
 
@@ -52,6 +54,7 @@ class SessionView:
             limit: what 95 % of the errors are to stay below [m]; None for no limit.
             host: address to listen at; at 127.0.0.1 only this machine can open the page.
             port: to listen at; where it is taken, the next one that is free.
+            sight: camera and board; None without a camera.
 
         Raises:
             ImportError: viser is not installed.
@@ -72,7 +75,7 @@ class SessionView:
         camera = self._server.initial_camera
         camera.position, camera.look_at = first_view(arm)
         camera.fov = FIELD
-        self._scene = SessionScene(self._server.scene, arm, body or CapsuleBody(arm.capsules))
+        self._scene = SessionScene(self._server.scene, arm, body or CapsuleBody(arm.capsules), sight)
         self._panel = SessionPanel(self._server.gui, arm.robot, limit)
         self._panel.magnification.on_update(self._magnify)
 

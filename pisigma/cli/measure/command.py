@@ -70,7 +70,7 @@ def measure(
     page = PageOptions(view_host, view_port, view_urdf) if view else None
     try:
         with (
-            shown_in_browser(session.plan.arm, limit_mm, page) as show_page,
+            shown_in_browser(session.plan.arm, limit_mm, page, session.plan.settings.camera) as show_page,
             _printer(session, f"measure {plan}", as_json) as show,
         ):
             for step in follow(session, growing, once):

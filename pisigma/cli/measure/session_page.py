@@ -14,6 +14,7 @@ from pisigma.cli.output import print_line
 
 if TYPE_CHECKING:
     from pisigma.measuring.state import SessionState
+    from pisigma.planning.camera_settings import CameraSettings
     from pisigma.planning.cell.arm_in_cell import ArmInCell
     from pisigma.robot.description import Robot
     from pisigma.viewing.mesh_body import MeshBody
@@ -58,7 +59,10 @@ class PageOptions:
 
 @contextmanager
 def shown_in_browser(
-    arm: "ArmInCell", limit_mm: float | None, options: PageOptions | None
+    arm: "ArmInCell",
+    limit_mm: float | None,
+    options: PageOptions | None,
+    camera: "CameraSettings | None" = None,
 ) -> Iterator[Callable[["SessionState"], None]]:
     """Serve the page of a session, and give what shows a state on it.
 
@@ -68,6 +72,7 @@ def shown_in_browser(
         arm: the robot in its cell.
         limit_mm: what 95 % of the errors are to stay below [mm]; None for no limit.
         options: how; None for no page.
+        camera: that measures; None for another sensor.
 
     Raises:
         ImportError: viser is not installed.
@@ -80,7 +85,8 @@ def shown_in_browser(
     from pisigma.viewing.session_view import SessionView
 
     limit = None if limit_mm is None else limit_mm / 1e3
-    with SessionView(arm, options.body(arm.robot), limit, options.host, options.port) as view:
+    sight = None if camera is None else camera.sight()
+    with SessionView(arm, options.body(arm.robot), limit, options.host, options.port, sight) as view:
         print_line(f"The session is shown at {view.url}", to_stderr=True)
         yield view.show
         if sys.stderr.isatty():
