@@ -3,6 +3,8 @@
 import math
 from collections.abc import Sequence
 
+from pydantic import Field
+
 from pisigma.fleet.prior import FleetPrior
 from pisigma.judging.summary import AbstractSummary
 from pisigma.recalibration.model_posterior import FLEET_PRIOR
@@ -44,6 +46,7 @@ class FleetPriorSummary(AbstractSummary):
     Attributes:
         robots: number of robots that count.
         odd: ids of those that are unlike the others and do not.
+        refused: by id why the file of a robot cannot be read, which does not count either.
         rows: of all robots.
         parameters: what they have in common.
         spectrum: of the joint correction.
@@ -53,6 +56,7 @@ class FleetPriorSummary(AbstractSummary):
 
     robots: int
     odd: tuple[str, ...]
+    refused: dict[str, str] = Field(default_factory=dict)
     rows: int
     parameters: tuple[CommonFigures, ...]
     spectrum: tuple[SpectrumFigures, ...]
@@ -60,7 +64,8 @@ class FleetPriorSummary(AbstractSummary):
     @property
     def warnings(self) -> tuple[str, ...]:
         """What to heed, a sentence each."""
-        return tuple(f"Robot '{name}' is unlike the others and did not count." for name in self.odd)
+        odd = (f"Robot '{name}' is unlike the others and did not count." for name in self.odd)
+        return (*odd, *(f"Robot '{name}' did not count: {reason}" for name, reason in self.refused.items()))
 
 
 def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:

@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 
 from pisigma.camera.corner_file import read_rows
-from pisigma.errors import FleetError
+from pisigma.errors import FleetError, MeasurementError
 from pisigma.fleet.members import Member, read_fleet
-from pisigma.fleet.prior import FleetPrior, fleet_prior
+from pisigma.fleet.prior import FEWEST_ROBOTS, FleetPrior, fleet_prior
 from pisigma.fleet.prior_summary import FleetPriorSummary, summarise_prior
 from pisigma.judging.progress import Progress
+from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.fleet_prior_card import write_fleet_prior_card
 from pisigma.robot.description import Robot
@@ -53,19 +54,30 @@ def estimate_fleet_prior(
         progress: called with what is being done.
 
     Raises:
-        FleetError: the fleet cannot be used, its robots are of several types, or too few.
-        MeasurementError: a file cannot be read.
+        FleetError: the fleet cannot be used, its robots are of several types, or too few have files that can be read;
+            others are named by the figures.
         IdentificationError: the rows of a robot do not determine where it stands.
     """
     started = time.perf_counter()
     members = read_fleet(source, robot)
     drawn = _common_robot(members)
     progress(f"{len(members)} robots")
-    rows = [read_rows(one.sessions[0].data, drawn, one.cameras).split_sets()[0] for one in members]
-    name = Path(source).resolve().stem
-    prior = fleet_prior(name, drawn, rows)
-    summary = summarise_prior(prior, [member.id for member in members])
-    summary = summary.having(command=f"pisigma.estimate_fleet_prior({Path(source).name!r})")
+    rows: dict[str, Measurements] = {}
+    refused: dict[str, str] = {}
+    for one in members:
+        try:
+            rows[one.id] = read_rows(one.sessions[0].data, drawn, one.cameras).split_sets()[0]
+        except MeasurementError as problem:  # one bad file does not stop the others
+            refused[one.id] = str(problem)
+    if refused and len(rows) < FEWEST_ROBOTS:
+        raise FleetError(
+            f"{FEWEST_ROBOTS} robots or more were wanted, got {len(rows)} with files that can be read; correct, among "
+            f"others: {next(iter(refused.values()))}"
+        )
+    prior = fleet_prior(Path(source).resolve().stem, drawn, list(rows.values()))
+    summary = summarise_prior(prior, list(rows)).having(
+        command=f"pisigma.estimate_fleet_prior({Path(source).name!r})", refused=refused
+    )
     model = replace(prior.model, metrics=summary.to_json())
     return FleetPriorResult(model, prior, summary, time.perf_counter() - started)
 
