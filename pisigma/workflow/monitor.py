@@ -174,8 +174,7 @@ def monitor(
     """Say of every session whether the robot is unchanged or what moved, and chart all sessions.
 
     Args:
-        model: of `pisigma calibrate` or `pisigma recalibrate`, or what
-            holds it, or its folder; only a folder has a history.
+        model: of `pisigma calibrate` or `pisigma recalibrate`, or what holds it, or its folder, which has a history.
         sessions: rows of any sensors, or their files; one with several days in the column `date` is several sessions.
         settings: see `MonitorSettings`.
         progress: called with what is being done.
@@ -212,8 +211,7 @@ def monitor(
             warnings.append(
                 f"{judged[-1].file}: {day.rows} rows say little of what moved; measure {FEWEST_ROWS} poses or more."
             )
-    new = in_order(judged)
-    records = new
+    records = new = in_order(judged)
     if settings.history and not isinstance(source, CalibratedModel):
         records = remember(history_path(source), model_hash(source), new)
     return Monitoring(
