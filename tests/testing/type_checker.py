@@ -5,7 +5,7 @@ from collections.abc import Callable
 from dataclasses import is_dataclass
 from functools import partial, wraps
 from types import FunctionType
-from typing import Any, get_args, get_type_hints
+from typing import Any, get_type_hints
 
 import jaxtyping
 import numpy as np
@@ -31,19 +31,15 @@ def type_checked(checked: Any = None, *, typechecker: Any = None) -> Any:
             checked.__init__ = type_checked(checked.__init__)
         return checked
     verified: Callable[..., Any] | None = None
-    has_axes = True
 
     @wraps(checked)
     def call(*args: Any, **kwargs: Any) -> Any:
-        nonlocal verified, has_axes
+        nonlocal verified
         if jaxtyping.config.jaxtyping_disable:
             return checked(*args, **kwargs)
         if verified is None:
-            copy = _with_resolved_annotations(checked)
-            has_axes = any(map(_has_axes, copy.__annotations__.values()))
-            verified = beartype(copy)
-        if not has_axes:
-            return verified(*args, **kwargs)
+            verified = beartype(_with_resolved_annotations(checked))
+        # around functions without arrays too, in whose context the generators that they call check theirs
         with SHAPES:
             return verified(*args, **kwargs)
 
@@ -74,10 +70,6 @@ def _resolved(annotation: Any, names: dict[str, Any]) -> Any:
         return get_type_hints(holder, names, include_extras=True)["value"]
     except NameError:
         return Any
-
-
-def _has_axes(annotation: Any) -> bool:
-    return isinstance(annotation, ARRAY) or any(map(_has_axes, get_args(annotation)))
 
 
 ARRAY = array_types._MetaAbstractArray
