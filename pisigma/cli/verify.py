@@ -62,7 +62,6 @@ def verify(
 
     if sha256 is not None:
         check_model_hash(model, sha256)
-
     with progress_of(f"verifying {model}"):
         settings = workflow.VerificationSettings(fit_frame, fit_tool, cameras=cameras)
         verification = workflow.verify(model, data, settings)

@@ -101,11 +101,8 @@ def run_fleet(
         check_fleet_prior(load_model(settings.prior))
     keys = {member.id: _key(member, settings, plans[member.id]) for member in members}
     _prepare(folder, Path(source), members)
-    records = {
-        member.id: record
-        for member in members
-        if (record := _finished(folder, member, keys[member.id])) is not None
-    }
+    finished = [_finished(folder, member, keys[member.id]) for member in members]
+    records = {record.robot: record for record in finished if record is not None}
     resumed, waiting = len(records), [member for member in members if member.id not in records]
     lost: dict[str, str] = {}
     work = functools.partial(work_out, settings=settings, out=folder.absolute(), keys=keys, plans=plans)
