@@ -20,7 +20,7 @@ from pisigma.hybrid.regression import regression
 from pisigma.hybrid.result import HybridResult, LearnedPart
 from pisigma.hybrid.search import FIRST_MODEL_SIZES, Choice, Fitted, Search
 from pisigma.hybrid.sensor_values import sensor_values
-from pisigma.hybrid.spectrum import lines
+from pisigma.hybrid.spectrum import lines, odds_against_a_line
 from pisigma.hybrid.uncertainty import position_uncertainty
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.initial_guess.initial_guess import chosen_rows
@@ -217,16 +217,17 @@ class HybridCalibrator:
             largest = [*others, *growing[-1:], *products]
             search = Search(rows, noise, prior_scale, largest, progress)
             best = search.best(growing, others, products)
-            choices.append(search.extended(best, self._lines(rows, best)))
+            orders = self._lines(rows, best)
+            odds = odds_against_a_line(robot.dof) * sum(map(len, orders))
+            choices.append(search.extended(best, [GearLines(robot, orders)] if odds else [], odds))
         return max(choices, key=lambda choice: choice.best.posterior.log_evidence)
 
-    def _lines(self, rows: Rows, best: Fitted) -> list[GearLines]:
-        """The lines that stand out of what a fit leaves, beyond the harmonics of its series."""
+    def _lines(self, rows: Rows, best: Fitted) -> tuple[tuple[int, ...], ...]:
+        """Orders of the lines that stand out of what a fit leaves, beyond the harmonics of its series."""
         if "lines" not in self.features:
-            return []
+            return ()
         lowest = 1 + (max((one.size for one in best.design.features), default=0) or USUAL_HARMONICS)
-        orders = lines(best.design, rows, best.posterior, lowest)
-        return [GearLines(self.geometric.robot, orders)] if any(orders) else []
+        return lines(best.design, rows, best.posterior, lowest)
 
     def _features(
         self, solved: SolvedCalibration, problem: CalibrationProblem, gravity: Direction

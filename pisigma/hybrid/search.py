@@ -200,19 +200,29 @@ class Search:
                 best = self._tried([*best.design.features, chosen], best, sizes)
         return best
 
-    def extended(self, best: Fitted, features: Sequence[AbstractFeature]) -> Choice:
-        """The best so far, or that with features that come out of it, which need a regression of their own."""
+    def extended(self, best: Fitted, features: Sequence[AbstractFeature], odds: float = 0.0) -> Choice:
+        """The best so far, or that with features that come out of it, which need a regression of their own.
+
+        Args:
+            best: so far.
+            features: chosen by their gain on the same rows.
+            odds: logarithm of the prior odds against them, which the evidence has to outweigh.
+        """
         if features:
             largest = [*best.design.features, *features]
             del self._regression  # one system of equations at a time: they are large
             self._regression = regression(Design(self.rows.problem, tuple(largest)), self.rows)
             self._order = [one.name for one in largest]
-            best = self._tried(largest, best)
+            best = self._tried(largest, best, odds=odds)
         same = self._regression.design.features == best.design.features
         return Choice(self.rows, self.geometry, best, tuple(self.trials), self._regression if same else None)
 
     def _tried(
-        self, features: Sequence[AbstractFeature], best: Fitted, sizes: Tensor | None = None
+        self,
+        features: Sequence[AbstractFeature],
+        best: Fitted,
+        sizes: Tensor | None = None,
+        odds: float = 0.0,
     ) -> Fitted:
         """The better of new features and the best so far, by evidence and by left-out rows."""
         # in the order of the largest design, whose equations then need no copy for all of its features
@@ -221,7 +231,7 @@ class Search:
         began = time.monotonic()
         tried, left_out = self.fitted(features, best, sizes)
         better = (
-            tried.posterior.log_evidence - best.posterior.log_evidence > CLEARLY
+            tried.posterior.log_evidence - best.posterior.log_evidence > CLEARLY + odds
             and left_out < self._least * LEVEL
             and self._regression.effective_share(tried.posterior) < LARGEST_EFFECTIVE_SHARE
         )

@@ -8,7 +8,6 @@ from torch import Tensor
 
 from pisigma.hybrid.design import Design, Rows
 from pisigma.hybrid.evidence import Posterior
-from pisigma.hybrid.search import STRONGLY
 from pisigma.joint_correction.feature import turning_rate
 
 HIGHEST = 3_000
@@ -27,9 +26,10 @@ def lines(design: Design, rows: Rows, posterior: Posterior, lowest: int) -> tupl
 
     The periodogram of unevenly sampled values (Scargle 1982, The Astrophysical Journal 263, 835-853) of what the joints
     would have to turn for the rest to vanish: by how much sine and cosine of an order raise the log likelihood.
-    Of pure noise the gain is exponential with mean 1, so the best of N orders has ln N; the mean is taken from the
-    median, as noise that the joints themselves make is larger than what the sensors' noise says. A line stands out
-    where the evidence for it is strong (see `STRONGLY`) beyond that.
+    Of pure noise the gain is exponential with mean 1; the mean is taken from the median, as noise that the joints
+    themselves make is larger than what the sensors' noise says. Orders whose gain outweighs the odds against them are
+    lines more likely than not, and these predict best (the median probability model: Barbieri and Berger 2004, The
+    Annals of Statistics 32(3), 870-897). Whether there are lines at all the evidence for all of them together says.
 
     Args:
         design: of a first model.
@@ -42,9 +42,14 @@ def lines(design: Design, rows: Rows, posterior: Posterior, lowest: int) -> tupl
     """
     slope, curvature = _slope_and_curvature(design, rows, posterior)
     angle = design.problem.q * torch.from_numpy(turning_rate(design.problem.space.robot)).to(slope)
-    least = math.log(angle.shape[1] * HIGHEST) + STRONGLY
+    least = odds_against_a_line(angle.shape[1])
     columns = zip(angle.t(), slope.t(), curvature.t(), strict=True)
     return tuple(_lines_of_joint(*column, lowest, least) for column in columns)
+
+
+def odds_against_a_line(joints: int) -> float:
+    """Logarithm of the number of orders of all joints, any of which may be a line."""
+    return math.log(joints * HIGHEST)
 
 
 def _slope_and_curvature(

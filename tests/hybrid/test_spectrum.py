@@ -49,6 +49,15 @@ def test_noise_has_no_lines() -> None:
     )
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_calibration_keeps_no_orders_that_stand_out_of_noise_by_chance(seed: int) -> None:
+    q = drawn_joints(ROBOT, 150, seed)
+    scatter = 3e-5 * torch.from_numpy(np.random.default_rng(seed).normal(size=q.shape))
+    calibrator = HybridCalibrator(ROBOT, ("lines", "series"), harmonics=(3,), products=False)
+    result = calibrator.fit(tracker_data(ROBOT, q, scatter, 3e-5, 1e-4))
+    assert "lines" not in result.verdict
+
+
 def test_lines_below_the_first_order_are_left_to_the_series() -> None:
     q = drawn_joints(ROBOT, 400, 0)
     assert lines_of(arm_of(q, rippled(q)), 2_021) == ((),) * 6
