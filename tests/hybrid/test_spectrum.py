@@ -49,12 +49,14 @@ def test_noise_has_no_lines() -> None:
     )
 
 
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize("seed", [2, 4])
 def test_a_calibration_keeps_no_orders_that_stand_out_of_noise_by_chance(seed: int) -> None:
-    q = drawn_joints(ROBOT, 150, seed)
-    scatter = 3e-5 * torch.from_numpy(np.random.default_rng(seed).normal(size=q.shape))
+    q = drawn_joints(ROBOT, 300, seed)
+    delta = 3e-5 * torch.from_numpy(np.random.default_rng(seed).normal(size=q.shape))
+    delta[:, 1] += 1e-4 * (2 * q[:, 1]).sin()
     calibrator = HybridCalibrator(ROBOT, ("lines", "series"), harmonics=(3,), products=False)
-    result = calibrator.fit(tracker_data(ROBOT, q, scatter, 3e-5, 1e-4))
+    result = calibrator.fit(tracker_data(ROBOT, q, delta, 3e-5, 1e-4))
+    assert "series 3 + lines" in [trial.name for trial in result.trials]
     assert "lines" not in result.verdict
 
 
