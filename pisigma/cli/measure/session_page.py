@@ -59,19 +59,14 @@ class PageOptions:
 
 @contextmanager
 def shown_in_browser(
-    arm: "ArmInCell",
-    limit_mm: float | None,
-    options: PageOptions | None,
-    camera: "CameraSettings | None" = None,
+    arm: "ArmInCell", limit_mm: float | None, page: PageOptions | None, camera: "CameraSettings | None" = None
 ) -> Iterator[Callable[["SessionState"], None]]:
-    """Serve the page of a session, and give what shows a state on it.
-
-    On a terminal the page stays, when the session has ended by itself, until Ctrl-C.
+    """Serve the page of a session, and give what shows a state on it; on a terminal it then stays until Ctrl-C.
 
     Args:
         arm: the robot in its cell.
         limit_mm: what 95 % of the errors are to stay below [mm]; None for no limit.
-        options: how; None for no page.
+        page: how it is shown; None for no page.
         camera: that measures; None for another sensor.
 
     Raises:
@@ -79,14 +74,14 @@ def shown_in_browser(
         OutputError: the host is no address of this machine.
         RobotError: the meshes cannot be shown.
     """
-    if options is None:
+    if page is None:
         yield lambda state: None
         return
     from pisigma.viewing.session_view import SessionView
 
     limit = None if limit_mm is None else limit_mm / 1e3
     sight = None if camera is None else camera.sight()
-    with SessionView(arm, options.body(arm.robot), limit, options.host, options.port, sight) as view:
+    with SessionView(arm, page.body(arm.robot), limit, page.host, page.port, sight) as view:
         print_line(f"The session is shown at {view.url}", to_stderr=True)
         yield view.show
         if sys.stderr.isatty():
