@@ -83,13 +83,13 @@ class Session:
         rms: root mean square of the errors under the model, with frames as they stand now [m].
         rms_after: the same expected after recalibrating [m].
         rotation_ratio: errors of the orientation by those expected after recalibrating; 1 where none was measured.
-        score_ratio: with images, whose poses have more noise than error, values over their standard deviations by the
-            same; else 1.
         error_score: root mean square of the errors over their standard deviations; 1 is usual.
         values: number of measured values.
         standing: names of bases and tools that stand elsewhere than when the model was made.
         observable: per joint, whether the rows say anything of its zero.
         outliers: places of rows that do not count, because they do not go with the others whatever has moved.
+        score_ratio: with images, whose poses have more noise than error, values over their standard deviations by those
+            expected after recalibrating; else 1.
     """
 
     rows: int
@@ -99,12 +99,12 @@ class Session:
     rms: float
     rms_after: float
     rotation_ratio: float
-    score_ratio: float
     error_score: float
     values: int
     standing: tuple[str, ...]
     observable: tuple[bool, ...]
     outliers: tuple[str, ...] = ()
+    score_ratio: float = 1.0
 
     @property
     def verdict(self) -> Verdict:

@@ -19,7 +19,7 @@ from pisigma.recalibration.moved import Moved
 def record(number, date="2026-01-01"):
     moved = (Shifted(Moved("joint 3", 0.05, 0.002, "deg"), 0.999),)
     session = Session(
-        10, 1e-9, moved, (("joint 3", 0.9),), 1e-4 * number, 5e-5, 1.0, 1.0, 1.1, 30, ("base",), (True, False)
+        10, 1e-9, moved, (("joint 3", 0.9),), 1e-4 * number, 5e-5, 1.0, 1.1, 30, ("base",), (True, False)
     )
     zeros = JointZeros(
         torch.tensor([1e-3, 2e-3]).double(),
