@@ -196,10 +196,6 @@ class AbstractRegression(ABC):
         """The same for the unknowns of a design that has some of the features, or smaller ones."""
 
     @abstractmethod
-    def extended(self, design: "Design") -> "AbstractRegression":
-        """The same for the unknowns of a design that has more features, behind those that there are."""
-
-    @abstractmethod
     def without(self, groups: Int64[Tensor, " groups"]) -> "AbstractRegression":
         """The same without the values of some groups of rows, see `Rows.group`; values that are certain stay."""
 

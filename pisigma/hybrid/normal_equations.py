@@ -69,23 +69,6 @@ class NormalEquations(AbstractRegression):
             _copy_chosen(whole, columns, part)
         return replace(self, design=design, normal=normal, descent=self.descent[:, columns])
 
-    def extended(self, design: Design) -> "NormalEquations":
-        """See `AbstractRegression.extended`; only what the new features add is summed up."""
-        old, size = self.design.unknowns, design.unknowns
-        _return_free_memory(size)
-        normal, descent = self.normal.new_zeros((len(self.normal), size, size)), []
-        normal[:, :old, :old] = self.normal
-        for k, sensor in enumerate(self.rows.values):
-            pull = self.descent.new_zeros(size - old)
-            for rows in chunks(len(sensor.row)):
-                root = sensor.root[rows, None]
-                X = (design.columns(sensor, rows) * root[..., None]).flatten(0, 1)
-                normal[k, old:] += X[:, old:].t() @ X
-                pull += X[:, old:].t() @ (sensor.residual[rows] * root).flatten()
-            normal[k, :old, old:] = normal[k, old:, :old].t()
-            descent.append(torch.cat([self.descent[k], pull]))
-        return replace(self, design=design, normal=normal, descent=torch.stack(descent))
-
     def without(self, groups: Int64[Tensor, " groups"]) -> "NormalEquations":
         """See `AbstractRegression.without`."""
         other = NormalEquations.of(self.design, self.rows.held_out(groups))

@@ -201,7 +201,7 @@ class Search:
         return best
 
     def extended(self, best: Fitted, features: Sequence[AbstractFeature], odds: float = 0.0) -> Choice:
-        """The best so far, or that with features that come out of it.
+        """The best so far, or that with features that come out of it, which need a regression of their own.
 
         Args:
             best: so far.
@@ -210,8 +210,8 @@ class Search:
         """
         if features:
             largest = [*best.design.features, *features]
-            design = Design(self.rows.problem, tuple(largest))
-            self._regression = self._regression.select(best.design).extended(design)
+            del self._regression  # one system of equations at a time: they are large
+            self._regression = regression(Design(self.rows.problem, tuple(largest)), self.rows)
             self._order = [one.name for one in largest]
             best = self._tried(largest, best, odds=odds)
         same = self._regression.design.features == best.design.features

@@ -91,10 +91,6 @@ class ValueCovariance(AbstractRegression):
             K.append(self.K[other - prior.classes] if whole else _gram(X, prior, g, design.active))
         return replace(self, design=design, X=X, prior=prior, K=_stacked(K, self.y))
 
-    def extended(self, design: Design) -> "ValueCovariance":
-        """See `AbstractRegression.extended`."""
-        return ValueCovariance.of(design, self.rows)
-
     def without(self, groups: Int64[Tensor, " groups"]) -> "ValueCovariance":
         """See `AbstractRegression.without`."""
         kept = (~torch.isin(self.group, groups)).nonzero()[:, 0]

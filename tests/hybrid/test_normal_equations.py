@@ -42,13 +42,6 @@ def test_sums_are_those_of_all_columns_at_once(name: str, monkeypatch: pytest.Mo
     assert_same_sums(NormalEquations.of(case.design, case.rows), case.dense)
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_sums_with_more_features_are_those_of_all_columns_at_once(name: str) -> None:
-    case = CASES[name]()
-    fewer = Design(case.design.problem, case.design.features[:-1])
-    assert_same_sums(NormalEquations.of(fewer, case.rows).extended(case.design), case.dense)
-
-
 def test_the_cases_are_what_they_are_for() -> None:
     """Sensors with one row, with two sides and with rows that count differently; columns that are not used."""
     values = {one.name: one for one in CASES["all kinds"]().rows.values}

@@ -89,10 +89,6 @@ class DenseRegression(AbstractRegression):
         """Of some columns, by their numbers."""
         return replace(self, X=self.X[:, design])
 
-    def extended(self, design: Tensor) -> "DenseRegression":
-        """No columns are at hand but those that there are."""
-        raise NotImplementedError
-
     def without(self, groups: Tensor) -> "DenseRegression":
         """The values of the other groups."""
         kept = ~torch.isin(self.group, groups)
