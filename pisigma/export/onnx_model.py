@@ -99,13 +99,13 @@ def add_joint_correction(graph: OnnxGraph, correction: JointCorrection, q: str) 
     for feature, weight in zip(correction.features, correction.linear, strict=True):
         if feature.usually_zero:
             continue
-        try:
-            terms.append(feature.add_onnx(graph, weight.detach().numpy(), q))
-        except NotImplementedError:
+        term = feature.add_onnx(graph, weight.detach().numpy(), q)
+        if term is None:
             raise ModelError(
                 f"the learned correction uses the feature '{feature.name}', which has no ONNX form; calibrate without "
                 "it, or give it the method `add_onnx`."
-            ) from None
+            )
+        terms.append(term)
     if correction.orders:
         dof, factors, inputs = correction.weight.shape
         weight = (correction.weight * correction.fixed[..., None]).detach().numpy()

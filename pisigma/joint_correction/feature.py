@@ -132,7 +132,7 @@ class AbstractFeature(ABC):
         """The numbers that the compiled form reads, in its own order."""
         return weight.ravel()
 
-    def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str:
+    def add_onnx(self, graph: OnnxGraph, weight: Float64[np.ndarray, "dof columns"], q: str) -> str | None:
         """Add the weighted sum of the columns to an ONNX graph.
 
         Args:
@@ -141,12 +141,9 @@ class AbstractFeature(ABC):
             q: joint values `(batch, dof)` in the graph.
 
         Returns:
-            Corrections `(batch, dof)` in the graph.
-
-        Raises:
-            NotImplementedError: the feature has no ONNX form.
+            Corrections `(batch, dof)` in the graph; None where the feature has no ONNX form.
         """
-        raise NotImplementedError
+        return None
 
     def is_periodic(self, weight: Float64[np.ndarray, "dof columns"]) -> bool:
         """Whether a full turn of a revolute joint changes nothing, with these weights."""

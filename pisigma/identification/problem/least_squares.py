@@ -95,15 +95,12 @@ class AbstractLeastSquares(ABC, Generic[Point]):
         return linearisation.misfit.sqrt()
 
     def of_robots(self, robots: Int64[Tensor, " chosen"]) -> "AbstractLeastSquares[Point]":
-        """The problem of some of its robots.
+        """The problem of some of its robots; that of one robot is the same whichever are chosen.
 
         Args:
-            robots: numbers of those that are kept, fewer than there are.
-
-        Raises:
-            NotImplementedError: it is a problem of one robot, whose search ends as a whole.
+            robots: numbers of those that are kept.
         """
-        raise NotImplementedError
+        return self
 
 
 @dataclass(frozen=True)
