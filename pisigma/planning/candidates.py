@@ -81,7 +81,8 @@ def draw_candidates(
     """Draw candidates until enough are allowed or too many were refused.
 
     They are uniform in the joint values: joints that turn by more than a full turn are drawn within half a turn of the
-    middle of their limits, and of 0 where they have none. Where a camera has to see a board, views are drawn instead.
+    middle of their limits, and of 0 where they have none, and then unwrapped (`with_workspace`). Where a camera has
+    to see a board, views are drawn instead.
 
     Args:
         arm: the robot in its cell.
@@ -109,7 +110,8 @@ def draw_candidates(
     enough = (
         int((faults.allowed.cumsum(0) < count).sum()) + 1
     )  # poses, of which the last is the last that is needed
-    return _allowed(q[:enough], replace(faults, failed=faults.failed[:enough]))
+    candidates = _allowed(q[:enough], replace(faults, failed=faults.failed[:enough]))
+    return candidates if views is not None else with_workspace(arm, candidates, candidates)
 
 
 def with_workspace(arm: ArmInCell, candidates: Candidates, others: Candidates) -> Candidates:

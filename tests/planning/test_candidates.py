@@ -77,3 +77,11 @@ def test_spread_poses_are_farther_apart_than_random_ones():
     assert len(chosen.unique()) == 10
     assert nearest(20 + chosen) > nearest(torch.arange(20, 30))
     assert len(spread(ARM, q, 0, q[:3])) == 0
+
+
+def test_a_joint_that_is_seldom_free_at_some_angles_is_unwrapped_around_them():
+    arm = ArmInCell.of(Robot.load("ur5"))  # its wrist cannot fold against the forearm: joint 4 at 90 deg
+    q = draw_candidates(arm, 400, 0).q[:, 3].rad2deg()
+    assert float(q.min()) < -220
+    assert float(q.max()) < 110
+    assert float(q.max() - q.min()) < 360
