@@ -3,7 +3,7 @@
 import functools
 import inspect
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -70,16 +70,25 @@ def stated_cameras(
 
     cameras, boards = (tuple(map(str, files or ())) for files in (camera, board))
     if not cameras and not boards:
-        unused = [name for name, option in _OPTIONS.items() if stated[name] != option.default]
-        if unused:
-            options = ", ".join(f"--{name.replace('_', '-')}" for name in unused)
-            raise typer.BadParameter(f"{options}: only with --camera and --board.")
+        refuse_without_camera(stated, _OPTIONS.values())
         return None
     repeatability = Repeatability(repeatability_mm / 1e3, math.radians(repeatability_deg))
     return CameraFiles(cameras, boards, fixed_camera, repeatability, stated["intrinsics"])
 
 
 _OPTIONS = inspect.signature(stated_cameras).parameters
+
+
+def refuse_without_camera(stated: Mapping[str, Any], options: Iterable[inspect.Parameter]) -> None:
+    """Refuse options of cameras whose values are not their defaults, as there is no camera.
+
+    Raises:
+        BadParameter: such an option is stated.
+    """
+    unused = [option.name for option in options if stated[option.name] != option.default]
+    if unused:
+        names = ", ".join(f"--{name.replace('_', '-')}" for name in unused)
+        raise typer.BadParameter(f"{names}: only with --camera and --board.")
 
 
 def takes_corners(command: Callable[..., None]) -> Callable[..., None]:

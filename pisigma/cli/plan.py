@@ -1,5 +1,6 @@
 """`pisigma plan`: which poses to measure, and the accuracy that they are expected to give."""
 
+import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -8,7 +9,12 @@ import typer
 
 from pisigma.cli.arguments import AsJson, complete_robot
 from pisigma.cli.calibrate import Base, Tip
-from pisigma.cli.camera_options import FixedCamera, RepeatabilityDeg, RepeatabilityMm
+from pisigma.cli.camera_options import (
+    FixedCamera,
+    RepeatabilityDeg,
+    RepeatabilityMm,
+    refuse_without_camera,
+)
 from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of
 
 if TYPE_CHECKING:
@@ -84,6 +90,9 @@ Programs = Annotated[
     ),
 ]
 
+OF_CAMERAS = ("fixed_camera", "sigma_px", "repeatability_mm", "repeatability_deg")
+"""Options that say nothing without a camera."""
+
 
 def plan(
     context: typer.Context,
@@ -144,7 +153,7 @@ def _print(planned: "Plan", files: list[Path]) -> None:
         for point in planned.curve
     ]
     print_table("expected errors of the tool's position by number of poses", columns, rows)
-    print_lines(_limit_lines(planned))
+    print_lines(_curve_lines(planned))
     print_line("What the expected error will mostly come from:")
     print_lines((f"- {line}" for line in planned.weak), indent="  ")
     points, settings = sum(map(len, planned.stored.way_points)), planned.stored.settings
@@ -160,15 +169,20 @@ def _print(planned: "Plan", files: list[Path]) -> None:
     )
 
 
-def _limit_lines(planned: "Plan") -> list[str]:
-    """How many poses the limit needs, where there is one."""
-    limit = planned.stored.settings.limit_mm
-    if limit is None:
-        return []
-    if planned.needed is None:
-        return [f"An RMS of {limit:g} mm needs more than {planned.poses} poses."]
-    needed = f"with {planned.needed} poses" if planned.needed else "already, without more poses"
-    return [f"An RMS of {limit:g} mm is expected {needed}."]
+def _curve_lines(planned: "Plan") -> list[str]:
+    """What the curve does not show, and how many poses the limit needs, where there is one."""
+    lines, last, limit = [], planned.curve[-1], planned.stored.settings.limit_mm
+    if planned.criterion == "D" and last.rms > last.random_rms:
+        lines.append(
+            "Poses chosen by criterion D determine all unknowns of the robot, and need not lower the error that is "
+            "expected of its class below that of random poses; measured robots were calibrated better with them."
+        )
+    if limit is not None and planned.needed is None:
+        lines.append(f"An RMS of {limit:g} mm needs more than {planned.poses} poses.")
+    elif limit is not None:
+        needed = f"with {planned.needed} poses" if planned.needed else "already, without more poses"
+        lines.append(f"An RMS of {limit:g} mm is expected {needed}.")
+    return lines
 
 
 def _settings(options: Mapping[str, Any]) -> "PlanSettings":
@@ -185,7 +199,10 @@ def _settings(options: Mapping[str, Any]) -> "PlanSettings":
         raise PlanningError(
             "--camera and --board were wanted together, with --sensor camera, got one of the two."
         )
-    if options["camera"] is not None:
+    if options["camera"] is None:
+        defaults = inspect.signature(plan).parameters
+        refuse_without_camera(options, [defaults[name] for name in OF_CAMERAS])
+    else:
         noise = (options[name] for name in ("sigma_px", "repeatability_mm", "repeatability_deg"))
         camera, board = str(options["camera"]), str(options["board"])
         stated["camera"] = CameraSettings(camera, board, options["fixed_camera"], *noise)

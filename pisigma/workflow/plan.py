@@ -23,7 +23,7 @@ from pisigma.planning.camera_prospects import CameraProspects
 from pisigma.planning.candidates import Candidates, spread
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.cell.cell import Cell, read_cell
-from pisigma.planning.choice import choose
+from pisigma.planning.choice import Criterion, choose
 from pisigma.planning.expected_accuracy import ExpectedAccuracy, RemainingError, curve, remaining_errors
 from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_file import StoredPlan, yaml_of
@@ -38,7 +38,7 @@ STEP = 10
 """Poses between two points of the curve."""
 WEAK = 0.1
 """Share of the variance that remains from which on what causes it is named."""
-ROUNDS = 2
+ROUNDS = 4
 """So often poses that cannot be reached are replaced."""
 
 
@@ -48,6 +48,7 @@ class Plan:
 
     Attributes:
         stored: the poses in their order, and what was planned.
+        criterion: by which they were chosen.
         candidates: what they were chosen from.
         curve: errors of the tool's position over the task that are expected against the number of poses; 0 poses
             where something is known already.
@@ -61,6 +62,7 @@ class Plan:
     """
 
     stored: StoredPlan
+    criterion: Criterion
     candidates: Candidates
     curve: tuple[ExpectedAccuracy, ...]
     needed: int | None
@@ -95,6 +97,7 @@ class Plan:
         return {
             "poses": self.poses,
             "check_poses": self.checks,
+            "criterion": self.criterion,
             "candidates": len(self.candidates.q),
             "refused": dict(self.candidates.refused.most_common()),
             "predicted_rms_mm": last.rms * 1e3,
@@ -190,6 +193,7 @@ def plan(
     points = problem.curve(chosen)
     return Plan(
         stored,
+        problem.criterion,
         candidates,
         points,
         problem.needed(chosen, points),
@@ -231,6 +235,12 @@ class _Problem:
         """Whether something was measured already."""
         return self.subject.model is not None or self.settings.measured is not None
 
+    @property
+    def criterion(self) -> Criterion:
+        """The stated criterion, or the one that suits what is known and how many poses are wanted."""
+        few = self.anything_known or self.settings.count <= FEW_POSES or self.settings.camera is not None
+        return self.settings.criterion or ("I" if few else "D")
+
     def choose(self, progress: Progress) -> tuple[Int64[Tensor, " chosen"], StoredPlan, Tour]:
         """Choose poses to calibrate with and poses to check with, and order them.
 
@@ -238,12 +248,10 @@ class _Problem:
         measuring may end early.
         """
         q, count = self.candidates.q, self.settings.count
-        few = self.anything_known or count <= FEW_POSES or self.settings.camera is not None
-        criterion = self.settings.criterion or ("I" if few else "D")
         free = torch.arange(len(q))
         for _ in range(ROUNDS):
             progress(f"{count} of {len(free):,} candidates")
-            chosen = free[choose(self.knowledge, q[free], count, self.task, criterion)]
+            chosen = free[choose(self.knowledge, q[free], count, self.task, self.criterion)]
             others = free[~torch.isin(free, chosen)]
             check = others[spread(self.arm, q[others], self.settings.check, q[chosen])]
             use = order_of_use(count, len(check))

@@ -26,6 +26,7 @@ def test_json_has_the_figures_of_the_plan(folder):
     assert printed["predicted_p95_mm"] > printed["predicted_rms_mm"]
     assert {"poses", "rms_mm", "random_rms_mm"} <= set(printed["curve"][0])
     assert 0.5 < printed["minutes"] < 10
+    assert printed["criterion"] == "I"
     assert printed["weak"]
 
 
@@ -70,6 +71,13 @@ def test_poses_of_a_file_keep_the_number_of_their_row(run, folder, tmp_path):
 def test_what_cannot_be_is_refused(refuses, tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
     assert message in refuses("plan", "fanuc_r2000", *SMALL, *arguments, "--out", tmp_path / "poses.csv")
+    assert not list(tmp_path.iterdir())
+
+
+def test_options_of_cameras_are_refused_without_one(run, tmp_path):
+    result = run("plan", "fanuc_r2000", *SMALL, "--sigma-px", "0.2", "--out", tmp_path / "poses.csv")
+    assert result.exit_code == 2
+    assert "--sigma-px: only with --camera and --board" in result.stderr
     assert not list(tmp_path.iterdir())
 
 
