@@ -148,7 +148,12 @@ class HybridCalibrator:
         learned = self._learned(solved, refined)
         progress("looking at left-out rows")
         uncertainty = position_uncertainty(
-            refined.rows, refined.design, refined.regression, refined.posterior, learned.geometry
+            refined.rows,
+            refined.design,
+            refined.regression,
+            refined.posterior,
+            learned.geometry,
+            refined.left_out,
         )
         return HybridResult(solved.result(), learned, uncertainty, trials, verdict)
 
@@ -202,7 +207,7 @@ class HybridCalibrator:
         if all(sigma <= SMALLEST_NOISE for sigma, one in pairs if not one.certain):
             # The geometry leaves nothing to learn; features would fit the errors of the linearisation.
             search = Search(rows, noise, prior_scale, [], progress)
-            return search.extended(search.geometry, [])
+            return search.extended(search.geometry, None)
         robot = self.geometric.robot
         gravity = self.gravity or gravity_by_evidence(robot, rows, noise, prior_scale)
         directions = dict.fromkeys((gravity, self.gravity or USUAL))
@@ -219,7 +224,7 @@ class HybridCalibrator:
             best = search.best(growing, others, products)
             orders = self._lines(rows, best)
             odds = odds_against_a_line(robot.dof) * sum(map(len, orders))
-            choices.append(search.extended(best, [GearLines(robot, orders)] if odds else [], odds))
+            choices.append(search.extended(best, GearLines(robot, orders) if odds else None, odds))
         return max(choices, key=lambda choice: choice.best.posterior.log_evidence)
 
     def _lines(self, rows: Rows, best: Fitted) -> tuple[tuple[int, ...], ...]:
@@ -283,5 +288,7 @@ def _geometric_alone(solved: SolvedCalibration, choice: Choice, verdict: str) ->
     geometry = identified_geometry(solved.setup, solved.solution.linearisation.point)
     first = choice.geometry
     fit = regression(first.design, choice.rows)
-    uncertainty = position_uncertainty(choice.rows, first.design, fit, first.posterior, geometry)
+    uncertainty = position_uncertainty(
+        choice.rows, first.design, fit, first.posterior, geometry, first.left_out
+    )
     return HybridResult(solved.result(), None, uncertainty, choice.trials, verdict)

@@ -21,6 +21,8 @@ CHUNK = 512
 """Rows whose columns are in memory at a time."""
 FOLDS = 4
 FOLDS_OF_FEW = 20
+MOST_GROUPS = 400
+"""So many groups of rows are held out at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,9 +247,10 @@ class Rows:
         return total
 
 
-def chunks(count: int) -> list[slice]:
-    """Rows that are worked on together."""
-    return [slice(start, start + CHUNK) for start in range(0, count, CHUNK)]
+def chunks(count: int, size: int = 0) -> list[slice]:
+    """Rows that are worked on together: so many, or `CHUNK`."""
+    size = size or CHUNK
+    return [slice(start, start + size) for start in range(0, count, size)]
 
 
 def weigh(

@@ -4,7 +4,7 @@ import ctypes
 import math
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import torch
 from jaxtyping import Float64, Int64
@@ -19,8 +19,48 @@ from pisigma.joint_correction.feature import AbstractFeature
 
 SMALL_BLOCK = 256
 """Triangular matrices up to this size are inverted at once."""
+NARROW = 64
+"""Rows of which all columns are in memory at a time where only products with some of them are made."""
 MANY_UNKNOWNS = 1_000
 """Matrices of more are large enough to make room for."""
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """The normal equations, divided by the noise's variance, with a prior: `D (Σ X^T X + precision) D = L L^T`.
+
+    Attributes:
+        prior: of the unknowns.
+        noise: per sensor.
+        scale: the diagonal of D.
+        inverse: L^-1, a lower triangle, so that the covariance is `D L^-T L^-1 D`.
+        log_det: logarithm of the determinant of `Σ X^T X + precision`.
+        x: the most probable values.
+    """
+
+    prior: GaussianPrior
+    noise: tuple[float, ...]
+    scale: Float64[Tensor, " unknowns"]
+    inverse: Float64[Tensor, "unknowns unknowns"]
+    log_det: float
+    x: Float64[Tensor, " unknowns"]
+
+    @property
+    def variance(self) -> Float64[Tensor, " unknowns"]:
+        """Diagonal of the covariance."""
+        deviation: Tensor = self.scale * torch.linalg.vector_norm(self.inverse, dim=0)
+        return deviation.square()
+
+    def traces(self, matrices: Float64[Tensor, "sensors unknowns unknowns"]) -> list[float]:
+        """Traces of the products of symmetric matrices and the covariance, of whose blocks one is made at a time."""
+        traces = [0.0] * len(matrices)
+        for rows in chunks(len(self.x)):
+            block = self.inverse[rows.start :, rows].t() @ self.inverse[rows.start :, : rows.stop]
+            block.mul_(self.scale[: rows.stop]).mul_(self.scale[rows, None])
+            block[:, : rows.start].mul_(2)  # the blocks above the diagonal as well
+            for k, matrix in enumerate(matrices):
+                traces[k] += float((matrix[rows, : rows.stop] * block).sum())
+        return traces
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +74,7 @@ class NormalEquations(AbstractRegression):
         descent: `Σ X^T y`.
         square: `Σ y^T y`.
         sensors: how many values there are.
+        latest: what was solved last, which the evidence, left-out values and the covariance are all made from.
     """
 
     design: Design
@@ -42,6 +83,7 @@ class NormalEquations(AbstractRegression):
     descent: Float64[Tensor, "sensors unknowns"]
     square: tuple[float, ...]
     sensors: tuple[SensorCount, ...]
+    latest: list[Solved] = field(default_factory=list, init=False)
 
     @staticmethod
     def of(design: Design, rows: Rows) -> "NormalEquations":
@@ -52,8 +94,8 @@ class NormalEquations(AbstractRegression):
         """
         size = design.unknowns
         _return_free_memory(size)
-        normal = design.problem.q.new_zeros((len(rows.values), size, size))
-        descent, square = normal.new_zeros((len(rows.values), size)), []
+        normal = design.problem.q.new_empty((len(rows.values), size, size))
+        descent, square = normal.new_empty((len(rows.values), size)), []
         for k, sensor in enumerate(rows.values):
             square.append(_add_sums(design, sensor, normal[k], descent[k]))
         return NormalEquations(design, rows, normal, descent, tuple(square), rows.sensors)
@@ -69,6 +111,30 @@ class NormalEquations(AbstractRegression):
             _copy_chosen(whole, columns, part)
         return replace(self, design=design, normal=normal, descent=self.descent[:, columns])
 
+    def extended(self, design: Design) -> "NormalEquations":
+        """The same rows for the unknowns of a design that has some of the features, and a new one as its last.
+
+        Sums that are there already are copied.
+        """
+        self.latest.clear()
+        _return_free_memory(design.unknowns)
+        before = self.design.indices(design.features[:-1])
+        first, new = len(before), slice(len(before), None)
+        normal = self.normal.new_empty((len(self.normal), design.unknowns, design.unknowns))
+        descent = torch.cat(
+            [self.descent[:, before], normal.new_zeros((len(normal), len(normal[0]) - first))], 1
+        )
+        for N, b, whole, sensor in zip(normal, descent, self.normal, self.rows.values, strict=True):
+            _copy_chosen(whole, before, N[:first, :first])
+            N[new] = 0.0
+            for rows in chunks(len(sensor.row), NARROW):
+                root = sensor.root[rows, None]
+                X = (design.columns(sensor, rows) * root[..., None]).flatten(0, 1)
+                N[new].addmm_(X[:, new].t(), X)
+                b[new].addmv_(X[:, new].t(), (sensor.residual[rows] * root).flatten())
+            N[:first, new] = N[new, :first].t()
+        return replace(self, design=design, normal=normal, descent=descent)
+
     def without(self, groups: Int64[Tensor, " groups"]) -> "NormalEquations":
         """See `AbstractRegression.without`."""
         other = NormalEquations.of(self.design, self.rows.held_out(groups))
@@ -83,54 +149,46 @@ class NormalEquations(AbstractRegression):
 
     def left_out(self, posterior: Posterior, folds: Sequence[Int64[Tensor, " _groups"]]) -> LeftOut:
         """See `AbstractRegression.left_out`."""
-        scale, factor, x = self._solved(posterior.prior, posterior.noise)
-        return LeftOut.joined([self._left_out(groups, posterior.noise, scale, factor, x) for groups in folds])
+        solved = self._solved(posterior.prior, posterior.noise)
+        return LeftOut.joined([self._left_out(groups, solved) for groups in folds])
 
-    def _left_out(
-        self,
-        groups: Int64[Tensor, " groups"],
-        noise: tuple[float, ...],
-        scale: Tensor,
-        factor: Tensor,
-        x: Tensor,
-    ) -> LeftOut:
-        """Leave out one fold, with what `_solved` gives."""
-        _return_free_memory(len(x))
-        test = self.rows.held_out(groups).values
+    def _left_out(self, groups: Int64[Tensor, " groups"], solved: Solved) -> LeftOut:
+        """Leave out one fold."""
+        _return_free_memory(len(solved.x))
+        test, x = self.rows.held_out(groups).values, solved.x
         whitened = x.new_empty((sum(sensor.residual.numel() for sensor in test), len(x)))
         r, number, first = [], [], 0
-        for k, (sensor, sigma) in enumerate(zip(test, noise, strict=True)):
+        for k, (sensor, sigma) in enumerate(zip(test, solved.noise, strict=True)):
             root = sensor.root[:, None] / sigma
             columns = self.design.columns(sensor, slice(None))
             r.append(((sensor.residual - columns @ x) * root).flatten())
             number.append(torch.full(r[-1].shape, k, device=x.device))
             block = whitened[first : first + len(r[-1])].view(columns.shape)
-            torch.mul(columns, root[..., None], out=block).mul_(scale)
+            torch.mul(columns, root[..., None], out=block).mul_(solved.scale)
             first += len(r[-1])
             del columns
-        S = torch.linalg.solve_triangular(factor, whitened.t(), upper=False)
-        del whitened, block
-        M = (S.t() @ S).neg_()
-        M.diagonal().add_(1.0)
+        M = torch.eye(first, dtype=x.dtype, device=x.device)
+        for rows in chunks(len(x)):
+            S = solved.inverse[rows, : rows.stop] @ whitened[:, : rows.stop].t()
+            M.addmm_(S.t(), S, alpha=-1)
         return LeftOut.of(M, torch.cat(r), torch.cat(number), self.sensors)
 
     def solve(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Posterior:
         """Solve `(Σ_s N_s / noise_s² + precision) x = Σ_s b_s / noise_s²` by Cholesky with column scaling."""
         precision = prior.precision
-        scale, factor, x = self._solved(prior, noise)
-        log_det = log_determinant(scale, factor)
-        covariance = inverted(scale, factor)
-        used = [
-            float(torch.dot(N.flatten(), covariance.flatten())) / sigma**2
-            for N, sigma in zip(self.normal, noise, strict=True)
-        ]
+        solved = self._solved(prior, noise)
+        x, held = solved.x, precision * solved.variance
+        if len(noise) == 1:  # what the unknowns use up, the prior does not hold
+            used = [float((1 - held).sum())]
+        else:
+            pairs = zip(solved.traces(self.normal), noise, strict=True)
+            used = [trace / sigma**2 for trace, sigma in pairs]
         misfit = self._misfits(x)
         log_prior = float(precision[precision > 0].log().sum())
         fit = sum(total / sigma**2 for total, sigma in zip(misfit, noise, strict=True))
-        evidence = fit + float((x.square() * precision).sum()) + log_det - log_prior
+        evidence = fit + float((x.square() * precision).sum()) + solved.log_det - log_prior
         evidence = -0.5 * (evidence + log_noise(self.sensors, noise))
-        determined = prior.of_groups(1 - precision * covariance.diagonal())
-        square = prior.of_groups(x.square() * prior.base)
+        square, determined = prior.of_groups(x.square() * prior.base), prior.of_groups(1 - held)
         return Posterior(x, evidence, prior, noise, square, determined, misfit, tuple(used))
 
     def first_sizes(
@@ -143,17 +201,17 @@ class NormalEquations(AbstractRegression):
         """
         columns = self.design.indices((*design.features, features))
         old, new = columns[: design.unknowns], columns[design.unknowns :]
-        scale, factor, x = self.select(design)._solved(posterior.prior, posterior.noise)
+        solved = self.select(design)._solved(posterior.prior, posterior.noise)
         normal = sum(N[new] * sigma**-2 for N, sigma in zip(self.normal, posterior.noise, strict=True))
         descent = sum(b * sigma**-2 for b, sigma in zip(self.descent, posterior.noise, strict=True))
         square = sum(total / sigma**2 for total, sigma in zip(self.square, posterior.noise, strict=True))
         cross = normal[:, old]
-        root = torch.linalg.solve_triangular(factor, (cross * scale).t(), upper=False)
-        rest = square - float(descent[old] @ x)
+        root = solved.inverse @ (cross * solved.scale).t()
+        rest = square - float(descent[old] @ solved.x)
         alone = replace(
             self,
             normal=(normal[:, new] - root.t() @ root)[None],
-            descent=(descent[new] - cross @ x)[None],
+            descent=(descent[new] - cross @ solved.x)[None],
             square=(rest,),
             sensors=(SensorCount(float(len(new)), False, True),),
         )
@@ -166,29 +224,33 @@ class NormalEquations(AbstractRegression):
         return best.log_evidence + rest / 2, best.prior.sizes
 
     def covariance_root(self, posterior: Posterior) -> CovarianceRoot:
-        """See `AbstractRegression.covariance_root`; with `N = L L^T` it is `L^-T`."""
-        scale, factor, _ = self._solved(posterior.prior, posterior.noise)
-        _return_free_memory(len(factor))
-        _invert_triangle(factor)
-        _return_free_memory(len(factor))
-        return CovarianceRoot(factor.t().mul_(scale[:, None]))
+        """See `AbstractRegression.covariance_root`; with the names of `Solved` it is `D L^-T`."""
+        solved = self._solved(posterior.prior, posterior.noise)
+        self.latest.clear()
+        return CovarianceRoot(solved.inverse.t().mul_(solved.scale[:, None]))
 
-    def _solved(self, prior: GaussianPrior, noise: tuple[float, ...]) -> tuple[Tensor, Tensor, Tensor]:
-        """Column scale and Cholesky factor of the matrix, and the most probable values."""
+    def _solved(self, prior: GaussianPrior, noise: tuple[float, ...]) -> Solved:
+        """What was solved last, or else solve now."""
 
         def normal() -> Tensor:
-            total = torch.zeros_like(self.normal[0])
-            for N, sigma in zip(self.normal, noise, strict=True):
-                total.add_(N, alpha=sigma**-2)
-            total.diagonal().add_(prior.precision)
-            return total
+            torch.mul(self.normal[0], noise[0] ** -2, out=memory)
+            for N, sigma in zip(self.normal[1:], noise[1:], strict=True):
+                memory.add_(N, alpha=sigma**-2)
+            memory.diagonal().add_(prior.precision)
+            return memory
 
-        descent = torch.zeros_like(self.descent[0])
-        for b, sigma in zip(self.descent, noise, strict=True):
-            descent.add_(b, alpha=sigma**-2)
-        scale, factor = factored(normal)
-        inner = torch.linalg.solve_triangular(factor, (scale * descent)[:, None], upper=False)
-        return scale, factor, scale * torch.linalg.solve_triangular(factor.mT, inner, upper=True)[:, 0]
+        if not self.latest or self.latest[0].prior is not prior or self.latest[0].noise != noise:
+            memory = self.latest.pop().inverse.mT if self.latest else torch.empty_like(self.normal[0])
+            descent = torch.zeros_like(self.descent[0])
+            for b, sigma in zip(self.descent, noise, strict=True):
+                descent.add_(b, alpha=sigma**-2)
+            scale, factor = factored(normal)
+            log_det = log_determinant(scale, factor)
+            inner = torch.linalg.solve_triangular(factor, (scale * descent)[:, None], upper=False)
+            x = scale * torch.linalg.solve_triangular(factor.mT, inner, upper=True)[:, 0]
+            _invert_triangle(factor)
+            self.latest.append(Solved(prior, noise, scale, factor, log_det, x))
+        return self.latest[0]
 
     def _misfits(self, x: Float64[Tensor, " unknowns"]) -> tuple[float, ...]:
         """`Σ (y - X x)²` per sensor."""
@@ -250,9 +312,12 @@ def _invert_triangle(factor: Tensor) -> None:
         factor.copy_(torch.linalg.solve_triangular(factor, identity, upper=False))
         return
     first, last = slice(0, size // 2), slice(size // 2, size)
+    below = torch.linalg.solve_triangular(factor[last, last], factor[last, first], upper=False)
+    factor[last, first] = torch.linalg.solve_triangular(
+        factor[first, first], below, upper=False, left=False
+    ).neg_()
     for block in (first, last):
         _invert_triangle(factor[block, block])
-    factor[last, first] = (factor[last, last] @ factor[last, first]).neg_() @ factor[first, first]
 
 
 def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> float:
@@ -272,16 +337,16 @@ def _add_sums(design: Design, sensor: SensorValues, N: Tensor, b: Tensor) -> flo
         for f, J in sides:
             Jw = J * w[:, None, None]
             along, pull = Jw.mT @ G, torch.einsum("rcj,rc->rj", Jw, y)
-            for j in range(dof):
-                block = slice(active + j * count, active + (j + 1) * count)
-                normal[:active, block] += along[:, j].t() @ f[j]
-                descent[block] += pull[:, j] @ f[j]
             for g, other in sides:
                 shared = Jw.mT @ other
                 for j in range(dof):
-                    blocks = f[j].t() @ (g[j:] * shared[:, j, j:].t()[..., None])
-                    own = slice(active + j * count, active + (j + 1) * count)
-                    normal[own, active + j * count :] += blocks.transpose(0, 1).reshape(count, -1)
+                    first = active + j * count
+                    right = (g[:, j:] * shared[:, j, j:, None]).flatten(1)
+                    normal[first : first + count, first:].addmm_(f[:, j].t(), right)
+            for j in range(dof):
+                block = slice(active + j * count, active + (j + 1) * count)
+                normal[:active, block].addmm_(along[:, j].t(), f[:, j])
+                descent[block].addmv_(f[:, j].t(), pull[:, j])
     order = torch.cat([torch.arange(active), active + _places(design, dof, count)])
     for rows in chunks(size):
         corner = normal[rows, rows]
@@ -298,10 +363,10 @@ def _copy_chosen(matrix: Tensor, chosen: Int64[Tensor, " chosen"], to: Tensor) -
         torch.index_select(matrix[chosen[rows]], 1, chosen, out=to[rows])
 
 
-def _feature_columns(design: Design, row: Tensor) -> Float64[Tensor, "dof rows columns"]:
+def _feature_columns(design: Design, row: Tensor) -> Float64[Tensor, "rows dof columns"]:
     """Columns of all features at some rows of the problem, those that a joint does not have as well."""
     state = design.problem.state[row]
-    return torch.cat([chosen.columns(state) for chosen in design.features], -1).movedim(1, 0).contiguous()
+    return torch.cat([chosen.columns(state) for chosen in design.features], -1)
 
 
 def _places(design: Design, dof: int, count: int) -> Int64[Tensor, " weights"]:

@@ -8,7 +8,7 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.hybrid.design import Design, Rows, weigh
-from pisigma.hybrid.evidence import AbstractRegression, Posterior
+from pisigma.hybrid.evidence import AbstractRegression, LeftOut, Posterior
 from pisigma.hybrid.regression import regression
 from pisigma.hybrid.search import Choice
 from pisigma.hybrid.sensor_values import sensor_values
@@ -41,6 +41,7 @@ class Refined:
         point: all parameters of the problem.
         correction: the network.
         rounds: linearisations made.
+        left_out: values of the folds of the search, predicted without them; None where another fit followed.
     """
 
     rows: Rows
@@ -50,6 +51,7 @@ class Refined:
     point: Float64[Tensor, " parameters"]
     correction: JointCorrection
     rounds: int
+    left_out: LeftOut | None = None
 
 
 def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: Choice) -> Refined:
@@ -71,7 +73,8 @@ def refine(problem: CalibrationProblem, group: Int64[Tensor, " rows"], choice: C
         fit = regression(design, there)
         posterior = fit.maximise_evidence(posterior.prior, posterior.noise)
         rounds += 1
-    return _refined(rows, design, posterior, fit or regression(design, rows), rounds)
+    refined = _refined(rows, design, posterior, fit or regression(design, rows), rounds)
+    return replace(refined, left_out=choice.best.left_out) if rounds == 1 else refined
 
 
 def refined_at(design: Design, posterior: Posterior, group: Int64[Tensor, " rows"], rounds: int) -> Refined:

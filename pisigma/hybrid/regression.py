@@ -14,3 +14,8 @@ def regression(design: Design, rows: Rows) -> AbstractRegression:
     values = sum(sensor.residual.numel() for sensor in rows.values)
     few = values <= min(MOST_VALUES, design.unknowns)
     return ValueCovariance.of(design, rows) if few else NormalEquations.of(design, rows)
+
+
+def extended(before: AbstractRegression, design: Design, rows: Rows) -> AbstractRegression:
+    """The regression of the same rows on a design that has some of the features, and a new one as its last."""
+    return before.extended(design) if isinstance(before, NormalEquations) else regression(design, rows)

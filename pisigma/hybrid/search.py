@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from pisigma.hybrid.design import FOLDS, FOLDS_OF_FEW, Design, Rows
-from pisigma.hybrid.evidence import AbstractRegression, Posterior
-from pisigma.hybrid.regression import regression
+from pisigma.hybrid.design import FOLDS, FOLDS_OF_FEW, MOST_GROUPS, Design, Rows
+from pisigma.hybrid.evidence import AbstractRegression, LeftOut, Posterior
+from pisigma.hybrid.regression import extended, regression
 from pisigma.joint_correction.feature import AbstractFeature
 
 LEVEL = 1.03
@@ -30,8 +30,6 @@ USUAL_UPDATES = 5
 """Updates of the usual sizes: more are not worth their time, as few values say little of them."""
 ROUGHLY = 1.0
 """While features are chosen, a log evidence that rises by less has settled."""
-MOST_GROUPS = 400
-"""So many groups of rows are held out at most."""
 FEW_GROUPS = 200
 """Up to so many there are more folds."""
 FEW_TOGETHER = 60
@@ -73,11 +71,13 @@ class Fitted:
         design: the unknowns.
         posterior: of them.
         largest_share: of the values that the unknowns may use up.
+        left_out: values of the folds, predicted without them; None where they were not.
     """
 
     design: Design
     posterior: Posterior
     largest_share: float = LARGEST_EFFECTIVE_SHARE
+    left_out: LeftOut | None = None
 
     @property
     def name(self) -> str:
@@ -153,7 +153,7 @@ class Search:
         chosen = self._regression.select(design)
         posterior = chosen.maximise_evidence(prior, noise, tolerance=ROUGHLY)
         errors = chosen.left_out(posterior, self._folds)
-        return Fitted(design, posterior), errors.rms(posterior.noise, self.noise)
+        return Fitted(design, posterior, left_out=errors), errors.rms(posterior.noise, self.noise)
 
     def _note(self, tried: Fitted, share: float, began: float, kept: bool) -> None:
         """Add a line to the table."""
@@ -200,18 +200,18 @@ class Search:
                 best = self._tried([*best.design.features, chosen], best, sizes)
         return best
 
-    def extended(self, best: Fitted, features: Sequence[AbstractFeature], odds: float = 0.0) -> Choice:
-        """The best so far, or that with features that come out of it, which need a regression of their own.
+    def extended(self, best: Fitted, feature: AbstractFeature | None, odds: float = 0.0) -> Choice:
+        """The best so far, or that with a feature that comes out of it.
 
         Args:
             best: so far.
-            features: chosen by their gain on the same rows.
-            odds: logarithm of the prior odds against them, which the evidence has to outweigh.
+            feature: chosen by its gain on the same rows; None for none.
+            odds: logarithm of the prior odds against it, which the evidence has to outweigh.
         """
-        if features:
-            largest = [*best.design.features, *features]
-            del self._regression  # one system of equations at a time: they are large
-            self._regression = regression(Design(self.rows.problem, tuple(largest)), self.rows)
+        if feature is not None:
+            largest = [*best.design.features, feature]
+            design = Design(self.rows.problem, tuple(largest))
+            self._regression = extended(self._regression, design, self.rows)
             self._order = [one.name for one in largest]
             best = self._tried(largest, best, odds=odds)
         same = self._regression.design.features == best.design.features

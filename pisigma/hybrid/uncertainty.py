@@ -9,7 +9,7 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.hybrid.covariance_root import CovarianceRoot
-from pisigma.hybrid.design import FOLDS, FOLDS_OF_FEW, Design, Rows
+from pisigma.hybrid.design import FOLDS, FOLDS_OF_FEW, MOST_GROUPS, Design, Rows
 from pisigma.hybrid.evidence import AbstractRegression, LeftOut, Posterior
 from pisigma.hybrid.sensor_values import joint_columns, weight_columns
 from pisigma.identification.problem.parameters import ParameterSpace
@@ -22,8 +22,6 @@ from pisigma.sensors.sensor import numbers_of
 
 CHUNK = 512
 """Rows whose columns are in memory at a time."""
-MOST_GROUPS = 400
-"""Left-out rows are looked at of so many groups at most."""
 FEW_GROUPS = 600
 """Up to so many, noise and prior sizes are estimated anew for every fold that is left out."""
 VERY_FEW_GROUPS = 60
@@ -153,7 +151,12 @@ def left_out_scale(errors: LeftOut) -> float:
 
 
 def position_uncertainty(
-    rows: Rows, design: Design, fit: AbstractRegression, posterior: Posterior, geometry: IdentifiedGeometry
+    rows: Rows,
+    design: Design,
+    fit: AbstractRegression,
+    posterior: Posterior,
+    geometry: IdentifiedGeometry,
+    left_out: LeftOut | None = None,
 ) -> PositionUncertainty:
     """Of the positions that a posterior predicts, scaled by what left-out rows show.
 
@@ -163,12 +166,13 @@ def position_uncertainty(
         fit: regression of the rows on them.
         posterior: of them.
         geometry: in the user's coordinates.
+        left_out: values left out of this fit, where they are at hand; used where their sizes need no estimate anew.
     """
     folds = rows.folds(FOLDS if rows.groups > VERY_FEW_GROUPS else FOLDS_OF_FEW, MOST_GROUPS)
     if rows.groups <= FEW_GROUPS:
         missed = fit.left_out_anew(posterior, folds, FOLD_UPDATES)
     else:
-        missed = fit.left_out(posterior, folds)
+        missed = left_out or fit.left_out(posterior, folds)
     prior_scale = left_out_scale(missed)
     root = fit.covariance_root(posterior)
     change = geometry.change[:, design.problem.active.cpu()]

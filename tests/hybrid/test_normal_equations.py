@@ -75,6 +75,16 @@ def test_sums_of_a_smaller_design_are_a_part_of_those_of_a_larger(name: str) -> 
 
 
 @pytest.mark.parametrize("name", CASES)
+def test_sums_with_another_feature_are_those_of_all_columns_at_once(name: str) -> None:
+    """Of some of the features that were there, one of which may be smaller, and the new one."""
+    case = CASES[name]()
+    features = [one for one in case.design.features if one.name != case.smaller[0].name]
+    first = NormalEquations.of(Design(case.rows.problem, tuple(features)), case.rows)
+    design = Design(case.rows.problem, (*features[:1], case.smaller[0]))
+    assert_same_sums(first.extended(design), DenseRegression.of(design, case.rows))
+
+
+@pytest.mark.parametrize("name", CASES)
 def test_sums_without_some_groups_are_those_of_the_others(name: str) -> None:
     """What is certain stays."""
     case = CASES[name]()
