@@ -30,6 +30,11 @@ def unreadable(row: LeftOut) -> Alarm:
     return Alarm(row.line, kind, f"line {row.line}, {row.reason}.", repeat)  # type: ignore[arg-type]
 
 
+def of_all_rows(sentence: str) -> Alarm:
+    """Complain of what is wrong with all rows alike, which the header of their file may say."""
+    return Alarm(1, "setup", f"line 1: {sentence} Do not go on before it is right.", repeat=False)
+
+
 def cleared(line: int) -> Alarm:
     """Take an alarm back."""
     text = f"line {line}: the rows that came since agree with it, so it counts after all."
@@ -79,8 +84,26 @@ def other_joint_values(
                 "at the joint values that it states."
             )
         else:
-            text = "no pose of the plan has its joint values; the row counts as one more pose."
+            text = _in_other_unit(robot, rows.q[row : row + 1], poses, names) or (
+                "no pose of the plan has its joint values; the row counts as one more pose."
+            )
         yield Alarm(rows.line[row], "pose", f"line {rows.line[row]}: {text}", repeat=False, counts=True)
+
+
+def _in_other_unit(
+    robot: Robot, q: Float64[Tensor, "1 dof"], poses: Float64[Tensor, "poses dof"], names: Sequence[str]
+) -> str:
+    """Name the planned pose that a row is at if its angles are in another unit than stated; "" where none is."""
+    stated = {
+        180 / torch.pi: "radians that are named degrees",
+        torch.pi / 180: "degrees that are named radians",
+    }
+    for factor, unit in stated.items():
+        other = torch.where(torch.tensor(robot.revolute), factor * q, q)
+        off = joint_differences(robot, other, poses)[0].abs().amax(1)
+        if float(off.min()) <= NEAR_POSE:
+            return f"its joint values are those of {names[int(off.argmin())]} if they are {unit}; correct the header."
+    return ""
 
 
 def contradicted(
@@ -107,9 +130,9 @@ def contradicted(
     parts = [f"{length * 1e3:.2f} mm"] if length == length else []
     parts += [f"{angle:.3f} deg in orientation"] if angle == angle else []
     what = (
-        f"line {line}: the measured value is {' and '.join(parts)} from what the other rows predict "
-        f"({usual:.2f} mm is usual here)"
+        f"line {line}: the measured value is {' and '.join(parts) or 'far'} from what the other rows predict"
     )
+    what += f" ({usual:.2f} mm is usual here)" if usual == usual else ""
     other = _other_pose(rows, judgement, row, poses, names)
     if other:
         advice = "Look for points or joint values that were swapped, and measure it again."

@@ -8,10 +8,10 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float64
 
-AlarmKind = Literal["unreadable", "duplicate", "frozen", "swapped", "off", "pose", "cleared"]
-"""The row cannot be read; it equals another one; the sensor shows an old value; the values of two poses are swapped;
-the value is off; the joint values are not those of a pose of the plan (a remark: the row counts); an
-alarm was taken back, as the rows that came since agree with the row."""
+AlarmKind = Literal["setup", "unreadable", "duplicate", "frozen", "swapped", "off", "pose", "cleared"]
+"""All rows have the same fault, such as a unit; the row cannot be read; it equals another one; the sensor shows an old
+value; the values of two poses are swapped; the value is off; the joint values are not those of a pose of the plan (a
+remark: the row counts); an alarm was taken back, as the rows that came since agree with the row."""
 
 
 @dataclass(frozen=True)

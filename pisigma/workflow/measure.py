@@ -18,6 +18,7 @@ from pisigma.identification.prediction import predicted_poses
 from pisigma.judging.progress import Progress
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.fields import LeftOut
+from pisigma.measuring.coverage import coverage
 from pisigma.measuring.reached import Reached, expected, reached, reached_with
 from pisigma.measuring.row_alarms import (
     NEAR_POSE,
@@ -25,12 +26,14 @@ from pisigma.measuring.row_alarms import (
     contradicted,
     is_wrong,
     joint_differences,
+    of_all_rows,
     other_joint_values,
     stale_readings,
     unreadable,
 )
 from pisigma.measuring.row_judgement import RowJudgement, judge_rows
-from pisigma.measuring.state import AccuracyPoint, Advice, Alarm, JointSpan, NextPose, RowsSoFar, SessionState
+from pisigma.measuring.setup_sentence import setup_sentence
+from pisigma.measuring.state import AccuracyPoint, Advice, Alarm, NextPose, RowsSoFar, SessionState
 from pisigma.measuring.stopping import AHEAD, advice
 from pisigma.planning.choice import choose
 from pisigma.planning.plan_file import StoredPlan, read_plan
@@ -114,6 +117,7 @@ class MeasuringSession:
         self._contradicted: dict[int, Alarm] = {}
         self._usable = torch.zeros(0, dtype=torch.bool)
         self._judgement = RowJudgement(self._usable)
+        self._setup = ""
         self._reached: list[AccuracyPoint] = []
         self._expected: tuple[AccuracyPoint, ...] = ()
         self._worked_out = 0
@@ -146,6 +150,8 @@ class MeasuringSession:
             for row in range(0 if rows is None else rows.rows):
                 assert rows is not None
                 alarms += self._add(rows.select(torch.tensor([row])))
+            if rows is not None:
+                alarms += self._judge_setup()
             self._fixed += [alarm for alarm in alarms if alarm.kind not in ("off", "swapped")]
         return tuple(sorted(alarms, key=lambda alarm: alarm.line))
 
@@ -158,7 +164,7 @@ class MeasuringSession:
         """Calibrate with the rows so far, judge that, and plan the rest again."""
         with self._lock:
             self._worked_out = self._training_rows
-            if self._rows is None:
+            if self._rows is None or self._setup:
                 return
             counting, check, rows, remaining = self._counting, self._check, self._rows, self._open
         training = rows.select(counting & ~check)
@@ -195,7 +201,7 @@ class MeasuringSession:
             return self._state()
 
     def _state(self) -> SessionState:
-        rows, open_poses, model = self._so_far(), self._open, self._judgement.model
+        rows, open_poses, model, counting = self._so_far(), self._open, self._judgement.model, self.rows
         following = None
         if len(open_poses):
             first, count = int(open_poses[0]), len(self.plan.q)
@@ -209,7 +215,7 @@ class MeasuringSession:
             alarms=tuple(sorted([*self._fixed, *self._contradicted.values()], key=lambda alarm: alarm.line)),
             next_pose=following,
             remaining=self.plan.q[open_poses].numpy(),
-            coverage=self._coverage(),
+            coverage=() if counting is None else coverage(self.plan.arm.robot, counting.q, self._planned),
             reached=tuple(self._reached),
             expected=self._expected,
             advice=self._advice(len(open_poses)),
@@ -235,6 +241,13 @@ class MeasuringSession:
             alarms += other_joint_values(self.plan.arm.robot, rows, new, self._planned, self._names)
         self._usable = torch.cat([self._usable, usable])
         return alarms + self._judge(rows)
+
+    def _judge_setup(self) -> list[Alarm]:
+        """Look for a fault that all rows have in common, and say it where it is new."""
+        assert self._rows is not None
+        usable, before = self._rows.select(self._usable), self._setup
+        self._setup = setup_sentence(self.plan.arm.robot, usable, self._judgement.counts)
+        return [of_all_rows(self._setup)] if self._setup and not before else []
 
     def _judge(self, rows: Measurements) -> list[Alarm]:
         """Judge all rows that are no copies, and say what is new."""
@@ -375,23 +388,10 @@ class MeasuringSession:
             (~self._counting).numpy(),
         )
 
-    def _coverage(self) -> tuple[JointSpan, ...]:
-        """What was measured of every joint, by the rows that count."""
-        if self._rows is None or not bool(self._counting.any()):
-            return ()
-        robot = self.plan.arm.robot
-        lower, upper = robot.to_controller(self._rows.q[self._counting]).aminmax(dim=0)
-        every = robot.to_controller(self._planned)
-        planned = every.amax(0) - every.amin(0)
-        return tuple(
-            JointSpan(joint.name, low, high, min(1.0, (high - low) / max(width, 1e-9)))
-            for joint, low, high, width in zip(
-                robot.axes, lower.tolist(), upper.tolist(), planned.tolist(), strict=True
-            )
-        )
-
     def _advice(self, left: int) -> Advice:
-        """Whether to go on; a pose that has to be measured again is measured before anything else."""
+        """Whether to go on: not while all rows are wrong; a pose to be measured again comes before anything else."""
+        if self._setup:
+            return Advice("repeat", of_all_rows(self._setup).sentence)
         last = None if self._rows is None else self._rows.line[-1]
         again = next((one for one in (*self._fixed, *self._contradicted.values()) if one.line == last), None)
         if again is not None and again.repeat:

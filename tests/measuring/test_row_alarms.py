@@ -42,6 +42,8 @@ def test_joint_values_beside_the_plan_are_a_remark():
     assert "no pose of the plan" in far.sentence
     assert near.counts
     assert not near.repeat
+    (alarm,) = other_joint_values(ROBOT, PLAN.measure(q[:1].deg2rad()), 0, PLAN.stored.q, NAMES)
+    assert "those of pose 1 of the plan if they are radians that are named degrees" in alarm.sentence
 
 
 def test_how_far_a_row_is_off_and_whose_point_it_is():

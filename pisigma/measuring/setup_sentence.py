@@ -1,0 +1,54 @@
+"""What is wrong with all rows alike, such as a unit, while few of them are there."""
+
+from jaxtyping import Bool, Float64
+from torch import Tensor
+
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.dataset import Measurements
+from pisigma.robot.description import Robot
+from pisigma.verification.checks.setup_fault import setup_diagnostics
+from pisigma.verification.faults_as_drawn import largest_group
+
+FEWEST_ROWS = 4
+"""Of fewer, the positions may happen to be near each other."""
+SCALE = 30.0
+"""Positions are in another unit that are so many times as far apart as those of the robot as drawn."""
+ARM_SHARE = 0.3
+"""Share of the reach by which a tool that is not drawn spreads positions, and that poses are spread over at least."""
+
+
+def setup_sentence(robot: Robot, rows: Measurements, counts: Bool[Tensor, " rows"]) -> str:
+    """Say which mistake in the setup or in the file all rows have in common; "" where none is found.
+
+    With few rows the size of what was measured is compared with that of the robot's motion; with 24 that count the
+    faults are tried that a calibration would be refused for.
+
+    Args:
+        robot: as drawn.
+        rows: all rows.
+        counts: those that others do not contradict.
+    """
+    for diagnostic in setup_diagnostics(robot, rows.select(counts)):
+        if diagnostic.severity == "implausible":
+            return diagnostic.sentence
+    group = largest_group(rows)
+    if group.position is None or group.rows < FEWEST_ROWS:
+        return ""
+    measured, drawn = _spread(group.position), _spread(forward_kinematics(robot, group.q)[:, :3, 3])
+    arm = ARM_SHARE * robot.reach
+    if measured > SCALE * (drawn + arm):
+        unit = "millimetres that are named metres"
+    elif SCALE * measured < drawn > arm:
+        unit = "metres that are named millimetres"
+    else:
+        return ""
+    return (
+        f"The measured positions are {measured * 1e3:,.1f} mm RMS from their mean, and those of robot '{robot.name}' "
+        f"at these joint values {drawn * 1e3:,.1f} mm: x, y and z are {unit}, or do not change with the robot; check "
+        "the column names and the instrument."
+    )
+
+
+def _spread(position: Float64[Tensor, "rows 3"]) -> float:
+    """Root mean square of the distances from the mean [m]."""
+    return float((position - position.mean(0)).square().sum(1).mean().sqrt())
