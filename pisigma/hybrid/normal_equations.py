@@ -312,10 +312,14 @@ def _invert_triangle(factor: Tensor) -> None:
         factor.copy_(torch.linalg.solve_triangular(factor, identity, upper=False))
         return
     first, last = slice(0, size // 2), slice(size // 2, size)
-    below = torch.linalg.solve_triangular(factor[last, last], factor[last, first], upper=False)
-    factor[last, first] = torch.linalg.solve_triangular(
-        factor[first, first], below, upper=False, left=False
-    ).neg_()
+    below = factor[last, first]
+    for some in chunks(len(below)):
+        below[:, some] = torch.linalg.solve_triangular(factor[last, last], below[:, some], upper=False)
+    for some in chunks(len(below)):
+        below[some] = torch.linalg.solve_triangular(
+            factor[first, first], below[some], upper=False, left=False
+        )
+    below.neg_()
     for block in (first, last):
         _invert_triangle(factor[block, block])
 
