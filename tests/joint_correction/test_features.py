@@ -9,8 +9,14 @@ from testing.closeness import assert_close
 
 from pisigma.joint_correction.backlash import Backlash
 from pisigma.joint_correction.conditions import ConditionFeatures
-from pisigma.joint_correction.feature import scaled_joints, turning_rate, unit_inputs
-from pisigma.joint_correction.fourier_series import BAND_STARTS, FourierSeries
+from pisigma.joint_correction.feature import FeatureOptions, scaled_joints, turning_rate, unit_inputs
+from pisigma.joint_correction.fourier_series import (
+    BAND_SIZES,
+    BAND_STARTS,
+    FINE_BAND_STARTS,
+    MANY_CONFIGURATIONS,
+    FourierSeries,
+)
 from pisigma.joint_correction.gear_lines import GearLines
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.joint_correction import JointCorrection
@@ -94,19 +100,30 @@ def test_a_slide_without_limits_turns_with_the_reach():
     )
 
 
+@pytest.mark.parametrize(("fine", "starts"), [(False, BAND_STARTS), (True, FINE_BAND_STARTS)])
 @pytest.mark.parametrize("harmonics", [1, 2, 5, 30])
-def test_harmonics_share_prior_sizes_in_bands(harmonics):
-    series = FourierSeries(Robot.load("rb5"), harmonics)
+def test_harmonics_share_prior_sizes_in_bands(harmonics, fine, starts):
+    series = FourierSeries(Robot.load("rb5"), harmonics, fine)
     assert series.count == 2 * harmonics
     assert bool(series.used.all())
     assert len(series.group_names) == int(series.group.max()) + 1
     bands = series.group[0, :harmonics]
     assert torch.equal(bands, series.group[3, harmonics:])
     for k in range(1, harmonics + 1):
-        band = max(i for i, start in enumerate(BAND_STARTS) if start <= k)
+        band = max(i for i, start in enumerate(starts) if start <= k)
         assert int(bands[k - 1]) == band
+        assert series.usual_sizes[band] == BAND_SIZES[sum(start <= starts[band] for start in BAND_STARTS) - 1]
         first, last = (int(word) for word in series.group_names[band].split()[1::2])
         assert first <= k <= last <= harmonics
+
+
+@pytest.mark.parametrize("more", [-1, 0])
+def test_bands_are_fine_where_many_configurations_were_measured(more):
+    robot = Robot.load("rb5")
+    options = FeatureOptions((8, 16), GRAVITY, MANY_CONFIGURATIONS + more)
+    tried = FourierSeries.candidates(robot, options, JointState(torch.zeros(1, robot.dof)))
+    expected = [FourierSeries(robot, k, fine=more == 0).group_names for k in (8, 16)]
+    assert [series.group_names for series in tried] == expected
 
 
 def test_gravity_columns_make_up_the_load_of_any_masses():
