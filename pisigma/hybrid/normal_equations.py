@@ -51,16 +51,15 @@ class Solved:
         deviation: Tensor = self.scale * torch.linalg.vector_norm(self.inverse, dim=0)
         return deviation.square()
 
-    def traces(self, matrices: Float64[Tensor, "sensors unknowns unknowns"]) -> list[float]:
-        """Traces of the products of symmetric matrices and the covariance, of whose blocks one is made at a time."""
-        traces = [0.0] * len(matrices)
+    def trace(self, matrix: Float64[Tensor, "unknowns unknowns"]) -> float:
+        """Trace of the product of a symmetric matrix and the covariance, of which one block is made at a time."""
+        trace = 0.0
         for rows in chunks(len(self.x)):
             block = self.inverse[rows.start :, rows].t() @ self.inverse[rows.start :, : rows.stop]
-            block.mul_(self.scale[: rows.stop]).mul_(self.scale[rows, None])
-            block[:, : rows.start].mul_(2)  # the blocks above the diagonal as well
-            for k, matrix in enumerate(matrices):
-                traces[k] += float((matrix[rows, : rows.stop] * block).sum())
-        return traces
+            scale = self.scale[: rows.stop].clone()
+            scale[: rows.start].mul_(2)  # the blocks above the diagonal as well
+            trace += float(self.scale[rows] @ (block.mul_(matrix[rows, : rows.stop]) @ scale))
+        return trace
 
 
 @dataclass(frozen=True, eq=False)
@@ -178,11 +177,9 @@ class NormalEquations(AbstractRegression):
         precision = prior.precision
         solved = self._solved(prior, noise)
         x, held = solved.x, precision * solved.variance
-        if len(noise) == 1:  # what the unknowns use up, the prior does not hold
-            used = [float((1 - held).sum())]
-        else:
-            pairs = zip(solved.traces(self.normal), noise, strict=True)
-            used = [trace / sigma**2 for trace, sigma in pairs]
+        pairs = zip(self.normal[1:], noise[1:], strict=True)
+        used = [solved.trace(N) / sigma**2 for N, sigma in pairs]
+        used.insert(0, float((1 - held).sum()) - sum(used))  # the prior holds what the values do not
         misfit = self._misfits(x)
         log_prior = float(precision[precision > 0].log().sum())
         fit = sum(total / sigma**2 for total, sigma in zip(misfit, noise, strict=True))
