@@ -28,8 +28,10 @@ JACOBIAN_CHUNK = 2_048
 """Poses worked on together, so that their Jacobian stays in the processor's cache."""
 
 
-AXES, ORIGIN, FRAME = slice(6, 9), 9, slice(8, 13)
-"""Where `_frame_axes` has x, y, z; the origin; and z, the origin, x, y, -x."""
+AXES, ORIGIN = slice(6, 9), 9
+"""Where `_frame_axes` has x, y, z; and the origin."""
+STARTS = ((0, 0, 0, 1, 1, ORIGIN, 2), (6, 6, 6, 7, 10, ORIGIN, 8))
+"""Which of them the walk starts from, see `_walk_rows`: what the base turns about, and where the first row stands."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,14 +53,17 @@ class ToolMotion:
 def motion_order(rows: int) -> list[int]:
     """Where the parameters stand in `ToolMotion.derivative`, which has all turns before all shifts.
 
+    It has the turns about every third axis of `_walk_rows`, of which some are no parameter's.
+
     Returns:
         For theta, d, a, alpha, beta of every row, then base and tool (x, y, z, roll, pitch, yaw each), its
         index.
     """
-    theta, alpha, beta, d, a = 0, rows, 2 * rows, 3 * rows + 6, 4 * rows + 6
-    order = [start + row for row in range(rows) for start in (theta, d, a, alpha, beta)]
-    base = [*range(5 * rows + 6, 5 * rows + 9), *range(3 * rows, 3 * rows + 3)]
-    return order + base + [index + 3 for index in base]
+    d, a, base, tool = (start + 3 * rows + 9 for start in (0, rows, 2 * rows, 2 * rows + 3))
+    order = [
+        index for row in range(rows) for index in (3 * row + 5, d + row, a + row, 3 * row + 6, 3 * row + 7)
+    ]
+    return [*order, base, base + 1, base + 2, 0, 1, 2, tool, tool + 1, tool + 2, d - 3, d - 2, d - 1]
 
 
 def identification_jacobian(
@@ -118,33 +123,31 @@ def tool_motion(
         frame: per pose the number of its base, where there is one a frame.
         target: per pose the number of its tool, where there is one a target.
     """
-    count, poses = len(robot.rows), q.shape[0]
+    poses = q.shape[0]
     axes, bases = _frame_axes(torch.cat([base, tool], 1), q), base.shape[1]
     base_axes, tool_axes = axes[..., :bases], axes[..., bases:]
     if frame is not None:
         base_axes = base_axes[..., frame]
     if target is not None:
         tool_axes = tool_axes[..., target]
-    walked = _walk_rows(robot, dh, q, base_axes)
-    tool_steps = _behind(walked.last, tool_axes)
+    frames = _walk_rows(robot, dh, q, base_axes)
+    tool_steps = _behind(_last(frames), tool_axes)
     position = tool_steps[ORIGIN]
-    number = 3 * count + 6
-    J = q.new_empty((number + 2 * count + 6, 6 if turning else 3, poses))
-    turns = J[:number, 3:] if turning else q.new_empty((number, 3, poses))
-    base_steps = _spread(base_axes[: ORIGIN + 1, :3], poses)
-    torch.cat([walked.z, walked.x, walked.y, base_steps[:3], tool_steps[:3]], out=turns)
-    origins = q.new_empty((number, 3, poses))
-    base_origin = base_steps[None, ORIGIN].expand(3, 3, poses)
-    torch.cat(
-        [walked.before, walked.moved, walked.moved, base_origin, position.expand(3, 3, poses)], out=origins
-    )
-    u, v, shift = turns.unbind(1), torch.sub(position, origins, out=origins).unbind(1), J[:number].unbind(1)
+    shifts = 3 * len(frames) + 3
+    J = q.new_empty((shifts + 2 * len(robot.rows) + 6, 6 if turning else 3, poses))
+    turns = frames[:, ::3]
+    u, v = turns.unbind(2), (position - frames[:, 5])[:, None].unbind(2)
+    of_turns = J[: shifts - 3].unflatten(0, turns.shape[:2])
     for k in range(3):  # the cross product of the axes and the ways from the origins to the tool
         i, j = (k + 1) % 3, (k + 2) % 3
-        torch.mul(u[i], v[j], out=shift[k]).addcmul_(u[j], v[i], value=-1)
-    torch.cat([walked.z, walked.x, base_steps[3:6], tool_steps[3:6]], out=J[number:, :3])
+        torch.mul(u[i], v[j], out=of_turns[:, :, k]).addcmul_(u[j], v[i], value=-1)
+    base_steps = _spread(base_axes[3:6, :3], poses)
+    torch.cat([frames[1:-1, 6], frames[2:, 0], base_steps, tool_steps[3:6]], out=J[shifts:, :3])
+    J[shifts - 3 : shifts, :3] = 0
     if turning:
-        J[number:, 3:] = 0
+        of_turns[:, :, 3:] = turns
+        J[shifts - 3 : shifts, 3:] = tool_steps[:3]
+        J[shifts:, 3:] = 0
     return ToolMotion(position, tool_steps[AXES].transpose(0, 1), J)
 
 
@@ -152,79 +155,63 @@ def flange_frames(
     robot: Robot, q: Float[Tensor, "poses dof"]
 ) -> tuple[Float[Tensor, "poses 3 3"], Float[Tensor, "poses 3"]]:
     """Return orientation and position [m] behind the last row in the first row's frame, without base and tool."""
-    last = _walk_rows(robot, robot.dh, q, _frame_axes(q.new_zeros(6, 1), q)).last
+    last = _last(_walk_rows(robot, robot.dh, q, _frame_axes(q.new_zeros(6, 1), q)))
     return last[:3].permute(2, 1, 0).contiguous(), last[3].t().contiguous()
-
-
-@dataclass(frozen=True, eq=False)
-class _Walked:
-    """Per row the axes z before, x turned and y twisted, and the origins before and moved.
-
-    Attributes:
-        last: axes x, y, z and origin after the last row.
-    """
-
-    z: Float[Tensor, "rows 3 poses"]
-    x: Float[Tensor, "rows 3 poses"]
-    y: Float[Tensor, "rows 3 poses"]
-    before: Float[Tensor, "rows 3 poses"]
-    moved: Float[Tensor, "rows 3 poses"]
-    last: Float[Tensor, "4 3 poses"]
 
 
 def _walk_rows(
     robot: Robot, dh: Float64[np.ndarray, "*robots rows 5"], q: Tensor, base_axes: Tensor
-) -> _Walked:
+) -> Float[Tensor, "rows_and_2 7 3 poses"]:
     """Walk from the base to the last row.
 
-    Per row are kept, one after the other: x and y turned; z, the origin, x, y and -x before. The turn about z
-    then is `(x, y) cos + (y, -x) sin`, and one small matrix leads from the first four to the next row.
+    The turn about z is `(x, y) cos + (y, -x) sin`, and one small matrix leads from what a row has turned to the next.
+
+    Returns:
+        One row further than the rows, x and y as the row before has turned them, then x, y, -x, the origin and z
+        before the row. Every third one is an axis that parameters turn about, through this origin. In front stand, in
+        the same way, what the base turns about (roll, pitch, yaw) and its origin.
     """
-    count, poses = len(robot.rows), q.shape[0]
-    frames = q.new_empty((count + 1, 7, 3, poses))
-    frames[0, 2:] = _spread(base_axes[FRAME, :3], poses)
+    frames = q.new_empty((len(robot.rows) + 2, 7, 3, q.shape[0]))
+    frames[:2] = _spread(base_axes[STARTS, :3], q.shape[0])
     offsets = torch.from_numpy(np.atleast_2d(dh[..., 0]).T.copy()).to(q)
-    angles = torch.addmm(_spread(offsets, poses), torch.from_numpy(_turning(robot)).to(q), q.t())
-    before, flat, matrices = frames[:-1], frames.flatten(2), _row_matrices(dh, q)
-    turns = zip(
-        *(block.unbind(0) for block in (before[:, :2], before[:, 4:6], before[:, 5:])),
-        angles.cos().unbind(0),
-        angles.sin().unbind(0),
-        strict=True,
-    )
+    angles = torch.addmm(_spread(offsets, q.shape[0]), torch.from_numpy(_turning(robot)).to(q), q.t())
+    before, turned, flat, matrices = frames[1:-1], frames[2:, :2], frames.flatten(0, 1), _row_matrices(dh, q)
+    turns = zip(turned, before[:, 2:4], before[:, 3:5], angles.cos(), angles.sin(), strict=True)
     lead = torch.mm if matrices.ndim == 3 else _led_by_robots
-    steps = zip(*(block.unbind(0) for block in (matrices, flat[:-1, :4], flat[1:, 2:])), strict=True)
     sliding = {
         row: joint for joint, row in enumerate(robot.joint_rows) if robot.rows[row].type == "prismatic"
     }
-    for row, ((turned, xy, side, cosine, sine), (matrix, state, after)) in enumerate(
-        zip(turns, steps, strict=True)
-    ):
-        torch.mul(xy, cosine, out=turned).addcmul_(side, sine)
-        lead(matrix, state, out=after)
+    for row, (after, xy, side, cosine, sine) in enumerate(turns):
+        torch.mul(xy, cosine, out=after).addcmul_(side, sine)
+        start = 7 * row + 12
+        lead(matrices[row], flat[start : start + 4].flatten(1), out=flat[start + 4 : start + 9].flatten(1))
         if row in sliding:
             joint = sliding[row]
-            frames[row + 1, 3].addcmul_(frames[row, 2], q[:, joint], value=robot.directions[joint])
-    last = torch.cat([frames[-1, 4:6], frames[-1, 2:4]])
-    return _Walked(before[:, 2], before[:, 0], frames[1:, 5], before[:, 3], frames[1:, 3], last)
+            frames[row + 2, 5].addcmul_(frames[row + 1, 6], q[:, joint], value=robot.directions[joint])
+    return frames
+
+
+def _last(frames: Float[Tensor, "rows_and_2 7 3 poses"]) -> Float[Tensor, "4 3 poses"]:
+    """Axes x, y, z and origin after the last row."""
+    return torch.cat([frames[-1, 2:4], frames[-1, 6:], frames[-1, 5:6]])
 
 
 def _row_matrices(
     dh: Float64[np.ndarray, "*robots rows 5"], like: Tensor
 ) -> Float[Tensor, "rows *robots 5 4"]:
-    """Per row z, origin, x, y and -x after it, by x and y turned, z and the origin before.
+    """Per row x, y, -x, origin and z after it, by the origin and z before, and x and y turned.
 
     `Trans(a, 0, d) · RotX(alpha) · RotY(beta)`; a joint that slides comes on top.
     """
-    theta, d, a, alpha, beta = dh.T
+    _, d, a, alpha, beta = dh.T
     ca, cb, sa, sb = np.cos(alpha), np.cos(beta), np.sin(alpha), np.sin(beta)
-    matrices = np.zeros((*theta.shape, 5, 4))
-    z, origin, x, y, minus_x = np.moveaxis(matrices, -2, 0)
-    z[..., 0], z[..., 1], z[..., 2] = sb, -sa * cb, ca * cb
-    origin[..., 0], origin[..., 2], origin[..., 3] = a, d, 1
-    x[..., 0], x[..., 1], x[..., 2] = cb, sa * sb, -ca * sb
-    y[..., 1], y[..., 2] = ca, sa
+    matrices = np.zeros((*d.shape, 5, 4))
+    x, y, minus_x, origin, z = (matrices[..., i, :] for i in range(5))
+    x[..., 1], x[..., 2], x[..., 3] = -ca * sb, cb, sa * sb
+    y[..., 1], y[..., 3] = sa, ca
     np.negative(x, out=minus_x)
+    origin[..., 0], origin[..., 1], origin[..., 2] = 1, d, a
+    z[..., 1], z[..., 2], z[..., 3] = ca * cb, sb, -sa * cb
     return torch.from_numpy(matrices).to(like)
 
 
@@ -236,11 +223,10 @@ def _turning(robot: Robot) -> Float64[np.ndarray, "rows dof"]:
     return turning
 
 
-def _frame_axes(xyzrpy: Float[Tensor, "6 frames"], like: Tensor) -> Float[Tensor, "13 4 frames"]:
-    """What bases or tools turn about (roll, pitch, yaw), shift along (x, y, z) and end as.
+def _frame_axes(xyzrpy: Float[Tensor, "6 frames"], like: Tensor) -> Float[Tensor, "11 4 frames"]:
+    """What bases or tools turn about (roll, pitch, yaw), shift along (x, y, z) and end as: x, y, z, origin, -x.
 
-    The end is x, y, z, the origin, x, y, -x, so that `AXES` and `FRAME` are stretches of it. All are given by
-    the axes x, y, z and the origin before `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
+    All are stated by the axes x, y, z and the origin before `Trans(x, y, z) · RotZ(roll) · RotY(pitch) · RotX(yaw)`.
     """
     values = xyzrpy.cpu().numpy()
     (cr, cp, cy), (sr, sp, sy) = np.cos(values[3:]), np.sin(values[3:])
@@ -248,11 +234,11 @@ def _frame_axes(xyzrpy: Float[Tensor, "6 frames"], like: Tensor) -> Float[Tensor
     x = (cr * cp, sr * cp, -sp)
     y = (cr * spsy - sr * cy, sr * spsy + cr * cy, cp * sy)
     z = (cr * spcy + sr * sy, sr * spcy - cr * sy, cp * cy)
-    axes = np.zeros((13, 4, values.shape[1]))
+    axes = np.zeros((11, 4, values.shape[1]))
     axes[0, 2] = axes[3, 0] = axes[4, 1] = axes[5, 2] = axes[9, 3] = 1
     axes[1, 0], axes[1, 1] = -sr, cr
     axes[6:9, :3] = np.array((*x, *y, *z)).reshape(3, 3, -1)
-    axes[2], axes[10:12], axes[12] = axes[6], axes[6:8], -axes[6]
+    axes[2], axes[10] = axes[6], -axes[6]
     axes[9, :3] = values[:3]
     return torch.from_numpy(axes).to(like)
 
@@ -288,6 +274,6 @@ def _led_by_robots(
 ) -> None:
     """Multiply the axes and origins of several robots, one behind the other among the poses, each by its matrix."""
     robots, size, _ = matrices.shape
-    of_robots = state.view(4, 3, robots, -1).permute(2, 0, 1, 3).flatten(2)
-    led = torch.bmm(matrices, of_robots).view(robots, size, 3, -1)
-    out.view(size, 3, robots, -1).copy_(led.permute(1, 2, 0, 3))
+    of_robots = state.view(4, 3 * robots, -1).transpose(0, 1)
+    led = torch.bmm(matrices.repeat(3, 1, 1), of_robots)
+    out.view(size, 3 * robots, -1).copy_(led.transpose(0, 1))
