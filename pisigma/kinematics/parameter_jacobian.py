@@ -30,7 +30,7 @@ JACOBIAN_CHUNK = 2_048
 
 AXES, ORIGIN = slice(6, 9), 9
 """Where `_frame_axes` has x, y, z; and the origin."""
-STARTS = ((0, 0, 0, 1, 1, ORIGIN, 2), (6, 6, 6, 7, 10, ORIGIN, 8))
+STARTS = torch.tensor((0, 0, 0, 1, 1, ORIGIN, 2, 6, 6, 6, 7, 10, ORIGIN, 8))
 """Which of them the walk starts from, see `_walk_rows`: what the base turns about, and where the first row stands."""
 
 
@@ -133,11 +133,11 @@ def tool_motion(
     frames = _walk_rows(robot, dh, q, base_axes)
     tool_steps = _behind(_last(frames), tool_axes)
     position = tool_steps[ORIGIN]
-    shifts = 3 * len(frames) + 3
+    shifts = 3 * frames.shape[0] + 3
     J = q.new_empty((shifts + 2 * len(robot.rows) + 6, 6 if turning else 3, poses))
     turns = frames[:, ::3]
     u, v = turns.unbind(2), (position - frames[:, 5])[:, None].unbind(2)
-    of_turns = J[: shifts - 3].unflatten(0, turns.shape[:2])
+    of_turns = J[: shifts - 3].view(-1, 3, J.shape[1], poses)
     for k in range(3):  # the cross product of the axes and the ways from the origins to the tool
         i, j = (k + 1) % 3, (k + 2) % 3
         torch.mul(u[i], v[j], out=of_turns[:, :, k]).addcmul_(u[j], v[i], value=-1)
@@ -172,11 +172,13 @@ def _walk_rows(
         the same way, what the base turns about (roll, pitch, yaw) and its origin.
     """
     frames = q.new_empty((len(robot.rows) + 2, 7, 3, q.shape[0]))
-    frames[:2] = _spread(base_axes[STARTS, :3], q.shape[0])
+    starts = base_axes.index_select(0, STARTS.to(q.device))[:, :3]
+    frames[:2].flatten(0, 1).copy_(_spread(starts, q.shape[0]))
     offsets = torch.from_numpy(np.atleast_2d(dh[..., 0]).T.copy()).to(q)
     angles = torch.addmm(_spread(offsets, q.shape[0]), torch.from_numpy(_turning(robot)).to(q), q.t())
     before, turned, flat, matrices = frames[1:-1], frames[2:, :2], frames.flatten(0, 1), _row_matrices(dh, q)
-    turns = zip(turned, before[:, 2:4], before[:, 3:5], angles.cos(), angles.sin(), strict=True)
+    blocks = (turned, before[:, 2:4], before[:, 3:5], angles.cos(), angles.sin())
+    turns = zip(*(block.unbind(0) for block in blocks), strict=True)
     lead = torch.mm if matrices.ndim == 3 else _led_by_robots
     sliding = {
         row: joint for joint, row in enumerate(robot.joint_rows) if robot.rows[row].type == "prismatic"

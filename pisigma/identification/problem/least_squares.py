@@ -339,13 +339,15 @@ def solve_damped(
         IdentificationError: they are not finite.
     """
     normal, descent = linearisation.normal, linearisation.descent
-    if not math.isfinite(float(normal.sum() + descent.sum())):
+    diagonal = normal.diagonal(dim1=-2, dim2=-1)
+    # a product of two columns is finite where their squares are
+    if not math.isfinite(float((diagonal + descent).sum())):
         raise IdentificationError(
             "the normal equations are not finite; look for huge values, or standard deviations of next to nothing, in "
             "the measurements."
         )
     while True:
-        damped = normal.diagonal(dim1=-2, dim2=-1) + damping[..., None] / step_scale.square()
+        damped = torch.addcdiv(diagonal, damping[..., None], step_scale.square())
         scale = damped.rsqrt()
         scaled = normal * (scale[..., None, :] * scale[..., None])
         scaled.diagonal(dim1=-2, dim2=-1).copy_(damped * scale.square() + 1e-14)

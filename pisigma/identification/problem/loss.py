@@ -104,7 +104,7 @@ class HampelLoss(AbstractLoss):
         """One, a / distance, falling, zero."""
         a = DISTANCE_99[components]
         b, c = 1.5 * a, 3 * a
-        falling: Tensor = (c - distance).div_(c - b).clamp_(0, 1)
+        falling: Tensor = torch.rsub(distance, c).div_(c - b).clamp_(0, 1)
         return falling.mul_(a).div_(distance.clamp(min=a))
 
     def scale(
@@ -129,4 +129,4 @@ def _left(distance: Float[Tensor, "*batch rows"], components: int, used: Figure)
     values = distance.shape[-1] * components
     if isinstance(used, float | int):
         return distance.new_tensor(max(values - used, 1.0))
-    return (values - used).clamp(min=1.0)
+    return torch.rsub(used, values).clamp(min=1.0)

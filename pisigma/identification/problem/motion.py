@@ -49,7 +49,7 @@ def motion_at(
         turning: whether the derivative of the rotation is wanted too.
     """
     dh, bases, tools = space.split(point)
-    robots, rows = point.shape[:-1].numel(), len(q)
+    robots, rows = point.shape[:-1].numel(), q.shape[0]
     robot = torch.arange(robots, device=q.device).repeat_interleave(rows // robots) if robots > 1 else 0
     frame_of_all, target_of_all = (
         None if owners.shape[-2] == 1 else number + owners.shape[-2] * robot

@@ -48,7 +48,8 @@ class SensorSums:
     @property
     def rms(self) -> Float64[Tensor, "*robots"]:
         """Root mean square of the residuals' lengths [m or rad]."""
-        return (self.residual.square().sum((-2, -1)) / max(self.measured, 1)).sqrt()
+        sizes: Tensor = torch.linalg.vector_norm(self.residual, dim=(-2, -1))
+        return sizes / math.sqrt(max(self.measured, 1))
 
 
 def joined_sums(chunks: Sequence[SensorSums]) -> SensorSums:

@@ -64,7 +64,7 @@ def effective_parameters(
     """
     variance = covariance.diagonal(dim1=-2, dim2=-1)
     lost = scaled_precision(precision, group, prior_scale) * variance
-    return _group_totals(torch.where(precision > 0, 1 - lost, 0.0), group)
+    return _group_totals(torch.where(precision > 0, torch.rsub(lost, 1), 0.0), group)
 
 
 def scaled_precision(

@@ -264,7 +264,8 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         """Rows that are worked on together; all or none of a robot where there are several."""
         # several robots take more operations a chunk, which larger chunks make up for
         size = JACOBIAN_CHUNK if not self.robots else max(2 * JACOBIAN_CHUNK // self.rows, 1) * self.rows
-        return [slice(start, min(start + size, len(self.q))) for start in range(0, len(self.q), size)]
+        count = self.q.shape[0]
+        return [slice(start, min(start + size, count)) for start in range(0, count, size)]
 
     def _of_rows(self, values: Float64[Tensor, "*robots size"], rows: slice) -> Float64[Tensor, "*some size"]:
         """What has one entry a robot, for the robots of some rows."""
@@ -283,9 +284,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         of_rows = (self._of_rows(point, rows), self.q[rows], self.frame[rows], self.target[rows])
         make = partial(motion_at, self.space, *of_rows, self._turning)
         made_from = (point, self.space, self.q, self.frame, self.target, self._turning)
-        motion = self.memory.motion(made_from, make) if self.chunks() == [rows] else make()
+        motion = self.memory.motion(made_from, make) if rows == slice(0, self.q.shape[0]) else make()
         columns = self.space.motion_columns.to(active.device)
-        J = motion.derivative.index_select(0, columns[0, active])
+        J = motion.derivative.index_select(0, columns[0].index_select(0, active))
         if not self.space.always_moving:
             f, t = columns[1:, active, None]
             moving = ((f == EVERYWHERE) | (f == self.frame[rows])) & (
@@ -374,8 +375,9 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         if sensor.sigma is not None:
             distance = torch.where(sensor.present[rows], distance / sensor.sigma[rows], 0.0)
         residual, distance = self.by_robot(residual), self.by_robot(distance)
-        root = torch.ones_like(distance)
-        if noise is not None:
+        if noise is None:
+            root = torch.ones_like(distance)
+        else:
             scale = noise[..., number, None].clamp(min=ALWAYS_GOOD)
             root = self.loss_of(sensor).weight(distance / scale, sensor.components).sqrt_()
         if sensor.sigma is not None:
