@@ -10,6 +10,8 @@ from pisigma.cli.output import print_json, print_line, print_lines, print_table
 from pisigma.errors import OutputError
 
 if TYPE_CHECKING:
+    from pisigma.export.projection import Departure
+    from pisigma.robot import Robot
     from pisigma.robot.pendant_poses import PendantPose
 
 Read = Annotated[
@@ -28,6 +30,8 @@ Like = Annotated[
 ]
 Out = Annotated[Path | None, typer.Option(help="With --read: the robot file (.yaml) to write.")]
 
+PLAUSIBLE_SHARE = 0.01
+"""Share of the reach that a calibration changes an arm by at most."""
 
 Check = Annotated[
     str | None,
@@ -65,16 +69,39 @@ def _convert(read: Path, like: str, out: Path, as_json: bool) -> None:
     """Write the robot that a controller's file describes."""
     from pisigma.export.controllers.reading import read_controller_file
     from pisigma.export.dh_table import dh_yaml
+    from pisigma.export.projection import departure_from_drawn
     from pisigma.files.output_file import check_output, write_whole
     from pisigma.robot import Robot
 
     check_output(out, (".yaml", ".yml"), "a robot file", (read, Path(like)))
-    robot = read_controller_file(read, Robot.load(like))
+    drawn = Robot.load(like)
+    robot = read_controller_file(read, drawn)
+    change = departure_from_drawn(robot, drawn)
     write_whole(out, dh_yaml(robot, (f"Read from {read.name} with the nominal robot {robot.name}.",)))
+    warnings = _doubts(change, drawn)
     if as_json:
-        print_json({"file": str(out), "robot": robot.name, "joints": robot.dof})
-    else:
-        print_line(f"Robot file written to {out}.")
+        sizes = {"mean_mm": change.mean_mm, "max_mm": change.max_mm}
+        written = {"file": str(out), "robot": robot.name, "joints": robot.dof}
+        print_json({**written, "change": sizes, "warnings": warnings})
+        return
+    print_line(f"Robot file written to {out}.")
+    print_lines(
+        [
+            f"With base and tool fitted, its tool is {change.mean_mm:.3g} mm from that of the robot as drawn in the "
+            f"mean, {change.max_mm:.3g} mm at most.",
+            *(f"Warning: {sentence}" for sentence in warnings),
+        ]
+    )
+
+
+def _doubts(change: "Departure", drawn: "Robot") -> list[str]:
+    """Warn of a file that changes the robot by more than calibrations do."""
+    if change.mean_mm < PLAUSIBLE_SHARE * drawn.reach * 1e3:
+        return []
+    return [
+        f"{change.mean_mm:.3g} mm are more than {100 * PLAUSIBLE_SHARE:g} % of the reach of robot '{drawn.name}', by which "
+        "no calibration changes an arm; check that --like is the robot of this file, and its units (radians, metres)."
+    ]
 
 
 def _list(as_json: bool) -> None:

@@ -96,13 +96,13 @@ def read_calibration(text: str, source: str, nominal: Robot) -> Robot:
 
 
 def _numbers(text: str, key: str, source: str) -> list[float]:
-    line = re.search(_LINE.format(key=key), text)
+    lines = re.findall(_LINE.format(key=key), text)
     try:
-        values = [float(word) for word in line[1].split(",")] if line else []
+        values = [float(word) for word in lines[0].split(",")] if len(lines) == 1 else []
     except ValueError:
         values = []
     if len(values) != JOINTS or not np.isfinite(values).all():
-        raise RobotError(f"{source}: a line '{key} = [...]' with {JOINTS} finite numbers was wanted.")
+        raise RobotError(f"{source}: one line '{key} = [...]' with {JOINTS} finite numbers was wanted.")
     return values
 
 

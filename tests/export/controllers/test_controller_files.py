@@ -221,8 +221,9 @@ def test_robots_that_a_file_cannot_hold(name, robot, complaint):
         (
             ".conf",
             "delta_theta = [1, 2, x]",
-            "a line 'delta_theta = \\[...\\]' with 6 finite numbers was wanted",
+            "one line 'delta_theta = \\[...\\]' with 6 finite numbers was wanted",
         ),
+        (".conf", "delta_theta = [0, 0, 0, 0, 0, 0]\n" * 2, "one line 'delta_theta"),
         (".cfx", "<a>", "no whole XML file"),
         (".cfx", '<DhArray name="dhOffset"><DH b="1"/></DhArray>', "has 1 joints, robot 'ur10' 6"),
         (".csv", "part,name\njoint,theta_1\n", "offsets of the joints theta_1, theta_2"),
