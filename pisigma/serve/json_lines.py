@@ -218,11 +218,7 @@ def _read(message: bytes) -> dict[str, Any]:
 def _solve(model: ServedModel, request: dict[str, Any]) -> tuple[str, dict[str, Any]]:
     """Solve one pose."""
     entries, near = _entries(request["pose"], "pose"), _near(model, request)
-    if (
-        model.direct is not None
-        and request.keys() <= _PLAIN
-        and (near is None or model.ik.postures.hold(near))
-    ):
+    if model.direct is not None and request.keys() <= _PLAIN:
         beside = b"" if near is None else struct.pack(f"<{len(near)}d", *near)
         row = model.direct.solve_packed(_POSE.pack(*entries), beside)
         values = _record(model, row, model.ik.axes.ignored)
@@ -307,7 +303,20 @@ def _entries(pose: Any, name: str) -> tuple[float, ...]:
 
 
 def _near(model: ServedModel, request: dict[str, Any]) -> list[float] | None:
-    return _joints(model, request, *_NEAR) if request.keys() & _NEAR else None
+    """Joint values to be near to [rad or m], if any.
+
+    Raises:
+        RequestError: they do not fit, or are no posture of the robot.
+    """
+    if not request.keys() & _NEAR:
+        return None
+    near = _joints(model, request, *_NEAR)
+    if not model.ik.postures.hold(near):
+        raise RequestError(
+            f"'{_NEAR[model.joints_key != 'q_deg']}' lies more than a full turn (or 1 m) beyond the joint limits of model "
+            f"'{model.name}'; give the joint values where the robot stands, in {_units(model)}."
+        )
+    return near
 
 
 def _joints(model: ServedModel, request: dict[str, Any], in_degrees: str, mixed: str) -> list[float]:
@@ -318,9 +327,13 @@ def _joints(model: ServedModel, request: dict[str, Any], in_degrees: str, mixed:
     """
     wanted, other = (in_degrees, mixed) if model.joints_key == "q_deg" else (mixed, in_degrees)
     if other in request:
-        raise RequestError(f"'{other}' is not for model '{model.name}'; give '{wanted}', in deg and mm.")
+        raise RequestError(f"'{other}' is not for model '{model.name}'; give '{wanted}', in {_units(model)}.")
     values, units = _numbers(request, wanted, len(model.ik.joints)), model.per_file_unit
     return [value / unit for value, unit in zip(values, units, strict=True)]
+
+
+def _units(model: ServedModel) -> str:
+    return "deg" if model.joints_key == "q_deg" else "deg and mm"
 
 
 def _numbers(request: dict[str, Any], key: str, count: int) -> list[float]:

@@ -163,7 +163,10 @@ def test_health_counts_what_was_answered(ask):
         ({"pose": [True, *POSE[1:]], "model": 0}, "'pose' holds 'True'"),
         ({"pose": [1e300, *POSE[1:]], "model": 0}, "'pose' holds '1e.300'"),
         ({"pose": POSE, "model": 0, "near_deg": [90] * 5}, "'near_deg' has to be a list of 6"),
-        ({"pose": POSE, "model": 0, "near_deg": [9e4] * 6}, "more than a full turn beyond its limits"),
+        (
+            {"pose": POSE, "model": 0, "near_deg": [9e4] * 6},
+            "'near_deg' lies more than a full turn .* in deg.",
+        ),
         ({"pose": POSE, "model": 0, "branch": "upside"}, "there is no branch 'upside'"),
         ({"pose": POSE, "model": 0, "braunch": "x"}, "did you mean 'branch'"),
         ({"pose": POSE, "q_deg": NEAR, "model": 0}, "this one has 2 of them"),
