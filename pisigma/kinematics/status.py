@@ -42,8 +42,8 @@ _SENTENCES = {
         "another branch or pose."
     ),
     Status.OUTSIDE_DOMAIN: (
-        "The joint values lie outside the region that the measurements covered, so the correction there is a "
-        "guess or left out; measure there too, or do not rely on it."
+        "The joint values reach the pose, but lie outside the region that the measurements covered, so the correction "
+        "there is extrapolated; look at the predicted accuracy, or measure there too."
     ),
     Status.UNREACHABLE: (
         "No joint values reach the pose, in position and orientation, on this branch, or none were found; choose "
