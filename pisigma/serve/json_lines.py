@@ -313,8 +313,8 @@ def _near(model: ServedModel, request: dict[str, Any]) -> list[float] | None:
     near = _joints(model, request, *_NEAR)
     if not model.ik.postures.hold(near):
         raise RequestError(
-            f"'{_NEAR[model.joints_key != 'q_deg']}' lies more than a full turn (or 1 m) beyond the joint limits of model "
-            f"'{model.name}'; give the joint values where the robot stands, in {_units(model)}."
+            f"'{_NEAR[model.joints_key != 'q_deg']}' lies more than a full turn (or 1 m) beyond the joint limits of "
+            f"model '{model.name}'; give the joint values where the robot stands, in {_units(model)}."
         )
     return near
 
