@@ -100,7 +100,8 @@ def _doubts(change: "Departure", drawn: "Robot") -> list[str]:
         return []
     return [
         f"{change.mean_mm:.3g} mm are more than {100 * PLAUSIBLE_SHARE:g} % of the reach of robot '{drawn.name}', by "
-        "which no calibration changes an arm; check that --like is the robot of this file, and its units (radians, metres)."
+        "which no calibration changes an arm; check that --like is the robot of this file, and its units (radians, "
+        "metres)."
     ]
 
 
