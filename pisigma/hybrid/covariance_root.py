@@ -67,10 +67,12 @@ class CovarianceRoot:
 
     def along(self, columns: Float64[Tensor, "*batch unknowns"]) -> Float64[Tensor, "*batch directions"]:
         """`columns @ R`."""
-        if self.weights is None:
-            return columns @ self.directions
-        first = self.directions.shape[0] - len(self.weights.size)
-        return torch.cat([columns @ self.directions, self.weights.along(columns[..., first:])], -1)
+        # one product of two matrices: torch would read R once for every row of columns that are a view
+        result = columns.flatten(0, -2) @ self.directions
+        if self.weights is not None:
+            first = self.directions.shape[0] - len(self.weights.size)
+            result = torch.cat([result, self.weights.along(columns.flatten(0, -2)[:, first:])], -1)
+        return result.reshape(*columns.shape[:-1], -1)
 
     def covariance_times(
         self, matrix: Float64[Tensor, "unknowns columns"]

@@ -20,7 +20,7 @@ from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.sensors.sensor import numbers_of
 
-CHUNK = 512
+CHUNK = 128
 """Rows whose columns are in memory at a time."""
 FEW_GROUPS = 600
 """Up to so many, noise and prior sizes are estimated anew for every fold that is left out."""
