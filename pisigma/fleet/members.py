@@ -83,7 +83,19 @@ def read_fleet(source: str | os.PathLike[str], robot: str | None = None) -> tupl
             f"{path}: holds no robot; a manifest (CSV) with the columns id, robot and data was wanted, or a folder "
             "with one folder or one CSV file per robot."
         )
+    _check_apart([one.id for one in members], path)
     return tuple(sorted(members, key=lambda one: one.id))
+
+
+def _check_apart(names: Sequence[str], path: Path) -> None:
+    """Refuse ids that are the same, or whose folders are the same where file systems take a for A."""
+    first: dict[str, str] = {}
+    for name in names:
+        other = first.setdefault(name.casefold(), name)
+        if other != name:
+            raise FleetError(f"{path}: the ids '{other}' and '{name}' differ by capitals only; rename one.")
+        if names.count(name) > 1:
+            raise FleetError(f"{path}: robot '{name}' is a folder and a file; rename one.")
 
 
 def _in_manifest(path: Path, robot: str | None) -> list[Member]:
@@ -185,10 +197,6 @@ def _in_folder(path: Path, robot: str | None) -> list[Member]:
             )
         sessions = [_session(file, "") for file in files]
         members.append(Member(name, drawn, _ordered(sessions, f"{entry}: robot '{name}'")))
-    names = [one.id for one in members]
-    for name in names:
-        if names.count(name) > 1:
-            raise FleetError(f"{path}: robot '{name}' is a folder and a file; rename one.")
     return members
 
 

@@ -70,6 +70,7 @@ def test_a_tree_of_folders_is_a_fleet(tmp_path):
             "line 1, column 'id;robot;data': fields are separated by semicolons",
         ),
         ("id,robot,data\n../a,ur5,a.csv\n", "line 2: '../a' cannot be the id of a robot"),
+        ("id,robot,data\na,ur5,a.csv\nA,ur5,b.csv\n", "the ids 'a' and 'A' differ by capitals only"),
         ("id,robot,data\na,,a.csv\n", "line 2: the field 'robot' is empty"),
         ("id,robot,data\na,ur5,\n", "line 2: the field 'data' is empty"),
         ("id,robot,data\na,ur5\n", "line 2: 3 fields were wanted, got 2"),
@@ -84,6 +85,15 @@ def test_what_is_wrong_with_a_manifest_is_said_with_its_line(tmp_path, text, com
     with pytest.raises((FleetError, MeasurementError)) as raised:
         read_fleet(write(tmp_path, text))
     assert complaint in str(raised.value)
+
+
+@pytest.mark.parametrize("file", ["cell1.csv", "Cell1.csv"])
+def test_a_folder_and_a_file_of_one_name_are_refused(tmp_path, file):
+    (tmp_path / "cell1").mkdir()
+    for path in (tmp_path / "cell1" / "2026-03-01.csv", tmp_path / file):
+        path.write_text("")
+    with pytest.raises(FleetError, match="rename one"):
+        read_fleet(tmp_path, "ur5")
 
 
 def test_an_empty_folder_is_no_fleet(tmp_path):
