@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from pisigma.camera.corner_file import read_rows
-from pisigma.errors import FleetError, MeasurementError
+from pisigma.errors import FleetError, MeasurementError, RobotError
 from pisigma.fleet.members import Member, read_fleet
 from pisigma.fleet.prior import FEWEST_ROBOTS, FleetPrior, fleet_prior
 from pisigma.fleet.prior_summary import FleetPriorSummary, summarise_prior
@@ -18,6 +19,7 @@ from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.fleet_prior_card import write_fleet_prior_card
 from pisigma.robot.description import Robot
+from pisigma.verification.checks.setup_fault import setup_diagnostics
 from pisigma.workflow.result import AbstractModelResult
 
 
@@ -60,15 +62,22 @@ def estimate_fleet_prior(
     """
     started = time.perf_counter()
     members = read_fleet(source, robot)
-    drawn = _common_robot(members)
+    robots, refused = _robots(members)
+    readable = [one for one in members if one.id in robots]
+    drawn = _common_robot(robots)
     progress(f"{len(members)} robots")
     rows: dict[str, Measurements] = {}
-    refused: dict[str, str] = {}
-    for one in members:
+    for one in readable:
         try:
-            rows[one.id] = read_rows(one.sessions[0].data, drawn, one.cameras).split_sets()[0]
+            some = read_rows(one.sessions[0].data, drawn, one.cameras).split_sets()[0]
         except MeasurementError as problem:  # one bad file does not stop the others
             refused[one.id] = str(problem)
+            continue
+        causes = [cause for cause in setup_diagnostics(drawn, some) if cause.severity == "implausible"]
+        if causes:  # a wrong unit would count as a large scatter between robots
+            refused[one.id] = f"{some.source}: {causes[0].sentence}"
+        else:
+            rows[one.id] = some
     if refused and len(rows) < FEWEST_ROBOTS:
         raise FleetError(
             f"{FEWEST_ROBOTS} robots or more were wanted, got {len(rows)} with files that can be read; correct, among "
@@ -82,19 +91,35 @@ def estimate_fleet_prior(
     return FleetPriorResult(model, prior, summary, time.perf_counter() - started)
 
 
-def _common_robot(members: tuple[Member, ...]) -> Robot:
+def _robots(members: tuple[Member, ...]) -> tuple[dict[str, Robot], dict[str, str]]:
+    """The drawings of the robots by their ids, and why others cannot be read.
+
+    Raises:
+        FleetError: none can be read.
+    """
+    robots: dict[str, Robot] = {}
+    refused: dict[str, str] = {}
+    for member in members:
+        try:
+            robots[member.id] = Robot.load(member.robot)
+        except RobotError as problem:  # one bad file does not stop the others
+            refused[member.id] = str(problem)
+    if not robots:
+        raise FleetError(f"no description of a robot can be read: {next(iter(refused.values()))}")
+    return robots, refused
+
+
+def _common_robot(robots: Mapping[str, Robot]) -> Robot:
     """The drawing that all robots have.
 
     Raises:
         FleetError: there are several.
     """
-    drawn = {member.robot: Robot.load(member.robot) for member in members}
-    first = drawn[members[0].robot]
-    for member in members:
-        other = drawn[member.robot]
+    (name, first), *others = robots.items()
+    for other_name, other in others:
         if other.dh.shape != first.dh.shape or not np.array_equal(other.dh, first.dh):
             raise FleetError(
-                f"robots '{members[0].id}' and '{member.id}' are of different types ({first.name} and {other.name}); "
+                f"robots '{name}' and '{other_name}' are of different types ({first.name} and {other.name}); "
                 "estimate what robots of one type have in common from a manifest of these alone."
             )
     return first

@@ -13,12 +13,17 @@ MODEL = REPOSITORY / "models" / "kiro3"
 
 @pytest.fixture(scope="module")
 def prior(tmp_path_factory, run):
-    """A folder with five robots and a bad file, few rows of another robot, and the prior of the five."""
+    """A folder with five robots and three bad ones, few rows of another robot, and the prior of the five."""
     folder = tmp_path_factory.mktemp("prior")
     (folder / "in").mkdir()
     for k in range(5):
         rows_of(k, 30, k).write_csv(folder / "in" / f"r{k}.csv", DRAWN)
     (folder / "in" / "bad.csv").write_text("q1_deg,x_mm\n1,2\n", encoding="utf-8")
+    (folder / "in" / "undrawn").mkdir()
+    (folder / "in" / "undrawn" / "robot.yaml").write_text("name: 3\n", encoding="utf-8")
+    (folder / "in" / "undrawn" / "rows.csv").write_text("q1_deg,x_mm\n1,2\n", encoding="utf-8")
+    metres = (folder / "in" / "r0.csv").read_text(encoding="utf-8").replace("_mm", "_m")
+    (folder / "in" / "metres.csv").write_text(metres, encoding="utf-8")
     rows_of(50, 10, 1).write_csv(folder / "few.csv", DRAWN)
     made = run("fleet", "prior", folder / "in", "--robot", "rb5", "--out", folder / "prior")
     assert made.exit_code == 0, made.output
@@ -32,7 +37,9 @@ def test_what_the_robots_have_in_common_is_printed_and_kept(prior):
     card = (folder / "prior" / "README.md").read_text(encoding="utf-8")
     assert "What 5 robots of the type rb5" in card
     assert "| a_2 | mm |" in card
-    assert "Robot 'bad' did not count: " in card
+    for name in ("bad", "undrawn", "metres"):
+        assert f"Robot '{name}' did not count: " in card
+    assert "millimetres that are named metres" in card
     assert "Made by `pisigma fleet prior in " in card
 
 
