@@ -136,8 +136,8 @@ def column_choices(name: str) -> str:
 
     Joint columns are listed for one joint: the one that `name` seems to mean, else the first.
     """
-    number = re.search(r"[1-9][0-9]?", name)
-    joint = number[0] if number else "1"
+    number = re.match(r"[A-Za-z]+[ _]?([1-9][0-9]?)(?![0-9])", name)
+    joint = number[1] if number else "1"
     joints = (f"q{joint}_{unit}" for unit in (*REVOLUTE_UNITS, *PRISMATIC_UNITS))
     meant = name.lower()
     if re.fullmatch(r"q[1-9][0-9]?", meant):  # most joints turn

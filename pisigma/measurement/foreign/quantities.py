@@ -127,7 +127,7 @@ def parse_target(text: str, place: str) -> Target:
         is_quantity = quantity in _quantities() or is_joint(quantity)
         if is_quantity and (not unit or unit in UNITS) and fits(quantity, unit):
             return Target(quantity, unit)
-    choices = ("q1_deg", "x_mm", "y_mm", "z_mm", "point", "time_s", LEFT_OUT, *_quantities())
+    choices = {"q1_deg", "x_mm", "y_mm", "z_mm", "time_s", LEFT_OUT, *_quantities()}
     raise MeasurementError(f"{place}: '{text}' is unknown; {nearest_choice(text, choices)}")
 
 

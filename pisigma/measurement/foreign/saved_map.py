@@ -27,6 +27,11 @@ def parse_map(text: str) -> StatedMaps:
         MeasurementError: it is neither.
     """
     if "=" not in text:
+        if not os.path.exists(text):
+            raise MeasurementError(
+                f"--map {text}: HEADING=COLUMN was wanted, such as A1=q1_deg,X=x_mm, or a file that --save-map wrote; "
+                "there is no such file."
+            )
         return read_yaml(text, SavedMap, MeasurementError).files
     stated: dict[str, str] = {}
     heading = ""

@@ -13,6 +13,8 @@ def test_mappings_of_a_command_line():
     assert parse_map("X, measured=x_mm,a=b=point") == ({"X, measured": "x_mm", "a=b": "point"},)
     with pytest.raises(MeasurementError, match="HEADING=COLUMN was wanted"):
         parse_map("A1=q1_deg,X")
+    with pytest.raises(MeasurementError, match=r"--map A1: HEADING=COLUMN was wanted, .* no such file"):
+        parse_map("A1")
 
 
 def test_mappings_of_a_file(tmp_path: Path):
