@@ -237,6 +237,7 @@ class NormalEquations(AbstractRegression):
             return memory
 
         if not self.latest or self.latest[0].prior is not prior or self.latest[0].noise != noise:
+            _return_free_memory(len(prior.base))
             memory = self.latest.pop().inverse.mT if self.latest else torch.empty_like(self.normal[0])
             descent = torch.zeros_like(self.descent[0])
             for b, sigma in zip(self.descent, noise, strict=True):
