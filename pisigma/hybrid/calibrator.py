@@ -15,7 +15,7 @@ from pisigma.hybrid.design import Design, Rows, weigh
 from pisigma.hybrid.evidence import SMALLEST_NOISE
 from pisigma.hybrid.gravity import USUAL, gravity_by_evidence, gravity_sentence, in_first_row
 from pisigma.hybrid.mini_batches import MANY_ROWS, MiniBatches, batch_checkpoints, refine_in_batches
-from pisigma.hybrid.refinement import Refined, linearised, refine, with_frames_of
+from pisigma.hybrid.refinement import Refined, in_chunks, linearised, refine, with_frames_of
 from pisigma.hybrid.regression import regression
 from pisigma.hybrid.result import HybridResult, LearnedPart
 from pisigma.hybrid.search import FIRST_MODEL_SIZES, Choice, Fitted, Search
@@ -265,7 +265,7 @@ class HybridCalibrator:
 def _outliers(solved: SolvedCalibration, refined: Refined) -> tuple[Outlier, ...]:
     """Rows that count for less than half by their distance from what the hybrid predicts, the worst first."""
     problem, setup, found = solved.problem, solved.setup, []
-    values = sensor_values(problem, refined.point, refined.correction)
+    values = sensor_values(problem, refined.point, in_chunks(refined.correction))
     weights = weigh(problem, values, refined.posterior.effective)
     for number, (one, weight) in enumerate(zip(values, weights, strict=True)):
         length, sensor = one.residual.norm(dim=1), problem.sensors[number]

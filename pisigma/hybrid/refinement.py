@@ -7,11 +7,11 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
-from pisigma.hybrid.design import Design, Rows, weigh
+from pisigma.hybrid.design import Design, Rows, chunks, weigh
 from pisigma.hybrid.evidence import AbstractRegression, LeftOut, Posterior
 from pisigma.hybrid.regression import regression
 from pisigma.hybrid.search import Choice
-from pisigma.hybrid.sensor_values import sensor_values
+from pisigma.hybrid.sensor_values import Shift, sensor_values
 from pisigma.identification.identifiability.sufficiency import floating_frames
 from pisigma.identification.prediction import predicted_poses
 from pisigma.identification.problem.problem import CalibrationProblem
@@ -122,6 +122,11 @@ def network(design: Design, x: Float64[Tensor, " unknowns"]) -> JointCorrection:
     return made
 
 
+def in_chunks(correction: JointCorrection) -> Shift:
+    """The correction of many rows, with the features of some of them in memory at a time."""
+    return lambda state: torch.cat([correction(state[rows]) for rows in chunks(len(state.q))])
+
+
 def linearised(
     design: Design, x: Float64[Tensor, " unknowns"], effective: float, group: Int64[Tensor, " rows"]
 ) -> Rows:
@@ -135,7 +140,7 @@ def linearised(
     """
     problem = design.problem
     point = problem.nominal.index_add(0, problem.active, x[: design.active])
-    values = sensor_values(problem, point, network(design, x) if design.features else None)
+    values = sensor_values(problem, point, in_chunks(network(design, x)) if design.features else None)
     return Rows.linearised(design, x, values, weigh(problem, values, effective), group)
 
 
