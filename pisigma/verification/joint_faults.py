@@ -145,7 +145,7 @@ def joint_causes(maps: JointMaps, number: int, robot: Robot) -> tuple[Cause, ...
     order = matrix.abs().argmax(1).tolist()
     factor = [row[column] for row, column in zip(matrix.tolist(), order, strict=True)]
     if int((matrix != 0).sum()) > robot.dof:
-        return (_coupling_cause(matrix.tolist()),)
+        return (_coupling_cause(matrix.tolist(), robot),)
     causes = []
     moved = tuple(i for i, column in enumerate(order) if column != i)
     advice = "check the order of the joint columns"
@@ -167,7 +167,7 @@ def joint_causes(maps: JointMaps, number: int, robot: Robot) -> tuple[Cause, ...
     return tuple(causes)
 
 
-def _coupling_cause(matrix: list[list[float]]) -> Cause:
+def _coupling_cause(matrix: list[list[float]], robot: Robot) -> Cause:
     joint, other, share = next(
         (i, j, share) for i, row in enumerate(matrix) for j, share in enumerate(row) if i != j and share
     )
@@ -175,7 +175,11 @@ def _coupling_cause(matrix: list[list[float]]) -> Cause:
     clause = (
         f"{joints_text(tuple(sorted((joint, other))))} are coupled: joint {joint + 1} is logged as {logged}"
     )
-    advice = "state the coupling in the robot file, or log the angles between the links"
+    advice = (
+        "state the coupling in the robot file, or log the angles between the links"
+        if robot.coupling is None
+        else "log what the controller shows, or correct the coupling that the robot file states"
+    )
     return Cause("joint_coupling", clause, advice, 1.0, (joint, other))
 
 

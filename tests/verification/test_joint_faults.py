@@ -2,11 +2,13 @@
 
 import torch
 from testing.closeness import assert_close
+from testing.coupled import coupled_robot
 
 from pisigma.robot import Robot
 from pisigma.verification.joint_faults import (
     JointMaps,
     coupled_joints,
+    joint_causes,
     moved_zeros,
     other_orders,
     other_units,
@@ -45,3 +47,11 @@ def test_every_fault_stands_once_and_changes_something():
         unchanged = JointMaps.unchanged(1, maps.offset.shape[1])
         same = torch.cat([unchanged.matrix.flatten(1), unchanged.offset], 1)
         assert not bool((rows == same).all(1).any()), name
+
+
+def test_the_advice_on_coupled_joints_knows_a_stated_coupling():
+    (unstated,) = joint_causes(coupled_joints(6), 0, Robot.load("ur5"))
+    (stated,) = joint_causes(coupled_joints(6), 0, coupled_robot())
+    assert unstated.clause == stated.clause
+    assert "state the coupling in the robot file" in unstated.advice
+    assert "log what the controller shows" in stated.advice
