@@ -77,8 +77,14 @@ def motion_text(motion: Session) -> str:
     for one in motion.moved:
         amounts.setdefault((one.moved.what, one.probability), []).append(one.moved.size)
     text = joined(
-        f"{'the ' if is_frame(what) else ''}{what} has {'changed' if '_' in what else 'moved'} by {joined(those)} "
-        f"(probability {shown_probability(probability)})"
+        f"{_subject(what)} by {joined(those)} (probability {shown_probability(probability)})"
         for (what, probability), those in amounts.items()
     )
     return f"{text[:1].upper()}{text[1:]}"
+
+
+def _subject(what: str) -> str:
+    """Say that a base or a tool, a joint or a geometric parameter such as "d_4" is another one."""
+    if is_frame(what):
+        return f"the {what} has moved"
+    return f"the parameter {what} has changed" if "_" in what else f"{what} has moved"
