@@ -92,8 +92,9 @@ def run_fleet(
         OutputError: the folder is not that of a fleet, or cannot be written to.
         ImportError: the extra of the engine or of the table is not installed.
     """
-    import_module("pyarrow")  # before the work, not after it
     started, settings = time.perf_counter(), settings or FleetSettings()
+    for extra in ("pyarrow", *(("ray",) if settings.engine == "ray" else ())):
+        import_module(extra)  # before the work, and before anything is written
     members = read_fleet(source, robot)
     plans = {member.id: settings.of(member) for member in members}
     folder = Path(out)

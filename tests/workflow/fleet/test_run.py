@@ -2,6 +2,8 @@
 
 import math
 import resource
+import sys
+from dataclasses import replace
 
 import pytest
 from testing.aged import model_before, rows_later
@@ -130,6 +132,13 @@ def test_options_of_one_robot_are_checked_before_the_work(plant, options, compla
     path.write_text(f"id,robot,data,options\nr0,rb5,0.csv,{options}\n", encoding="utf-8")
     with pytest.raises(FleetError, match=complaint):
         run_fleet(path, plant / "out", SETTINGS)
+    assert not (plant / "out").exists()
+
+
+def test_nothing_is_written_without_the_package_of_the_engine(plant, monkeypatch):
+    monkeypatch.setitem(sys.modules, "ray", None)
+    with pytest.raises(ImportError):
+        run_fleet(plant / "fleet.csv", plant / "out", replace(SETTINGS, engine="ray"))
     assert not (plant / "out").exists()
 
 
