@@ -2,17 +2,21 @@
 
 Run `OMP_NUM_THREADS=1 python benchmarks/serve.py models/my_ur10 --seconds 600` on a machine that does nothing else.
 Every client sends a pose of the model's training rows with the joint values to be near to, waits for the answer,
-compares it with that of Python, and sleeps until its next turn. Printed are the times from before a request is sent
-until its answer is read, per protocol; how many answers were lost or wrong; and the memory of the server at the begin
-and the end. For comparison the same clients first ask two bare loops, for a minute at most each, that stay awake for
-the next request as long as the server does: one sends answers that it worked out before, the other reads, solves once
-and sends. How long waking up takes differs between machines more than how long answering does, so the ratio to the
-second loop is what can be compared. The first tells what the sockets and the clients cost.
+compares it with that of Python, and sleeps until its next turn, which comes half a period after the other client's.
+It waits awake, as the loop of a real-time controller does; with `--sleeping` it lets the system wake it, and the times
+then contain how long that takes, which on some machines is more than the answer itself. Printed are the times from
+before a request is sent until its answer is read, per protocol; how many answers were lost or wrong; and the memory of
+the server at the begin and the end. For comparison the same clients first ask two bare loops, for a minute at most
+each, that stay awake for the next request as long as the server does: one sends answers that it worked out before, the
+other reads, solves once and sends. The first tells what the sockets and the clients cost, the second what the server
+adds to a solve.
 """
 
 import argparse
 import functools
+import itertools
 import json
+import math
 import multiprocessing
 import select
 import socket
@@ -75,43 +79,60 @@ def right(kind: str, answer: bytes, index: int, wanted: np.ndarray, per_unit: np
     return bool(said["id"] == index and np.abs(q - wanted).max() < 1e-9)
 
 
+def received(stream: socket.socket, kind: str) -> bytes:
+    """The next answer, whole; asks again at once while there is nothing, unless the stream blocks."""
+    answer = b""
+    while not (answer.endswith(b"\n") if kind == "json" else len(answer) == ANSWER.size):
+        try:
+            chunk = stream.recv(65536)
+        except BlockingIOError:
+            continue
+        if not chunk:
+            raise ConnectionError("the server closed the connection")
+        answer += chunk
+    return answer
+
+
 def ask(
     kind: str,
     port: int,
     sent: list[bytes],
     wanted: np.ndarray,
     per_unit: np.ndarray,
+    options: argparse.Namespace,
     seconds: float,
+    number: int,
     queue: object,
 ) -> None:
-    """One client; puts its times [µs] and how many answers were lost or wrong."""
+    """Client `number`; puts its times [µs] and how many answers were lost or wrong."""
     times, bad = [], 0
-    with socket.create_connection(("127.0.0.1", port)) as stream, stream.makefile("rb") as file:
+    with socket.create_connection(("127.0.0.1", port)) as stream:
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        turn = time.perf_counter()
+        stream.setblocking(options.sleeping)
+        period = CLIENTS / RATE
+        turn = (math.ceil(time.perf_counter() / period) + number / CLIENTS) * period
         end = turn + seconds
-        for number in range(sys.maxsize):
-            index = number % len(sent)
+        for index in itertools.cycle(range(len(sent))):
+            time.sleep(max(0.0, turn - time.perf_counter()))
             begun = time.perf_counter()
             if begun > end:
                 break
             stream.sendall(sent[index])
-            answer = file.readline() if kind == "json" else file.read(ANSWER.size)
+            answer = received(stream, kind)
             times.append(1e6 * (time.perf_counter() - begun))
             bad += not right(kind, answer, index, wanted[index], per_unit)
-            turn += CLIENTS / RATE
-            time.sleep(max(0.0, turn - time.perf_counter()))
+            turn += period
     queue.put((times, bad))  # type: ignore[attr-defined]
 
 
-def measure(kind: str, port: int, model: str, seconds: float) -> tuple[np.ndarray, str]:
+def measure(kind: str, port: int, options: argparse.Namespace, seconds: float) -> tuple[np.ndarray, str]:
     """Have all clients ask; gives the median and what 99 % stay below [µs], and a sentence."""
-    ik = pisigma.load(model)
+    ik = pisigma.load(options.model)
     poses, near, wanted = poses_of(ik)
     sent, per_unit = messages(kind, ik, poses, near), np.where(ik.revolute, 180 / np.pi, 1e3)
     queue = multiprocessing.Queue()
-    arguments = (kind, port, sent, wanted, per_unit, seconds, queue)
-    clients = [multiprocessing.Process(target=ask, args=arguments) for _ in range(CLIENTS)]
+    arguments = kind, port, sent, wanted, per_unit, options, seconds
+    clients = [multiprocessing.Process(target=ask, args=(*arguments, i, queue)) for i in range(CLIENTS)]
     for client in clients:
         client.start()
     results = [queue.get() for _ in clients]
@@ -193,11 +214,11 @@ def compare(kind: str, ports: dict[str, int], pid: int, options: argparse.Namesp
         arguments = options.model, kind, stored, options.poll_ms / 1e3, queue
         bare = multiprocessing.Process(target=bare_loop, args=arguments, daemon=True)
         bare.start()
-        least, said = measure(kind, queue.get(), options.model, min(options.seconds, BARE_SECONDS))
+        least, said = measure(kind, queue.get(), options, min(options.seconds, BARE_SECONDS))
         bare.join()
         print(f"bare loop, {name}, {kind}: {said}", flush=True)
     before, used = cost(pid)
-    times, said = measure(kind, ports[f"{kind}_port"], options.model, options.seconds)
+    times, said = measure(kind, ports[f"{kind}_port"], options, options.seconds)
     after, total = cost(pid)
     (p50, p99), share = times / least, (total - used) / options.seconds
     print(f"pisigma serve, {kind}: {said}; memory {before:.1f} -> {after:.1f} MB")
@@ -214,6 +235,7 @@ def main() -> None:
     parser.add_argument("model", nargs="?", default="models/kiro4")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--poll-ms", type=float, default=2.5, help="of the server and the bare loop alike")
+    parser.add_argument("--sleeping", action="store_true", help="clients wait for their answers asleep")
     options = parser.parse_args()
     command = [sys.executable, "-m", "pisigma", "serve", options.model, "--poll-ms", str(options.poll_ms)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
