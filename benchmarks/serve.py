@@ -3,13 +3,13 @@
 Run `OMP_NUM_THREADS=1 python benchmarks/serve.py models/my_ur10 --seconds 600` on a machine that does nothing else.
 Every client sends a pose of the model's training rows with the joint values to be near to, waits for the answer,
 compares it with that of Python, and sleeps until its next turn, which comes half a period after the other client's.
-It waits awake, as the loop of a real-time controller does; with `--sleeping` it lets the system wake it, and the times
-then contain how long that takes, which on some machines is more than the answer itself. Printed are the times from
-before a request is sent until its answer is read, per protocol; how many answers were lost or wrong; and the memory of
-the server at the begin and the end. For comparison the same clients first ask two bare loops, for a minute at most
-each, that stay awake for the next request as long as the server does: one sends answers that it worked out before, the
-other reads, solves once and sends. The first tells what the sockets and the clients cost, the second what the server
-adds to a solve.
+It waits awake for 100 µs, as the loop of a real-time controller does, then asleep; with `--awake-us 0` the system wakes
+it for every answer, and the times then contain how long that takes, which on some machines is more than the answer
+itself. Printed are the times from before a request is sent until its answer is read, per protocol; how many answers
+were lost or wrong; and the memory of the server at the begin and the end. For comparison the same clients first ask two
+bare loops, for a minute at most each, that stay awake for the next request as long as the server does: one sends answers
+that it worked out before, the other reads, solves once and sends. The first tells what the sockets and the clients cost,
+the second what the server adds to a solve.
 """
 
 import argparse
@@ -79,12 +79,12 @@ def right(kind: str, answer: bytes, index: int, wanted: np.ndarray, per_unit: np
     return bool(said["id"] == index and np.abs(q - wanted).max() < 1e-9)
 
 
-def received(stream: socket.socket, kind: str) -> bytes:
-    """The next answer, whole; asks again at once while there is nothing, unless the stream blocks."""
-    answer = b""
+def received(stream: socket.socket, kind: str, awake: float) -> bytes:
+    """The next answer, whole; waits awake for some seconds, then asleep."""
+    answer, end = b"", time.perf_counter() + awake
     while not (answer.endswith(b"\n") if kind == "json" else len(answer) == ANSWER.size):
         try:
-            chunk = stream.recv(65536)
+            chunk = stream.recv(65536, socket.MSG_DONTWAIT if time.perf_counter() < end else 0)
         except BlockingIOError:
             continue
         if not chunk:
@@ -108,7 +108,6 @@ def ask(
     times, bad = [], 0
     with socket.create_connection(("127.0.0.1", port)) as stream:
         stream.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        stream.setblocking(options.sleeping)
         period = CLIENTS / RATE
         turn = (math.ceil(time.perf_counter() / period) + number / CLIENTS) * period
         end = turn + seconds
@@ -118,7 +117,7 @@ def ask(
             if begun > end:
                 break
             stream.sendall(sent[index])
-            answer = received(stream, kind)
+            answer = received(stream, kind, options.awake_us * 1e-6)
             times.append(1e6 * (time.perf_counter() - begun))
             bad += not right(kind, answer, index, wanted[index], per_unit)
             turn += period
@@ -235,7 +234,7 @@ def main() -> None:
     parser.add_argument("model", nargs="?", default="models/kiro4")
     parser.add_argument("--seconds", type=float, default=10.0)
     parser.add_argument("--poll-ms", type=float, default=2.5, help="of the server and the bare loop alike")
-    parser.add_argument("--sleeping", action="store_true", help="clients wait for their answers asleep")
+    parser.add_argument("--awake-us", type=float, default=100.0, help="that clients wait awake for an answer")
     options = parser.parse_args()
     command = [sys.executable, "-m", "pisigma", "serve", options.model, "--poll-ms", str(options.poll_ms)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server:
