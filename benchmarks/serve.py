@@ -2,14 +2,14 @@
 
 Run `OMP_NUM_THREADS=1 python benchmarks/serve.py models/my_ur10 --seconds 600` on a machine that does nothing else.
 Every client sends a pose of the model's training rows with the joint values to be near to, waits for the answer,
-compares it with that of Python, and sleeps until its next turn, which comes half a period after the other client's.
-It waits awake for 100 µs, as the loop of a real-time controller does, then asleep; with `--awake-us 0` the system wakes
+compares it with that of Python, and sleeps until its next turn, which comes half a period after the other client's. It
+waits awake for 100 µs, as the loop of a real-time controller does, then asleep; with `--awake-us 0` the system wakes
 it for every answer, and the times then contain how long that takes, which on some machines is more than the answer
 itself. Printed are the times from before a request is sent until its answer is read, per protocol; how many answers
-were lost or wrong; and the memory of the server at the begin and the end. For comparison the same clients first ask two
-bare loops, for a minute at most each, that stay awake for the next request as long as the server does: one sends answers
-that it worked out before, the other reads, solves once and sends. The first tells what the sockets and the clients cost,
-the second what the server adds to a solve.
+were lost or wrong; and the memory of the server at the begin and the end. For comparison the same clients first ask
+two bare loops, for a minute at most each, that stay awake for the next request as long as the server does: one sends
+answers that it worked out before, the other reads, solves once and sends. The first tells what the sockets and the
+clients cost, the second what the server adds to a solve.
 """
 
 import argparse

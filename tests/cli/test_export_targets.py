@@ -201,7 +201,7 @@ def test_a_pose_outside_the_domain(run, models, poses, tmp_path):
         assert result.exit_code == 0
         assert "1 reached, 1 outside_domain" in result.stdout
         assert result.stderr.startswith(
-            "pisigma: 1 of 2 poses, line 4: outside_domain. The joint values lie outside"
+            "pisigma: 1 of 2 poses, line 4: outside_domain. The joint values reach the pose, but lie outside"
         )
         text = out.read_text()
         assert ("4,outside_domain," if suffix == ".csv" else "line 4 OUTSIDE DOMAIN") in text
