@@ -72,7 +72,7 @@ class CovarianceRoot:
         if self.weights is not None:
             first = self.directions.shape[0] - len(self.weights.size)
             result = torch.cat([result, self.weights.along(columns.flatten(0, -2)[:, first:])], -1)
-        return result.unflatten(0, columns.shape[:-1])
+        return result.reshape(*columns.shape[:-1], result.shape[-1])
 
     def covariance_times(
         self, matrix: Float64[Tensor, "unknowns columns"]
