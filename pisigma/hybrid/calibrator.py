@@ -45,6 +45,11 @@ SEARCHED_ROWS = 4_000
 GROSS = 50.0
 """[standard deviations of the geometric calibration] Rows that are farther off take no part in the first model."""
 
+_TOO_FEW_ROWS = (
+    "A joint correction would take up nearly all that the few rows say, so the geometric calibration stands; measure "
+    "more poses."
+)
+
 
 @dataclass(frozen=True)
 class HybridCalibrator:
@@ -138,11 +143,7 @@ class HybridCalibrator:
                 solved, few, group, batches=batches, progress=progress, checkpoints=kept
             )
         if refined.regression.effective_share(refined.posterior) > choice.best.largest_share:
-            verdict = (
-                "A joint correction would take up nearly all that the few rows say, so the geometric calibration "
-                "stands; measure more poses."
-            )
-            return _geometric_alone(solved, choice, verdict)
+            return _geometric_alone(solved, choice, _TOO_FEW_ROWS)
         falling = gravity_sentence(self.geometric.robot, choice.best.design.features)
         verdict, trials = " ".join(filter(None, (_kept_sentence(choice), falling, trained))), choice.trials
         learned = self._learned(solved, refined)

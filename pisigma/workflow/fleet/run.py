@@ -29,6 +29,8 @@ from pisigma.workflow.fleet.one_robot import FleetSettings, work_out
 ROBOTS_A_CHUNK = 4
 """Calibrations that a worker gets at once: some seconds of work."""
 
+_LOST = "the process that worked on it ended twice; look at memory and at its files."
+
 
 @dataclass(frozen=True)
 class FleetRun:
@@ -110,9 +112,7 @@ def run_fleet(
     with _engine(settings, len(waiting)) as engine:
         for member, record in engine.results(work, waiting, ROBOTS_A_CHUNK) if waiting else ():
             if record is None:
-                lost[member.id] = (
-                    "the process that worked on it ended twice; look at memory and at its files."
-                )
+                lost[member.id] = _LOST
                 record = RobotRecord(member.id, keys[member.id], ())
             records[member.id] = record
             progress(f"{len(records)} of {len(members)} robots")
