@@ -78,7 +78,7 @@ def _convert(read: Path, like: str, out: Path, as_json: bool) -> None:
     robot = read_controller_file(read, drawn)
     change = departure_from_drawn(robot, drawn)
     write_whole(out, dh_yaml(robot, (f"Read from {read.name} with the nominal robot {robot.name}.",)))
-    warnings = _doubts(change, drawn)
+    warnings = _warnings(change, drawn)
     if as_json:
         sizes = {"mean_mm": change.mean_mm, "max_mm": change.max_mm}
         written = {"file": str(out), "robot": robot.name, "joints": robot.dof}
@@ -94,7 +94,7 @@ def _convert(read: Path, like: str, out: Path, as_json: bool) -> None:
     )
 
 
-def _doubts(change: "Departure", drawn: "Robot") -> list[str]:
+def _warnings(change: "Departure", drawn: "Robot") -> list[str]:
     """Warn of a file that changes the robot by more than calibrations do."""
     if change.mean_mm < PLAUSIBLE_SHARE * drawn.reach * 1e3:
         return []

@@ -247,7 +247,7 @@ class Rows:
         return total
 
 
-def chunks(count: int, size: int = 0) -> list[slice]:
+def chunks(count: int, size: int | None = None) -> list[slice]:
     """Rows that are worked on together: so many, or `CHUNK`."""
     size = size or CHUNK
     return [slice(start, start + size) for start in range(0, count, size)]

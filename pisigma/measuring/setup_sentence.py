@@ -37,15 +37,14 @@ def setup_sentence(robot: Robot, rows: Measurements, counts: Bool[Tensor, " rows
     measured, drawn = _spread(group.position), _spread(forward_kinematics(robot, group.q)[:, :3, 3])
     arm = ARM_SHARE * robot.reach
     if measured > SCALE * (drawn + arm):
-        unit = "millimetres that are named metres"
+        mistake = "x, y and z are millimetres that are named metres"
     elif SCALE * measured < drawn > arm:
-        unit = "metres that are named millimetres"
+        mistake = "x, y and z are metres that are named millimetres, or do not change with the robot"
     else:
         return ""
     return (
         f"The measured positions are {measured * 1e3:,.1f} mm RMS from their mean, and those of robot '{robot.name}' "
-        f"at these joint values {drawn * 1e3:,.1f} mm: x, y and z are {unit}, or do not change with the robot; check "
-        "the column names and the instrument."
+        f"at these joint values {drawn * 1e3:,.1f} mm: {mistake}; check the column names and the instrument."
     )
 
 
