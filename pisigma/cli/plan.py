@@ -69,12 +69,7 @@ SigmaMm = Annotated[
     typer.Option(help="Standard deviation of a measured length [mm]. [default: of laser trackers]"),
 ]
 CriterionName = Annotated[
-    str | None,
-    typer.Option(
-        "--criterion",
-        help="D: all unknowns; I: the tool's position over the task. [default: D, or I of up to 18 poses, of a "
-        "camera and where something is measured]",
-    ),
+    str, typer.Option("--criterion", help="I: the tool's position over the task; D: all unknowns.")
 ]
 LimitMm = Annotated[
     float | None,
@@ -115,7 +110,7 @@ def plan(
     repeatability_mm: RepeatabilityMm = 0.02,
     repeatability_deg: RepeatabilityDeg = 0.01,
     sigma_mm: SigmaMm = None,
-    criterion: CriterionName = None,
+    criterion: CriterionName = "I",
     limit_mm: LimitMm = None,
     speed_deg_s: SpeedDegS = 30.0,
     settling_s: SettlingS = 3.0,
@@ -171,11 +166,12 @@ def _print(planned: "Plan", files: list[Path]) -> None:
 
 def _curve_lines(planned: "Plan") -> list[str]:
     """What the curve does not show, and how many poses the limit needs, where there is one."""
-    lines, last, limit = [], planned.curve[-1], planned.stored.settings.limit_mm
-    if planned.criterion == "D" and last.rms > last.random_rms:
+    lines, last, settings = [], planned.curve[-1], planned.stored.settings
+    limit = settings.limit_mm
+    if settings.criterion == "D" and last.rms > last.random_rms:
         lines.append(
-            "Poses chosen by criterion D determine all unknowns of the robot, and need not lower the error that is "
-            "expected of its class below that of random poses; measured robots were calibrated better with them."
+            "Poses chosen by criterion D determine all unknowns of the robot, and need not lower the error of the "
+            "tool's position; choose by criterion I for that."
         )
     if limit is not None and planned.needed is None:
         lines.append(f"An RMS of {limit:g} mm needs more than {planned.poses} poses.")

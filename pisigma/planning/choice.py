@@ -1,5 +1,6 @@
 """Which of many candidate poses to measure: those that leave least uncertain."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -10,8 +11,9 @@ from pisigma.errors import PlanningError
 from pisigma.planning.knowledge import Knowledge
 
 Criterion = Literal["D", "I"]
-LEAST_VARIANCE = 1e-4
-"""Share of the task's variance that directions which are left out may hold together."""
+LEAST_VARIANCE = 1e-10
+"""Share of the task's variance that directions which are left out may hold together: where a base may stand anywhere
+within a metre, errors of a tenth of a millimetre, which a plan is for, are 1e-8 of it."""
 EXCHANGED = 400
 """So many of the candidates take part in the exchange: the chosen ones, and the best of the others."""
 LEAST_GAIN = 1e-6
@@ -33,9 +35,9 @@ def choose(
 
     "D" maximises the information on all unknowns, `log det(1 + Σ B_i^T B_i)`, with B of `Knowledge.measured`; "I"
     minimises the mean variance of the tool's position over the task, `tr(C W)`. Poses are taken one after the other,
-    each the best beside those before it: for D a pivoted block Cholesky factorisation of the covariance of all values.
-    Then each is exchanged for the best other one as long as that gains something, and the chosen poses are put in
-    order again, so that the first n of them are a good choice of n.
+    each the best by D beside those before it: a pivoted block Cholesky factorisation of the covariance of all values.
+    Then each is exchanged for the best other one by the criterion as long as that gains something, and the chosen poses
+    are put in order by it, so that the first n of them are a good choice of n.
 
     Source: exchange of Fedorov 1972, "Theory of Optimal Experiments", section 3.3; greedy choice of Krause, Singh and
     Guestrin 2008, JMLR 9, 235-284; for robots Borm and Menq 1991 choose poses by observability.
@@ -61,17 +63,14 @@ def choose(
     if not len(task):
         raise PlanningError("joint values of the task were wanted, got none; state some poses.")
     B, goal = knowledge.measured(candidates), condensed(knowledge.tool(task))
-    choice = Choice(B, goal, criterion)
-    choice.grow(count)
-    remaining = choice.gains().argsort(descending=True)[: max(EXCHANGED - count, 0)]
-    pool = torch.cat(
-        [torch.tensor(choice.chosen), remaining[~torch.isin(remaining, torch.tensor(choice.chosen))]]
-    )
-    few = Choice(B[pool], goal, criterion)
-    for number in range(count):
-        few.add(number)
-    few.exchange()
-    chosen = pool[torch.tensor(few.chosen)]
+    first = Choice(B, goal, "D")
+    first.grow(count)
+    chosen = torch.tensor(first.chosen)
+    remaining = Choice(B, goal, criterion, first.chosen).gains().argsort(descending=True)[: len(B) - count]
+    few = torch.cat([chosen, remaining[: max(EXCHANGED - count, 0)]])
+    choice = Choice(B[few], goal, criterion, range(count))
+    choice.exchange()
+    chosen = few[torch.tensor(choice.chosen)]
     ordered = Choice(B[chosen], goal, criterion)
     ordered.grow(count)
     result: Tensor = chosen[torch.tensor(ordered.chosen)]
@@ -102,19 +101,19 @@ class Choice:
         B: Float64[Tensor, "candidates values directions"],
         goal: Float64[Tensor, "rank directions"],
         criterion: Criterion,
+        chosen: Sequence[int] = (),
     ) -> None:
-        """Start with no pose.
+        """Start with no pose, or with some.
 
         Args:
             B: see `Knowledge.measured`.
             goal: see `condensed`.
             criterion: see `choose`.
+            chosen: numbers of candidates that are chosen already.
         """
-        self.chosen: list[int] = []
+        self.chosen = list(chosen)
         self._B, self._goal, self._criterion = B, goal, criterion
-        self._C = torch.eye(B.shape[2]).to(B)
-        self._S = B @ B.mT  # covariance of the values of every candidate
-        self._X = B @ goal.t() if criterion == "I" else B[..., :0]  # with the task's positions
+        self._update_all()
 
     def gains(self) -> Float64[Tensor, " candidates"]:
         """What every candidate would gain: information [nats] for D, less variance [m²] for I; none for chosen ones."""
@@ -123,7 +122,7 @@ class Choice:
         if self._criterion == "D":
             gains: Tensor = lower.diagonal(dim1=1, dim2=2).log().sum(1)
         else:
-            gains = torch.linalg.solve_triangular(lower, self._X, upper=False).square().sum((1, 2))
+            gains = (torch.cholesky_inverse(lower) * (self._X @ self._X.mT)).sum((1, 2))
         gains[self.chosen] = -torch.inf
         return gains
 
@@ -154,14 +153,14 @@ class Choice:
             if not exchanged:
                 break
 
-    def _start_again(self) -> None:
-        """The covariance of the chosen candidates, from the beginning."""
+    def _update_all(self) -> None:
+        """The covariance with the chosen candidates, from the beginning."""
         rows = self._B[self.chosen].flatten(0, 1)
         information = torch.eye(rows.shape[1]).to(rows) + rows.t() @ rows
         self._C = torch.cholesky_inverse(torch.linalg.cholesky(information))
         along = self._B @ self._C
-        self._S = along @ self._B.mT
-        self._X = along @ self._goal.t() if self._criterion == "I" else self._B[..., :0]
+        self._S = along @ self._B.mT  # covariance of the values of every candidate
+        self._X = along @ self._goal.t() if self._criterion == "I" else self._B[..., :0]  # with the task
 
     def _update(self, number: int, sign: float) -> None:
         """The covariance with a candidate (+1) or without it (-1)."""
@@ -169,11 +168,11 @@ class Choice:
         here = torch.eye(G.shape[1]).to(G) + sign * self._B[number] @ G
         lower, failed = torch.linalg.cholesky_ex(here)
         if sign < 0 and (int(failed) or float(lower.diagonal().min()) < LEAST_LEFT):
-            self._start_again()
+            self._update_all()
             return
         half = torch.linalg.solve_triangular(lower, G.t(), upper=False)
         U = self._B @ half.t()
         self._C -= sign * half.t() @ half
         self._S -= sign * U @ U.mT
         if self._criterion == "I":
-            self._X -= sign * U @ (half @ self._goal.t())
+            self._X.flatten(0, 1).addmm_(U.flatten(0, 1), half @ self._goal.t(), alpha=-sign)

@@ -38,10 +38,6 @@ FILES = ("candidates_from", "task", "measured")
 """Settings that are files."""
 
 
-FEW_POSES = 18
-"""Up to so many cannot determine all unknowns of a robot that was never measured."""
-
-
 @dataclass(frozen=True)
 class PlanSettings:
     """What is to be planned.
@@ -55,7 +51,7 @@ class PlanSettings:
         sigma_mm: standard deviation of a measured length [mm]; None for that of laser trackers, see
             `pisigma.planning.knowledge.Instrument`.
         criterion: "D": what lowers the uncertainty of all unknowns most; "I": what lowers that of the tool's position
-            over the task most; None for I with a model, measured rows, a camera or up to `FEW_POSES` poses, else for D.
+            over the task most.
         limit_mm: RMS of the tool's position that is wanted [mm]; None for no limit.
         candidates: poses that are drawn to choose from.
         candidates_from: file of joint values to choose from instead.
@@ -78,7 +74,7 @@ class PlanSettings:
     sensor: SensorKind = "position"
     camera: CameraSettings | None = None
     sigma_mm: float | None = None
-    criterion: Criterion | None = None
+    criterion: Criterion = "I"
     limit_mm: float | None = None
     candidates: int = 5000
     candidates_from: str | None = None
@@ -93,7 +89,7 @@ class PlanSettings:
         """Refuse settings that are none."""
         for name, choices in (("sensor", get_args(SensorKind)), ("criterion", get_args(Criterion))):
             value = getattr(self, name)
-            if value is not None and value not in choices:
+            if value not in choices:
                 raise PlanningError(f"{name} '{value}' is unknown; {nearest_choice(str(value), choices)}")
         if (self.sensor == "camera") != (self.camera is not None):
             raise PlanningError(

@@ -279,8 +279,8 @@ class MeasuringSession:
         for _ in range(ROUNDS):
             if count > len(new):
                 return None
-            criterion = plan.settings.criterion or "I"
-            chosen = new[choose(knowledge, self._candidates[new], count, self._task, criterion)]
+            candidates, criterion = self._candidates[new], plan.settings.criterion
+            chosen = new[choose(knowledge, candidates, count, self._task, criterion)]
             use = order_of_use(count, len(check))
             poses = torch.cat([self._candidates[chosen], plan.q[check]])[use]
             start = plan.q[first[0]]

@@ -23,11 +23,11 @@ from pisigma.planning.camera_prospects import CameraProspects
 from pisigma.planning.candidates import Candidates, spread
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.cell.cell import Cell, read_cell
-from pisigma.planning.choice import Criterion, choose
+from pisigma.planning.choice import choose
 from pisigma.planning.expected_accuracy import ExpectedAccuracy, RemainingError, curve, remaining_errors
 from pisigma.planning.knowledge import Knowledge
 from pisigma.planning.plan_file import StoredPlan, yaml_of
-from pisigma.planning.plan_settings import FEW_POSES, PlanSettings
+from pisigma.planning.plan_settings import PlanSettings
 from pisigma.planning.subject import Subject
 from pisigma.planning.task import task_poses
 from pisigma.planning.tour import Tour, order_of_use, stages_of, tour
@@ -48,7 +48,6 @@ class Plan:
 
     Attributes:
         stored: the poses in their order, and what was planned.
-        criterion: by which they were chosen.
         candidates: what they were chosen from.
         curve: errors of the tool's position over the task that are expected against the number of poses; 0 poses
             where something is known already.
@@ -62,7 +61,6 @@ class Plan:
     """
 
     stored: StoredPlan
-    criterion: Criterion
     candidates: Candidates
     curve: tuple[ExpectedAccuracy, ...]
     needed: int | None
@@ -97,7 +95,7 @@ class Plan:
         return {
             "poses": self.poses,
             "check_poses": self.checks,
-            "criterion": self.criterion,
+            "criterion": settings.criterion,
             "candidates": len(self.candidates.q),
             "refused": dict(self.candidates.refused.most_common()),
             "predicted_rms_mm": last.rms * 1e3,
@@ -193,7 +191,6 @@ def plan(
     points = problem.curve(chosen)
     return Plan(
         stored,
-        problem.criterion,
         candidates,
         points,
         problem.needed(chosen, points),
@@ -235,12 +232,6 @@ class _Problem:
         """Whether something was measured already."""
         return self.subject.model is not None or self.settings.measured is not None
 
-    @property
-    def criterion(self) -> Criterion:
-        """The stated criterion, or the one that suits what is known and how many poses are wanted."""
-        few = self.anything_known or self.settings.count <= FEW_POSES or self.settings.camera is not None
-        return self.settings.criterion or ("I" if few else "D")
-
     def choose(self, progress: Progress) -> tuple[Int64[Tensor, " chosen"], StoredPlan, Tour]:
         """Choose poses to calibrate with and poses to check with, and order them.
 
@@ -251,7 +242,7 @@ class _Problem:
         free = torch.arange(len(q))
         for _ in range(ROUNDS):
             progress(f"{count} of {len(free):,} candidates")
-            chosen = free[choose(self.knowledge, q[free], count, self.task, self.criterion)]
+            chosen = free[choose(self.knowledge, q[free], count, self.task, self.settings.criterion)]
             others = free[~torch.isin(free, chosen)]
             check = others[spread(self.arm, q[others], self.settings.check, q[chosen])]
             use = order_of_use(count, len(check))

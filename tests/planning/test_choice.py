@@ -55,6 +55,28 @@ def test_gains_and_exchange_are_those_of_the_criterion(knowledge: Knowledge, cri
     assert value(choice.chosen) >= grown - 1e-9 * abs(grown)
 
 
+@pytest.mark.parametrize("hybrid", [False, True])
+def test_the_goal_holds_what_is_left_of_the_variance_when_poses_are_measured(hybrid: bool) -> None:
+    # before it is all where base and tool are, metres against tenths of a millimetre
+    knowledge, task = Knowledge.of_robot(Robot.load("ur5"), hybrid=hybrid), random_joints(50, 1)
+    q, goal = random_joints(60, 0), condensed(knowledge.tool(task))
+    for count in (5, 20, 60):
+        left = rms_of(knowledge.informed(q[:count]).tool(task)) ** 2
+        assert_close(variance(knowledge.measured(q[:count]), goal), left, rtol=0.01)
+
+
+def test_criterion_i_leaves_less_error_of_the_tool_than_criterion_d_and_random_poses() -> None:
+    knowledge, q, task = Knowledge.of_robot(Robot.load("ur5")), random_joints(200, 4), random_joints(50, 5)
+    for count in (10, 25):
+        chosen = [
+            choose(knowledge, q, count, task, "I"),
+            choose(knowledge, q, count, task, "D"),
+            torch.arange(count),
+        ]
+        left, *others = (rms_of(knowledge.informed(q[rows]).tool(task)) for rows in chosen)
+        assert left < 0.9 * min(others)
+
+
 def test_the_first_of_a_choice_are_the_greedy_choice_among_it(knowledge: Knowledge) -> None:
     q, task = random_joints(60, 2), random_joints(40, 3)
     chosen = choose(knowledge, q, 12, task, "I")
