@@ -85,15 +85,14 @@ def measured(
 
 
 def sequential(name: str, counts: tuple[int, ...], draws: range) -> None:
-    """Poses chosen in rounds, with what a hybrid of those before them knows: the first by D, the others by I."""
+    """Poses chosen in rounds, with what a hybrid of those before them knows."""
     robot = Robot.load(name)
     table: dict[tuple[int, str], list[float]] = {}
     for pool, test in pools(name, draws):
         knowledge, chosen = Knowledge.of_robot(robot), torch.arange(0)
         for count in counts:
             free = torch.arange(POOL)[~torch.isin(torch.arange(POOL), chosen)]
-            criterion: Criterion = "I" if len(chosen) else "D"
-            more = choose(knowledge, pool.q[free], count - len(chosen), pool.q[:300], criterion)
+            more = choose(knowledge, pool.q[free], count - len(chosen), pool.q[:300], "I")
             chosen = torch.cat([chosen, free[more]])
             result = HybridCalibrator(robot).fit(pool.select(chosen))
             knowledge = Knowledge.of_result(result, knowledge.instrument)
@@ -151,7 +150,7 @@ def predicted(seeds: range) -> None:
         arm = Arm(ARMS[seed % len(ARMS)], seed)
         knowledge, q = Knowledge.of_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
         for count in (15, 30, 60):
-            chosen = q[choose(knowledge, q, count, q[:300], "D")]
+            chosen = q[choose(knowledge, q, count, q[:300], "I")]
             one = arm.figures(chosen, knowledge)
             ratios.setdefault((count, "plan"), []).append(one.predicted / one.true)
             ratios.setdefault((count, "calibration"), []).append(one.after / one.true)
@@ -170,7 +169,7 @@ def needed(seeds: range) -> None:
         for seed in seeds:
             arm = Arm(name, seed)
             knowledge, q = Knowledge.of_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
-            order = choose(knowledge, q, STEPS[-1], q[:300], "D")
+            order = choose(knowledge, q, STEPS[-1], q[:300], "I")
             poses = [first(arm, rows, knowledge) for rows in (q, q[order])]
             ratios.append(poses[1] / poses[0])
             print(f"{name} seed {seed}: {poses[0]:.0f} random, {poses[1]:.0f} chosen", flush=True)
