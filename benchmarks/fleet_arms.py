@@ -97,7 +97,7 @@ class Fleet:
         base = np.array([*arm.base[1], *np.deg2rad([130.0, 2.0, 1.0])])
         tool = np.array([*arm.tool, 0.0, 0.0, 0.0])
         knowledge = Knowledge.of_model(prior, self.instrument).seen_anew(base, tool)
-        chosen: Tensor = q[choose(knowledge, q, count, task)]
+        chosen: Tensor = q[choose(knowledge.measured(q), knowledge.tool(task), count)]
         return chosen.numpy()
 
     def figures(self, robots: int, judged: int) -> np.ndarray:

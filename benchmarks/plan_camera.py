@@ -123,7 +123,7 @@ def main(draws: int, candidates: int, counts: list[int]) -> None:
         }
         for name, knowledge in bench.knowledge.items():
             for criterion in get_args(Criterion):
-                chosen = choose(knowledge, bench.q, count, bench.task, criterion)
+                chosen = choose(knowledge.measured(bench.q), knowledge.tool(bench.task), count, criterion)
                 ways[f"{criterion}, {name}"] = [chosen] * draws
         pooled = {}
         for way, choices in ways.items():

@@ -77,7 +77,10 @@ def measured(
     for pool, test in pools(name, draws):
         for count in counts:
             rows: dict[str, Tensor] = {"random": torch.arange(count)}
-            rows |= {one: choose(knowledge, pool.q, count, pool.q[:300], one) for one in criteria}
+            rows |= {
+                one: choose(knowledge.measured(pool.q), knowledge.tool(pool.q[:300]), count, one)
+                for one in criteria
+            }
             for how, chosen in rows.items():
                 rms = rms_mm(calibrator.fit(pool.select(chosen)), test)
                 table.setdefault((count, how), []).append(rms)
@@ -92,7 +95,9 @@ def sequential(name: str, counts: tuple[int, ...], draws: range) -> None:
         knowledge, chosen = Knowledge.of_robot(robot), torch.arange(0)
         for count in counts:
             free = torch.arange(POOL)[~torch.isin(torch.arange(POOL), chosen)]
-            more = choose(knowledge, pool.q[free], count - len(chosen), pool.q[:300], "I")
+            more = choose(
+                knowledge.measured(pool.q[free]), knowledge.tool(pool.q[:300]), count - len(chosen), "I"
+            )
             chosen = torch.cat([chosen, free[more]])
             result = HybridCalibrator(robot).fit(pool.select(chosen))
             knowledge = Knowledge.of_result(result, knowledge.instrument)
@@ -150,7 +155,7 @@ def predicted(seeds: range) -> None:
         arm = Arm(ARMS[seed % len(ARMS)], seed)
         knowledge, q = Knowledge.of_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
         for count in (15, 30, 60):
-            chosen = q[choose(knowledge, q, count, q[:300], "I")]
+            chosen = q[choose(knowledge.measured(q), knowledge.tool(q[:300]), count, "I")]
             one = arm.figures(chosen, knowledge)
             ratios.setdefault((count, "plan"), []).append(one.predicted / one.true)
             ratios.setdefault((count, "calibration"), []).append(one.after / one.true)
@@ -169,7 +174,7 @@ def needed(seeds: range) -> None:
         for seed in seeds:
             arm = Arm(name, seed)
             knowledge, q = Knowledge.of_robot(arm.planned, Instrument(sigma=NOISE)), arm.candidates(1000)
-            order = choose(knowledge, q, STEPS[-1], q[:300], "I")
+            order = choose(knowledge.measured(q), knowledge.tool(q[:300]), STEPS[-1], "I")
             poses = [first(arm, rows, knowledge) for rows in (q, q[order])]
             ratios.append(poses[1] / poses[0])
             print(f"{name} seed {seed}: {poses[0]:.0f} random, {poses[1]:.0f} chosen", flush=True)
@@ -198,7 +203,7 @@ def speed() -> None:
     knowledge = Knowledge.of_robot(robot)
     for criterion in ("D", "I"):
         began = time.perf_counter()
-        choose(knowledge, q, 100, q[:300], criterion)  # type: ignore[arg-type]
+        choose(knowledge.measured(q), knowledge.tool(q[:300]), 100, criterion)  # type: ignore[arg-type]
         seconds = time.perf_counter() - began
         unknowns = len(knowledge.uncertainty.root)
         print(

@@ -110,7 +110,7 @@ def expected(
     """
     counts = [*range(step, len(poses), step), len(poses)] if len(poses) else []
     both = torch.cat([poses, candidates])
-    points = curve(knowledge, both, torch.arange(len(poses)), task, counts)
+    points = curve(knowledge.measured(both), knowledge.tool(task), torch.arange(len(poses)), counts)
     return tuple(
         AccuracyPoint(measured + point.poses, point.rms, point.p95, random_rms=point.random_rms)
         for point in points

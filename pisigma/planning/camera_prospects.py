@@ -72,7 +72,9 @@ class CameraProspects:
         others = torch.ones(len(candidates.q), dtype=torch.bool)
         others[chosen] = False
         left = candidates.q[others]
-        more = left[choose(after, left, min(MORE, len(left)), task)] if len(left) else left
+        more = (
+            left[choose(after.measured(left), after.tool(task), min(MORE, len(left)))] if len(left) else left
+        )
         return CameraProspects(
             rms_of(after.tool(task)),
             rms_of(after.informed(more).tool(task)) if len(more) else rms_of(after.tool(task)),

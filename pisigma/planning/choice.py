@@ -8,7 +8,6 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import PlanningError
-from pisigma.planning.knowledge import Knowledge
 
 Criterion = Literal["D", "I"]
 LEAST_VARIANCE = 1e-10
@@ -25,15 +24,14 @@ PASSES = 3
 
 
 def choose(
-    knowledge: Knowledge,
-    candidates: Float64[Tensor, "candidates dof"],
+    B: Float64[Tensor, "candidates values directions"],
+    D: Float64[Tensor, "tasks 3 directions"],
     count: int,
-    task: Float64[Tensor, "tasks dof"],
     criterion: Criterion = "I",
 ) -> Int64[Tensor, " count"]:
     """Choose poses to measure, the most useful first.
 
-    "D" maximises the information on all unknowns, `log det(1 + Σ B_i^T B_i)`, with B of `Knowledge.measured`; "I"
+    "D" maximises the information on all unknowns, `log det(1 + Σ B_i^T B_i)`; "I"
     minimises the mean variance of the tool's position over the task, `tr(C W)`. Poses are taken one after the other,
     each the best by D beside those before it: a pivoted block Cholesky factorisation of the covariance of all values.
     Then each is exchanged for the best other one by the criterion as long as that gains something, and the chosen poses
@@ -43,10 +41,9 @@ def choose(
     Guestrin 2008, JMLR 9, 235-284; for robots Borm and Menq 1991 choose poses by observability.
 
     Args:
-        knowledge: before the first of them is measured.
-        candidates: joint values [rad or m].
+        B: of the candidates, before the first of them is measured; see `Knowledge.measured`.
+        D: of the poses where the robot shall be accurate; see `Knowledge.tool`.
         count: how many to choose.
-        task: joint values [rad or m] where the robot shall be accurate.
         criterion: see above.
 
     Returns:
@@ -55,14 +52,14 @@ def choose(
     Raises:
         PlanningError: there are not as many candidates, or no task.
     """
-    if not 1 <= count <= len(candidates):
+    if not 1 <= count <= len(B):
         raise PlanningError(
-            f"1 to {len(candidates)} poses can be chosen from {len(candidates)} candidates, {count} were wanted; ask "
+            f"1 to {len(B)} poses can be chosen from {len(B)} candidates, {count} were wanted; ask "
             "for fewer or draw more candidates."
         )
-    if not len(task):
+    if not len(D):
         raise PlanningError("joint values of the task were wanted, got none; state some poses.")
-    B, goal = knowledge.measured(candidates), condensed(knowledge.tool(task))
+    goal = condensed(D)
     first = Choice(B, goal, "D")
     first.grow(count)
     chosen = torch.tensor(first.chosen)

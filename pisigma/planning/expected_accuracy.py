@@ -48,26 +48,23 @@ class RemainingError:
 
 
 def curve(
-    knowledge: Knowledge,
-    candidates: Float64[Tensor, "candidates dof"],
+    B: Float64[Tensor, "candidates values directions"],
+    D: Float64[Tensor, "tasks 3 directions"],
     chosen: Int64[Tensor, " chosen"],
-    task: Float64[Tensor, "tasks dof"],
     counts: Sequence[int],
     seed: int = 0,
 ) -> tuple[ExpectedAccuracy, ...]:
     """Predict the accuracy against the number of poses.
 
     Args:
-        knowledge: before the first of them is measured.
-        candidates: joint values [rad or m].
+        B: of the candidates, before the first of them is measured; see `Knowledge.measured`.
+        D: of the poses where the robot shall be accurate; see `Knowledge.tool`.
         chosen: numbers of candidates, in their order.
-        task: joint values [rad or m] where the robot shall be accurate.
         counts: numbers of poses.
         seed: of the random choices.
     """
-    B, D = knowledge.measured(candidates), knowledge.tool(task)
     generator = torch.Generator().manual_seed(seed)
-    orders = [torch.randperm(len(candidates), generator=generator) for _ in range(RANDOM_CHOICES)]
+    orders = [torch.randperm(len(B), generator=generator) for _ in range(RANDOM_CHOICES)]
     points = []
     for count in counts:
         after = _after(B[chosen[:count]], D)

@@ -35,6 +35,9 @@ SensorKind = Literal["position", "pose", "distance", "camera"]
 WIDE = (*(1.0,) * 6, *(0.1,) * 3, *(1.0,) * 3)
 """[m, rad, m, rad] Where base and tool may be before anything is measured: so wide that it does not matter."""
 
+CHUNK = 512
+"""Poses whose derivatives are taken together: some MB."""
+
 
 @dataclass(frozen=True)
 class Instrument:
@@ -185,6 +188,9 @@ class Knowledge:
 
     def measured(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
         """Derivative B of what is measured, over its noise, by these numbers; values have covariance `B B^T + 1`."""
+        return torch.cat([self._measured(some) for some in torch.split(q, CHUNK)])
+
+    def _measured(self, q: Float64[Tensor, "poses dof"]) -> Float64[Tensor, "poses values directions"]:
         columns, instrument = self.columns(q), self.instrument
         if instrument.kind == "distance":
             geometry = self.uncertainty.geometry

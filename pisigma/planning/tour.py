@@ -11,16 +11,13 @@ from jaxtyping import Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import PlanningError
-from pisigma.planning.cell.arm_in_cell import ArmInCell
-from pisigma.planning.cell.motion import is_free, way_points
+from pisigma.planning.cell.motion import Motions
 from pisigma.robot.description import Robot
 
 FIRST_STAGE = 20
 """Poses with which a robot that was never measured is calibrated first: fewer do not determine its unknowns."""
 ROUNDS = 8
 """So often motions that turn out to be blocked are avoided by another order; what is left gets way points."""
-SAMPLE = 50
-"""Poses to which ways are looked for, to tell which of two poses is shut in."""
 SLOWEST = 1e-3
 """[rad/s or m/s] No robot goes from pose to pose more slowly."""
 LONGEST_SETTLING = 3600.0
@@ -81,10 +78,9 @@ class Tour:
 
 
 def tour(
-    arm: ArmInCell,
+    motions: Motions,
     q: Float64[Tensor, "poses dof"],
     pace: Pace,
-    pool: Float64[Tensor, "free dof"],
     start: Float64[Tensor, " dof"] | None = None,
     stages: Sequence[int] = (),
 ) -> Tour:
@@ -94,23 +90,22 @@ def tour(
     that are blocked are made expensive and the order is improved again; those that stay get way points.
 
     Args:
-        arm: the robot in its cell.
+        motions: of the robot in its cell; they know those of earlier tours.
         q: joint values [rad or m] of the poses, each of them free.
         pace: of the robot.
-        pool: free poses that way points may be.
         start: joint values where the robot stands [rad or m]; None for anywhere.
         stages: numbers of poses that are gone to before all that follow in `q`, ascending, such as (20, 40): the
             first 20 poses, then the next 20, then the rest, each in the order that takes little time.
     """
     poses = q if start is None else torch.cat([start[None], q])
-    seconds = pace.seconds(arm.robot, poses[:, None], poses[None]).numpy()
-    motions, first = _Motions(arm, poses), int(start is not None)
+    seconds = pace.seconds(motions.arm.robot, poses[:, None], poses[None]).numpy()
+    first = int(start is not None)
     order = np.arange(first)
     ends = [*(end for end in stages if end < len(q)), len(q)]
     for begin, end in pairwise([0, *ends]):
         stage = np.concatenate([order[-1:], np.arange(begin, end) + first])
-        order = np.concatenate([order[:-1], _ordered(motions, seconds, stage, len(order) > 0)])
-    return _with_way_points(motions, order, pace, pool, start is not None)
+        order = np.concatenate([order[:-1], _ordered(motions, poses, seconds, stage, len(order) > 0)])
+    return _with_way_points(motions, poses, order, pace, start is not None)
 
 
 def order_of_use(chosen: int, check: int) -> Int64[Tensor, " poses"]:
@@ -130,7 +125,8 @@ def stages_of(poses: int) -> tuple[int, ...]:
 
 
 def _ordered(
-    motions: "_Motions",
+    motions: Motions,
+    poses: Float64[Tensor, "poses dof"],
     seconds: Float64[np.ndarray, "poses poses"],
     stage: Int64[np.ndarray, " stage"],
     fixed_start: bool,
@@ -140,47 +136,14 @@ def _ordered(
     order = _nearest_neighbours(times, fixed_start)
     for _ in range(ROUNDS):
         order = _two_opt(times, order, fixed_start)
-        free = motions.are_free(stage[order[:-1]], stage[order[1:]])
+        path = poses[stage[order]]
+        free = motions.are_free(path[:-1], path[1:]).numpy()
         blocked = ~free & (times[order[:-1], order[1:]] < _BLOCKED)
         if not blocked.any():
             break
         one, other = order[:-1][blocked], order[1:][blocked]
         times[one, other] = times[other, one] = _BLOCKED + DETOUR * times[one, other]
     return np.take(stage, order)
-
-
-class _Motions:
-    """Straight motions between poses, each of which is looked at once at most."""
-
-    def __init__(self, arm: ArmInCell, poses: Float64[Tensor, "poses dof"]) -> None:
-        self.arm, self.poses = arm, poses
-        self._free: dict[tuple[int, int], bool] = {}
-
-    def are_free(
-        self, start: Int64[np.ndarray, " motions"], end: Int64[np.ndarray, " motions"]
-    ) -> np.ndarray:
-        """Whether they touch nothing, by the numbers of their poses."""
-        pairs = [(min(pair), max(pair)) for pair in zip(start.tolist(), end.tolist(), strict=True)]
-        new = torch.tensor([pair for pair in pairs if pair not in self._free], dtype=torch.int64).reshape(
-            -1, 2
-        )
-        free = is_free(self.arm, self.poses[new[:, 0]], self.poses[new[:, 1]])
-        self._free |= dict(zip(map(tuple, new.tolist()), free.tolist(), strict=True))
-        return np.array([self._free[pair] for pair in pairs], dtype=bool)
-
-    def points_between(
-        self, start: int, end: int, pool: Float64[Tensor, "free dof"]
-    ) -> Float64[Tensor, "points dof"] | None:
-        """Way points of a motion, none where it is free as it is; None where no way was found."""
-        if self.are_free(np.array([start]), np.array([end]))[0]:
-            return pool[:0]
-        return way_points(self.arm, self.poses[start], self.poses[end], pool)
-
-    def is_shut_in(self, pose: int, other: int, pool: Float64[Tensor, "free dof"]) -> bool:
-        """Whether fewer free motions lead away from a pose than from another one."""
-        sample = pool[:: max(1, len(pool) // SAMPLE)]
-        ways = [int(is_free(self.arm, self.poses[i].expand_as(sample), sample).sum()) for i in (pose, other)]
-        return ways[0] < ways[1]
 
 
 _BLOCKED = 1e4
@@ -224,17 +187,17 @@ def _two_opt(seconds: Float64[np.ndarray, "poses poses"], order: np.ndarray, fix
 
 
 def _with_way_points(
-    motions: _Motions, order: np.ndarray, pace: Pace, pool: Float64[Tensor, "free dof"], fixed_start: bool
+    motions: Motions, poses: Float64[Tensor, "poses dof"], order: np.ndarray, pace: Pace, fixed_start: bool
 ) -> Tour:
     """Put way points in where a motion is blocked, and leave out poses that none leads to."""
-    poses = motions.poses
     stops, before, left_out = [int(order[0])], [poses[:0]], []
     for stop in order[1:].tolist():
-        points = motions.points_between(stops[-1], stop, pool)
-        if points is None and len(stops) > int(fixed_start) and motions.is_shut_in(stops[-1], stop, pool):
+        points = motions.points_between(poses[stops[-1]], poses[stop])
+        movable = len(stops) > int(fixed_start)
+        if points is None and movable and motions.is_shut_in(poses[stops[-1]], poses[stop]):
             left_out.append(stops.pop())
             before.pop()
-            points = motions.points_between(stops[-1], stop, pool) if stops else poses[:0]
+            points = motions.points_between(poses[stops[-1]], poses[stop]) if stops else poses[:0]
         if points is None:
             left_out.append(stop)
         else:

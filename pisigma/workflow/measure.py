@@ -35,6 +35,7 @@ from pisigma.measuring.row_judgement import RowJudgement, judge_rows
 from pisigma.measuring.setup_sentence import setup_sentence
 from pisigma.measuring.state import AccuracyPoint, Advice, Alarm, NextPose, RowsSoFar, SessionState
 from pisigma.measuring.stopping import AHEAD, advice
+from pisigma.planning.cell.motion import Motions
 from pisigma.planning.choice import choose
 from pisigma.planning.plan_file import StoredPlan, read_plan
 from pisigma.planning.subject import Subject
@@ -106,7 +107,7 @@ class MeasuringSession:
         candidates = plan.settings.find_candidates(plan.arm)
         some = torch.linspace(0, len(candidates.q) - 1, min(len(candidates.q), CANDIDATES)).round().long()
         self._candidates, self._number = candidates.q[some], candidates.number[some]
-        self._by_way_of = candidates.workspace[:CANDIDATES]
+        self._motions = Motions(plan.arm, candidates.workspace[:CANDIDATES])
         subject = Subject(plan.arm.drawn) if plan.model is None else Subject.of(plan.model)
         self._task = task_poses(plan.arm, plan.settings, candidates.workspace, subject.model)
         self._before = subject.knowledge(plan.arm, replace(plan.settings, measured=None))
@@ -276,15 +277,15 @@ class MeasuringSession:
             return None
         if not bool(plan.check[first]):
             knowledge = knowledge.informed(plan.q[first])
+        measured, tool = knowledge.measured(self._candidates), knowledge.tool(self._task)
         for _ in range(ROUNDS):
             if count > len(new):
                 return None
-            candidates, criterion = self._candidates[new], plan.settings.criterion
-            chosen = new[choose(knowledge, candidates, count, self._task, criterion)]
+            chosen = new[choose(measured[new], tool, count, plan.settings.criterion)]
             use = order_of_use(count, len(check))
             poses = torch.cat([self._candidates[chosen], plan.q[check]])[use]
             start = plan.q[first[0]]
-            way = tour(plan.arm, poses, plan.settings.pace, self._by_way_of, start, stages=(AHEAD,))
+            way = tour(self._motions, poses, plan.settings.pace, start, stages=(AHEAD,))
             left_out = use[way.left_out]
             shut_in = left_out[left_out < count]
             new = new[~torch.isin(new, chosen[shut_in])]

@@ -23,6 +23,7 @@ from pisigma.planning.camera_prospects import CameraProspects
 from pisigma.planning.candidates import Candidates, spread
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.cell.cell import Cell, read_cell
+from pisigma.planning.cell.motion import Motions
 from pisigma.planning.choice import choose
 from pisigma.planning.expected_accuracy import ExpectedAccuracy, RemainingError, curve, remaining_errors
 from pisigma.planning.knowledge import Knowledge
@@ -227,6 +228,16 @@ class _Problem:
         """From where the camera has to see its board; None without a camera."""
         return self.settings.views(self.arm)
 
+    @cached_property
+    def measured(self) -> Float64[Tensor, "candidates values directions"]:
+        """What measuring the candidates says; see `Knowledge.measured`."""
+        return self.knowledge.measured(self.candidates.q)
+
+    @cached_property
+    def tool(self) -> Float64[Tensor, "tasks 3 directions"]:
+        """How uncertain the tool is over the task; see `Knowledge.tool`."""
+        return self.knowledge.tool(self.task)
+
     @property
     def anything_known(self) -> bool:
         """Whether something was measured already."""
@@ -239,17 +250,17 @@ class _Problem:
         measuring may end early.
         """
         q, count = self.candidates.q, self.settings.count
-        free = torch.arange(len(q))
+        free, motions = torch.arange(len(q)), Motions(self.arm, self.candidates.workspace)
         for _ in range(ROUNDS):
             progress(f"{count} of {len(free):,} candidates")
-            chosen = free[choose(self.knowledge, q[free], count, self.task, self.settings.criterion)]
+            chosen = free[choose(self.measured[free], self.tool, count, self.settings.criterion)]
             others = free[~torch.isin(free, chosen)]
             check = others[spread(self.arm, q[others], self.settings.check, q[chosen])]
             use = order_of_use(count, len(check))
             poses = torch.cat([chosen, check])[use]
             progress("order of the poses")
             stages = stages_of(len(poses))
-            way = tour(self.arm, q[poses], self.settings.pace, self.candidates.workspace, stages=stages)
+            way = tour(motions, q[poses], self.settings.pace, stages=stages)
             free = free[~torch.isin(free, poses[way.left_out])]
             if not len(way.left_out) or len(free) < len(poses):
                 break
@@ -296,7 +307,7 @@ class _Problem:
         return tuple(view_warnings(self.views.obliqueness(self.arm, q), q, self.arm.robot))
 
     def _curve(self, chosen: Int64[Tensor, " chosen"], counts: list[int]) -> tuple[ExpectedAccuracy, ...]:
-        return curve(self.knowledge, self.candidates.q, chosen, self.task, counts, self.settings.seed)
+        return curve(self.measured, self.tool, chosen, counts, self.settings.seed)
 
 
 def _warnings(way: Tour) -> tuple[str, ...]:

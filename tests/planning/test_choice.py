@@ -79,7 +79,7 @@ def test_criterion_i_leaves_less_error_of_the_tool_than_criterion_d_and_random_p
 
 def test_the_first_of_a_choice_are_the_greedy_choice_among_it(knowledge: Knowledge) -> None:
     q, task = random_joints(60, 2), random_joints(40, 3)
-    chosen = choose(knowledge, q, 12, task, "I")
+    chosen = choose(knowledge.measured(q), knowledge.tool(task), 12, "I")
     assert len(set(chosen.tolist())) == 12
     choice = Choice(knowledge.measured(q[chosen]), condensed(knowledge.tool(task)), "I")
     choice.grow(12)
@@ -88,8 +88,8 @@ def test_the_first_of_a_choice_are_the_greedy_choice_among_it(knowledge: Knowled
 
 def test_the_curve_is_the_covariance_after_the_poses(knowledge: Knowledge) -> None:
     q, task = random_joints(80, 4), random_joints(40, 5)
-    chosen = choose(knowledge, q, 20, task)
-    points = curve(knowledge, q, chosen, task, (10, 20))
+    chosen = choose(knowledge.measured(q), knowledge.tool(task), 20)
+    points = curve(knowledge.measured(q), knowledge.tool(task), chosen, (10, 20))
     for point in points:
         after = knowledge.informed(q[chosen[: point.poses]])
         assert_close(point.rms, float(after.deviation(task).square().mean().sqrt()), rtol=1e-6)
@@ -117,6 +117,6 @@ def test_what_remains_is_named(knowledge: Knowledge) -> None:
 def test_impossible_choices_are_refused(knowledge: Knowledge) -> None:
     q = random_joints(5, 0)
     with pytest.raises(PlanningError, match="1 to 5 poses"):
-        choose(knowledge, q, 6, q)
+        choose(knowledge.measured(q), knowledge.tool(q), 6)
     with pytest.raises(PlanningError, match="joint values of the task"):
-        choose(knowledge, q, 2, q[:0])
+        choose(knowledge.measured(q), knowledge.tool(q[:0]), 2)

@@ -13,7 +13,7 @@ from pisigma.errors import PlanningError
 from pisigma.planning.candidates import draw_candidates
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.cell.cell import Cell
-from pisigma.planning.cell.motion import is_free
+from pisigma.planning.cell.motion import Motions, is_free
 from pisigma.planning.tour import Pace, order_of_use, stages_of, tour
 from pisigma.robot import Robot
 
@@ -24,7 +24,7 @@ PACE = Pace(speed=math.radians(20), settling=2.0)
 def test_few_poses_are_in_the_best_order():
     q = torch.from_numpy(np.random.default_rng(3).uniform(-0.4, 0.4, (7, 6)))
     arm = ArmInCell.of(Robot.load("fanuc_r2000"))
-    way = tour(arm, q, PACE, q)
+    way = tour(Motions(arm, q), q, PACE)
 
     def seconds(order: tuple[int, ...]) -> float:
         path = q[list(order)]
@@ -40,7 +40,7 @@ def test_a_tour_goes_on_from_where_the_robot_stands():
     q = torch.from_numpy(np.random.default_rng(3).uniform(-0.4, 0.4, (7, 6)))
     arm = ArmInCell.of(Robot.load("fanuc_r2000"))
     start = q[4] + 0.01
-    way = tour(arm, q, PACE, q, start)
+    way = tour(Motions(arm, q), q, PACE, start)
     assert int(way.order[0]) == 4
     assert sorted(way.order.tolist()) == list(range(7))
 
@@ -48,7 +48,7 @@ def test_a_tour_goes_on_from_where_the_robot_stands():
 def test_what_is_most_useful_comes_first_in_stages():
     q = torch.from_numpy(np.random.default_rng(4).uniform(-0.4, 0.4, (9, 6)))
     arm = ArmInCell.of(Robot.load("fanuc_r2000"))
-    order = tour(arm, q, PACE, q, q[0], stages=(2, 5, 20)).order.tolist()
+    order = tour(Motions(arm, q), q, PACE, q[0], stages=(2, 5, 20)).order.tolist()
     assert [set(order[:2]), set(order[2:5]), set(order[5:])] == [{0, 1}, {2, 3, 4}, {5, 6, 7, 8}]
     assert stages_of(20) == ()
     assert stages_of(81) == (20, 40, 80)
@@ -62,7 +62,7 @@ def test_poses_to_check_with_stand_evenly_between_the_others():
 def test_every_motion_touches_nothing():
     arm = ArmInCell.of(ARM.drawn, CELL.model_copy(update={"tracker": None, "reflector": None}))
     pool = draw_candidates(arm, 60, 0).q
-    way = tour(arm, pool[:5], PACE, pool)
+    way = tour(Motions(arm, pool), pool[:5], PACE)
     assert not len(way.left_out)
     assert sum(map(len, way.before)) == 1, "the test wants a motion that is blocked"
     stops = [
@@ -79,7 +79,7 @@ def test_a_pose_that_no_motion_leads_to_is_left_out():
     blocked = Cell.model_validate(
         {"boxes": [wall, wall | {"name": "other", "center_mm": (3200.0, 0.0, 1500.0)}]}
     )
-    way = tour(ArmInCell.of(robot, blocked), q, PACE, q)
+    way = tour(Motions(ArmInCell.of(robot, blocked), q), q, PACE)
     assert len(way.left_out) == 1
     assert len(way.order) == 2
 

@@ -6,8 +6,6 @@ from torch import Tensor
 
 SMALLEST = 1e-18
 """[m²] Segments whose squared length is smaller are points."""
-HALVINGS = 40
-"""Of a segment, to find where it is nearest to a box: 1e-12 of its length."""
 
 Segments = Float64[Tensor, "*#batch 2 3"]
 """Both ends of line segments [m]."""
@@ -36,24 +34,35 @@ def segment_distance(first: Segments, second: Segments) -> Float64[Tensor, "*_ba
 def box_distance(segments: Segments, half_size: Float64[Tensor, "*#batch 3"]) -> Float64[Tensor, "*_batch"]:
     """Distance of line segments from boxes about the origin, 0 inside [m].
 
-    The squared distance along a segment is convex with a continuous slope, whose sign is halved for.
+    The squared distance along a segment is convex, and its slope is linear between the planes of the box's faces: where
+    it is 0 follows from the slopes at the two planes around it.
 
     Args:
         segments: in the frame of the box.
         half_size: of the box along its axes [m].
     """
     start, along = segments[..., 0, :], segments[..., 1, :] - segments[..., 0, :]
-    low = (start + half_size)[..., 0] * 0.0
-    width = torch.ones_like(low)
+    level = along == 0.0
+    steps = torch.where(level, 1.0, along)
+    planes = [torch.where(level, 0.0, (face - start) / steps).clamp(0, 1) for face in (-half_size, half_size)]
+    first = torch.zeros_like(planes[0][..., :1])
+    t = torch.cat([first, *planes, first + 1.0], -1)
+    slope = torch.zeros_like(t)
+    for s, u, half in zip(
+        *(values[..., None].unbind(-2) for values in (start, along, half_size)), strict=True
+    ):
+        slope += u * _outside(s + t * u, half)
+    falling = slope < 0
+    low, high = torch.where(falling, t, 0.0).amax(-1), torch.where(falling, 1.0, t).amin(-1)
+    before = torch.where(falling, slope, -torch.inf).amax(-1)
+    behind = torch.where(falling, torch.inf, slope).amin(-1)
+    share = torch.where(behind.isinf(), 1.0, before / (before - torch.where(behind.isinf(), 0.0, behind)))
+    share = torch.where(before.isinf(), 0.0, share)
+    nearest = start + (low + share * (high - low))[..., None] * along
+    distance: Tensor = _outside(nearest, half_size).norm(dim=-1)
+    return distance
 
-    def outside(t: Tensor) -> Tensor:
-        point = start + t[..., None] * along
-        return point - torch.minimum(torch.maximum(point, -half_size), half_size)
 
-    for _ in range(HALVINGS):
-        width = width / 2
-        falling = (outside(low + width) * along).sum(-1) < 0
-        low = torch.where(falling, low + width, low)
-    ends = torch.stack([outside(t) for t in (low, low + width)])
-    nearest: Tensor = ends.norm(dim=-1).min(0).values
-    return nearest
+def _outside(point: Tensor, half: Tensor) -> Tensor:
+    """By how much coordinates are outside a box about the origin [m]."""
+    return point - torch.minimum(torch.maximum(point, -half), half)

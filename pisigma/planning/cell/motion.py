@@ -13,6 +13,51 @@ TRIED = 60
 """Poses that are tried as way points of a motion, and ten times as many pairs of them."""
 BATCH = 20
 """Of these are looked at together."""
+SAMPLE = 50
+"""Poses to which ways are looked for, to tell which of two poses is shut in."""
+
+
+class Motions:
+    """Straight motions of the joints between poses, each of which is looked at once at most.
+
+    Attributes:
+        arm: the robot in its cell.
+        pool: free poses that way points may be [rad or m].
+    """
+
+    def __init__(self, arm: ArmInCell, pool: Float64[Tensor, "free dof"]) -> None:
+        """Start with no motion."""
+        self.arm, self.pool = arm, pool
+        self._free: dict[tuple[bytes, bytes], bool] = {}
+        self._points: dict[tuple[bytes, bytes], Float64[Tensor, "points dof"] | None] = {}
+
+    def are_free(
+        self, start: Float64[Tensor, "motions dof"], end: Float64[Tensor, "motions dof"]
+    ) -> Bool[Tensor, " motions"]:
+        """Whether they touch nothing, one way or the other."""
+        names = [*map(sorted, zip(_names(start), _names(end), strict=True))]
+        pairs = [(one, other) for one, other in names]
+        new = torch.tensor([pair not in self._free for pair in pairs], dtype=torch.bool).nonzero()[:, 0]
+        free = is_free(self.arm, start[new], end[new])
+        self._free |= {pairs[motion]: one for motion, one in zip(new.tolist(), free.tolist(), strict=True)}
+        return torch.tensor([self._free[pair] for pair in pairs], dtype=torch.bool)
+
+    def points_between(
+        self, start: Float64[Tensor, " dof"], end: Float64[Tensor, " dof"]
+    ) -> Float64[Tensor, "points dof"] | None:
+        """Way points of a motion, none where it is free as it is; None where no way was found."""
+        if bool(self.are_free(start[None], end[None])):
+            return self.pool[:0]
+        (pair,) = zip(_names(start[None]), _names(end[None]), strict=True)
+        if pair not in self._points:
+            self._points[pair] = way_points(self.arm, start, end, self.pool)
+        return self._points[pair]
+
+    def is_shut_in(self, pose: Float64[Tensor, " dof"], other: Float64[Tensor, " dof"]) -> bool:
+        """Whether fewer free motions lead away from a pose than from another one."""
+        sample = self.pool[:: max(1, len(self.pool) // SAMPLE)]
+        one, two = (int(self.are_free(q.expand_as(sample), sample).sum()) for q in (pose, other))
+        return one < two
 
 
 def is_free(
@@ -75,15 +120,20 @@ def way_points(
     first, second = torch.cartesian_prod(first, second).unbind(-1)
     length = to[first] + _travel(arm, pool[first], pool[second]) + back[second]
     shortest = length.argsort()[: 10 * TRIED]
-    first, second = first[shortest], second[shortest]
-    free = is_free(arm, pool[first], pool[second])
-    if not bool(free.any()):
-        return None
-    best = int(free.int().argmax())
-    return torch.stack([pool[first[best]], pool[second[best]]])
+    for some in torch.split(shortest, BATCH):
+        free = is_free(arm, pool[first[some]], pool[second[some]])
+        if bool(free.any()):
+            best = some[int(free.int().argmax())]
+            return torch.stack([pool[first[best]], pool[second[best]]])
+    return None
 
 
 def _travel(arm: ArmInCell, start: Tensor, end: Tensor) -> Float64[Tensor, " poses"]:
     """How far points of the robot move at most [m]."""
     length: Tensor = (end - start).abs() @ arm.lever
     return length
+
+
+def _names(poses: Float64[Tensor, "poses dof"]) -> list[bytes]:
+    """What tells poses apart: the bytes of their joint values."""
+    return [pose.tobytes() for pose in poses.contiguous().numpy()]
