@@ -167,7 +167,8 @@ class Choice:
         if sign < 0 and (int(failed) or float(lower.diagonal().min()) < LEAST_LEFT):
             self._update_all()
             return
-        half = torch.linalg.solve_triangular(lower, G.t(), upper=False)
+        # by rows: products with all candidates read it as it lies
+        half = torch.linalg.solve_triangular(lower, G.t(), upper=False).contiguous()
         U = self._B @ half.t()
         self._C -= sign * half.t() @ half
         self._S -= sign * U @ U.mT

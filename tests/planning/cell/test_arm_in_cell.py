@@ -6,7 +6,7 @@ from testing.cells import CELL, is_collision_free, is_visible
 from testing.closeness import assert_close
 
 from pisigma.planning.cell.arm_in_cell import ArmInCell
-from pisigma.planning.cell.motion import is_free, way_points
+from pisigma.planning.cell.motion import Motions, is_free, way_points
 from pisigma.robot import Robot
 
 ARM = ArmInCell.of(Robot.load("fanuc_r2000"), CELL)
@@ -67,3 +67,15 @@ def test_way_points_lead_round_what_blocks_a_motion():
     path = torch.cat([start[None], points, end[None]])
     assert bool(is_free(ARM, path[:-1], path[1:]).all())
     assert way_points(ARM, start, end, q[:0]) is None
+
+
+def test_motions_that_were_looked_at_are_known_both_ways():
+    q = Q[ARM.gap(Q) >= 0]
+    motions, free = Motions(ARM, q), is_free(ARM, q[:20], q[20:40])
+    assert motions.are_free(q[:20], q[20:40]).tolist() == free.tolist()
+    assert motions.are_free(q[20:40], q[:20]).tolist() == free.tolist()
+    assert motions.are_free(q[:30], q[10:40]).tolist() == is_free(ARM, q[:30], q[10:40]).tolist()
+    first = (~free).nonzero()[0]
+    points = motions.points_between(q[first][0], q[20 + first][0])
+    assert points is not None
+    assert motions.points_between(q[first][0], q[20 + first][0]) is points

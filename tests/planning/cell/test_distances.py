@@ -39,3 +39,23 @@ def test_a_segment_is_as_far_from_a_box_as_its_nearest_point():
     outside = [((_points(segment).abs() - half).clamp(min=0)).norm(dim=1).min() for segment in segments]
     assert_close(box_distance(segments, half), torch.stack(outside), atol=5e-3)
     assert bool((box_distance(segments, half) <= torch.stack(outside) + 1e-9).all())
+
+
+def test_a_segment_is_nearest_to_a_box_where_the_slope_of_its_distance_is_none():
+    half = torch.tensor([1.0, 1.0, 1.0], dtype=torch.float64)
+    cases = [
+        ([[-3, 0, 1.5], [3, 0, 1.5]], 0.5),  # along a face
+        ([[0, 4, 0], [4, 0, 0]], 2**0.5),  # past an edge
+        ([[6, 0, 0], [0, 6, 0]], 2 * 2**0.5),
+        ([[3, 0, 0], [0, 3, 0]], 0.5**0.5),
+        ([[7, 1, 1], [1, 7, 1]], 3 * 2**0.5),
+        ([[3, 3, 3], [3, 3, 3]], 12**0.5),  # a point, past a corner
+        ([[0.2, 0.1, 0], [0.2, 0.1, 0]], 0.0),
+        ([[-3, 0.1, 0.2], [3, 0.1, 0.2]], 0.0),  # through it
+        ([[2, 0, 0], [5, 0, 0]], 1.0),  # away from it
+        ([[5, 0, 0], [2, 0, 0]], 1.0),  # towards it
+    ]
+    segments = torch.tensor([ends for ends, _ in cases], dtype=torch.float64)
+    assert_close(box_distance(segments, half), torch.tensor([far for _, far in cases]).double(), atol=1e-6)
+    assert_close(box_distance(segments, half), box_distance(segments.flip(-2), half), atol=1e-14)
+    assert_close(box_distance(segments[:, None], half[None])[:, 0], box_distance(segments, half), atol=0)
