@@ -82,6 +82,10 @@ class IdentificationError(PisigmaError, ValueError):
     """The measurements do not determine what is asked for."""
 
 
+class ImplausibleError(IdentificationError):
+    """No calibration error explains what was measured: it is of another robot, or in other units."""
+
+
 class PlanningError(PisigmaError, ValueError):
     """A cell, a plan or the settings of one cannot be used."""
 

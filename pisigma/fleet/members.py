@@ -221,13 +221,23 @@ def _ordered(sessions: Sequence[SessionFile], where: str) -> tuple[SessionFile, 
     """Sessions by their dates.
 
     Raises:
-        FleetError: two cannot be told apart, or cannot be put in order.
+        FleetError: two cannot be told apart, are of one file, or cannot be put in order.
     """
     names = [one.name for one in sessions]
-    for name in names:
-        _check_id(name, f"{where}, session")
-        if names.count(name) > 1:
-            raise FleetError(f"{where}: has two sessions '{name}'; state different dates.")
+    for one in sessions:
+        if not _ID.fullmatch(one.name):
+            raise FleetError(
+                f"{where}: the session of '{one.data.name}' cannot be called '{one.name}'; state its date, or name the "
+                "file with letters, digits and . _ - only, at most 100, a letter or digit first."
+            )
+        if names.count(one.name) > 1:
+            raise FleetError(f"{where}: has two sessions '{one.name}'; state different dates.")
+    files = [one.data.resolve() for one in sessions]
+    if twice := [one for one, file in zip(sessions, files, strict=True) if files.count(file) > 1]:
+        raise FleetError(
+            f"{where}: the sessions '{twice[0].name}' and '{twice[1].name}' are of the same file "
+            f"'{twice[0].data.name}'; name the file of each."
+        )
     if len(sessions) > 1 and not all(one.date for one in sessions):
         raise FleetError(
             f"{where}: has several sessions, and not all have dates; state them in the column 'date' or in the names "

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float64, Int64
+from jaxtyping import Bool, Float64, Int64
 from torch import Tensor
 
 from pisigma.errors import PlanningError
@@ -24,7 +24,10 @@ WINDOW, SELDOM = 0.25, 0.5
 """[rad] Width in which angles of a joint are counted, and the share of their mean number that is few."""
 LEAST_VIEWS = 100
 """Of a board are drawn together, as a robot reaches few of them."""
+SAME = 1e-6
+"""[rad or m] Rows of a file whose joint values differ by less are of one pose."""
 OUTSIDE_WORKSPACE = "the reflector is outside the box of the workspace"
+REPEATED = "an earlier row has the same joint values"
 UNREACHED = "the robot does not reach a view of the board"
 
 Workspace = Float64[Tensor, "2 3"]
@@ -146,7 +149,7 @@ def read_candidates(
     workspace: Workspace | None = None,
     views: BoardViews | None = None,
 ) -> Candidates:
-    """Take candidates from the joint values of a file, of measurements or of others.
+    """Take candidates from the joint values of a file, of measurements or of others, those that repeat once.
 
     Args:
         arm: the robot in its cell.
@@ -158,7 +161,16 @@ def read_candidates(
         MeasurementError: the file or a joint's cell cannot be used; the message names file, line and column.
     """
     q = read_joints(path, arm.robot)
-    return _allowed(q, _faults(arm, q, workspace, views))
+    faults = _faults(arm, q, workspace, views)
+    failed = torch.cat([_repeats(q)[:, None], faults.failed], 1)
+    return _allowed(q, Faults((REPEATED, *faults.reasons), failed))
+
+
+def _repeats(q: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
+    """Poses that are the same as one before them, which would be planned twice, or checked where they are measured."""
+    _, group = (q / SAME).round().unique(dim=0, return_inverse=True)
+    first = torch.full((len(q),), len(q)).scatter_reduce(0, group, torch.arange(len(q)), "amin")
+    return first[group] < torch.arange(len(q))
 
 
 def spread(

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import IdentificationError, MeasurementError
+from pisigma.errors import IdentificationError, ImplausibleError, MeasurementError
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.covariance_root import CovarianceRoot
 from pisigma.hybrid.gravity import USUAL, in_first_row
@@ -137,12 +137,15 @@ class Knowledge:
 
         Raises:
             PoseError: the joint values do not fit the robot.
+            ImplausibleError: no calibration error explains the rows.
         """
         try:
             return Knowledge.of_result(
                 HybridCalibrator(self.uncertainty.space.robot).fit(rows), self.instrument
             )
-        except IdentificationError:
+        except ImplausibleError:
+            raise
+        except IdentificationError:  # too few rows
             return self.informed(rows.q)
 
     def informed(self, q: Float64[Tensor, "poses dof"]) -> "Knowledge":

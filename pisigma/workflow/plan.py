@@ -1,5 +1,6 @@
 """Plan which poses to measure: typed settings in, a typed plan out that writes itself as a table, and as programs."""
 
+import math
 import os
 import time
 from collections.abc import Sequence
@@ -11,11 +12,13 @@ import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.errors import MeasurementError
 from pisigma.export.programs.languages import LANGUAGES, check_program
 from pisigma.export.programs.planned import planned_program
 from pisigma.files.conflicts import Input
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.judging.progress import Progress
+from pisigma.measuring.setup_sentence import setup_sentence
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_source import HoldsModel
 from pisigma.planning.board_views import BoardViews
@@ -39,6 +42,8 @@ STEP = 10
 """Poses between two points of the curve."""
 WEAK = 0.1
 """Share of the variance that remains from which on what causes it is named."""
+LITTLE = 0.1
+"""Share of its range by which candidates move a joint at least, so that they stand for the workspace."""
 ROUNDS = 4
 """So often poses that cannot be reached are replaced."""
 
@@ -172,7 +177,9 @@ def plan(
     Raises:
         RobotError: there is no such robot.
         ModelError: there is no such model.
-        MeasurementError: a file of joint values or of measurements cannot be used.
+        MeasurementError: a file of joint values or of measurements cannot be used, or a mistake explains what was
+            measured.
+        IdentificationError: no calibration error explains what was measured.
         PlanningError: the cell cannot be used, or allows too few poses.
     """
     started, settings = time.perf_counter(), settings or PlanSettings()
@@ -184,6 +191,7 @@ def plan(
     candidates = settings.find_candidates(arm)
     candidates.check_count(settings.count + settings.check)
     progress("what is known")
+    _check_measured(settings, arm.robot)
     knowledge = subject.knowledge(arm, settings)
     task = task_poses(arm, settings, candidates.workspace, subject.model)
     problem = _Problem(subject, settings, arm, candidates, knowledge, task)
@@ -197,7 +205,7 @@ def plan(
         problem.needed(chosen, points),
         remaining_errors(knowledge.informed(candidates.q[chosen]), task),
         way.seconds,
-        (*_warnings(way), *problem.view_warnings(chosen)),
+        (*_warnings(way), *problem.still_joints, *problem.view_warnings(chosen)),
         problem.prospects(chosen),
         time.perf_counter() - started,
     )
@@ -299,6 +307,29 @@ class _Problem:
             return None
         return CameraProspects.of(self.knowledge, self.candidates, chosen, self.task, self.views, self.arm)
 
+    @property
+    def still_joints(self) -> tuple[str, ...]:
+        """Which joints hardly move among the candidates of a file, a sentence; mostly none."""
+        arm, q = self.arm, self.candidates.q
+        if self.settings.candidates_from is None:
+            return ()
+        values, still = arm.robot.to_controller(q), []
+        for axis, moved, (lower, upper) in zip(
+            arm.robot.axes, (values.amax(0) - values.amin(0)).tolist(), arm.limits.tolist(), strict=True
+        ):
+            room = min(upper - lower, 2 * math.pi) if axis.type == "revolute" else upper - lower
+            if math.isfinite(room) and moved < LITTLE * room:
+                unit = axis.file_unit
+                still.append(
+                    f"{axis.name} by {axis.in_file_unit(moved):.3g} of {axis.in_file_unit(room):.4g} {unit}"
+                )
+        if not still:
+            return ()
+        return (
+            f"The candidates move joint {', '.join(still)} only, and the expected errors are of poses like them unless "
+            "--task names others; check the units of their columns.",
+        )
+
     def view_warnings(self, chosen: Int64[Tensor, " chosen"]) -> tuple[str, ...]:
         """Where the chosen images are too frontal or of one branch of the arm, a sentence each."""
         if self.views is None:
@@ -308,6 +339,19 @@ class _Problem:
 
     def _curve(self, chosen: Int64[Tensor, " chosen"], counts: list[int]) -> tuple[ExpectedAccuracy, ...]:
         return curve(self.measured, self.tool, chosen, counts, self.settings.seed)
+
+
+def _check_measured(settings: PlanSettings, robot: Robot) -> None:
+    """Refuse rows that a mistake in the setup or in the file explains: what they seem to say is not known.
+
+    Raises:
+        MeasurementError: they cannot be used; the message names the mistake.
+    """
+    if settings.measured is None:
+        return
+    rows = settings.read_rows(settings.measured, robot).split_sets()[0]
+    if mistake := setup_sentence(robot, rows, torch.ones(rows.rows, dtype=torch.bool)):
+        raise MeasurementError(f"{settings.measured}: {mistake}")
 
 
 def _warnings(way: Tour) -> tuple[str, ...]:

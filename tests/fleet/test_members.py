@@ -77,6 +77,14 @@ def test_a_tree_of_folders_is_a_fleet(tmp_path):
         ("id,robot,data,date\na,ur5,a.csv,May\n", "line 2: a date such as 2026-11-22 was wanted, got 'May'"),
         ("id,robot,data\na,ur5,a.csv\na,ur5,b.csv\n", "line 2: robot 'a': has several sessions, and not all"),
         ("id,robot,data\na,ur5,x/a.csv\na,ur5,y/a.csv\n", "has two sessions 'a'"),
+        (
+            "id,robot,data,date\na,ur5,a.csv,2026-01-01\na,ur5,./a.csv,2026-02-01\n",
+            "the sessions '2026-01-01' and '2026-02-01' are of the same file 'a.csv'",
+        ),
+        (
+            "id,robot,data\na,ur5,of cell 7.csv\n",
+            "the session of 'of cell 7.csv' cannot be called 'of cell 7'",
+        ),
         ("id,robot,data\na,ur5,a.csv\na,ur10,b.csv\n", "several different entries in the column 'robot'"),
         ("id,robot,data,options\na,ur5,a.csv,free\n", "name=value; name=value were wanted, got 'free'"),
     ],

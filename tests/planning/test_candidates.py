@@ -48,6 +48,17 @@ def test_candidates_of_a_file_keep_their_row(tmp_path: Path):
     assert_close(candidates.q, drawn.q, atol=1e-12)
 
 
+def test_poses_that_stand_in_a_file_twice_are_candidates_once(tmp_path: Path):
+    drawn = draw_candidates(ARM, 4, 0)
+    q = torch.cat([drawn.q, drawn.q + 1e-8, drawn.q[1:3]])
+    path = tmp_path / "repeated.csv"
+    rows = [",".join(map(repr, row)) for row in torch.rad2deg(q).tolist()]
+    path.write_text("\n".join(["q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg", *rows]))
+    candidates = read_candidates(ARM, path)
+    assert candidates.number.tolist() == [1, 2, 3, 4]
+    assert candidates.refused == {"an earlier row has the same joint values": 6}
+
+
 def test_too_few_candidates_are_refused_with_the_reasons():
     with pytest.raises(
         PlanningError, match=r"50 poses were wanted, but 10 of .* turned away .* Ask for fewer"

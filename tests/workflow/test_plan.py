@@ -10,7 +10,7 @@ from testing.closeness import assert_close
 from testing.models import no_type_checker
 from testing.report import hybrid_under_test
 
-from pisigma.errors import PlanningError
+from pisigma.errors import PisigmaError, PlanningError
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.cell.motion import is_free
@@ -92,6 +92,38 @@ def test_what_is_measured_already_counts(planned: Plan, tmp_path: Path):
         more = plan("fanuc_r2000", settings, CELL)
     assert [point.poses for point in more.curve] == [0, 2]
     assert more.checks == 0
+
+
+@pytest.mark.parametrize(
+    ("rows", "scale", "word"),
+    [(6, 1.0, "metres that are named millimetres"), (60, 1e3, "whether this robot")],
+)
+def test_measured_rows_that_cannot_be_of_the_robot_are_no_knowledge(
+    rows: int, scale: float, word: str, tmp_path: Path
+):
+    """Few rows in another unit, and many of another robot."""
+    robot = Robot.load("ur5")
+    q = torch.rand(rows, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) * 4 - 2
+    position = forward_kinematics(Robot.load("rb5" if rows > 6 else "ur5"), q)[:, :3, 3] * scale
+    lines = torch.cat([torch.rad2deg(q), position], 1).tolist()
+    header = ",".join([*(f"q{joint}_deg" for joint in range(1, 7)), "x_mm", "y_mm", "z_mm"])
+    (tmp_path / "rows.csv").write_text("\n".join([header, *(",".join(map(repr, line)) for line in lines)]))
+    settings = PlanSettings(count=2, check=0, candidates=12, measured=str(tmp_path / "rows.csv"))
+    with no_type_checker(), pytest.raises(PisigmaError, match=word):
+        plan(robot, settings)
+
+
+def test_candidates_that_hardly_move_a_joint_do_not_stand_for_the_workspace(tmp_path: Path):
+    q = torch.rand(20, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(1)) * 2 - 1
+    header = ",".join(f"q{joint}_deg" for joint in range(1, 7))
+    scale = torch.tensor([50.0, 50, 50, 50, 50, 0.8])  # the last joint in rad
+    rows = [",".join(map(repr, row)) for row in (q * scale).tolist()]
+    (tmp_path / "some.csv").write_text("\n".join([header, *rows]))
+    settings = PlanSettings(count=2, check=0, candidates_from=str(tmp_path / "some.csv"))
+    with no_type_checker():
+        (warning,) = plan("ur5", settings).warnings
+    assert "joint theta_6 by 1.27 of 360 deg only" in warning
+    assert "check the units" in warning
 
 
 def test_a_model_says_what_to_measure_next():

@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
-from pisigma.errors import IdentificationError
+from pisigma.errors import ImplausibleError
 from pisigma.identification.problem.least_squares import Linearisation
 from pisigma.identification.problem.noise import view_of
 from pisigma.identification.problem.problem import CalibrationProblem
@@ -41,7 +41,7 @@ def refuse_implausible(
         sources: what complaints call the measurements of every robot.
 
     Raises:
-        IdentificationError: the median residual of positions or balls in sockets is more than 1 % of the reach, or a
+        ImplausibleError: the median residual of positions or balls in sockets is more than 1 % of the reach, or a
             link is half as long again as drawn, or less than half as long.
     """
     _refuse_ruined_links(problem, here.point.reshape(len(sources), -1), sources)
@@ -55,7 +55,7 @@ def refuse_implausible(
     typical = sizes.median(-1).values.reshape(-1) if sizes.shape[-1] else sizes.new_zeros(1)
     for source, size in zip(sources, typical.tolist(), strict=True):
         if size > IMPLAUSIBLE_SHARE * robot.reach:
-            raise IdentificationError(
+            raise ImplausibleError(
                 f"{source}: with the best fit a typical row is still {size * 1e3:.3g} mm per axis from where robot "
                 f"'{robot.name}' says, {size / robot.reach:.1%} of its reach, which no calibration error explains; "
                 "check the units (millimetres in a _m column?), stated distances, order and directions of the joints, "
@@ -67,7 +67,7 @@ def _refuse_ruined_links(problem: CalibrationProblem, points: Tensor, sources: S
     """Refuse an arm whose long lengths changed by half, as where metres stand in a column of millimetres.
 
     Raises:
-        IdentificationError: see above.
+        ImplausibleError: see above.
     """
     robot = problem.space.robot
     is_length = problem.space.is_length.numpy()
@@ -75,7 +75,7 @@ def _refuse_ruined_links(problem: CalibrationProblem, points: Tensor, sources: S
     long = is_length[: len(drawn)] & (np.abs(drawn) > LONG_SHARE * robot.reach)
     ruined = long & (np.abs(fitted - drawn) > RUINED_SHARE * np.abs(drawn))
     for one, number in np.argwhere(ruined)[:1].tolist():
-        raise IdentificationError(
+        raise ImplausibleError(
             f"{sources[one]}: the best fit makes {problem.space.names[number]} of robot '{robot.name}' "
             f"{float(fitted[one, number]) * 1e3:.4g} mm instead of {float(drawn[number]) * 1e3:.4g} mm, which no "
             "calibration error explains; check the units (metres in a _mm column?), stated distances, order and "
