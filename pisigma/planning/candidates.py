@@ -168,9 +168,9 @@ def read_candidates(
 
 def _repeats(q: Float64[Tensor, "poses dof"]) -> Bool[Tensor, " poses"]:
     """Poses that are the same as one before them, which would be planned twice, or checked where they are measured."""
-    _, group = (q / SAME).round().unique(dim=0, return_inverse=True)
-    first = torch.full((len(q),), len(q)).scatter_reduce(0, group, torch.arange(len(q)), "amin")
-    return first[group] < torch.arange(len(q))
+    steps = (q / SAME).round().numpy()
+    _, first, group = np.unique(steps, axis=0, return_index=True, return_inverse=True)
+    return torch.from_numpy(first[group.reshape(-1)] < np.arange(len(q)))
 
 
 def spread(

@@ -69,8 +69,8 @@ def test_criterion_i_leaves_less_error_of_the_tool_than_criterion_d_and_random_p
     knowledge, q, task = Knowledge.of_robot(Robot.load("ur5")), random_joints(200, 4), random_joints(50, 5)
     for count in (10, 25):
         chosen = [
-            choose(knowledge, q, count, task, "I"),
-            choose(knowledge, q, count, task, "D"),
+            choose(knowledge.measured(q), knowledge.tool(task), count, "I"),
+            choose(knowledge.measured(q), knowledge.tool(task), count, "D"),
             torch.arange(count),
         ]
         left, *others = (rms_of(knowledge.informed(q[rows]).tool(task)) for rows in chosen)
