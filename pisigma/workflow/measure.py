@@ -284,8 +284,7 @@ class MeasuringSession:
             chosen = new[choose(measured[new], tool, count, plan.settings.criterion)]
             use = order_of_use(count, len(check))
             poses = torch.cat([self._candidates[chosen], plan.q[check]])[use]
-            start = plan.q[first[0]]
-            way = tour(self._motions, poses, plan.settings.pace, start, stages=(AHEAD,))
+            way = tour(self._motions, poses, plan.settings.pace, plan.q[first[0]], stages=(AHEAD,))
             left_out = use[way.left_out]
             shut_in = left_out[left_out < count]
             new = new[~torch.isin(new, chosen[shut_in])]
