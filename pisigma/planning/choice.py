@@ -34,8 +34,8 @@ def choose(
     "D" maximises the information on all unknowns, `log det(1 + Σ B_i^T B_i)`; "I"
     minimises the mean variance of the tool's position over the task, `tr(C W)`. Poses are taken one after the other,
     each the best by D beside those before it: a pivoted block Cholesky factorisation of the covariance of all values.
-    Then each is exchanged for the best other one by the criterion as long as that gains something, and the chosen poses
-    are put in order by it, so that the first n of them are a good choice of n.
+    Then each is exchanged for the best other one as long as that gains something, by D and then by the criterion (from
+    there it ends lower), and the chosen poses are put in order by it, so that the first n are a good choice of n.
 
     Source: exchange of Fedorov 1972, "Theory of Optimal Experiments", section 3.3; greedy choice of Krause, Singh and
     Guestrin 2008, JMLR 9, 235-284; for robots Borm and Menq 1991 choose poses by observability.
@@ -64,10 +64,13 @@ def choose(
     first.grow(count)
     chosen = torch.tensor(first.chosen)
     remaining = Choice(B, goal, criterion, first.chosen).gains().argsort(descending=True)[: len(B) - count]
-    few = torch.cat([chosen, remaining[: max(EXCHANGED - count, 0)]])
-    choice = Choice(B[few], goal, criterion, range(count))
-    choice.exchange()
-    chosen = few[torch.tensor(choice.chosen)]
+    few, numbers = torch.cat([chosen, remaining[: max(EXCHANGED - count, 0)]]), list(range(count))
+    criteria: tuple[Criterion, ...] = ("D",) if criterion == "D" else ("D", "I")
+    for one in criteria:
+        choice = Choice(B[few], goal, one, numbers)
+        choice.exchange()
+        numbers = choice.chosen
+    chosen = few[torch.tensor(numbers)]
     ordered = Choice(B[chosen], goal, criterion)
     ordered.grow(count)
     result: Tensor = chosen[torch.tensor(ordered.chosen)]
