@@ -44,7 +44,7 @@ from pisigma.identification.problem.setup import (
     SetupOptions,
     identified_geometries,
 )
-from pisigma.identification.problem.side_by_side import pattern_of, side_by_side
+from pisigma.identification.problem.side_by_side import batches, pattern_of, side_by_side
 from pisigma.identification.result import CalibrationResult, SolvedCalibration
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
@@ -169,8 +169,10 @@ class GeometricCalibrator:
         """Calibrate several robots of one type, those whose data are alike side by side; see `fit_many` and `solve`."""
         robots = [_Robot(*pair) for pair in zip(data, self._build(data), strict=True)]
         patterns = [pattern_of(robot.setup.problem) if len(robots) > 1 else None for robot in robots]
-        for group in _groups(patterns):
-            alike = [robots[number] for number in group]
+        for numbers in (
+            some for group in _groups(patterns) for some in batches(group, robots[group[0]].rows)
+        ):
+            alike = [robots[number] for number in numbers]
             problem, start = _side_by_side(alike)
             self._choose(alike, problem, start)
             for some in _groups_of(alike, problem, start, [tuple(robot.active) for robot in alike]):
@@ -344,6 +346,11 @@ class _Robot:
     findings: Findings = field(init=False)
     end: SearchEnd = field(init=False)
     solved: SolvedCalibration = field(init=False)
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of its problem."""
+        return self.setup.problem.rows
 
 
 def _finish(robots: list[_Robot], problem: CalibrationProblem, fine: Solution[Tensor]) -> None:

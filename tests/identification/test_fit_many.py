@@ -1,6 +1,7 @@
 """Robots that are calibrated side by side are calibrated as each alone."""
 
 from dataclasses import replace
+from types import ModuleType
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from testing.simulated_arm import simulate
 
 from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.problem import problem, side_by_side
 from pisigma.identification.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
@@ -94,6 +96,21 @@ def test_other_sizes_of_the_prior(prior_sizes: str) -> None:
     data = [positions(4), positions(5)]
     for many, one in zip(calibrator.fit_many(data), data, strict=True):
         assert_same(many, calibrator.fit(one))
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "rows"),
+    [(problem, "JACOBIAN_CHUNK", 30), (side_by_side, "MOST_ROWS", 60)],
+    ids=["chunks", "batches"],
+)
+def test_many_robots_in_chunks_and_batches(
+    module: ModuleType, name: str, rows: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = [positions(seed) for seed in range(4, 9)]
+    each = [CALIBRATOR.fit(one) for one in data]
+    monkeypatch.setattr(module, name, rows)
+    for many, one in zip(CALIBRATOR.fit_many(data), each, strict=True):
+        assert_same(many, one)
 
 
 def test_nothing_is_fitted_to_nothing() -> None:

@@ -18,16 +18,21 @@ class MotionMemory:
 
     def __init__(self) -> None:
         self._made_from: tuple[object, ...] = ()
-        self._motion: ToolMotion | None = None
+        self._motions: dict[tuple[int, int], ToolMotion] = {}
 
-    def motion(self, made_from: tuple[object, ...], make: Callable[[], ToolMotion]) -> ToolMotion:
-        """Return the motion that was made from the same objects, or else a new one."""
+    def motion(
+        self, made_from: tuple[object, ...], rows: slice, make: Callable[[], ToolMotion]
+    ) -> ToolMotion:
+        """Return the motion of some rows that was made from the same objects, or else a new one."""
         same = len(made_from) == len(self._made_from) and all(
             one is other for one, other in zip(made_from, self._made_from, strict=True)
         )
-        if not same or self._motion is None:
-            self._made_from, self._motion = made_from, make()
-        return self._motion
+        if not same:
+            self._made_from, self._motions = made_from, {}
+        number = rows.start, rows.stop
+        if number not in self._motions:
+            self._motions[number] = make()
+        return self._motions[number]
 
 
 def motion_at(

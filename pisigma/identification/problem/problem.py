@@ -284,7 +284,8 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         of_rows = (self._of_rows(point, rows), self.q[rows], self.frame[rows], self.target[rows])
         make = partial(motion_at, self.space, *of_rows, self._turning)
         made_from = (point, self.space, self.q, self.frame, self.target, self._turning)
-        motion = self.memory.motion(made_from, make) if rows == slice(0, self.q.shape[0]) else make()
+        remembered = bool(self.robots) or rows == slice(0, self.q.shape[0])
+        motion = self.memory.motion(made_from, rows, make) if remembered else make()
         columns = self.space.motion_columns.to(active.device)
         J = motion.derivative.index_select(0, columns[0].index_select(0, active))
         if not self.space.always_moving:

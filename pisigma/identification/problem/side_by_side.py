@@ -1,6 +1,6 @@
 """Problems of several robots of one type as one problem."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +11,16 @@ from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.kinematics.parameter_jacobian import JACOBIAN_CHUNK
 from pisigma.sensors.pose import PositionSensor, RotationSensor
 from pisigma.sensors.sensor import AbstractSensor
+
+MOST_ROWS = 65_536
+"""Rows of robots that stand side by side, as some 2 kB of a row's derivatives are kept from step to step."""
+
+
+def batches(robots: Sequence[int], rows: int) -> Iterator[Sequence[int]]:
+    """Split robots with so many rows each into those that stand side by side."""
+    most = max(MOST_ROWS // max(rows, 1), 1)
+    for first in range(0, len(robots), most):
+        yield robots[first : first + most]
 
 
 def pattern_of(problem: CalibrationProblem) -> tuple[object, ...] | None:
