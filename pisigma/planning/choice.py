@@ -31,11 +31,12 @@ def choose(
 ) -> Int64[Tensor, " count"]:
     """Choose poses to measure, the most useful first.
 
-    "D" maximises the information on all unknowns, `log det(1 + Σ B_i^T B_i)`; "I"
-    minimises the mean variance of the tool's position over the task, `tr(C W)`. Poses are taken one after the other,
-    each the best by D beside those before it: a pivoted block Cholesky factorisation of the covariance of all values.
-    Then each is exchanged for the best other one as long as that gains something, by D and then by the criterion (from
-    there it ends lower), and the chosen poses are put in order by it, so that the first n are a good choice of n.
+    "D" maximises the information on all unknowns, `log det(1 + Σ B_i^T B_i)`; "I" minimises the mean variance of the
+    tool's position over the task, `tr(C W)`. Poses are taken one after the other, each the best by D beside those
+    before it: a pivoted block Cholesky factorisation of the covariance of all values.
+    Then each is exchanged for the best other one as long as that gains something; for I from there and from where the
+    exchange by D ends, of which the better end is taken. The chosen poses are put in order by the criterion, so that
+    the first n of them are a good choice of n.
 
     Source: exchange of Fedorov 1972, "Theory of Optimal Experiments", section 3.3; greedy choice of Krause, Singh and
     Guestrin 2008, JMLR 9, 235-284; for robots Borm and Menq 1991 choose poses by observability.
@@ -64,13 +65,15 @@ def choose(
     first.grow(count)
     chosen = torch.tensor(first.chosen)
     remaining = Choice(B, goal, criterion, first.chosen).gains().argsort(descending=True)[: len(B) - count]
-    few, numbers = torch.cat([chosen, remaining[: max(EXCHANGED - count, 0)]]), list(range(count))
-    criteria: tuple[Criterion, ...] = ("D",) if criterion == "D" else ("D", "I")
-    for one in criteria:
-        choice = Choice(B[few], goal, one, numbers)
-        choice.exchange()
-        numbers = choice.chosen
-    chosen = few[torch.tensor(numbers)]
+    few = torch.cat([chosen, remaining[: max(EXCHANGED - count, 0)]])
+    choice = Choice(B[few], goal, "D", range(count))
+    choice.exchange()
+    if criterion == "I":
+        both = [Choice(B[few], goal, "I", start) for start in (range(count), choice.chosen)]
+        for one in both:
+            one.exchange()
+        choice = min(both, key=lambda one: one.variance)
+    chosen = few[torch.tensor(choice.chosen)]
     ordered = Choice(B[chosen], goal, criterion)
     ordered.grow(count)
     result: Tensor = chosen[torch.tensor(ordered.chosen)]
@@ -114,6 +117,11 @@ class Choice:
         self.chosen = list(chosen)
         self._B, self._goal, self._criterion = B, goal, criterion
         self._update_all()
+
+    @property
+    def variance(self) -> float:
+        """Mean variance of the tool's position over the task after the chosen poses [m²]."""
+        return float(((self._goal @ self._C) * self._goal).sum())
 
     def gains(self) -> Float64[Tensor, " candidates"]:
         """What every candidate would gain: information [nats] for D, less variance [m²] for I; none for chosen ones."""
