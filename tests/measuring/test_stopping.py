@@ -9,13 +9,25 @@ def point(poses: int, p95_mm: float) -> AccuracyPoint:
 
 
 def test_the_limit_ends_the_session():
-    reached, ahead = [point(12, 0.4), point(15, 0.14)], [point(25, 0.08)]
+    reached, ahead = [point(12, 0.4), point(15, 0.14), point(18, 0.12)], [point(25, 0.08)]
     said = advice(0.15, 0.005, reached, ahead, 10)
     assert said.action == "stop"
     assert said.sentence == (
-        "Stop: with 15 poses 95 % of the errors are expected below 0.140 mm; the limit is 0.15 mm."
+        "Stop: with 18 poses 95 % of the errors are expected below 0.120 mm; the limit is 0.15 mm."
     )
     assert advice(0.15, 0.005, reached[:1], ahead, 10).action == "measure"
+    assert advice(0.15, 0.005, reached[1:2], ahead, 10).action == "stop"
+
+
+def test_the_first_point_below_the_limit_has_to_be_confirmed():
+    reached, ahead = [point(12, 0.4), point(15, 0.14)], [point(25, 0.08)]
+    said = advice(0.15, 0.005, reached, ahead, 10)
+    assert said.action == "measure"
+    assert said.sentence == (
+        "10 poses are left; 95 % of the errors are expected below 0.140 mm; the limit is 0.15 mm, which the next poses "
+        "have to confirm."
+    )
+    assert "confirm" not in advice(0.15, 0.005, reached, [], 0).sentence
 
 
 def test_little_gain_ends_the_session():
