@@ -232,7 +232,7 @@ def _ordered(sessions: Sequence[SessionFile], where: str) -> tuple[SessionFile, 
             )
         if names.count(one.name) > 1:
             raise FleetError(f"{where}: has two sessions '{one.name}'; state different dates.")
-    files = [one.data.resolve() for one in sessions]
+    files = [os.path.realpath(one.data) for one in sessions]  # also of a link that leads to itself
     if twice := [one for one, file in zip(sessions, files, strict=True) if files.count(file) > 1]:
         raise FleetError(
             f"{where}: the sessions '{twice[0].name}' and '{twice[1].name}' are of the same file "

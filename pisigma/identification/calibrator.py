@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import TypeVar
 
 import numpy as np
@@ -169,9 +170,8 @@ class GeometricCalibrator:
         """Calibrate several robots of one type, those whose data are alike side by side; see `fit_many` and `solve`."""
         robots = [_Robot(*pair) for pair in zip(data, self._build(data), strict=True)]
         patterns = [pattern_of(robot.setup.problem) if len(robots) > 1 else None for robot in robots]
-        for numbers in (
-            some for group in _groups(patterns) for some in batches(group, robots[group[0]].rows)
-        ):
+        groups = _groups(patterns)
+        for numbers in chain(*(batches(group, robots[group[0]].setup.problem.rows) for group in groups)):
             alike = [robots[number] for number in numbers]
             problem, start = _side_by_side(alike)
             self._choose(alike, problem, start)
@@ -346,11 +346,6 @@ class _Robot:
     findings: Findings = field(init=False)
     end: SearchEnd = field(init=False)
     solved: SolvedCalibration = field(init=False)
-
-    @property
-    def rows(self) -> int:
-        """Number of rows of its problem."""
-        return self.setup.problem.rows
 
 
 def _finish(robots: list[_Robot], problem: CalibrationProblem, fine: Solution[Tensor]) -> None:
