@@ -20,8 +20,9 @@ def advice(
     Args:
         limit_mm: 95 % of the errors are to stay below [mm]; None for no limit.
         least_gain_mm: by which the next `AHEAD` poses have to lower that [mm].
-        reached: accuracy so far; the last point holds, and it has reached the limit if the one before it has, too: what
-            few rows say of themselves scatters, and the first of many points below the limit is there by chance.
+        reached: accuracy so far; the last point holds, and it has reached the limit if the one before it, where there
+            is one, has, too: what few rows say of themselves scatters, and the first of many points below the limit
+            is often there by chance.
         expected: accuracy that the poses that are left would bring.
         left: number of poses that are left.
     """

@@ -33,10 +33,10 @@ def choose(
 
     "D" maximises the information on all unknowns, `log det(1 + Σ B_i^T B_i)`; "I" minimises the mean variance of the
     tool's position over the task, `tr(C W)`. Poses are taken one after the other, each the best by D beside those
-    before it: a pivoted block Cholesky factorisation of the covariance of all values.
-    Then each is exchanged for the best other one as long as that gains something; for I from there and from where the
-    exchange by D ends, of which the better end is taken. The chosen poses are put in order by the criterion, so that
-    the first n of them are a good choice of n.
+    before it: a pivoted block Cholesky factorisation of the covariance of all values. Then each is exchanged for the
+    best other one as long as that gains something; for I from there and from where the exchange by D ends, of which
+    the better end is taken. The chosen poses are put in order by the criterion, so that the first n of them are a good
+    choice of n.
 
     Source: exchange of Fedorov 1972, "Theory of Optimal Experiments", section 3.3; greedy choice of Krause, Singh and
     Guestrin 2008, JMLR 9, 235-284; for robots Borm and Menq 1991 choose poses by observability.
