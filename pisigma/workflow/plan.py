@@ -191,7 +191,7 @@ def plan(
     candidates = settings.find_candidates(arm)
     candidates.check_count(settings.count + settings.check)
     progress("what is known")
-    _check_measured(settings, arm.robot)
+    _check_measured(subject.model, settings, arm.robot)
     knowledge = subject.knowledge(arm, settings)
     task = task_poses(arm, settings, candidates.workspace, subject.model)
     problem = _Problem(subject, settings, arm, candidates, knowledge, task)
@@ -341,8 +341,8 @@ class _Problem:
         return curve(self.measured, self.tool, chosen, counts, self.settings.seed)
 
 
-def _check_measured(settings: PlanSettings, robot: Robot) -> None:
-    """Refuse rows that a mistake in the setup or in the file explains: what they seem to say is not known.
+def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot: Robot) -> None:
+    """Refuse rows that a mistake in the setup or in the file explains, and those that a model was made of already.
 
     Raises:
         MeasurementError: they cannot be used; the message names the mistake.
@@ -352,6 +352,11 @@ def _check_measured(settings: PlanSettings, robot: Robot) -> None:
     rows = settings.read_rows(settings.measured, robot).split_sets()[0]
     if mistake := setup_sentence(robot, rows, torch.ones(rows.rows, dtype=torch.bool)):
         raise MeasurementError(f"{settings.measured}: {mistake}")
+    if model is not None and model.provenance.data_sha256 == rows.content_hash():
+        raise MeasurementError(
+            f"{settings.measured}: rows that model '{model.name}' does not know yet were wanted; it was made of these, "
+            "and they would count twice. Plan with the model alone."
+        )
 
 
 def _warnings(way: Tour) -> tuple[str, ...]:

@@ -1,5 +1,6 @@
 """Plans from a robot to its files: every pose is allowed by a check of its own, and the measured plan calibrates."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +112,16 @@ def test_measured_rows_that_cannot_be_of_the_robot_are_no_knowledge(
     settings = PlanSettings(count=2, check=0, candidates=12, measured=str(tmp_path / "rows.csv"))
     with no_type_checker(), pytest.raises(PisigmaError, match=word):
         plan(robot, settings)
+
+
+def test_rows_that_a_model_was_made_of_do_not_count_twice(tmp_path: Path):
+    arm, model = hybrid_under_test()
+    arm.measurements.write_csv(tmp_path / "rows.csv")
+    made_of = Measurements.read_csv(tmp_path / "rows.csv").content_hash()
+    model = replace(model, provenance=replace(model.provenance, data_sha256=made_of))
+    settings = PlanSettings(count=2, check=0, candidates=12, measured=str(tmp_path / "rows.csv"))
+    with no_type_checker(), pytest.raises(PisigmaError, match="made of these, and they would count twice"):
+        plan(model, settings)
 
 
 def test_candidates_that_hardly_move_a_joint_do_not_stand_for_the_workspace(tmp_path: Path):
