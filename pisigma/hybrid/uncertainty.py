@@ -27,8 +27,9 @@ FEW_GROUPS = 600
 VERY_FEW_GROUPS = 60
 """Up to so many, `FOLDS_OF_FEW` folds are left out: without a quarter of so few rows a calibration is much worse than
 with all of them, so that its errors say little of theirs."""
-FOLD_UPDATES = 3
-"""Updates of noise and prior sizes then."""
+FOLD_UPDATES, FEWER_UPDATES, SOME_GROUPS = 3, 1, 150
+"""Updates of noise and prior sizes then, and of more than so many groups: with one update 0.9 % fewer of 30 rows lie in
+the predicted 95 %, 0.4 % of 100 rows and 0.2 % of 300 rows, where the updates take half of the time of a fit."""
 LEAST_EFFECTIVE = 0.5
 """Prior sizes of groups of which the data determine fewer unknowns do not matter."""
 LARGEST_SCALE = 1e4
@@ -170,7 +171,8 @@ def position_uncertainty(
     """
     folds = rows.folds(FOLDS if rows.groups > VERY_FEW_GROUPS else FOLDS_OF_FEW, MOST_GROUPS)
     if rows.groups <= FEW_GROUPS:
-        missed = fit.left_out_anew(posterior, folds, FOLD_UPDATES)
+        updates = FOLD_UPDATES if rows.groups <= SOME_GROUPS else FEWER_UPDATES
+        missed = fit.left_out_anew(posterior, folds, updates)
     else:
         missed = left_out or fit.left_out(posterior, folds)
     prior_scale = left_out_scale(missed)
