@@ -1,6 +1,7 @@
 """Which of many candidate poses to measure: those that leave least uncertain."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Literal
 
 import torch
@@ -89,6 +90,25 @@ def condensed(D: Float64[Tensor, "tasks 3 directions"]) -> Float64[Tensor, "rank
     return rows
 
 
+@dataclass(frozen=True, eq=False)
+class _Change:
+    """What a candidate more, or fewer, changes.
+
+    Attributes:
+        sign: +1 where it is added, -1 where it is taken back.
+        half: root H of the covariance that goes or comes back, `C' = C - sign H^T H`.
+        along: U = B H^T of every candidate.
+        S: covariance of the values of every candidate afterwards.
+        P: `X X^T` of every candidate afterwards, for I.
+    """
+
+    sign: float
+    half: Float64[Tensor, "values directions"]
+    along: Float64[Tensor, "candidates values values"]
+    S: Float64[Tensor, "candidates values values"]
+    P: Float64[Tensor, "candidates values values"]
+
+
 class Choice:
     """Some of the candidates, and what every one of the others would add to them.
 
@@ -125,18 +145,13 @@ class Choice:
 
     def gains(self) -> Float64[Tensor, " candidates"]:
         """What every candidate would gain: information [nats] for D, less variance [m²] for I; none for chosen ones."""
-        values = self._S + torch.eye(self._S.shape[1]).to(self._S)
-        lower = torch.linalg.cholesky(values)
-        if self._criterion == "D":
-            gains: Tensor = lower.diagonal(dim1=1, dim2=2).log().sum(1)
-        else:
-            gains = (torch.cholesky_inverse(lower) * (self._X @ self._X.mT)).sum((1, 2))
-        gains[self.chosen] = -torch.inf
-        return gains
+        return self._gains(self._S, self._P)
 
     def add(self, number: int) -> None:
         """Choose a candidate."""
-        self._update(number, 1.0)
+        change = self._change(number, 1.0)
+        assert change is not None  # adding loses no digits
+        self._take(change)
         self.chosen.append(number)
 
     def grow(self, count: int) -> None:
@@ -149,17 +164,38 @@ class Choice:
         for _ in range(PASSES if len(self.chosen) < len(self._B) else 0):
             exchanged = False
             for number in list(self.chosen):
-                self.chosen.remove(number)
-                self._update(number, -1.0)
-                gains = self.gains()
-                best = int(gains.argmax())
-                scale = 1.0 if self._criterion == "D" else float(gains[number])
-                if float(gains[best] - gains[number]) > LEAST_GAIN * scale:
-                    exchanged = True
-                    number = best
-                self.add(number)
+                exchanged |= self._exchange(number)
             if not exchanged:
                 break
+
+    def _exchange(self, number: int) -> bool:
+        """Exchange a chosen candidate for the best other one, or put it last; say whether it was exchanged."""
+        self.chosen.remove(number)
+        without = self._change(number, -1.0)
+        if without is None:
+            self._update_all()
+            gains = self.gains()
+        else:
+            gains = self._gains(without.S, without.P)
+        best = int(gains.argmax())
+        scale = 1.0 if self._criterion == "D" else float(gains[number])
+        exchanged = float(gains[best] - gains[number]) > LEAST_GAIN * scale
+        if without is not None and not exchanged:
+            self.chosen.append(number)
+            return False
+        if without is not None:
+            self._take(without)
+        self.add(best if exchanged else number)
+        return exchanged
+
+    def _gains(self, S: Tensor, P: Tensor) -> Float64[Tensor, " candidates"]:
+        lower = torch.linalg.cholesky(S + torch.eye(S.shape[1]).to(S))
+        if self._criterion == "D":
+            gains: Tensor = lower.diagonal(dim1=1, dim2=2).log().sum(1)
+        else:
+            gains = (torch.cholesky_inverse(lower) * P).sum((1, 2))
+        gains[self.chosen] = -torch.inf
+        return gains
 
     def _update_all(self) -> None:
         """The covariance with the chosen candidates, from the beginning."""
@@ -169,19 +205,32 @@ class Choice:
         along = self._B @ self._C
         self._S = along @ self._B.mT  # covariance of the values of every candidate
         self._X = along @ self._goal.t() if self._criterion == "I" else self._B[..., :0]  # with the task
+        self._P = self._X @ self._X.mT
 
-    def _update(self, number: int, sign: float) -> None:
-        """The covariance with a candidate (+1) or without it (-1)."""
+    def _change(self, number: int, sign: float) -> _Change | None:
+        """What a candidate more (+1) or fewer (-1) changes; None where taking it back loses all digits."""
         G = self._C @ self._B[number].t()
         here = torch.eye(G.shape[1]).to(G) + sign * self._B[number] @ G
         lower, failed = torch.linalg.cholesky_ex(here)
         if sign < 0 and (int(failed) or float(lower.diagonal().min()) < LEAST_LEFT):
-            self._update_all()
-            return
+            return None
         # by rows: products with all candidates read it as it lies
         half = torch.linalg.solve_triangular(lower, G.t(), upper=False).contiguous()
         U = self._B @ half.t()
-        self._C -= sign * half.t() @ half
-        self._S -= sign * U @ U.mT
+        P = self._P
+        if (
+            self._criterion == "I" and sign < 0
+        ):  # where it is added it is worked out from X, without cancellation
+            task = half @ self._goal.t()
+            cross = (self._X @ task.t()) @ U.mT
+            P = P + cross + cross.mT + U @ (task @ task.t()) @ U.mT
+        return _Change(sign, half, U, self._S - sign * U @ U.mT, P)
+
+    def _take(self, change: _Change) -> None:
+        """Let the candidates be changed."""
+        half, U, self._S, self._P = change.half, change.along, change.S, change.P
+        self._C -= change.sign * half.t() @ half
         if self._criterion == "I":
-            self._X.flatten(0, 1).addmm_(U.flatten(0, 1), half @ self._goal.t(), alpha=-sign)
+            self._X.flatten(0, 1).addmm_(U.flatten(0, 1), half @ self._goal.t(), alpha=-change.sign)
+            if change.sign > 0:
+                self._P = self._X @ self._X.mT
