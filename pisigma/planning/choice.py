@@ -218,9 +218,7 @@ class Choice:
         half = torch.linalg.solve_triangular(lower, G.t(), upper=False).contiguous()
         U = self._B @ half.t()
         P = self._P
-        if (
-            self._criterion == "I" and sign < 0
-        ):  # where it is added it is worked out from X, without cancellation
+        if self._criterion == "I" and sign < 0:  # where one is added, this would cancel, and X says it
             task = half @ self._goal.t()
             cross = (self._X @ task.t()) @ U.mT
             P = P + cross + cross.mT + U @ (task @ task.t()) @ U.mT
