@@ -17,7 +17,7 @@ from pisigma.identification.identifiability.plausibility import refuse_implausib
 from pisigma.identification.identifiability.redundancy import (
     Findings,
     Redundancy,
-    find_redundancy,
+    find_redundancies,
     rank_extension,
 )
 from pisigma.identification.identifiability.sufficiency import (
@@ -236,17 +236,20 @@ class GeometricCalibrator:
         """
         space, unknowns = problem.space, robots[0].setup.free_unknowns
         candidates, explicit = self.candidates(space), not isinstance(self.free, str)
+        at_start = []
         for robot, every in zip(robots, information(problem, start, unknowns + candidates), strict=True):
-            setup, measurements = robot.setup, robot.measurements
-            robot.candidates, at_start = self._at_start(
-                setup, candidates, every.after(list(range(len(unknowns))))
+            every = every.after(list(range(len(unknowns))))
+            robot.candidates, of_robot = self._at_start(robot.setup, candidates, every)
+            at_start.append(of_robot)
+        sizes = start.reshape(len(robots), -1).cpu().numpy()[:, robots[0].candidates]
+        of_each = zip(robots, sizes, find_redundancies(at_start, sizes), strict=True)
+        for robot, its_sizes, redundancy in of_each:
+            refuse_too_few(
+                robot.setup.problem, redundancy, explicit, len(unknowns), robot.measurements.source
             )
-            sizes = setup.start.cpu().numpy()[robot.candidates]
-            redundancy = find_redundancy(at_start, sizes)
-            refuse_too_few(setup.problem, redundancy, explicit, len(unknowns), measurements.source)
-            robot.active = [*self._chosen(space, at_start, sizes, redundancy), *unknowns]
+            robot.active = [*self._chosen(space, its_sizes, redundancy), *unknowns]
             wanted = free_parameters(redundancy, explicit, len(unknowns))
-            robot.findings = Findings(sizes, redundancy, [], wanted)
+            robot.findings = Findings(its_sizes, redundancy, [], wanted)
 
     def _at_start(
         self, setup: CalibrationSetup, candidates: list[int], at_start: Information
@@ -270,16 +273,15 @@ class GeometricCalibrator:
     def _chosen(
         self,
         space: ParameterSpace,
-        at_start: Information,
         sizes: Float64[np.ndarray, " candidates"],
         redundancy: Redundancy,
     ) -> list[int]:
         """Indices of the parameters to start with."""
         if self.elimination == "exact":
             return [space.index(name) for name in redundancy.kept]
-        names = at_start.names
+        names = redundancy.names
         if self.elimination == "pairwise":
-            names = find_pairwise_redundancy(at_start, sizes).kept
+            names = find_pairwise_redundancy(redundancy.information, sizes).kept
         return [space.index(name) for name in names]
 
     def _solve(self, robots: "list[_Robot]", problem: CalibrationProblem, start: Tensor) -> None:

@@ -66,6 +66,11 @@ def motion_order(rows: int) -> list[int]:
     return [*order, base, base + 1, base + 2, 0, 1, 2, tool, tool + 1, tool + 2, d - 3, d - 2, d - 1]
 
 
+def motion_shape(robot: Robot, turning: bool) -> tuple[int, int]:
+    """Numbers of parameters and components in `ToolMotion.derivative`, with or without the turns."""
+    return 5 * len(robot.rows) + 15, 6 if turning else 3
+
+
 def identification_jacobian(
     robot: Robot, q: Float[Tensor, "*batch dof"]
 ) -> tuple[Float[Tensor, "*batch 4 4"], Float[Tensor, "*batch 6 parameters"]]:
@@ -108,6 +113,7 @@ def tool_motion(
     turning: bool,
     frame: Int64[Tensor, " poses"] | None = None,
     target: Int64[Tensor, " poses"] | None = None,
+    out: Float[Tensor, "parameters components poses"] | None = None,
 ) -> ToolMotion:
     """Tool pose and its derivative, with the batch index last.
 
@@ -122,6 +128,7 @@ def tool_motion(
         turning: whether the derivative of the rotation is wanted too.
         frame: per pose the number of its base, where there is one a frame.
         target: per pose the number of its tool, where there is one a target.
+        out: where the derivative is written, of the shape that `motion_shape` gives; a new tensor where None.
     """
     poses = q.shape[0]
     axes, bases = _frame_axes(torch.cat([base, tool], 1), q), base.shape[1]
@@ -134,7 +141,7 @@ def tool_motion(
     tool_steps = _behind(_last(frames), tool_axes)
     position = tool_steps[ORIGIN]
     shifts = 3 * frames.shape[0] + 3
-    J = q.new_empty((shifts + 2 * len(robot.rows) + 6, 6 if turning else 3, poses))
+    J = q.new_empty((*motion_shape(robot, turning), poses)) if out is None else out
     turns = frames[:, ::3]
     u, v = turns.unbind(2), (position - frames[:, 5])[:, None].unbind(2)
     of_turns = J[: shifts - 3].view(-1, 3, J.shape[1], poses)

@@ -72,8 +72,9 @@ class Redundancy:
     @cached_property
     def singular_values(self) -> Float64[np.ndarray, " singular"]:
         """Singular values of the column-scaled Jacobian."""
-        acting, lengths = _acting(self.information)
-        return _singular_values(self.information.jacobian[:, acting] / lengths[acting])
+        J = self.information.jacobian
+        lengths = _lengths(J)
+        return _singular_values(J[:, lengths > 0] / lengths[lengths > 0])
 
     @cached_property
     def dependencies(self) -> tuple[Dependency, ...]:
@@ -108,45 +109,48 @@ class Findings:
         return self.redundancy.information
 
 
-def find_redundancy(
-    information: Information,
-    sizes: Float64[np.ndarray, " parameters"],
+def find_redundancies(
+    of_each: Sequence[Information],
+    sizes: Float64[np.ndarray, "robots parameters"],
     tolerance: float = RANK_TOLERANCE,
-) -> Redundancy:
-    """Find rank, a choice of independent parameters and the dependencies of the others on them.
+) -> list[Redundancy]:
+    """Find ranks, choices of independent parameters and the dependencies of the others on them.
 
     The columns are scaled to length one; the rank is that of the singular values. The choice is the first
     `rank` pivots of a QR factorisation with column pivoting (Businger and Golub 1965) of the columns times
     their preference.
 
     Args:
-        information: the condensed Jacobian.
+        of_each: the condensed Jacobian of every robot, by the same parameters.
         sizes: nominal values; of equal columns that with the larger one is kept (a group of parallel axes
             keeps the d that is a real offset).
         tolerance: see `RANK_TOLERANCE`.
     """
-    acting, lengths = _acting(information)
-    unit = information.jacobian[:, acting] / lengths[acting]
-    preference = preferences(information.parameters, sizes)[acting]
-    R, pivots = pivoted_triangle(unit * preference)
-    rank = _rank(R / preference[pivots], tolerance)
-    kept, removed = acting[np.sort(pivots[:rank])], np.delete(acting, pivots[:rank])
-    names = information.names
-    return Redundancy(
-        information=information,
-        rank=rank,
-        tolerance=tolerance,
-        kept=tuple(names[i] for i in kept),
-        removed=tuple(names[i] for i in removed),
-        no_effect=tuple(name for name, length in zip(names, lengths, strict=True) if length == 0.0),
-    )
+    jacobians, names = np.stack([one.jacobian for one in of_each]), np.array(of_each[0].names)
+    lengths = _lengths(jacobians)
+    preference = preferences(of_each[0].parameters, sizes)
+    wanted = np.divide(preference, lengths, out=np.zeros_like(lengths), where=lengths > 0)
+    triangles, pivots = pivoted_triangles(jacobians * wanted[:, None])
+    triangles /= np.take_along_axis(preference, pivots, 1)[:, None]
+    acting = (lengths > 0).sum(1)  # the others are the last pivots
+    ranks = _ranks(triangles, tolerance)
+
+    def named(columns: Int64[np.ndarray, " some"]) -> tuple[str, ...]:
+        return tuple(names[np.sort(columns)].tolist())
+
+    return [
+        Redundancy(one, rank, tolerance, named(columns[:rank]), named(columns[rank:count]), named(columns[count:]))
+        for one, rank, columns, count in zip(of_each, ranks, pivots, acting.tolist(), strict=True)
+    ]
 
 
-def _acting(information: Information) -> tuple[Int64[np.ndarray, " acting"], Float64[np.ndarray, " columns"]]:
-    """Return the columns that change any measured value, and the lengths of all, 0 of those that do not."""
-    lengths = np.linalg.norm(information.jacobian, axis=0)
-    lengths[lengths <= NO_EFFECT * lengths.max(initial=0.0)] = 0.0
-    return np.flatnonzero(lengths), lengths
+def _lengths(
+    jacobians: Float64[np.ndarray, "*robots rank columns"],
+) -> Float64[np.ndarray, "*robots columns"]:
+    """Return the lengths of the columns, 0 of those that change no measured value."""
+    lengths = np.sqrt(np.square(jacobians).sum(-2))
+    lengths[lengths <= NO_EFFECT * lengths.max(-1, initial=0.0, keepdims=True)] = 0.0
+    return lengths
 
 
 def _singular_values(A: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarray, " singular"]:
@@ -154,47 +158,43 @@ def _singular_values(A: Float64[np.ndarray, "rows columns"]) -> Float64[np.ndarr
     return values
 
 
-def _rank(R: Float64[np.ndarray, "rank columns"], tolerance: float) -> int:
-    """Count the singular values above a share of the largest, of a triangle whose columns have length one.
+def _ranks(R: Float64[np.ndarray, "robots rank columns"], tolerance: float) -> list[int]:
+    """Count the singular values above a share of the largest, of triangles whose columns have length one, or none.
 
     The largest lies between one and the root of the number of columns. So the rank is k where what is below the k-th
     row is shorter than the tolerance, and the inverse of what is beside it is short enough; nearly always that shows
     it, and the singular values need not be worked out.
     """
-    below = np.sqrt(np.square(R).sum(1)[::-1].cumsum()[::-1])
-    rank = int((below > tolerance).sum())
-    inverse, singular = _inverse_triangle(R[:rank, :rank])
-    if not singular and np.square(inverse).sum() * R.shape[1] * tolerance**2 < 1:
-        return rank
-    singular_values = _singular_values(R)
-    return int((singular_values > tolerance * singular_values.max(initial=0.0)).sum())
+    from scipy.linalg.lapack import dtrtri  # here, since models are loaded without scipy
+
+    below = np.sqrt(np.square(R).sum(2)[:, ::-1].cumsum(1)[:, ::-1])
+    ranks: list[int] = (below > tolerance).sum(1).tolist()
+    for number, (triangle, rank) in enumerate(zip(R, ranks, strict=True)):
+        inverse, singular = dtrtri(triangle[:rank, :rank]) if rank else (triangle[:0], 0)
+        if singular or np.square(inverse).sum() * R.shape[2] * tolerance**2 >= 1:
+            values = _singular_values(triangle)
+            ranks[number] = int((values > tolerance * values.max(initial=0.0)).sum())
+    return ranks
 
 
 def preferences(
-    parameters: Sequence[Parameter], sizes: Float64[np.ndarray, " parameters"]
-) -> Float64[np.ndarray, " parameters"]:
+    parameters: Sequence[Parameter], sizes: Float64[np.ndarray, "*robots parameters"]
+) -> Float64[np.ndarray, "*robots parameters"]:
     """How much parameters are wanted among those that are kept; their order decides ties, the earlier wins."""
     weights = np.array([_WEIGHT[parameter.group] for parameter in parameters])
     result: np.ndarray = weights * (1 + 1e-3 * (np.abs(sizes) > 1e-9) - 1e-6 * np.arange(len(weights)))
     return result
 
 
-def pivoted_triangle(
-    A: Float64[np.ndarray, "rows columns"],
-) -> tuple[Float64[np.ndarray, "rank columns"], Int64[np.ndarray, " columns"]]:
-    """Return R and the pivots of a QR factorisation with column pivoting (LAPACK's `geqp3`)."""
+def pivoted_triangles(
+    A: Float64[np.ndarray, "robots rows columns"],
+) -> tuple[Float64[np.ndarray, "robots rank columns"], Int64[np.ndarray, "robots columns"]]:
+    """Return R and the pivots of QR factorisations with column pivoting (LAPACK's `geqp3`), matrix by matrix."""
     from scipy.linalg.lapack import dgeqp3  # here, since models are loaded without scipy
 
-    R, pivots, *_ = dgeqp3(A)
-    return np.triu(R[: A.shape[1]]), np.asarray(pivots - 1, dtype=np.int64)
-
-
-def _inverse_triangle(R: Float64[np.ndarray, "size size"]) -> tuple[Float64[np.ndarray, "size size"], bool]:
-    """Invert an upper triangle (LAPACK's `trtri`), and say whether it is singular."""
-    from scipy.linalg.lapack import dtrtri
-
-    inverse, singular = dtrtri(R) if len(R) else (R, 0)
-    return inverse, singular != 0
+    factors = [dgeqp3(one)[:2] for one in A]
+    triangles = np.triu(np.stack([R[: A.shape[2]] for R, _ in factors]))
+    return triangles, np.stack([pivots for _, pivots in factors]).astype(np.int64) - 1
 
 
 def _dependencies(

@@ -15,6 +15,8 @@ from pisigma.se3 import rotation_from_rpy
 ALTERNATIONS = 60
 LINEAR_ROWS = 13
 """Rows from which base and tool follow from a linear system."""
+DEPENDENT = 1e-9
+"""Singular values of the linear system below this share of the largest count as zero."""
 SINGLE = 0.9
 """A second singular value above this share of the first may mean that the rotations are not unique."""
 
@@ -137,7 +139,7 @@ def start_from_products(
         R_base, p_base [m], point [m].
     """
     regressor = torch.cat([R_flange.flatten(-2), p_flange, torch.ones_like(p_flange[..., :1])], -1)
-    solution = torch.linalg.pinv(regressor, rtol=1e-9) @ position
+    solution = _least_squares(regressor, position)
     R_base = nearest_rotation(solution[..., 9:12, :].mT)
     return R_base, *_translations(R_base, R_flange, p_flange, position)
 
@@ -188,15 +190,39 @@ def _procrustes(points: Tensor, position: Tensor) -> Tensor:
     return nearest_rotation((position - position.mean(0)).mT @ (points - points.mean(0)))
 
 
+def _least_squares(
+    A: Float64[Tensor, "*batch rows columns"], b: Float64[Tensor, "*batch rows values"]
+) -> Float64[Tensor, "*batch columns values"]:
+    """Solve `A x = b` in least squares; the shortest solution where columns depend on others.
+
+    That needs singular values, which are not worked out where the inverse of the triangle is short enough to show that
+    none is to be left out.
+    """
+    Q, R = torch.linalg.qr(A)
+    inverse = torch.linalg.solve_triangular(R, torch.eye(R.shape[-1]).to(R), upper=True)
+    condition = inverse.flatten(-2).norm(dim=-1) * R.flatten(-2).norm(dim=-1)
+    if not bool((condition < 1 / DEPENDENT).all()):
+        inverse = torch.linalg.pinv(R, rtol=DEPENDENT)
+    return inverse @ (Q.mT @ b)
+
+
 def _translations(
-    R_base: Tensor, R_flange: Tensor, p_flange: Tensor, position: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Positions of base and tool for a fixed rotation of the base; they are linear then."""
-    turned = R_base[..., None, :, :] @ R_flange
-    A = torch.cat([torch.eye(3).to(position).expand_as(turned), turned], -1).flatten(-3, -2)
-    b = (position - p_flange @ R_base.mT).flatten(-2)[..., None]
-    solution = torch.linalg.pinv(A.mT @ A, rtol=1e-10, hermitian=True) @ (A.mT @ b)
-    return solution[..., :3, 0], solution[..., 3:, 0]
+    R_base: Float64[Tensor, "*batch 3 3"],
+    R_flange: Float64[Tensor, "*batch rows 3 3"],
+    p_flange: Float64[Tensor, "*batch rows 3"],
+    position: Float64[Tensor, "*batch rows 3"],
+) -> tuple[Float64[Tensor, "*batch 3"], Float64[Tensor, "*batch 3"]]:
+    """Positions of base and tool for a fixed rotation of the base; they are linear then.
+
+    In the base's axes the regressor of a row is `[1 R_flange]`, and rotations are orthogonal.
+    """
+    b = position @ R_base - p_flange
+    turns, same = R_flange.mean(-3), torch.eye(3).to(position).expand_as(R_base)
+    normal = torch.cat([torch.cat([same, turns], -1), torch.cat([turns.mT, same], -1)], -2)
+    seen = torch.einsum("...nij,...ni->...j", R_flange, b) / b.shape[-2]
+    descent = torch.cat([b.mean(-2), seen], -1)[..., None]
+    solution = torch.linalg.pinv(normal, rtol=1e-10, hermitian=True) @ descent
+    return (R_base @ solution[..., :3, :])[..., 0], solution[..., 3:, 0]
 
 
 def _cube_rotations(like: Tensor) -> Tensor:

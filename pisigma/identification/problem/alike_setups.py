@@ -1,5 +1,6 @@
 """The calibration problems of robots of one type with positions of one target each, worked out side by side."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -90,10 +91,8 @@ def _kind(measurements: Measurements, options: SetupOptions) -> tuple[object, ..
     free = options.free_base and options.free_tool and not options.frames and not options.socket_distances
     if not plain or not free or not LINEAR_ROWS <= measurements.rows <= GUESS_ROWS:
         return None
-    if measurements.position is None or not bool(torch.isfinite(measurements.position).all()):
-        return None
-    stated = measurements.sigma_position
-    if stated is not None and not bool(torch.isfinite(stated).all()):
+    values = (measurements.position, measurements.sigma_position)
+    if values[0] is None or not all(one is None or math.isfinite(float(one.sum())) for one in values):
         return None
     return (measurements.rows, measurements.dof, *frames, *targets, measurements.q.device)
 

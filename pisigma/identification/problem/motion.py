@@ -1,5 +1,6 @@
 """How the tool moves with the parameters in the rows of a problem, and the memory of the last such motion."""
 
+import math
 from collections.abc import Callable
 
 import torch
@@ -19,19 +20,39 @@ class MotionMemory:
     def __init__(self) -> None:
         self._made_from: tuple[object, ...] = ()
         self._motions: dict[tuple[int, int], ToolMotion] = {}
+        self._derivatives: Tensor | None = None
 
     def motion(
-        self, made_from: tuple[object, ...], rows: slice, make: Callable[[], ToolMotion]
+        self,
+        made_from: tuple[object, ...],
+        rows: slice,
+        shape: tuple[int, int],
+        q: Float64[Tensor, "all_rows dof"],
+        make: Callable[[Tensor], ToolMotion],
     ) -> ToolMotion:
-        """Return the motion of some rows that was made from the same objects, or else a new one."""
+        """Return the motion of some rows that was made from the same objects, or else a new one.
+
+        The derivatives of all rows stand in one tensor: memory that is asked for and given back in pieces is taken
+        from the system anew each time, which costs as much as half of the work.
+
+        Args:
+            made_from: the objects.
+            rows: which rows.
+            shape: numbers of parameters and components of the derivative.
+            q: joint values of all rows.
+            make: works the motion of the rows out, with the derivative in the tensor that it is given.
+        """
         same = len(made_from) == len(self._made_from) and all(
             one is other for one, other in zip(made_from, self._made_from, strict=True)
         )
-        if not same:
-            self._made_from, self._motions = made_from, {}
+        values = math.prod(shape)
+        if not same or self._derivatives is None:
+            self._made_from, self._motions, self._derivatives = made_from, {}, None  # given back first
+            self._derivatives = q.new_empty(values * q.shape[0])
         number = rows.start, rows.stop
         if number not in self._motions:
-            self._motions[number] = make()
+            place = self._derivatives[values * rows.start : values * rows.stop]
+            self._motions[number] = make(place.view(*shape, -1))
         return self._motions[number]
 
 
@@ -42,6 +63,7 @@ def motion_at(
     frame: Int64[Tensor, " rows"],
     target: Int64[Tensor, " rows"],
     turning: bool,
+    out: Float64[Tensor, "motions components rows"] | None = None,
 ) -> ToolMotion:
     """Work out tool poses and their derivative by every kind of parameter.
 
@@ -52,6 +74,7 @@ def motion_at(
         frame: number of every row's frame among those of its robot.
         target: number of every row's target among those of its robot.
         turning: whether the derivative of the rotation is wanted too.
+        out: where the derivative is written; a new tensor where None.
     """
     dh, bases, tools = space.split(point)
     robots, rows = point.shape[:-1].numel(), q.shape[0]
@@ -61,4 +84,5 @@ def motion_at(
         for number, owners in ((frame, bases), (target, tools))
     )
     base, tool = bases.reshape(-1, 6).t(), tools.reshape(-1, 6).t()
-    return tool_motion(space.robot, dh.cpu().numpy(), base, tool, q, turning, frame_of_all, target_of_all)
+    owners_of_rows = frame_of_all, target_of_all
+    return tool_motion(space.robot, dh.cpu().numpy(), base, tool, q, turning, *owners_of_rows, out)

@@ -36,7 +36,7 @@ from pisigma.identification.problem.prior_sizes import (
     settled_scales,
 )
 from pisigma.identification.problem.robots import of_robots, with_robots
-from pisigma.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion
+from pisigma.kinematics.parameter_jacobian import JACOBIAN_CHUNK, ToolMotion, motion_shape
 from pisigma.measurement.conditions import JointState
 from pisigma.sensors.sensor import AbstractSensor, Unknowns
 
@@ -284,8 +284,11 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         of_rows = (self._of_rows(point, rows), self.q[rows], self.frame[rows], self.target[rows])
         make = partial(motion_at, self.space, *of_rows, self._turning)
         made_from = (point, self.space, self.q, self.frame, self.target, self._turning)
-        remembered = bool(self.robots) or rows == slice(0, self.q.shape[0])
-        motion = self.memory.motion(made_from, rows, make) if remembered else make()
+        if self.robots or rows == slice(0, self.q.shape[0]):
+            shape = motion_shape(self.space.robot, self._turning)
+            motion = self.memory.motion(made_from, rows, shape, self.q, make)
+        else:
+            motion = make()
         columns = self.space.motion_columns.to(active.device)
         J = motion.derivative.index_select(0, columns[0].index_select(0, active))
         if not self.space.always_moving:
