@@ -318,7 +318,8 @@ class GeometricCalibrator:
         """Add parameters that the data determine after the rough steps, though not at the nominal geometry."""
         kept = sorted(robots[0].active)
         others = [i for i in robots[0].candidates if i not in set(kept)]
-        if self.elimination != "exact" or not others:
+        most = problem.space.most_independent(problem.turning) + len(robots[0].setup.free_unknowns)
+        if self.elimination != "exact" or not others or len(kept) >= most:
             return
         of_each = information(problem, here.point, kept + others, view_of(here))
         for robot, now in zip(robots, of_each, strict=True):

@@ -173,6 +173,19 @@ class ParameterSpace:
         """Whether every parameter moves the tool in all rows."""
         return len(self.frames) == len(self.targets) == 1 and not self.unknowns
 
+    def most_independent(self, turning: bool) -> int:
+        """How many numbers of arm, bases and tools can be told apart at most, whatever is measured in whatever poses.
+
+        A turning axis is a line in space (4 numbers), a sliding one a direction (2), a target a pose (6) or a point
+        (3) behind them, and a frame but the first a pose (6). With one frame and one pose that is `4 R + 2 P + 6` for R
+        turning and P sliding joints (Everett, Driels and Mooring 1987, ICRA).
+
+        Args:
+            turning: whether the tool's orientation is seen.
+        """
+        axes = sum(2 if joint.type == "prismatic" else 4 for joint in self.robot.joints)
+        return axes + (6 if turning else 3) * len(self.targets) + 6 * (len(self.frames) - 1)
+
     def index(self, name: str) -> int:
         """Where a parameter stands.
 

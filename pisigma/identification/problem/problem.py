@@ -282,10 +282,10 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         move the tool.
         """
         of_rows = (self._of_rows(point, rows), self.q[rows], self.frame[rows], self.target[rows])
-        make = partial(motion_at, self.space, *of_rows, self._turning)
-        made_from = (point, self.space, self.q, self.frame, self.target, self._turning)
+        make = partial(motion_at, self.space, *of_rows, self.turning)
+        made_from = (point, self.space, self.q, self.frame, self.target, self.turning)
         if self.robots or rows == slice(0, self.q.shape[0]):
-            shape = motion_shape(self.space.robot, self._turning)
+            shape = motion_shape(self.space.robot, self.turning)
             motion = self.memory.motion(made_from, rows, shape, self.q, make)
         else:
             motion = make()
@@ -351,7 +351,7 @@ class CalibrationProblem(AbstractLeastSquares[Tensor]):
         return self.q.new_tensor([values * (epsilon * size) ** 2 for values, size in pairs])
 
     @cached_property
-    def _turning(self) -> bool:
+    def turning(self) -> bool:
         """Whether any sensor needs the tool's rotation."""
         return any(sensor.turning for sensor in self.sensors)
 

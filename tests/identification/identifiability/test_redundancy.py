@@ -90,6 +90,33 @@ def test_rank_with_base_and_tool_is_4r_2p_3(name: str, rank: int, poses: bool) -
     assert redundancy.no_effect == (() if poses else ("tool_roll", "tool_pitch", "tool_yaw"))
 
 
+@pytest.mark.parametrize("name", ["ur10", "rb5", "panda", "kiro3"])
+@pytest.mark.parametrize("poses", [True, False])
+@pytest.mark.parametrize(("frames", "targets"), [(1, 1), (2, 1), (1, 2), (1, 3), (3, 2)])
+def test_no_more_is_independent_than_axes_targets_and_frames_have(
+    name: str, poses: bool, frames: int, targets: int
+) -> None:
+    """Where no axes are parallel or meet, all of it is."""
+    robot, rng = Robot.load(name), np.random.default_rng(frames + 10 * targets)
+    robot = robot.with_geometry(robot.dh + 0.1 * rng.standard_normal(robot.dh.shape), BASE, TOOL)
+    q = torch.from_numpy(rng.uniform(*robot.limits.T, (40 * frames * targets, robot.dof)))
+    T = forward_kinematics(robot, q)
+    data = Measurements(
+        q=q,
+        position=T[:, :3, 3].contiguous(),
+        rotation=T[:, :3, :3].contiguous() if poses else None,
+        frame=tuple(f"frame {row % frames}" for row in range(len(q))),
+        target=tuple(f"target {row // frames % targets}" for row in range(len(q))),
+    )
+    setup = GeometricCalibrator(robot).build(data)
+    problem, point = setup.problem, setup.start.clone()
+    tools = problem.space.of("tool")
+    point[list(tools)] += 0.1 * torch.from_numpy(rng.standard_normal(len(tools)))
+    (seen,) = information(problem, point, list(range(len(point))))
+    found = find_redundancies([seen], point.numpy()[None])[0]
+    assert found.rank == problem.space.most_independent(turning=poses)
+
+
 @pytest.mark.parametrize("name", ["ur10", "panda", "kiro3"])
 def test_every_dependency_holds(name: str) -> None:
     robot = Robot.load(name).with_geometry(tool=TOOL)

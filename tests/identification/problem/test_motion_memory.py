@@ -22,10 +22,12 @@ def test_another_point_is_looked_at_anew() -> None:
     problem, start = _problem()
     active, rows = torch.arange(len(start)), problem.chunks()[0]
     before = problem.motion(start, rows, active)
-    moved = start.clone()
+    derivative, moved = before.derivative.clone(), start.clone()
     moved[problem.space.index("base_x")] += 0.5
     shift = problem.motion(moved, rows, active).position - before.position
     assert_close(shift[0], torch.full((40,), 0.5, dtype=torch.float64), atol=1e-12)
+    problem.motion(moved * 1.01, rows, active)
+    assert_close(before.derivative, derivative, atol=0.0)
 
 
 def test_some_rows_are_some_rows_of_all() -> None:
