@@ -139,7 +139,9 @@ def find_redundancies(
         return tuple(names[np.sort(columns)].tolist())
 
     return [
-        Redundancy(one, rank, tolerance, named(columns[:rank]), named(columns[rank:count]), named(columns[count:]))
+        Redundancy(
+            one, rank, tolerance, named(columns[:rank]), named(columns[rank:count]), named(columns[count:])
+        )
         for one, rank, columns, count in zip(of_each, ranks, pivots, acting.tolist(), strict=True)
     ]
 
@@ -148,7 +150,7 @@ def _lengths(
     jacobians: Float64[np.ndarray, "*robots rank columns"],
 ) -> Float64[np.ndarray, "*robots columns"]:
     """Return the lengths of the columns, 0 of those that change no measured value."""
-    lengths = np.sqrt(np.square(jacobians).sum(-2))
+    lengths: np.ndarray = np.sqrt(np.square(jacobians).sum(-2))
     lengths[lengths <= NO_EFFECT * lengths.max(-1, initial=0.0, keepdims=True)] = 0.0
     return lengths
 

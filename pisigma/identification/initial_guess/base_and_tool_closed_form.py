@@ -203,7 +203,8 @@ def _least_squares(
     condition = inverse.flatten(-2).norm(dim=-1) * R.flatten(-2).norm(dim=-1)
     if not bool((condition < 1 / DEPENDENT).all()):
         inverse = torch.linalg.pinv(R, rtol=DEPENDENT)
-    return inverse @ (Q.mT @ b)
+    solution: Tensor = inverse @ (Q.mT @ b)
+    return solution
 
 
 def _translations(

@@ -13,8 +13,8 @@ from pisigma.sensors.pose import PositionSensor, RotationSensor
 from pisigma.sensors.sensor import AbstractSensor
 
 MOST_ROWS = 28_672
-"""Rows of robots that stand side by side. The derivatives of a row's position by the parameters of six joints take 1.1 kB
-and are kept from step to step; up to 32 MB glibc keeps for the next such tensor what one gives back."""
+"""Rows of robots that stand side by side. The derivatives of a position by the parameters of six joints take 1.1 kB a
+row and are kept from step to step; what a tensor of up to 32 MB gives back, glibc keeps for the next one."""
 
 
 def batches(robots: Sequence[int], rows: int) -> Iterator[Sequence[int]]:
