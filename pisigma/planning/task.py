@@ -1,7 +1,9 @@
 """Where a robot is to be accurate: joint values, or poses of its tool, from a file."""
 
 import os
+from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Float64
 from torch import Tensor
@@ -9,6 +11,7 @@ from torch import Tensor
 from pisigma.errors import PlanningError
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.kinematics.status import Status
+from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.csv.poses import read_poses
 from pisigma.measurement.csv.reading import read_joints
@@ -16,6 +19,7 @@ from pisigma.measurement.csv.table import read_table
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.planning.cell.arm_in_cell import ArmInCell
 from pisigma.planning.plan_settings import PlanSettings
+from pisigma.robot import Robot
 
 REACHED = (Status.REACHED, Status.OUTSIDE_DOMAIN)
 
@@ -59,14 +63,34 @@ def read_task(path: str | os.PathLike[str], model: CalibratedModel) -> Float64[T
 
     Raises:
         MeasurementError: the file cannot be used; the message names file, line and column.
-        PlanningError: a pose cannot be reached; the message names its line.
+        PlanningError: a pose cannot be reached, or a joint value is outside its limits; the message names the line.
     """
-    if any(column.joint for name in read_table(path).header if (column := find_column(name))):
-        return read_joints(path, model.robot)
+    table = read_table(path)
+    if any(column.joint for name in table.header if (column := find_column(name))):
+        q = read_joints(path, model.robot)
+        _refuse_outside(model.robot, q, [f"{path}, line {line}" for line in table.lines])
+        return q
     poses = read_poses(path)
     solution = CorrectedIK(model)(poses.T)
     for line, status in zip(poses.line, map(Status, solution.status.tolist()), strict=True):
         if status not in REACHED:
             raise PlanningError(f"{path}, line {line}: {status.name.lower()}. {status.sentence}")
-    q: Tensor = model.robot.to_dh(torch.as_tensor(solution.q))
-    return q
+    reached: Tensor = model.robot.to_dh(torch.as_tensor(solution.q))
+    return reached
+
+
+def _refuse_outside(robot: Robot, q: Float64[Tensor, "tasks dof"], places: Sequence[str]) -> None:
+    """Refuse joint values [rad or m] that the robot cannot have.
+
+    Raises:
+        PlanningError: one is outside its limits; the message names its place.
+    """
+    values, (lower, upper) = robot.to_controller(q).numpy(), robot.axis_limits.T
+    outside = (values < lower - LIMIT_TOLERANCE) | (values > upper + LIMIT_TOLERANCE)
+    for row, number in np.argwhere(outside)[:1].tolist():
+        axis = robot.axes[number]
+        value, low, high = (axis.in_file_unit(some) for some in (values[row, number], axis.lower, axis.upper))
+        raise PlanningError(
+            f"{places[row]}: joint '{axis.name}' at {value:.6g} {axis.file_unit} is outside its limits {low:.6g} to "
+            f"{high:.6g} {axis.file_unit}; give joint values that robot '{robot.name}' can have, and check their unit."
+        )

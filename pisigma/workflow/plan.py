@@ -205,7 +205,7 @@ def plan(
         problem.needed(chosen, points),
         remaining_errors(knowledge.informed(candidates.q[chosen]), task),
         way.seconds,
-        (*_warnings(way), *problem.still_joints, *problem.view_warnings(chosen)),
+        (*_warnings(way), *arm.too_thick, *problem.still_joints, *problem.view_warnings(chosen)),
         problem.prospects(chosen),
         time.perf_counter() - started,
     )

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
-from pisigma.planning.cell.capsules import Capsules
-from pisigma.planning.cell.cell import Cell
+from pisigma.planning.cell.capsules import TOOL_RADIUS, Capsules
+from pisigma.planning.cell.cell import Cell, LinkSection
 from pisigma.planning.cell.distances import box_distance, segment_distance
 from pisigma.robot.description import Robot
 
@@ -85,6 +85,32 @@ class ArmInCell:
             capsules.pairs(cell.clearance / 2),
             _beside(capsules, cell.clearance),
             cell.joints.limits(robot),
+        )
+
+    @property
+    def too_thick(self) -> tuple[str, ...]:
+        """Which links the cell states so thick that nothing keeps them apart any more, a sentence; mostly none.
+
+        Links that touch in more than half of random poses are not kept apart, see `Capsules.pairs`.
+        """
+        tool = (
+            None
+            if self.cell.tool is None
+            else self.cell.tool.model_copy(update={"radius_mm": TOOL_RADIUS * 1e3})
+        )
+        usual = self.cell.model_copy(update={"links": LinkSection(), "tool": tool}).capsules(self.drawn)
+        looked_at = set(map(tuple, self.pairs.tolist()))
+        lost = [
+            pair for pair in usual.pairs(self.cell.clearance / 2).tolist() if tuple(pair) not in looked_at
+        ]
+        links = {tuple(self.capsules.link[pair].tolist()) for pair in lost}
+        if not links:
+            return ()
+        names = ("the base", *(f"link {joint.name}" for joint in self.robot.joints))
+        text = ", ".join(f"{names[one]} and {names[other]}" for one, other in sorted(links))
+        return (
+            f"With the stated radii {text} touch in more than half of all poses, so nothing keeps them apart; if they "
+            "do not touch by construction, state smaller radii [mm] of links or tool in the cell's file.",
         )
 
     def faults(self, q: Float64[Tensor, "poses dof"]) -> Faults:

@@ -1,11 +1,13 @@
 """Which poses and motions a cell allows, against points on the links."""
 
 import numpy as np
+import pytest
 import torch
 from testing.cells import CELL, is_collision_free, is_visible
 from testing.closeness import assert_close
 
 from pisigma.planning.cell.arm_in_cell import ArmInCell
+from pisigma.planning.cell.cell import Cell, LinkSection
 from pisigma.planning.cell.motion import Motions, is_free, way_points
 from pisigma.robot import Robot
 
@@ -45,6 +47,21 @@ def test_every_reason_is_named():
     outside = ARM.faults(torch.tensor([[4.0, 0, 0, 0, 0, 0]], dtype=torch.float64))
     assert "outside its limits" in str(outside.sentence(0))
     assert FAULTS.sentence(int(FAULTS.allowed.nonzero()[0])) is None
+
+
+@pytest.mark.parametrize(
+    ("links", "named"),
+    [
+        ({}, None),
+        ({"radius_mm": 60.0}, None),
+        ({"radius_mm": 900.0}, "link theta_1 and link theta_4"),
+        ({"radii_mm": {"theta_4": 1700.0}}, "link theta_1 and link theta_4"),
+    ],
+)
+def test_links_that_are_too_thick_to_be_kept_apart_are_named(links: dict[str, object], named: str | None):
+    arm = ArmInCell.of(Robot.load("ur10"), Cell(links=LinkSection.model_validate(links)))
+    assert len(arm.too_thick) == (named is not None)
+    assert named is None or named in arm.too_thick[0]
 
 
 def test_a_motion_is_free_where_all_poses_on_it_are():
