@@ -52,7 +52,7 @@ class MotionMemory:
         number = rows.start, rows.stop
         if number not in self._motions:
             place = self._derivatives[values * rows.start : values * rows.stop]
-            self._motions[number] = make(place.view(*shape, -1))
+            self._motions[number] = make(place.view(*shape, rows.stop - rows.start))
         return self._motions[number]
 
 
