@@ -8,6 +8,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.errors import IdentificationError, MeasurementError
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.result import HybridResult
 from pisigma.judging.calibration_validation import errors_under, validate
@@ -18,6 +19,7 @@ from pisigma.measurement.splits import k_folds
 from pisigma.measuring.state import AccuracyPoint
 from pisigma.planning.expected_accuracy import curve, p95_of, rms_of
 from pisigma.planning.knowledge import Knowledge
+from pisigma.planning.plan_file import StoredPlan
 from pisigma.robot.description import Robot
 
 FOLDS = 5
@@ -35,6 +37,34 @@ class Reached:
 
     point: AccuracyPoint
     knowledge: Knowledge
+
+
+def reached_so_far(
+    plan: StoredPlan,
+    before: Knowledge,
+    rows: Measurements,
+    check: Measurements | None,
+    task: Float64[Tensor, "tasks dof"],
+    progress: Progress = lambda what: None,
+) -> Reached | None:
+    """What the rows of a plan came to; None where they are too few as yet, or contradict each other.
+
+    Args:
+        plan: for a model, which takes the rows as they come, or for a robot as drawn, which is calibrated with them.
+        before: what was known before the first of them.
+        rows: see `reached`, as for the next three.
+        check: see there; unused with a model.
+        task: see there.
+        progress: see there.
+    """
+    if not rows.rows:
+        return None
+    try:
+        if plan.model is not None:
+            return reached_with(before, rows, task)
+        return reached(plan.arm.robot, before, rows, check, task, progress)
+    except (IdentificationError, MeasurementError):
+        return None
 
 
 def reached(

@@ -13,13 +13,13 @@ from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from pisigma.camera.corner_file import with_one_noise
-from pisigma.errors import IdentificationError, MeasurementError, PlanningError
+from pisigma.errors import PlanningError
 from pisigma.identification.prediction import predicted_poses
 from pisigma.judging.progress import Progress
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.fields import LeftOut
 from pisigma.measuring.coverage import coverage
-from pisigma.measuring.reached import Reached, expected, reached, reached_with
+from pisigma.measuring.reached import Reached, expected, reached_so_far
 from pisigma.measuring.row_alarms import (
     NEAR_POSE,
     cleared,
@@ -170,13 +170,13 @@ class MeasuringSession:
             counting, check, rows, remaining = self._counting, self._check, self._rows, self._open
         training = rows.select(counting & ~check)
         kept_apart = rows.select(counting & check) if bool((counting & check).any()) else None
-        robot = self.plan.arm.robot
-        try:
-            if self.plan.model is None:
-                came_to = reached(robot, self._before, training, kept_apart, self._task, progress)
-            else:
-                came_to = reached_with(self._before, training, self._task)
-        except (IdentificationError, MeasurementError):  # too few rows as yet
+        # a session that begins with rows has the figure before its first one, too, as if it had gone on
+        counts = [training.rows] if self._reached else [training.rows - self._settings.every, training.rows]
+        parts = [training.select(torch.arange(max(count, 0))) for count in counts]
+        known = (kept_apart, self._task, progress)
+        found = [reached_so_far(self.plan, self._before, some, *known) for some in parts]
+        came_to = found[-1]
+        if came_to is None:
             return
         progress("planning what is left")
         again = self._planned_again(came_to, remaining) if self._settings.replan else None
@@ -188,7 +188,7 @@ class MeasuringSession:
         ahead = expected(came_to.knowledge, training.rows, poses, self._candidates, self._task, STEP)
         with self._lock:
             self._expected = ahead
-            self._reached = [*self._reached, came_to.point]
+            self._reached += [one.point for one in found if one is not None]
 
     @property
     def rows(self) -> Measurements | None:

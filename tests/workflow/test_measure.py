@@ -79,6 +79,24 @@ def test_the_accuracy_so_far_and_that_of_the_rest(session):
     assert figures["rows_counting"] == 17
 
 
+def test_a_session_that_is_begun_again_has_the_figure_before_the_first_one(session):
+    rows = session.rows
+    again = MeasuringSession(PLAN.stored, MeasureSettings(limit_mm=1e3, every=4, replan=False))
+    again.add(rows)
+    with no_type_checker():
+        again.work_out()
+    assert [point.poses for point in again.state.reached] == [11, 15]
+    assert again.state.advice.action == "stop"
+    once = MeasuringSession(PLAN.stored, MeasureSettings(limit_mm=1e3, every=4, replan=False))
+    once.add(
+        rows.select(torch.arange(rows.rows)[~session.state.rows.check[~session.state.rows.alarmed]][:11])
+    )
+    with no_type_checker():
+        once.work_out()
+    first = again.state.reached[0]
+    assert once.state.reached[-1].predicted_rms == pytest.approx(first.predicted_rms, rel=1e-6)
+
+
 def test_settings_that_cannot_be_are_refused():
     for wrong, words in (
         ({"limit_mm": 0.0}, "limit"),
