@@ -20,9 +20,8 @@ def advice(
     Args:
         limit_mm: 95 % of the errors are to stay below [mm]; None for no limit.
         least_gain_mm: by which the next `AHEAD` poses have to lower that [mm].
-        reached: accuracy so far; the last point holds, and it has reached the limit if the one before it, where there
-            is one, has, too: what few rows say of themselves scatters, and the first of many points below the limit
-            is often there by chance.
+        reached: accuracy so far; the last point holds, and it has reached the limit if the one before it has, too: what
+            few rows say of themselves scatters, and the first of many points below the limit is often there by chance.
         expected: accuracy that the poses that are left would bring.
         left: number of poses that are left.
     """
@@ -31,7 +30,7 @@ def advice(
         point = reached[-1]
         now = f"95 % of the errors are expected below {point.predicted_p95 * 1e3:.3f} mm"
         below = [limit_mm is not None and one.predicted_p95 * 1e3 <= limit_mm for one in reached[-2:]]
-        if all(below):
+        if len(below) > 1 and all(below):
             return Advice("stop", f"Stop: with {point.poses} poses {now}{limit}.")
         confirm = ", which the next poses have to confirm" if below[-1] else ""
         ahead = next((one for one in expected if one.poses >= point.poses + AHEAD), None) or next(
