@@ -66,6 +66,8 @@ def test_the_accuracy_so_far_and_that_of_the_rest(session):
     state = session.state
     point = state.accuracy
     assert point.poses == 15
+    # the session began with all its rows, and has the figure before the last three, too
+    assert [one.poses for one in state.reached] == [12, 15]
     for lower, higher in (
         (point.predicted_rms, point.predicted_p95),
         (point.cross_validated_rms, point.cross_validated_p95),
@@ -77,24 +79,6 @@ def test_the_accuracy_so_far_and_that_of_the_rest(session):
     figures = json.loads(json.dumps(state.to_json(), allow_nan=False))
     assert figures["accuracy"]["predicted_rms_mm"] == point.predicted_rms * 1e3
     assert figures["rows_counting"] == 17
-
-
-def test_a_session_that_is_begun_again_has_the_figure_before_the_first_one(session):
-    rows = session.rows
-    again = MeasuringSession(PLAN.stored, MeasureSettings(limit_mm=1e3, every=4, replan=False))
-    again.add(rows)
-    with no_type_checker():
-        again.work_out()
-    assert [point.poses for point in again.state.reached] == [11, 15]
-    assert again.state.advice.action == "stop"
-    once = MeasuringSession(PLAN.stored, MeasureSettings(limit_mm=1e3, every=4, replan=False))
-    once.add(
-        rows.select(torch.arange(rows.rows)[~session.state.rows.check[~session.state.rows.alarmed]][:11])
-    )
-    with no_type_checker():
-        once.work_out()
-    first = again.state.reached[0]
-    assert once.state.reached[-1].predicted_rms == pytest.approx(first.predicted_rms, rel=1e-6)
 
 
 def test_settings_that_cannot_be_are_refused():
