@@ -118,15 +118,13 @@ class Fleet:
     def _derivative(self, q: np.ndarray) -> np.ndarray:
         """Derivative of positions [m] by all that differs from arm to arm, in units of its standard deviation."""
         arm = sim.True_("kr10", SHARED_SEED)
-        amplitudes = np.full(
-            2 * arm.amp.size, self.gears * np.deg2rad(0.015) / np.sqrt(2)
-        )  # of cosine and sine
+        harmonic = self.gears * np.deg2rad(0.015) / np.sqrt(2)  # of its cosine and of its sine
         sizes = np.concatenate(
             [
                 np.full(arm.do.size, self.errors * 0.3e-3),
                 np.full(arm.dr.size, self.errors * 0.4e-3),
                 np.full(arm.off.size, self.errors * np.deg2rad(0.05)),
-                amplitudes,
+                np.full(2 * arm.amp.size, harmonic),
                 np.full(9, 0.1),  # base and tool may be anywhere
             ]
         )

@@ -39,7 +39,7 @@ class Reached:
     knowledge: Knowledge
 
 
-def reached_so_far(
+def reached(
     plan: StoredPlan,
     before: Knowledge,
     rows: Measurements,
@@ -47,46 +47,39 @@ def reached_so_far(
     task: Float64[Tensor, "tasks dof"],
     progress: Progress = lambda what: None,
 ) -> Reached | None:
-    """What the rows of a plan came to; None where they are too few as yet, or contradict each other.
+    """Say what the rows of a plan came to; None where they are too few as yet, or contradict each other.
 
     Args:
-        plan: for a model, which takes the rows as they come, or for a robot as drawn, which is calibrated with them.
-        before: what was known before the first of them.
-        rows: see `reached`, as for the next three.
-        check: see there; unused with a model.
-        task: see there.
-        progress: see there.
+        plan: for a robot as drawn, which is calibrated with the rows, or for a model, to which they are added whatever
+            their values.
+        before: what was known before the first row, and what measures.
+        rows: to calibrate with.
+        check: rows that are kept apart; None where there are none yet. Unused with a model.
+        task: joint values [rad or m] where the robot shall be accurate.
+        progress: called with what is being done.
     """
     if not rows.rows:
         return None
-    try:
-        if plan.model is not None:
-            return reached_with(before, rows, task)
-        return reached(plan.arm.robot, before, rows, check, task, progress)
-    except (IdentificationError, MeasurementError):
-        return None
+    judged: tuple[float, ...] = ()
+    if plan.model is not None:
+        knowledge = before.informed(rows.q)
+    else:
+        try:
+            knowledge, judged = _calibrated(plan.arm.robot, before, rows, check, progress)
+        except (IdentificationError, MeasurementError):
+            return None
+    D = knowledge.tool(task)
+    return Reached(AccuracyPoint(rows.rows, rms_of(D), p95_of(D), *judged), knowledge)
 
 
-def reached(
-    robot: Robot,
-    before: Knowledge,
-    rows: Measurements,
-    check: Measurements | None,
-    task: Float64[Tensor, "tasks dof"],
-    progress: Progress = lambda what: None,
-) -> Reached:
-    """Calibrate with the rows so far, and judge that by its posterior, by left-out rows and by rows that check it.
-
-    Args:
-        robot: as drawn.
-        before: what is known of a robot that was never measured, and what measures.
-        rows: to calibrate with.
-        check: rows that are kept apart; None where there are none yet.
-        task: joint values [rad or m] where the robot shall be accurate.
-        progress: called with what is being done.
+def _calibrated(
+    robot: Robot, before: Knowledge, rows: Measurements, check: Measurements | None, progress: Progress
+) -> tuple[Knowledge, tuple[float, ...]]:
+    """Calibrate, and judge that by left-out rows and by rows that check it: RMS and 95 % of either [m].
 
     Raises:
         IdentificationError: the rows are too few, or contradict each other.
+        MeasurementError: too few of them can be left out.
     """
     calibrator = HybridCalibrator(robot)
     result = fit_where_it_helps(calibrator, rows, progress)
@@ -96,28 +89,12 @@ def reached(
         knowledge = before.informed(rows.q)
     else:
         knowledge = Knowledge.of_result(result, before.instrument)
-    D = knowledge.tool(task)
-    errors = validate(calibrator, rows, k_folds(rows, min(FOLDS, rows.rows), seed=0), progress).models[
-        "hybrid"
-    ]
+    folds = k_folds(rows, min(FOLDS, rows.rows), seed=0)
+    errors = validate(calibrator, rows, folds, progress).models["hybrid"].position
     checked = torch.full((1,), math.nan, dtype=torch.float64)
     if check is not None:
         checked = errors_under(result, check).position
-    point = AccuracyPoint(rows.rows, rms_of(D), p95_of(D), *_rms_p95(errors.position), *_rms_p95(checked))
-    return Reached(point, knowledge)
-
-
-def reached_with(before: Knowledge, rows: Measurements, task: Float64[Tensor, "tasks dof"]) -> Reached:
-    """Say what rows add to what a model knows already, whatever their values.
-
-    Args:
-        before: what the model knows.
-        rows: measured since.
-        task: see `reached`.
-    """
-    knowledge = before.informed(rows.q)
-    D = knowledge.tool(task)
-    return Reached(AccuracyPoint(rows.rows, rms_of(D), p95_of(D)), knowledge)
+    return knowledge, (*_rms_p95(errors), *_rms_p95(checked))
 
 
 def expected(

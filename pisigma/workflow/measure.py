@@ -19,7 +19,7 @@ from pisigma.judging.progress import Progress
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.fields import LeftOut
 from pisigma.measuring.coverage import coverage
-from pisigma.measuring.reached import Reached, expected, reached_so_far
+from pisigma.measuring.reached import Reached, expected, reached
 from pisigma.measuring.row_alarms import (
     NEAR_POSE,
     cleared,
@@ -174,7 +174,7 @@ class MeasuringSession:
         counts = [training.rows] if self._reached else [training.rows - self._settings.every, training.rows]
         parts = [training.select(torch.arange(max(count, 0))) for count in counts]
         known = (kept_apart, self._task, progress)
-        found = [reached_so_far(self.plan, self._before, some, *known) for some in parts]
+        found = [reached(self.plan, self._before, some, *known) for some in parts]
         came_to = found[-1]
         if came_to is None:
             return
