@@ -142,10 +142,11 @@ class GeometricCalibrator:
 
     @torch.inference_mode()
     def fit_many(self, data: Sequence[Measurements]) -> list[CalibrationResult]:
-        """Calibrate several robots of one type: the same as `fit` of each, to rounding, in less time.
+        """Calibrate several robots of one type: the same as `fit` of each in less time.
 
         Robots whose data are alike are calibrated side by side: equally many rows, with poses or positions in the same
-        of them, in frames and of targets with the same names. Others are calibrated one by one.
+        of them, in frames and of targets with the same names. Others are calibrated one by one. Predictions agree to
+        rounding for positions, and for poses to some 1e-8 m, as rounding may decide whether a last step is taken.
 
         Args:
             data: the measurements of every robot.
@@ -235,20 +236,18 @@ class GeometricCalibrator:
             IdentificationError: the measurements of one do not determine them.
         """
         space, unknowns = problem.space, robots[0].setup.free_unknowns
-        candidates, explicit = self.candidates(space), not isinstance(self.free, str)
+        candidates, explicit, count = self.candidates(space), not isinstance(self.free, str), len(unknowns)
         at_start = []
         for robot, every in zip(robots, information(problem, start, unknowns + candidates), strict=True):
-            every = every.after(list(range(len(unknowns))))
+            every = every.after(list(range(count)))
             robot.candidates, of_robot = self._at_start(robot.setup, candidates, every)
             at_start.append(of_robot)
         sizes = start.reshape(len(robots), -1).cpu().numpy()[:, robots[0].candidates]
         of_each = zip(robots, sizes, find_redundancies(at_start, sizes), strict=True)
         for robot, its_sizes, redundancy in of_each:
-            refuse_too_few(
-                robot.setup.problem, redundancy, explicit, len(unknowns), robot.measurements.source
-            )
+            refuse_too_few(robot.setup.problem, redundancy, explicit, count, robot.measurements.source)
             robot.active = [*self._chosen(space, its_sizes, redundancy), *unknowns]
-            wanted = free_parameters(redundancy, explicit, len(unknowns))
+            wanted = free_parameters(redundancy, explicit, count)
             robot.findings = Findings(its_sizes, redundancy, [], wanted)
 
     def _at_start(
