@@ -1,0 +1,125 @@
+"""What series C of the measured UR10 tells of series B, far outside its joint values, and what it could tell at best.
+
+Run `OMP_NUM_THREADS=2 python benchmarks/beyond_measured.py` with the measured files in `PISIGMA_DATA`. Every line is
+the root mean square of the position errors of series B [mm] under a hybrid that is fitted to series C, with the base
+and the tool of series B fitted to it. Prior sizes are estimated from series C; or from both series together; or those
+of both and, in their place, the amplitude that both have of every harmonic of every joint, so that only its phase is
+left to find: no rule that estimates sizes from series C knows more.
+"""
+
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from pisigma.hybrid.calibrator import HybridCalibrator
+from pisigma.hybrid.design import Design
+from pisigma.hybrid.evidence import GaussianPrior
+from pisigma.hybrid.refinement import Refined, linearised, refined_at
+from pisigma.hybrid.regression import regression
+from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.prediction import predicted_poses
+from pisigma.identification.problem.noise import view_of
+from pisigma.identification.problem.setup import identified_geometry
+from pisigma.identification.result import SolvedCalibration
+from pisigma.joint_correction.feature import AbstractFeature
+from pisigma.joint_correction.input_products import InputProducts
+from pisigma.judging.frames.fitted_frames import fit_frames
+from pisigma.judging.frames.frame_fits import LEVER_SHARE, MeasuredPoses
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import held_out_groups
+from pisigma.robot import Robot
+
+DATA = Path(os.environ.get("PISIGMA_DATA", "../shared/data")) / "ur10"
+ROUNDS = 3
+
+
+def named(rows: Measurements, name: str) -> Measurements:
+    """Rows in a frame of their own, with a tool of their own."""
+    return replace(rows, frame=(name,) * rows.rows, target=(name,) * rows.rows)
+
+
+def together(first: Measurements, second: Measurements) -> Measurements:
+    """All poses of two series."""
+    q, position, rotation, temperature = (
+        torch.cat([getattr(rows, name) for rows in (first, second)])
+        for name in ("q", "position", "rotation", "temperature")
+    )
+    frame, target = first.frame + second.frame, first.target + second.target
+    return Measurements(q, position, rotation, frame, target, temperature=temperature)
+
+
+def fitted(
+    solved: SolvedCalibration, features: tuple[AbstractFeature, ...], prior: GaussianPrior | None = None
+) -> Refined:
+    """The hybrid with some features, its prior sizes estimated or given."""
+    problem, group = solved.problem, held_out_groups(solved.setup.measurements)
+    view, design = view_of(solved.solution.linearisation), Design(problem, features)
+    x = torch.zeros(design.unknowns, dtype=torch.float64)
+    x[: design.active] = (solved.solution.linearisation.point - problem.nominal)[problem.active]
+    noise, sizes = tuple(view.noise.tolist()), prior or design.prior(view.prior_scale.tolist())
+    effective = float(design.active)
+    for _ in range(ROUNDS):
+        fit = regression(design, linearised(design, x, effective, group))
+        if prior is None:
+            posterior = fit.maximise_evidence(sizes, noise)
+        else:
+            posterior = fit.solve(prior, noise)
+            posterior = fit.solve(prior, fit.renewed_noise(posterior))
+        x, sizes, noise, effective = posterior.x, posterior.prior, posterior.noise, posterior.effective
+    return refined_at(design, posterior, group, ROUNDS)
+
+
+def amplitudes(both: Refined, prior: GaussianPrior) -> GaussianPrior:
+    """The prior of series C with the amplitude that both series have of every harmonic of every joint."""
+    design, precision = both.design, prior.precision.clone()
+    # base and tool of the other series are unknowns of both that stand before the weights
+    shift = len(prior.base) - design.unknowns
+    for number, feature in enumerate(design.features):
+        if feature.name == "series":
+            place = design.stretch(number)
+            weight = torch.zeros(feature.used.shape).to(both.posterior.x)
+            weight = weight.masked_scatter(feature.used, both.posterior.x[place])
+            sine, cosine = weight.chunk(2, 1)
+            size = ((sine.square() + cosine.square()) / 2).repeat(1, 2)
+            precision[place.start + shift : place.stop + shift] = 1 / size[feature.used]
+    return replace(prior, base=precision * prior.sizes[prior.group].square())
+
+
+def error(solved: SolvedCalibration, refined: Refined, rows: Measurements) -> float:
+    """Error of other rows in base and tool that are fitted to them [mm]."""
+    geometry = identified_geometry(solved.setup, refined.point)
+    rows = named(rows, "c")
+    with torch.no_grad():
+        moved = replace(rows, q=rows.q + refined.correction.of_rows(rows))
+    T: Tensor = predicted_poses(geometry.robot, geometry.bases, geometry.tools, moved)
+    measured = MeasuredPoses.of(rows, LEVER_SHARE * geometry.robot.reach)
+    T, _ = fit_frames(T, measured, rows, ("base", "tool"))
+    assert rows.position is not None
+    return float((rows.position - T[:, :3, 3]).square().sum(1).mean().sqrt() * 1e3)
+
+
+def main() -> None:
+    """Print one line a prior."""
+    robot = Robot.load("ur10")
+    files = (("c", "series_c_train.csv"), ("b", "series_b.csv"))
+    c, b = (named(Measurements.read_csv(DATA / file, robot), name) for name, file in files)
+    learned = HybridCalibrator(robot).fit(c).learned
+    assert learned is not None
+    features = learned.correction.features
+    if learned.correction.orders:
+        features += (InputProducts(robot),)
+    solved, solved_both = (GeometricCalibrator(robot).solve(rows) for rows in (c, together(c, b)))
+    own, both = fitted(solved, features), fitted(solved_both, features)
+    print(f"prior sizes from series C                  {error(solved, own, b):.3f}", flush=True)
+    known = replace(own.posterior.prior, sizes=both.posterior.prior.sizes)
+    at_best = fitted(solved, features, known)
+    print(f"prior sizes from both series               {error(solved, at_best, b):.3f}", flush=True)
+    at_best = fitted(solved, features, amplitudes(both, known))
+    print(f"the amplitude of every harmonic from both  {error(solved, at_best, b):.3f}")
+
+
+if __name__ == "__main__":
+    main()
