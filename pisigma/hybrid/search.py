@@ -15,7 +15,10 @@ from pisigma.joint_correction.feature import AbstractFeature
 LEVEL = 1.03
 """Features that the evidence is for are kept unless the left-out RMS rises above so many times the least so far."""
 CLEARLY = 5.0
-"""The log evidence has to rise by so much (a Bayes factor of 150: very strong, Kass and Raftery 1995)."""
+"""The log evidence has to rise by so much (a Bayes factor of 150: very strong, Kass and Raftery 1995).
+
+On 20 to 30 positions of simulated arms a threshold of 3 gains nothing where joints err (errors of 0.997 and 1.004
+times those at 5, in the mean of 120 fits each) and costs 1.7 % where the geometry alone does."""
 STRONGLY = 3.0
 """A rise of the log evidence that is strong: a Bayes factor of 20, same source."""
 LARGEST_EFFECTIVE_SHARE = 0.75
