@@ -36,6 +36,7 @@ _SIX = r"\s*,\s*".join(
 _VALUES = re.compile(rf"(?P<config>\s*CONFIG\s*:\s*'[^']*'\s*,\s*)(?P<six>{_SIX})")
 _VALUE = re.compile(rf"(=\s*)({NUMBER})")
 _FLOW = re.compile(r"[ \t]*(LBL|JMP|IF|ELSE|ENDIF|FOR|ENDFOR|SELECT|CALL|RUN|END|ABORT)\b")
+_REDEFINED = re.compile(r"\b(UFRAME|UTOOL)\[(\d+)?[^\]]*\]+(?:\.\w+)?\s*=")
 _MODIFIED = re.compile(r"\b(Offset|Tool_Offset|INC|VOFFSET|TOOL_OFFSET|Skip|OFFSET)\b")
 
 
@@ -58,10 +59,13 @@ class _Reader:
     stated: FrameFile
     positions: dict[str, re.Match[str]] = field(default_factory=dict)
     numbers: Iterator[int] = field(default_factory=count)
+    redefined: list[re.Match[str]] = field(default_factory=list)
 
     def read(self) -> ScannedProgram:
         self.positions = {match["number"]: match for match in _POSITION.finditer(self.text)}
         self.numbers = count(1 + max(map(int, self.positions), default=0))
+        lines = (re.sub(r"!.*", "", line["body"]) for line in _LINE.finditer(self.text))
+        self.redefined = [match for line in lines for match in _REDEFINED.finditer(line)]
         computed: set[str] = set()
         for line in _LINE.finditer(self.text):
             body = re.sub(r"!.*", "", line["body"])
@@ -89,8 +93,8 @@ class _Reader:
             tool: Frame | str = ""
             if index and match is not None:
                 pose = self._pose(index[1])
-                frame = IDENTITY if match["uf"] == "0" else self.stated.frame(f"UFRAME {match['uf']}")
-                tool = IDENTITY if match["ut"] == "0" else self.stated.tool(f"UTOOL {match['ut']}")
+                frame = IDENTITY if match["uf"] == "0" else self._stated("UFRAME", match["uf"])
+                tool = IDENTITY if match["ut"] == "0" else self._stated("UTOOL", match["ut"])
                 if modified := _MODIFIED.search(move["rest"]):
                     if isinstance(pose, Pose):
                         self.scan.blur(pose)
@@ -99,6 +103,13 @@ class _Reader:
             cuttable = isinstance(pose, Pose) and (circular or move["kind"] == "L")
             cut = partial(self._way_points, line, move, match, len(names)) if cuttable and match else None
             self.scan.move(line.start(), pose, frame, tool, cut, circular)
+
+    def _stated(self, kind: str, index: str) -> Frame | str:
+        """A frame or tool as stated, unless the program sets it."""
+        if any(match[1] == kind and match[2] in (None, index) for match in self.redefined):
+            return f"the program sets {kind} {index}"
+        name = f"{kind} {index}"
+        return self.stated.frame(name) if kind == "UFRAME" else self.stated.tool(name)
 
     def _pose(self, name: str) -> Pose | str:
         match = self.positions[name]

@@ -8,6 +8,7 @@ from functools import partial
 import torch
 
 from pisigma.export.programs.text import labelled, millimetres_and_euler
+from pisigma.export.rewriting.control_flow import FramesInForce, Step
 from pisigma.export.rewriting.frame_file import FrameFile
 from pisigma.export.rewriting.scan import (
     COMPUTED,
@@ -37,16 +38,20 @@ _AXES = re.compile(r"\{\s*(?:(?:AXIS|E6AXIS)\s*:|A1\b)", re.IGNORECASE)
 _NAME = re.compile(r"\w+(?![\w.:\[])")
 _STATEMENT = re.compile(
     r"^[ \t]*(?:"
-    r"(?P<flow>(?:GLOBAL\s+)?DEF|END|IF|ELSE|ENDIF|FOR|ENDFOR|WHILE|ENDWHILE|LOOP|ENDLOOP|REPEAT|UNTIL|SWITCH|CASE|DEFAULT|"
+    r"(?:GLOBAL[ \t]+)?DEF(?:FCT[ \t]+\w+)?[ \t]+(?P<routine>\w+)"
+    r"|(?P<flow>ENDFCT|END|IF|ELSE|ENDIF|FOR|ENDFOR|WHILE|ENDWHILE|LOOP|ENDLOOP|REPEAT|UNTIL|SWITCH|CASE|DEFAULT|"
     r"ENDSWITCH|GOTO|INTERRUPT|RETURN|\w+:)(?=\W|$)"
-    r"|\$(?P<system>BASE|TOOL)\s*=\s*(?P<value>[^\n]*?)[ \t\r]*$"
-    r"|BAS\s*\(\s*#(?P<bas>BASE|TOOL)\s*,\s*(?P<number>\d+)\s*\)"
-    r"|S?(?P<move>PTP|LIN|CIRC)(?P<relative>_REL)?\s+(?P<target>[^\n]*?)[ \t\r]*$)",
+    r"|\$(?P<system>BASE|TOOL)(?P<part>\.\w+)?\s*=\s*(?P<value>[^\n]*?)[ \t\r]*$"
+    r"|BAS\s*\(\s*#(?P<bas>BASE|TOOL)\s*,\s*(?P<number>[^)\n]*?)\s*\)"
+    r"|(?P<form>FDAT_ACT)\s*="
+    r"|S?(?P<move>PTP|LIN|CIRC)(?P<relative>_REL)?\s+(?P<target>[^\n]*?)[ \t\r]*$"
+    r"|(?P<call>\w+)[ \t]*\()",
     re.MULTILINE | re.IGNORECASE,
 )
 _TURNING = re.compile(r"\$(?:CIRC_TYPE|ORI_TYPE)\b", re.IGNORECASE)
-_OPENS = re.compile(r"(?:GLOBAL\s+)?DEF|IF|FOR|WHILE|LOOP|REPEAT|SWITCH", re.IGNORECASE)
-_CLOSES = re.compile(r"END\w*|UNTIL", re.IGNORECASE)
+_FIXED_TOOL = re.compile(r"(?:\$IPO_MODE\s*=\s*|IPO_FRAME\s+)#TCP\b", re.IGNORECASE)
+_LOOPS = ("FOR", "WHILE", "LOOP", "REPEAT")
+_FRAMES_OF_MOVES = ("$BASE", "$TOOL")
 
 
 def scan_krl(text: str, stated: FrameFile) -> ScannedProgram:
@@ -96,38 +101,43 @@ class _Reader:
     scan: Scan
     text: str
     stated: FrameFile
-    state: dict[str, Frame | str] = field(default_factory=dict)
+    frames: FramesInForce = field(init=False)
 
     def __post_init__(self) -> None:
         self.names = NamedPoses(self.text, _SET, str.upper)
 
     def read(self) -> ScannedProgram:
-        self.state = {name: f"${name} is not stated before the move" for name in ("BASE", "TOOL")}
         for match in _ASSIGNMENT.finditer(self.text):
             literal = _AGGREGATE.match(self.text, match.end())
             if literal and self.names.is_set_once(match[1]):
                 self.names.add(match[1], _pose(literal))
-        depth = 0
-        for match in _STATEMENT.finditer(self.text):
-            if word := match["flow"]:
+        steps = [(match, step) for match in _STATEMENT.finditer(self.text) for step in _steps(match)]
+        unknown = "the tool stands still and the workpiece moves" if _FIXED_TOOL.search(self.text) else ""
+        self.frames = FramesInForce(
+            [step for _, step in steps],
+            {name: unknown or f"{name} is not stated before the move" for name in _FRAMES_OF_MOVES},
+        )
+        for place, (match, step) in enumerate(steps):
+            if match["flow"] or step.kind == "routine":
                 self.scan.interrupt()
-                depth += bool(_OPENS.fullmatch(word)) - bool(_CLOSES.fullmatch(word))
-            elif match["move"]:
+            if match["move"]:
                 self._move(match)
-            else:
-                self._set_frame(match, computed=depth > 1)
+            self.frames.advance(place, unknown or self._value(match, step))
         return self.scan.program(self.names)
 
-    def _set_frame(self, match: re.Match[str], computed: bool) -> None:
-        name = (match["system"] or match["bas"]).upper()
-        look_up = self.stated.frame if name == "BASE" else self.stated.tool
-        value = f"{name}_DATA[{match['number']}]" if match["bas"] else match["value"]
-        if computed:
-            self.state[name] = f"${name} depends on which way the program takes"
-        elif literal := _AGGREGATE.fullmatch(value):
-            self.state[name] = _pose(literal).T
-        else:
-            self.state[name] = IDENTITY if value.upper() == "$NULLFRAME" else look_up(value)
+    def _value(self, match: re.Match[str], step: Step) -> Frame | str:
+        """What a statement sets a frame or the tool to, or why that is not known."""
+        if match["form"]:
+            return f"{step.name} is that of FDAT_ACT"
+        look_up = self.stated.frame if step.name == "$BASE" else self.stated.tool
+        if match["bas"]:
+            return look_up(f"{step.name[1:]}_DATA[{match['number']}]")
+        value = match["value"] or ""
+        if match["part"]:
+            return f"a part of {step.name} is set"
+        if literal := _AGGREGATE.fullmatch(value):
+            return _pose(literal).T
+        return IDENTITY if value.upper() == "$NULLFRAME" else look_up(value)
 
     def _move(self, match: re.Match[str]) -> None:
         start, kind = match.start("target"), match["move"].upper()
@@ -145,7 +155,7 @@ class _Reader:
                     self.scan.leave(match.start(), "the angle of the arc, or how the tool turns, is stated")
                 else:
                     cut = partial(self._way_points, match, operands)
-            self.scan.move(match.start(), pose, self.state["BASE"], self.state["TOOL"], cut, circular)
+            self.scan.move(match.start(), pose, self.frames["$BASE"], self.frames["$TOOL"], cut, circular)
 
     def _target(self, start: int) -> Pose | str:
         if literal := _AGGREGATE.match(self.text, start):
@@ -168,6 +178,26 @@ class _Reader:
             assert passed is not None
             edits.append(Edit(passed.span(), f"{{{_six(poses[-1])}}}"))
         return edits
+
+
+def _steps(match: re.Match[str]) -> list[Step]:
+    """What a statement means for the order."""
+    word = (match["flow"] or "").upper()
+    if name := match["system"] or match["bas"]:
+        return [Step("set", f"${name.upper()}")]
+    if match["form"]:
+        return [Step("set", name) for name in _FRAMES_OF_MOVES]
+    if match["routine"]:
+        return [Step("routine", match["routine"].upper())]
+    if match["call"]:
+        return [Step("call", match["call"].upper())]
+    if word in _LOOPS:
+        return [Step("loop")]
+    if word in ("IF", "SWITCH"):
+        return [Step("branch")]
+    if word.startswith("END") or word == "UNTIL":
+        return [Step("end")]
+    return [Step("jump" if word == "GOTO" or word.endswith(":") else "other")]
 
 
 def _pose(literal: re.Match[str]) -> Pose:

@@ -44,6 +44,7 @@ _DATA = re.compile(
     r"(?im)^[ \t]*(?:LOCAL\s+|TASK\s+)?(?:CONST|PERS|VAR)\s+(robtarget|tooldata|wobjdata)\s+(\w+)\s*:=\s*"
 )
 _TURNING = re.compile(r"(?i)\bCirPathMode\b")
+_DISPLACED = re.compile(r"(?i)\bPDisp(?:On|Set)\b")
 _SET = re.compile(r"\b(\w+)(?:\.\w+)*\s*:=")
 _FLOW = (
     "PROC|ENDPROC|FUNC|ENDFUNC|TRAP|ENDTRAP|IF|ELSEIF|ELSE|ENDIF|FOR|ENDFOR|WHILE|ENDWHILE|TEST|CASE|DEFAULT|ENDTEST|"
@@ -108,6 +109,8 @@ class _Reader:
             self.scan.move(match.start(), "the move is of a kind that is not understood", IDENTITY, IDENTITY)
             return
         frame, tool = self._frames(self.text[slice(*spans[count + 2])])
+        if displaced := _DISPLACED.search(self.text):
+            frame = f"{displaced[0]} displaces the poses of the module"
         timed = re.search(r"(?i)\\T\s*:=", self.text[slice(*spans[count])])
         for index, span in enumerate(spans[:count]):
             pose = self._target(re.split(r"\s*\\", self.text[slice(*span)])[0], span)

@@ -2,12 +2,13 @@
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import torch
 
 from pisigma.export.programs.text import metres_and_rotation_vector, number, numbers
+from pisigma.export.rewriting.control_flow import FramesInForce, Step
 from pisigma.export.rewriting.frame_file import FrameFile
 from pisigma.export.rewriting.scan import (
     COMPUTED,
@@ -30,10 +31,13 @@ _HIDDEN = re.compile(r'#[^\n]*|"[^"\n]*"')
 _LITERAL = re.compile(rf"p\[\s*{NUMBER}(?:\s*,\s*{NUMBER}){{5}}\s*\]")
 _ASSIGNMENT = re.compile(r"(?m)^[ \t]*(?:global\s+|local\s+)?(\w+)\s*=(?!=)\s*")
 _STATEMENT = re.compile(
-    r"(?P<flow>^[ \t]*(?:def|thread|while|if|elif|else|for|end|return|break|continue|halt)\b)"
-    r"|(?P<call>\b(?P<name>move[jlpc]|servo[jc]|set_tcp)\s*\()",
+    r"^[ \t]*(?:def|thread)[ \t]+(?P<routine>\w+)"
+    r"|(?P<flow>^[ \t]*(?:while|if|elif|else|for|end|return|break|continue|halt)\b)"
+    r"|(?P<call>\b(?P<name>\w+)\s*\()",
     re.MULTILINE,
 )
+_MOVES = ("movej", "movel", "movep", "movec", "servoj", "servoc")
+_TOOL = "the tool"
 _TURNING = re.compile(r"mode\s*=\s*(?!0$)")
 _Span = tuple[int, int]
 
@@ -58,29 +62,27 @@ class _Reader:
     scan: Scan
     text: str
     stated: FrameFile
-    tool: Frame | str = ""
+    frames: FramesInForce = field(init=False)
 
     def __post_init__(self) -> None:
         self.names = NamedPoses(self.text, _ASSIGNMENT, str)
 
     def read(self) -> ScannedProgram:
-        self.tool, depth = self.stated.tool("tcp"), 0
         for match in _ASSIGNMENT.finditer(self.text):
             literal = _LITERAL.match(self.text, match.end())
             if literal and self.names.is_set_once(match[1]):
                 self.names.add(match[1], _pose(self.text, literal.span()))
-        for match in _STATEMENT.finditer(self.text):
-            if match["flow"]:
+        statements = list(_STATEMENT.finditer(self.text))
+        self.frames = FramesInForce([_step(match) for match in statements], {_TOOL: self.stated.tool("tcp")})
+        for place, match in enumerate(statements):
+            tool: Frame | str = f"{_TOOL} is computed"
+            if match["routine"] or match["flow"]:
                 self.scan.interrupt()
-                opens = match["flow"].strip() in ("def", "thread", "while", "if", "for")
-                depth += 1 if opens else -1 if match["flow"].strip() == "end" else 0
-            elif match["name"] == "set_tcp":
-                literal = _LITERAL.match(self.text, match.end())
-                self.tool = (
-                    _pose(self.text, literal.span()).T if literal and depth < 2 else "the tool is computed"
-                )
-            else:
+            elif match["name"] in _MOVES:
                 self._move(match)
+            elif literal := _LITERAL.match(self.text, match.end()):
+                tool = _pose(self.text, literal.span()).T
+            self.frames.advance(place, tool)
         return self.scan.program(self.names)
 
     def _move(self, call: re.Match[str]) -> None:
@@ -96,7 +98,7 @@ class _Reader:
             cut = None
             if call["name"] == "movel" or len(operands) == 2:
                 cut = self._cut(call, spans, operands, pose)
-            self.scan.move(call.start(), pose, frame, self.tool, cut, circular=len(operands) == 2)
+            self.scan.move(call.start(), pose, frame, self.frames[_TOOL], cut, circular=len(operands) == 2)
 
     def _cut(
         self, call: re.Match[str], spans: Sequence[_Span], operands: Sequence[_Span], pose: Pose | str
@@ -161,6 +163,18 @@ class _Reader:
             lines.append(f"{head}{', '.join([*targets, *rest])}){self.scan.line_end}")
         passed = [Edit(operands[0], pose.write(poses[-1]))] if count == 2 else []
         return [Edit((start, start), "".join(lines)), *passed]
+
+
+def _step(match: re.Match[str]) -> Step:
+    """What a statement means for the order."""
+    word = (match["flow"] or "").strip()
+    if match["routine"]:
+        return Step("routine", match["routine"])
+    if match["name"]:
+        return Step("set", _TOOL) if match["name"] == "set_tcp" else Step("call", match["name"])
+    if word in ("while", "for"):
+        return Step("loop")
+    return Step("branch" if word == "if" else "end" if word == "end" else "other")
 
 
 def _pose(text: str, span: _Span) -> Pose:
