@@ -11,6 +11,8 @@ from pisigma.robot.description import Robot
 
 MAXIMUM_STARTS = 512
 
+SAME = 1e-6
+"""[rad or m] Joint values that are rounded to the same multiple of this are the same."""
 _CHUNK = 4096
 """Poses whose distances to all starts are computed at once."""
 
@@ -71,3 +73,9 @@ def nearest_branch(solver: AbstractClosedForm, q: Float64[Tensor, "poses dof"]) 
     known = torch.isfinite(q).all(-1)
     safe = torch.where(known[:, None], q, 0.0)
     return torch.where(known, solver.nearest(forward_kinematics(solver.robot, safe), safe)[1], 0)
+
+
+def rows_at_starts(starts: Float64[Tensor, "starts dof"], q: Float64[Tensor, "rows dof"]) -> int:
+    """Count the rows whose joint values [rad or m] are among those that a model keeps."""
+    kept = {tuple(row) for row in (starts / SAME).round().tolist()}
+    return sum(tuple(row) in kept for row in (q / SAME).round().tolist())

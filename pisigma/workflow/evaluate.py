@@ -22,6 +22,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
+from pisigma.model.training_rows import training_row_warnings
 from pisigma.reporting.tables import figure_text
 from pisigma.verification.setup_fault import either
 from pisigma.verification.setup_faults import find_setup_faults, is_implausible, unexplained
@@ -252,8 +253,15 @@ def evaluate(
         warnings=(
             *fitted_remark(rows, settings.fitted),
             *image_remark(rows),
-            *_warnings(comparison, evaluated),
-            *(sentence for model in loaded.values() for sentence in condition_warnings(model, rows)),
+            *_warnings(comparison),
+            *(
+                sentence
+                for model in loaded.values()
+                for sentence in (
+                    *training_row_warnings(model, rows, everything),
+                    *condition_warnings(model, rows),
+                )
+            ),
         ),
         seconds=time.perf_counter() - begin,
     )
@@ -339,7 +347,7 @@ def _diagnostics(
         yield Diagnostic(kind=kind, severity="implausible", sentence=f"{figures.name}: {sentence}")
 
 
-def _warnings(comparison: ModelComparison, evaluated: Mapping[str, EvaluatedModel]) -> list[str]:
+def _warnings(comparison: ModelComparison) -> list[str]:
     warnings = []
     if comparison.rows_without_position:
         warnings.append(f"{comparison.rows_without_position} rows hold no position and are not judged.")
@@ -348,9 +356,5 @@ def _warnings(comparison: ModelComparison, evaluated: Mapping[str, EvaluatedMode
             warnings.append(
                 f"{model.rows_not_predicted} rows lie so far outside the domain of {model.name} that it predicts "
                 "nothing; they are left out for all models."
-            )
-        if model.name in evaluated and evaluated[model.name].trained_on:
-            warnings.append(
-                f"{model.name} was trained on these rows, so its figures say nothing about other poses."
             )
     return warnings

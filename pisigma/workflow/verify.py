@@ -21,6 +21,7 @@ from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
+from pisigma.model.training_rows import training_row_warnings
 from pisigma.monitoring.session import Session
 from pisigma.robot.row import Row
 from pisigma.verification.cause import length_text
@@ -342,9 +343,7 @@ def _warnings(
             f"{int(outside.sum())} of {rows.rows} rows, the first in {rows.place(first)}, have joint values outside "
             f"the limits of robot '{model.robot.name}'."
         )
-    if model.provenance.data_sha256 == rows.content_hash():
-        warnings.append("The model was fitted to these rows: the figures say nothing about other poses.")
-    warnings += condition_warnings(model, rows)
+    warnings += [*training_row_warnings(model, rows), *condition_warnings(model, rows)]
     corrected = comparison.models[-1]
     if corrected.rows_not_predicted:
         warnings.append(

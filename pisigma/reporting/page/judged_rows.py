@@ -19,6 +19,7 @@ from pisigma.measurement.groups import numbers_of_names
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
+from pisigma.model.stored_starts import rows_at_starts
 from pisigma.reporting.rendering import sentences
 from pisigma.se3 import invert, transform_from_xyzrpy
 
@@ -101,9 +102,9 @@ def rows_of_file(
         models["geometric"] = _errors(poses_of_rows(replace(model, hybrid=None), rows), rows)[0]
     identified = "corrected" if model.calibrated is None else "geometric"
     models["hybrid" if model.hybrid is not None else identified] = errors
-    again, kept = _measured_again(model, rows) if origin == "other" else (0, 0)
+    again = rows_at_starts(model.starts.double().cpu(), rows.q.cpu()) if origin == "other" else 0
     unknown = int((~torch.isfinite(errors.position)).sum())
-    remarks = _say("remarks_on_rows", rows, left_out, again, kept, model, own_frames, unknown)
+    remarks = _say("remarks_on_rows", rows, left_out, again, len(model.starts), model, own_frames, unknown)
     return _judged(model, rows, models, residual, (origin, origin), remarks)
 
 
@@ -172,12 +173,6 @@ def _repeats(model: CalibratedModel) -> tuple[str, ...]:
     """Say where the errors that are kept of every row are those of one repeat among several."""
     repeats = model.metrics.get("cross_validation", {}).get("repeats", 1)
     return () if repeats == 1 else _say("rows_of_folds", repeats)
-
-
-def _measured_again(model: CalibratedModel, rows: Measurements) -> tuple[int, int]:
-    """Count the rows whose joint values the model keeps of its training rows, and those that it keeps."""
-    kept = {tuple(row) for row in model.starts.tolist()}
-    return sum(tuple(row) in kept for row in rows.q.tolist()), len(kept)
 
 
 def _nominal_poses(model: CalibratedModel, rows: Measurements) -> tuple[Float64[Tensor, "rows 4 4"], bool]:

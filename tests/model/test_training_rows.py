@@ -1,0 +1,66 @@
+"""Rows that a model was made of are named, whole or in part, in any order and among others."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from testing.calibrated_ur5 import calibrated_ur5, measured
+
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.stored_starts import MAXIMUM_STARTS, rows_at_starts, spread_rows
+from pisigma.model.training_rows import training_row_warnings
+
+ROWS = 40
+SAME = "At least {} of {} rows have joint values that"
+
+
+@pytest.fixture(scope="module")
+def made():
+    """A model, the rows that it is made of, and as many others."""
+    model, q, T = calibrated_ur5(2 * ROWS)
+    own, others = (measured(q[part], T[part], False) for part in (slice(ROWS), slice(ROWS, None)))
+    provenance = replace(model.provenance, data_sha256=own.content_hash(), rows=ROWS)
+    return replace(model, starts=own.q.clone(), provenance=provenance), own, others
+
+
+def joined(first: Measurements, second: Measurements) -> Measurements:
+    return Measurements(torch.cat([first.q, second.q]), torch.cat([first.position, second.position]))
+
+
+def test_its_own_file_is_known_for_certain(made):
+    model, own, others = made
+    certain = (f"{model.name} was made of these rows, so its figures say nothing about other poses.",)
+    assert training_row_warnings(model, own) == certain
+    assert training_row_warnings(model, others, own) == certain
+
+
+def test_parts_of_its_rows_are_known_by_joint_values(made):
+    model, own, others = made
+    backwards = own.select(torch.arange(ROWS - 1, -1, -1))
+    cases = [(backwards, ROWS, ROWS), (own.select(torch.arange(10)), 10, 10)]
+    cases.append((joined(own.select(torch.arange(3)), others), 3, ROWS + 3))
+    for rows, known, count in cases:
+        (sentence,) = training_row_warnings(model, rows)
+        assert sentence.startswith(SAME.format(known, count))
+        assert f"it keeps {ROWS} of {ROWS}" in sentence
+
+
+def test_other_rows_are_not(made):
+    model, own, others = made
+    assert training_row_warnings(model, others) == ()
+    assert training_row_warnings(model, replace(own, q=own.q + 1e-5)) == ()
+    unknown = replace(model, provenance=replace(model.provenance, data_sha256=""))
+    assert training_row_warnings(replace(unknown, starts=others.q[:0]), own) == ()
+
+
+def test_half_of_many_rows_are_known_by_those_that_are_kept(made):
+    """Of many rows a model keeps some, evenly spread over all."""
+    q = torch.rand(3 * MAXIMUM_STARTS, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    half = q[torch.randperm(len(q), generator=torch.Generator().manual_seed(1))[: len(q) // 2]]
+    assert 200 < rows_at_starts(spread_rows(q), half) < 312
+
+
+def test_rows_that_a_table_rounded_are_known(made):
+    """Nearly all: a few joint values lie where rounding goes up or down."""
+    _, own, _ = made
+    assert rows_at_starts(own.q, (own.q * 1e8).round() / 1e8) > 0.9 * ROWS
