@@ -44,7 +44,7 @@ _STATEMENT = re.compile(
     r"|\$(?P<system>BASE|TOOL)(?P<part>\.\w+)?\s*=\s*(?P<value>[^\n]*?)[ \t\r]*$"
     r"|BAS\s*\(\s*#(?P<bas>BASE|TOOL)\s*,\s*(?P<number>[^)\n]*?)\s*\)"
     r"|(?P<form>FDAT_ACT)\s*="
-    r"|S?(?P<move>PTP|LIN|CIRC)(?P<relative>_REL)?\s+(?P<target>[^\n]*?)[ \t\r]*$"
+    r"|(?P<move>S?(?:PTP|LIN|CIRC)|SPL)(?P<relative>_REL)?\s+(?P<target>[^\n]*?)[ \t\r]*$"
     r"|(?P<call>\w+)[ \t]*\()",
     re.MULTILINE | re.IGNORECASE,
 )
@@ -143,14 +143,14 @@ class _Reader:
         start, kind = match.start("target"), match["move"].upper()
         spans = [(start + begin, start + end) for begin, end in arguments(match["target"] + ";", 0)]
         operands = []
-        for begin, _ in spans[: 2 if kind == "CIRC" else 1]:
+        for begin, _ in spans[: 2 if kind.endswith("CIRC") else 1]:
             if _AXES.match(self.text, begin):
                 self.scan.joints(match.start())
                 continue
             pose = self._target(begin) if not match["relative"] else COMPUTED
             operands.append(begin)
             circular, cut = len(operands) == 2, None
-            if isinstance(pose, Pose) and (circular or kind == "LIN"):
+            if isinstance(pose, Pose) and (circular or kind.endswith("LIN")):
                 if circular and (len(spans) > 2 or _TURNING.search(self.text)):
                     self.scan.leave(match.start(), "the angle of the arc, or how the tool turns, is stated")
                 else:

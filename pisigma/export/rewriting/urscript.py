@@ -96,7 +96,7 @@ class _Reader:
             pose, frame, operand = self._target(span)
             operands.append(operand)
             cut = None
-            if call["name"] == "movel" or len(operands) == 2:
+            if call["name"] in ("movel", "movep") or len(operands) == 2:
                 cut = self._cut(call, spans, operands, pose)
             self.scan.move(call.start(), pose, frame, self.frames[_TOOL], cut, circular=len(operands) == 2)
 

@@ -23,6 +23,17 @@ def krl(*lines: str) -> str:
     return "\n".join(["DEF main()", "$BASE=$NULLFRAME", *lines, "END", ""])
 
 
+FRAMES = FrameFile.model_validate({"frames": {"UFRAME 1": {"x_mm": 800}}})
+
+
+def fanuc(*lines: str) -> str:
+    numbered = "".join(f"{number:4d}:{line} ;\n" for number, line in enumerate(lines, 1))
+    return (
+        f"/PROG CELL\n/MN\n{numbered}/POS\nP[1]{{\n   GP1:\n    UF : 1, UT : 0,     CONFIG : 'N U T, 0, 0, 0',\n"
+        "    X = 600.0 mm, Y = 0.0 mm, Z = 400.0 mm,\n    W = 0.0 deg, P = 90.0 deg, R = 0.0 deg\n};\n/END\n"
+    )
+
+
 def kept(scan, text, frames=None):
     """Tools [m] of the poses that are understood, and the reasons for leaving the others."""
     program = scan(text, frames or FrameFile())
@@ -99,13 +110,7 @@ def test_displaced_poses_of_a_module_stay():
     ],
 )
 def test_a_frame_that_a_fanuc_program_sets_is_not_as_stated(line, understood):
-    frames = FrameFile.model_validate({"frames": {"UFRAME 1": {"x_mm": 800}}})
-    text = (
-        f"/PROG CELL\n/MN\n   1:  {line} ;\n   2:L P[1] 100mm/sec FINE ;\n/POS\nP[1]{{\n   GP1:\n"
-        "    UF : 1, UT : 0,     CONFIG : 'N U T, 0, 0, 0',\n    X = 600.0 mm, Y = 0.0 mm, Z = 400.0 mm,\n"
-        "    W = 0.0 deg, P = 90.0 deg, R = 0.0 deg\n};\n/END\n"
-    )
-    program = scan_fanuc(text, frames)
+    program = scan_fanuc(fanuc(f"  {line}", "L P[1] 100mm/sec FINE"), FRAMES)
     assert bool(program.targets) == understood
     assert understood or program.left == ((4, "the program sets UFRAME 1"),)
 
@@ -117,3 +122,23 @@ def test_values_outside_of_routines_hold_from_their_place_on():
     for number in (1, 2, 3):
         frames.advance(number)
         assert isinstance(frames["tool"], torch.Tensor)
+
+
+def test_all_kinds_of_moves_are_seen():
+    """Those of splines as well; straight ones of a process are straight."""
+    pose = "{X 600, Y 0, Z 400, A 0, B 90, C 0}"
+    words = ("SPTP", "PTP", "SPL", "SLIN", "LIN", "spl")
+    program = scan_krl(krl(FIRST, *(f"{word} {pose}" for word in words)), FrameFile())
+    assert [target.line for target in program.targets] == [4, 5, 6, 7, 8, 9]
+    assert [move.line for move in program.moves] == [7, 8]
+    arc = scan_krl(krl(FIRST, f"SCIRC {pose}, {pose}"), FrameFile())
+    assert (len(arc.targets), [move.circular for move in arc.moves]) == (2, [True])
+    moves = [MOVE.replace("movel", name) for name in ("movej", "movel", "movep", "servoj")]
+    program = scan_urscript("\n".join(["def cell():", SET_FIRST, *moves, "end", ""]), FrameFile())
+    assert len(program.targets) == 4
+    assert [move.line for move in program.moves] == [4, 5]
+
+
+def test_arcs_without_way_points_are_named():
+    text = fanuc("A P[1] 100mm/sec CNT50")
+    assert "no way points" in dict(scan_fanuc(text, FRAMES).left)[3]
