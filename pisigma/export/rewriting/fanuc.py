@@ -102,9 +102,7 @@ class _Reader:
             circular = move["kind"] == "C" and order == 1
             cuttable = isinstance(pose, Pose) and (circular or move["kind"] == "L")
             if move["kind"] == "A":
-                self.scan.leave(
-                    line.start(), "arcs of A get no way points, only their poses are corrected"
-                )
+                self.scan.leave(line.start(), "arcs of A get no way points, only their poses are corrected")
             cut = partial(self._way_points, line, move, match, len(names)) if cuttable and match else None
             self.scan.move(line.start(), pose, frame, tool, cut, circular)
 
