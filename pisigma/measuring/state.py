@@ -130,11 +130,11 @@ class Advice:
     """Whether to go on.
 
     Attributes:
-        action: "measure" the next pose; "repeat" a pose; "stop".
+        action: "measure" the next pose; "repeat" a pose; "correct" what is wrong with all rows; "stop".
         sentence: why.
     """
 
-    action: Literal["measure", "repeat", "stop"]
+    action: Literal["measure", "repeat", "correct", "stop"]
     sentence: str
 
 

@@ -391,7 +391,7 @@ class MeasuringSession:
     def _advice(self, left: int) -> Advice:
         """Whether to go on: not while all rows are wrong; a pose to be measured again comes before anything else."""
         if self._setup:
-            return Advice("repeat", of_all_rows(self._setup).sentence)
+            return Advice("correct", of_all_rows(self._setup).sentence)
         last = None if self._rows is None else self._rows.line[-1]
         again = next((one for one in (*self._fixed, *self._contradicted.values()) if one.line == last), None)
         if again is not None and again.repeat:

@@ -97,7 +97,11 @@ def test_what_is_measured_already_counts(planned: Plan, tmp_path: Path):
 
 @pytest.mark.parametrize(
     ("rows", "scale", "word"),
-    [(6, 1.0, "metres that are named millimetres"), (60, 1e3, "whether this robot")],
+    [
+        (6, 1.0, "metres that are named millimetres"),
+        (20, 1e3, "Robot 'ur5e'"),
+        (60, 1e3, "Robot 'rb5'"),
+    ],
 )
 def test_measured_rows_that_cannot_be_of_the_robot_are_no_knowledge(
     rows: int, scale: float, word: str, tmp_path: Path
@@ -105,7 +109,8 @@ def test_measured_rows_that_cannot_be_of_the_robot_are_no_knowledge(
     """Few rows in another unit, and many of another robot."""
     robot = Robot.load("ur5")
     q = torch.rand(rows, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(3)) * 4 - 2
-    position = forward_kinematics(Robot.load("rb5" if rows > 6 else "ur5"), q)[:, :3, 3] * scale
+    measured = {6: "ur5", 20: "ur5e", 60: "rb5"}[rows]
+    position = forward_kinematics(Robot.load(measured), q)[:, :3, 3] * scale
     lines = torch.cat([torch.rad2deg(q), position], 1).tolist()
     header = ",".join([*(f"q{joint}_deg" for joint in range(1, 7)), "x_mm", "y_mm", "z_mm"])
     (tmp_path / "rows.csv").write_text("\n".join([header, *(",".join(map(repr, line)) for line in lines)]))

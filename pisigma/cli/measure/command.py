@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from pisigma.cli.arguments import AsJson
+from pisigma.cli.endings import NOT_ACCEPTED
 from pisigma.cli.measure.session_page import PageOptions, View, ViewHost, ViewPort, ViewUrdf, shown_in_browser
 from pisigma.cli.output import print_json, print_line, print_lines
 
@@ -57,7 +58,7 @@ def measure(
 
     Ends when more poses would not help, or with Ctrl-C. The poses of the plan are never overwritten: where the rest is
     planned again, it is written beside them. With --json, sentences go to stderr, and one JSON object to stdout at the
-    end.
+    end. Exit status 3 while all rows are wrong alike.
     """
     from pisigma.measuring.growing_images import growing_file
     from pisigma.workflow.follow import follow, rest_file
@@ -81,6 +82,8 @@ def measure(
     except KeyboardInterrupt:
         pass
     _print_summary(session, rest, as_json)
+    if session.state.advice.action == "correct":
+        raise typer.Exit(NOT_ACCEPTED)
 
 
 @contextmanager

@@ -97,7 +97,9 @@ def page(step: SessionStep | None, state: SessionState, title: str) -> "Renderab
     points = (*state.reached, *state.expected)[-SHOWN_POINTS:]
     waiting = "" if step is None else step.growth.waiting
     alarms = [printable(alarm.sentence, cut=False) for alarm in state.alarms[-SHOWN_ALARMS:]]
-    colour = {"measure": "bold", "repeat": "bold red", "stop": "bold green"}[state.advice.action]
+    colour = {"measure": "bold", "repeat": "bold red", "correct": "bold red", "stop": "bold green"}[
+        state.advice.action
+    ]
     return Group(
         Text(printable(title), style="bold"),
         Text(next_text(state)),

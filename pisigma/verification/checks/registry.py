@@ -1,6 +1,10 @@
 """All checks; a new one is a file and a line here."""
 
+from pisigma.errors import IdentificationError, ImplausibleError
+from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.judging.diagnostic import Diagnostic
+from pisigma.judging.trained_calibrations import trained
+from pisigma.measurement.dataset import Measurements
 from pisigma.verification.checks.camera import CameraCheck
 from pisigma.verification.checks.check import AbstractCheck, CheckedCalibration
 from pisigma.verification.checks.few_rows import FewRowsCheck
@@ -40,3 +44,19 @@ def diagnostics_of(checked: CheckedCalibration) -> tuple[Diagnostic, ...]:
     """
     diagnostics = [diagnostic for check in CHECKS for diagnostic in check.diagnose(checked)]
     return tuple(sorted(diagnostics, key=lambda diagnostic: diagnostic.severity != "implausible"))
+
+
+def diagnostics_of_rows(calibrator: GeometricCalibrator, rows: Measurements) -> tuple[Diagnostic, ...]:
+    """Calibrate with some rows and run all checks; nothing is said while they are too few for a calibration.
+
+    Raises:
+        ImplausibleError: no calibration error explains the rows.
+        IdentificationError: they cannot be of this robot at all.
+    """
+    try:
+        results = trained(calibrator, rows)
+    except ImplausibleError:
+        raise
+    except IdentificationError:
+        return ()
+    return diagnostics_of(CheckedCalibration(calibrator, rows, results))

@@ -1,6 +1,7 @@
 """`pisigma measure`: what it prints and writes."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -41,6 +42,19 @@ def test_once_judges_the_rows_that_are_there(run, folder):
     assert (folder / "poses.rest.csv").exists()
 
 
+def test_a_fault_of_all_rows_ends_with_3(run, folder, tmp_path):
+    """Positions in metres, in columns of millimetres."""
+    robot, rows = PLAN.stored.arm.robot, PLAN.rows(5)
+    lines = row_lines(robot, replace(rows, position=rows.position / 1000))
+    (tmp_path / "rows.csv").write_text(header(robot) + "".join(lines))
+    result = run("measure", folder / "poses.csv", "--rows", tmp_path / "rows.csv", "--once")
+    assert result.exit_code == 3, result.output
+    printed = " ".join(result.stdout.split())
+    assert "metres that are named millimetres" in printed
+    assert "Do not go on before it is right" in printed
+    assert "expected" not in printed
+
+
 def test_json_is_one_object_and_sentences_go_to_stderr(run, folder):
     arguments = ("--rows", folder / "rows.csv", "--once", "--json", "--no-replan")
     result = run("measure", folder / "poses.plan.yaml", *arguments)
@@ -50,7 +64,7 @@ def test_json_is_one_object_and_sentences_go_to_stderr(run, folder):
     assert (figures["rows"], figures["rows_counting"]) == (12, 11)
     assert [alarm["line"] for alarm in figures["alarms"]] == [10, 14]
     assert figures["accuracy"]["poses"] == 9
-    assert figures["action"] in ("measure", "repeat", "stop")
+    assert figures["action"] in ("measure", "repeat", "correct", "stop")
     assert "ALARM: line 10" in result.stderr
 
 
