@@ -3,21 +3,15 @@
 from jaxtyping import Bool, Float64
 from torch import Tensor
 
-from pisigma.errors import IdentificationError
-from pisigma.identification.calibrator import GeometricCalibrator
-from pisigma.judging.trained_calibrations import base_and_tool
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
-from pisigma.verification.checks.check import CheckedCalibration
-from pisigma.verification.checks.other_robot import OtherRobotCheck
+from pisigma.verification.checks.other_robot import other_robot_diagnostics
 from pisigma.verification.checks.setup_fault import setup_diagnostics
 from pisigma.verification.faults_as_drawn import largest_group
 
 FEWEST_ROWS = 4
 """Of fewer, the positions may happen to be near each other."""
-FEWEST_OF_ROBOT = 8
-"""Of fewer, base and tool alone bring another robot near the rows."""
 SCALE = 30.0
 """Positions are in another unit that are so many times as far apart as those of the robot as drawn."""
 ARM_SHARE = 0.3
@@ -41,8 +35,8 @@ def setup_sentence(robot: Robot, rows: Measurements, counts: Bool[Tensor, " rows
     group = largest_group(rows)
     if group.position is None or group.rows < FEWEST_ROWS:
         return ""
-    if other := _other_robot(robot, rows.select(counts)):
-        return other
+    if others := other_robot_diagnostics(robot, rows.select(counts)):
+        return others[0].sentence
     measured, drawn = _spread(group.position), _spread(forward_kinematics(robot, group.q)[:, :3, 3])
     arm = ARM_SHARE * robot.reach
     if measured > SCALE * (drawn + arm):
@@ -55,19 +49,6 @@ def setup_sentence(robot: Robot, rows: Measurements, counts: Bool[Tensor, " rows
         f"The measured positions are {measured * 1e3:,.1f} mm RMS from their mean, and those of robot '{robot.name}' "
         f"at these joint values {drawn * 1e3:,.1f} mm: {mistake}; check the column names and the instrument."
     )
-
-
-def _other_robot(robot: Robot, rows: Measurements) -> str:
-    """Say which robot of the catalogue was measured, if it was another one."""
-    calibrator = GeometricCalibrator(robot)
-    if rows.rows < FEWEST_OF_ROBOT:
-        return ""
-    try:
-        as_drawn = base_and_tool(calibrator).fit(rows)
-    except IdentificationError:
-        return ""
-    checked = CheckedCalibration(calibrator, rows, {"nominal": as_drawn, "geometric": as_drawn})
-    return next((diagnostic.sentence for diagnostic in OtherRobotCheck().diagnose(checked)), "")
 
 
 def _spread(position: Float64[Tensor, "rows 3"]) -> float:

@@ -17,6 +17,7 @@ from pisigma.errors import IdentificationError, ModelError, nearest_choice
 from pisigma.files.model_files import model_hash
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.result import HybridResult
+from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.judging.calibration_validation import errors_under
 from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.distillation_summary import ParentFigures
@@ -45,6 +46,8 @@ from pisigma.recalibration.summary import (
 )
 from pisigma.reporting.recalibration_card import write_recalibration_card
 from pisigma.robot.description import Robot
+from pisigma.verification.checks.other_robot import other_robot_diagnostics
+from pisigma.verification.checks.registry import diagnostics_of_rows
 from pisigma.workflow.result import AbstractModelResult
 
 if TYPE_CHECKING:
@@ -312,7 +315,16 @@ def _elsewhere(
 
 
 def _diagnostics(robot: Robot, judged: Gate, rows: Measurements) -> tuple[Diagnostic, ...]:
-    """Rows that no candidate predicts are not of this robot."""
+    """Rows that no candidate predicts, or that another robot does, are not of this robot.
+
+    A calibration from scratch is checked as `calibrate` checks it.
+    """
+    if judged.kept == "scratch":
+        found = diagnostics_of_rows(GeometricCalibrator(robot), rows)
+    else:
+        found = other_robot_diagnostics(robot, rows)
+    if implausible := tuple(one for one in found if one.severity == "implausible"):
+        return implausible
     error = judged.rms[judged.kept]
     if error is None or error <= IMPLAUSIBLE * robot.reach:
         return ()

@@ -11,9 +11,12 @@ from testing.closeness import assert_close
 import pisigma
 from pisigma.errors import AcceptanceError, IdentificationError, ModelError
 from pisigma.inverse.corrected_ik import CorrectedIK
+from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.dataset import Measurements
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.recalibration.summary import RecalibrationSummary
+from pisigma.robot import Robot
 from pisigma.se3 import transform_from_xyzrpy
 from pisigma.workflow.recalibrate import Recalibration, RecalibrationSettings, recalibrate
 
@@ -92,6 +95,17 @@ def test_rows_of_another_arm_are_not_trusted(tmp_path):
     assert result.summary.changed.startswith("What has moved cannot be said")
     with pytest.raises(AcceptanceError, match="must not be trusted"):
         result.save(tmp_path / "no")
+
+
+@pytest.mark.parametrize(("name", "rows"), [("ur5", 10), ("ur5", 30)])
+def test_rows_of_another_robot_of_the_catalogue_are_named(name, rows, tmp_path):
+    """Of many rows a calibration from scratch predicts left-out ones well, with an arm of other lengths."""
+    q = rows_later(rows, 4).q
+    later = Measurements(q, forward_kinematics(Robot.load(name), q)[:, :3, 3])
+    result = recalibrate(model_before(), later)
+    assert f"Robot '{name}' of the catalogue" in result.summary.diagnostics[0].sentence
+    with pytest.raises(AcceptanceError, match="must not be trusted"):
+        result.save(tmp_path / "another")
 
 
 def test_what_cannot_be_is_refused(tmp_path):

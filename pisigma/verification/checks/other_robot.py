@@ -6,9 +6,11 @@ from dataclasses import replace
 import torch
 
 from pisigma.errors import IdentificationError
+from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.judging.calibration_validation import errors_under
 from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.trained_calibrations import base_and_tool
+from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
 from pisigma.robot.robot_file import catalogue
 from pisigma.verification.checks.check import AbstractCheck, CheckedCalibration
@@ -18,6 +20,8 @@ SUSPICIOUS = 0.01
 NEARER = 1 / 3
 """Share of the errors that another robot must leave at most. An arm as drawn explains its own measurements to a
 thousandth of its reach, so that of two different robots one is nearer by more."""
+FEWEST_ROWS = 8
+"""Of fewer, base and tool alone bring another robot near the rows."""
 ROWS = 200
 """Rows that are enough to tell robots apart."""
 
@@ -44,6 +48,19 @@ class OtherRobotCheck(AbstractCheck):
                 f"errors are {others[name]:.3g} mm RMS, those of robot '{robot.name}' {stated:.3g} mm; check which "
                 "robot was measured.",
             )
+
+
+def other_robot_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...]:
+    """Say of rows alone, before a calibration, whether another robot was measured; of few rows nothing is said."""
+    calibrator = GeometricCalibrator(robot)
+    if rows.rows < FEWEST_ROWS:
+        return ()
+    try:
+        as_drawn = base_and_tool(calibrator).fit(rows)
+    except IdentificationError:
+        return ()
+    checked = CheckedCalibration(calibrator, rows, {"nominal": as_drawn, "geometric": as_drawn})
+    return tuple(OtherRobotCheck().diagnose(checked))
 
 
 def _rms_mm(checked: CheckedCalibration, other: Robot) -> float | None:
