@@ -254,14 +254,8 @@ def evaluate(
             *fitted_remark(rows, settings.fitted),
             *image_remark(rows),
             *_warnings(comparison),
-            *(
-                sentence
-                for model in loaded.values()
-                for sentence in (
-                    *training_row_warnings(model, rows, everything),
-                    *condition_warnings(model, rows),
-                )
-            ),
+            *(one for model in loaded.values() for one in training_row_warnings(model, rows, everything)),
+            *(one for model in loaded.values() for one in condition_warnings(model, rows)),
         ),
         seconds=time.perf_counter() - begin,
     )
