@@ -25,6 +25,7 @@ from pisigma.judging.model_comparison import Difference, ModelComparison, compar
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
+from pisigma.model.training_rows import training_row_warnings
 from pisigma.planning.task import read_task
 from pisigma.workflow.evaluate import (
     REFERENCES,
@@ -219,12 +220,15 @@ def compare(
     ):
         second = replace(second, name=f"{second.name}-2")
     sources = labelled([first, second])
-    models = with_references(list(sources), load_models(sources), turned=True)
+    loaded = load_models(sources)
+    models = with_references(list(sources), loaded, turned=True)
     one, other = models.values()
     pair = ModelPair.of(one, other, settings.frames)
-    compared = None
+    compared, warnings = None, _warnings(pair, list(sources.values()))
     if rows is not None:
         data = read_rows(rows, pair.first.robot, settings.cameras)
+        for model in loaded.values():
+            warnings += training_row_warnings(model, test_rows(data), data)
         free = settings.frames == "fitted"
         fitted = fitted_kinds(free, free)
         compared = compare_models(models, test_rows(data), settings.bootstrap, fitted)
@@ -237,7 +241,7 @@ def compare(
         program=None
         if program is None
         else Displacement.at(pair, read_task(program, pair.first), Path(program).name),
-        warnings=_warnings(pair, list(sources.values())),
+        warnings=warnings,
         seconds=time.perf_counter() - begin,
     )
 

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+import torch
 from testing.aged import rows_later
 from testing.closeness import assert_close
 from testing.compared import COLLISION, joints_of, model_of
@@ -54,6 +55,16 @@ def test_models_of_the_same_name_and_rows_are_told_apart_and_warned_of():
     assert result.parameters.differing == ()
     assert_close(result.to_json()["workspace"]["max_mm"], 0.0, atol=1e-6)
     assert any("same rows" in line for line in result.warnings)
+
+
+def test_rows_that_one_of_both_was_made_of_are_no_even_test(compared):
+    """A part of them among others."""
+    assert not any("was made with" in line for line in compared.warnings)
+    models = [model_of(50), model_of(61, COLLISION)]
+    some = rows_later(80, 61, COLLISION).select(torch.arange(8))
+    result = compare(*models, some)
+    (warning,) = (line for line in result.warnings if "was made with" in line)
+    assert warning.startswith("At least 8 of 8 rows have joint values that rows_61")
 
 
 @pytest.mark.parametrize(
