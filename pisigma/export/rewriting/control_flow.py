@@ -15,21 +15,23 @@ class Step(NamedTuple):
     """One statement that matters for the order.
 
     Attributes:
-        kind: "routine", "loop" and "branch" begin a block, and "end" ends the innermost one; "jump" is a label or a
-            jump; "set" sets a frame or a tool; "call" calls a routine; "other" is anything else.
+        kind: "routine", "loop" and "branch" begin a block, and "end" ends the innermost one; "else" begins another
+            part of a branch; "jump" is a label or a jump; "set" sets a frame or a tool; "call" calls a routine; "other"
+            is anything else.
         name: of the routine that begins or is called, or of the frame or the tool that is set.
     """
 
-    kind: Literal["routine", "loop", "branch", "end", "jump", "set", "call", "other"]
+    kind: Literal["routine", "loop", "branch", "else", "end", "jump", "set", "call", "other"]
     name: str = ""
 
 
 class FramesInForce:
     """The frame or tool of every name, or why it is not certain, while a reader passes from step to step.
 
-    A value is certain where every way through the program leads to the same one. Values that loops and branches set
-    are not, neither after these nor earlier in the same loop; nor are values that a called routine sets, nor those
-    that a routine finds when it is called, if the program sets them in several places.
+    A value is certain where every way through the program leads to the same one. A value that is set in a loop or a
+    branch holds there from its place on, but neither after it nor earlier in the same loop. Values that a called
+    routine sets are not certain, nor those that a routine finds when it is called, if the program sets them in several
+    places.
     """
 
     def __init__(self, steps: Sequence[Step], before: dict[str, Frame | str]) -> None:
@@ -81,21 +83,37 @@ class FramesInForce:
         """
         step = self._steps[number]
         if step.kind == "set":
-            self._values[step.name] = f"{step.name} {_WAY}" if self._is_open(number) else value
+            self._values[step.name] = f"{step.name} {_WAY}" if self._is_reached_twice(number) else value
         elif step.kind == "call":
             for name in self._set_by.get(step.name, ()):
                 self._values[name] = f"{name} is set by the routine {step.name}"
-        elif step.kind == "loop":
-            following = range(number + 1, len(self._steps))
-            inside = takewhile(lambda other: number in self._open[other], following)
-            self._doubt({name for other in inside for name in self._set_at(other)}, _WAY)
-        elif step.kind == "routine":
+        elif step.kind == "else" and self._saved:
+            self._values = dict(self._saved[-1])
+        elif step.kind == "end":
+            self._end(number)
+        elif step.kind in ("routine", "loop", "branch"):
             self._saved.append(dict(self._values))
-            self._doubt({name for name, places in self._places.items() if places > 1}, _CALLER)
-        elif step.kind == "end" and self._steps[self._ends.get(number, number)].kind == "routine":
-            saved, nested = self._saved.pop(), bool(self._open[number])
-            kept = {name for name, places in self._places.items() if places == 1 and not nested}
-            self._values = {name: self._values[name] if name in kept else saved[name] for name in saved}
+            if step.kind == "loop":
+                self._doubt(self._set_in(number), _WAY)
+            elif step.kind == "routine":
+                self._doubt({name for name, places in self._places.items() if places > 1}, _CALLER)
+
+    def _end(self, number: int) -> None:
+        """Leave a block."""
+        if number not in self._ends:
+            return
+        begin, saved = self._ends[number], self._saved.pop()
+        if self._steps[begin].kind != "routine":
+            self._doubt(self._set_in(begin), _WAY)
+            return
+        nested = bool(self._open[number])
+        kept = {name for name, places in self._places.items() if places == 1 and not nested}
+        self._values = {name: self._values[name] if name in kept else saved[name] for name in saved}
+
+    def _set_in(self, begin: int) -> set[str]:
+        """Names that are set in a block."""
+        inside = takewhile(lambda step: begin in self._open[step], range(begin + 1, len(self._steps)))
+        return {name for step in inside for name in self._set_at(step)}
 
     def _doubt(self, names: set[str], why: str) -> None:
         for name in names:
@@ -106,12 +124,9 @@ class FramesInForce:
         """The step that began the routine in which a step stands; -1 outside of all."""
         return next((k for k in reversed(self._open[number]) if self._steps[k].kind == "routine"), -1)
 
-    def _is_open(self, number: int) -> bool:
-        """Whether a value that is set here may or may not hold where the text goes on."""
-        opened, routine = self._open[number], self._routine(number)
-        if opened and opened[-1] != routine:
-            return True
-        inside = self._of_routine[routine]
+    def _is_reached_twice(self, number: int) -> bool:
+        """Whether jumps may lead behind a place where a value is set, from another place where it is set."""
+        inside = self._of_routine[self._routine(number)]
         jumps = any(self._steps[other].kind == "jump" for other in inside)
         return jumps and sum(self._steps[number].name in self._set_at(other) for other in inside) > 1
 

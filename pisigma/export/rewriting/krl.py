@@ -195,6 +195,8 @@ def _steps(match: re.Match[str]) -> list[Step]:
         return [Step("loop")]
     if word in ("IF", "SWITCH"):
         return [Step("branch")]
+    if word in ("ELSE", "CASE", "DEFAULT"):
+        return [Step("else")]
     if word.startswith("END") or word == "UNTIL":
         return [Step("end")]
     return [Step("jump" if word == "GOTO" or word.endswith(":") else "other")]

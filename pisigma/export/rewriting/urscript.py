@@ -174,7 +174,13 @@ def _step(match: re.Match[str]) -> Step:
         return Step("set", _TOOL) if match["name"] == "set_tcp" else Step("call", match["name"])
     if word in ("while", "for"):
         return Step("loop")
-    return Step("branch" if word == "if" else "end" if word == "end" else "other")
+    kinds: dict[str, Step] = {
+        "if": Step("branch"),
+        "elif": Step("else"),
+        "else": Step("else"),
+        "end": Step("end"),
+    }
+    return kinds.get(word, Step("other"))
 
 
 def _pose(text: str, span: _Span) -> Pose:
