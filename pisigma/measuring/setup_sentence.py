@@ -21,7 +21,7 @@ ARM_SHARE = 0.3
 def setup_sentence(robot: Robot, rows: Measurements, counts: Bool[Tensor, " rows"]) -> str:
     """Say which mistake in the setup or in the file all rows have in common; "" where none is found.
 
-    With few rows the size of what was measured is compared with that of the robot's motion, with 8 that count the
+    With few rows the size of what was measured is compared with that of the robot's motion, with 6 that count the
     other robots of the catalogue are tried, and with 24 the faults that a calibration would be refused for.
 
     Args:

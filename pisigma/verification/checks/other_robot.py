@@ -20,7 +20,7 @@ SUSPICIOUS = 0.01
 NEARER = 1 / 3
 """Share of the errors that another robot must leave at most. An arm as drawn explains its own measurements to a
 thousandth of its reach, so that of two different robots one is nearer by more."""
-FEWEST_ROWS = 8
+FEWEST_ROWS = 6
 """Of fewer, base and tool alone bring another robot near the rows."""
 ROWS = 200
 """Rows that are enough to tell robots apart."""
