@@ -22,6 +22,7 @@ from pisigma.judging.progress import Progress
 from pisigma.measuring.setup_sentence import setup_sentence
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_source import HoldsModel
+from pisigma.model.training_rows import training_row_warnings
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.camera_prospects import CameraProspects
 from pisigma.planning.candidates import Candidates, spread
@@ -193,7 +194,7 @@ def plan(
     candidates = settings.find_candidates(arm)
     candidates.check_count(settings.count + settings.check)
     progress("what is known")
-    _check_measured(subject.model, settings, arm.robot)
+    repeated = _check_measured(subject.model, settings, arm.robot)
     knowledge = subject.knowledge(arm, settings)
     task = task_poses(arm, settings, candidates.workspace, subject.model)
     problem = _Problem(subject, settings, arm, candidates, knowledge, task)
@@ -207,7 +208,7 @@ def plan(
         problem.needed(chosen, points),
         remaining_errors(knowledge.informed(candidates.q[chosen]), task),
         way.seconds,
-        (*_warnings(way), *arm.too_thick, *problem.still_joints, *problem.view_warnings(chosen)),
+        (*repeated, *_warnings(way), *arm.too_thick, *problem.still_joints, *problem.view_warnings(chosen)),
         problem.prospects(chosen),
         time.perf_counter() - started,
     )
@@ -343,14 +344,17 @@ class _Problem:
         return curve(self.measured, self.tool, chosen, counts, self.settings.seed)
 
 
-def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot: Robot) -> None:
+def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot: Robot) -> tuple[str, ...]:
     """Refuse rows that a mistake in the setup or in the file explains, and those that a model was made of already.
+
+    Returns:
+        A warning where the model may have been made of some of them.
 
     Raises:
         MeasurementError: they cannot be used; the message names the mistake.
     """
     if settings.measured is None:
-        return
+        return ()
     rows = settings.read_rows(settings.measured, robot).split_sets()[0]
     if mistake := setup_sentence(robot, rows, torch.ones(rows.rows, dtype=torch.bool)):
         raise MeasurementError(f"{settings.measured}: {mistake}")
@@ -362,6 +366,8 @@ def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot
             f"{settings.measured}: rows that model '{model.name}' does not know yet were wanted; it was made of these, "
             "and they would count twice. Plan with the model alone."
         )
+    twice = "they count twice, and the expected errors are too small"
+    return () if model is None else training_row_warnings(model, rows, consequence=twice)
 
 
 def _warnings(way: Tour) -> tuple[str, ...]:

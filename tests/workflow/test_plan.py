@@ -127,6 +127,12 @@ def test_rows_that_a_model_was_made_of_do_not_count_twice(tmp_path: Path):
     settings = PlanSettings(count=2, check=0, candidates=12, measured=str(tmp_path / "rows.csv"))
     with no_type_checker(), pytest.raises(PisigmaError, match="made of these, and they would count twice"):
         plan(model, settings)
+    some = arm.measurements.select(torch.arange(30))
+    some.write_csv(tmp_path / "rows.csv")
+    with no_type_checker():
+        warning = plan(model, settings).warnings[0]
+    assert warning.startswith("At least ")
+    assert "they count twice, and the expected errors are too small" in warning
 
 
 def test_candidates_that_hardly_move_a_joint_do_not_stand_for_the_workspace(tmp_path: Path):
