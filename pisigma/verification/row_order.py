@@ -18,6 +18,8 @@ from pisigma.verification.ordered_rows import OrderedRows, inverse_of
 
 FEWEST_ROWS = 3
 """Measured before and after a motion, at least."""
+MOST_USED = 0.8
+"""Share of the values that parameters and motions may use up, or the fit follows the noise, whose size it finds."""
 DEGREES = (1, 3, 6)
 """Of the polynomials in the share of the rows that were measured which slow motions follow."""
 CAP = 3.0
@@ -129,12 +131,14 @@ class _Fit:
         motion: its motions.
         after: residuals that are left.
         scale: standard deviation of one of them, per sensor.
+        effective: how many unknowns the values determine, the motions among them.
     """
 
     candidate: _Candidate
     motion: Float64[np.ndarray, " motions"]
     after: Float64[np.ndarray, "rows values"]
     scale: tuple[float, ...]
+    effective: float
 
     @property
     def shifts(self) -> Float64[np.ndarray, "own values"]:
@@ -251,17 +255,25 @@ class _Search:
         weight, scale = np.ones_like(self.rows.residual), np.ones(self.rows.residual.shape[1] // 3)
         for _ in range(ROUNDS):
             weighted = A * (weight / np.repeat(scale, 3) ** 2).reshape(-1, 1)
-            x = inverse_of(weighted.T @ A + held) @ (weighted.T @ self.rows.residual.ravel())
+            normal = weighted.T @ A
+            covariance = inverse_of(normal + held)
+            x = covariance @ (weighted.T @ self.rows.residual.ravel())
             after = self.rows.residual - (A @ x).reshape(self.rows.residual.shape)
             old, scale = scale, np.array([_scale(part) for part in _sensors(after)]) / left**0.5
-            fit = _Fit(candidate, x[size:], after, tuple(scale.tolist()))
+            effective = float(np.einsum("ij,ji->", covariance, normal))
+            fit = _Fit(candidate, x[size:], after, tuple(scale.tolist()), effective)
             before, weight = weight, fit.weights
             if np.abs(weight - before).max() < SETTLED and np.abs(scale / old - 1).max() < SETTLED:
                 break
         return fit
 
     def log_bayes_factor(self, fit: _Fit, values_of_one: float) -> float:
-        """Logarithm of the odds of a candidate against no motion, where so many values say as much as one."""
+        """Logarithm of the odds of a candidate against no motion, where so many values say as much as one.
+
+        Where motions and parameters use up nearly all values, nothing is left that contradicts them: no odds.
+        """
+        if fit.effective > MOST_USED * self.rows.values:
+            return -math.inf
         values = max(min((self.rows.values - self.rows.used) / values_of_one, self.rows.independent), 1.0)
         before = min(float(fit.costs(residual).sum()) for residual in (self.rows.residual, self.still.after))
         left = float(fit.costs(fit.after).sum()) / max(before, 1e-300)

@@ -17,7 +17,6 @@ from pisigma.export.programs.languages import LANGUAGES, check_program
 from pisigma.export.programs.planned import planned_program
 from pisigma.files.conflicts import Input
 from pisigma.files.output_file import check_output, write_whole
-from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.judging.progress import Progress
 from pisigma.measuring.setup_sentence import setup_sentence
 from pisigma.model.calibrated_model import CalibratedModel
@@ -39,7 +38,6 @@ from pisigma.planning.task import task_poses
 from pisigma.planning.tour import Tour, order_of_use, stages_of, tour
 from pisigma.robot.description import Robot
 from pisigma.verification.checks.camera import view_warnings
-from pisigma.verification.checks.registry import diagnostics_of_rows
 
 STEP = 10
 """Poses between two points of the curve."""
@@ -358,9 +356,6 @@ def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot
     rows = settings.read_rows(settings.measured, robot).split_sets()[0]
     if mistake := setup_sentence(robot, rows, torch.ones(rows.rows, dtype=torch.bool)):
         raise MeasurementError(f"{settings.measured}: {mistake}")
-    for diagnostic in diagnostics_of_rows(GeometricCalibrator(robot), rows):
-        if diagnostic.severity == "implausible":
-            raise MeasurementError(f"{settings.measured}: {diagnostic.sentence}")
     if model is not None and model.provenance.data_sha256 == rows.content_hash():
         raise MeasurementError(
             f"{settings.measured}: rows that model '{model.name}' does not know yet were wanted; it was made of these, "

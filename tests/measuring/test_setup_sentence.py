@@ -45,6 +45,19 @@ def test_another_robot_of_the_catalogue_is_named(measured, rows):
     assert found.startswith(f"Robot '{measured}' of the catalogue") == (measured != "ur5" and rows >= 6)
 
 
+@pytest.mark.parametrize(("longer", "rows", "said"), [(0.06, 12, True), (0.06, 30, True), (5e-4, 30, False)])
+def test_an_arm_that_nobody_drew_is_named(longer, rows, said):
+    """A link is longer than the catalogue says of any robot."""
+    robot = Robot.load("ur5")
+    dh = robot.dh.copy()
+    dh[1, 2] -= longer
+    q = torch.rand(rows, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(rows)) * 4 - 2
+    noise = 5e-5 * torch.randn(rows, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    some = Measurements(q, forward_kinematics(robot.with_geometry(dh), q)[:, :3, 3] + noise)
+    found = setup_sentence(robot, some, torch.ones(rows, dtype=torch.bool))
+    assert ("check whether this robot was measured" in found) == said
+
+
 def test_a_session_says_so_once_and_does_not_advise_to_go_on():
     session, rows = MeasuringSession(PLAN.stored), PLAN.rows(5)
     rows = replace(rows, position=rows.position * 1000)

@@ -126,6 +126,20 @@ def test_healthy_rows_in_any_order_are_left_alone(seed: int, rows: int, wrong: f
     assert said(simulated.nominal, in_order) == []
 
 
+@pytest.mark.parametrize(("seed", "rows"), [(2, 20), (7, 20), (10, 20), (3, 24), (6, 24), (7, 24)])
+def test_few_rows_of_an_arm_with_gears_are_left_alone(seed: int, rows: int) -> None:
+    """What motions and parameters could follow to the noise, as they are nearly as many as the values."""
+    simulated = simulate("ur5", seed=seed, rows=rows)
+    drawn, q = np.random.default_rng(seed), simulated.measurements.q
+    size, phase = (
+        torch.from_numpy(made) for made in (drawn.normal(0, 2.6e-4, (3, 6)), drawn.uniform(0, 6.28, (3, 6)))
+    )
+    gears = sum(size[k] * torch.sin(harmonic * q + phase[k]) for k, harmonic in enumerate((1, 2, 7)))
+    position = forward_kinematics(simulated.true, q + gears)[:, :3, 3]
+    measured = Measurements(q, position + torch.from_numpy(drawn.normal(0, 3.6e-5, (rows, 3))))
+    assert said(simulated.nominal, measured) == []
+
+
 def test_exact_rows_and_few_rows_show_nothing() -> None:
     exact, few = simulate("ur5", rows=40), simulate("ur5", rows=14, noise=5e-5)
     assert find_motion(GeometricCalibrator(exact.nominal).fit(exact.measurements)) is None
