@@ -35,7 +35,8 @@ def setup_sentence(robot: Robot, rows: Measurements, counts: Bool[Tensor, " rows
         rows: all rows.
         counts: those that others do not contradict.
     """
-    for diagnostic in setup_diagnostics(robot, rows.select(counts)):
+    counted = rows.select(counts)
+    for diagnostic in setup_diagnostics(robot, counted):
         if diagnostic.severity == "implausible":
             return diagnostic.sentence
     group = largest_group(rows)
@@ -48,7 +49,7 @@ def setup_sentence(robot: Robot, rows: Measurements, counts: Bool[Tensor, " rows
     elif SCALE * measured < drawn > arm:
         mistake = "x, y and z are metres that are named millimetres, or do not change with the robot"
     else:
-        return _implausible(robot, rows.select(counts))
+        return _implausible(robot, counted)
     return (
         f"The measured positions are {measured * 1e3:,.1f} mm RMS from their mean, and those of robot '{robot.name}' "
         f"at these joint values {drawn * 1e3:,.1f} mm: {mistake}; check the column names and the instrument."

@@ -227,8 +227,8 @@ def compare(
     compared, warnings = None, _warnings(pair, list(sources.values()))
     if rows is not None:
         data = read_rows(rows, pair.first.robot, settings.cameras)
-        for model in loaded.values():
-            warnings += training_row_warnings(model, test_rows(data), data)
+        for label, model in loaded.items():
+            warnings += training_row_warnings(replace(model, name=label), test_rows(data), data)
         free = settings.frames == "fitted"
         fitted = fitted_kinds(free, free)
         compared = compare_models(models, test_rows(data), settings.bootstrap, fitted)

@@ -4,7 +4,7 @@ import math
 import os
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -254,7 +254,11 @@ def evaluate(
             *fitted_remark(rows, settings.fitted),
             *image_remark(rows),
             *_warnings(comparison),
-            *(one for model in loaded.values() for one in training_row_warnings(model, rows, everything)),
+            *(
+                one
+                for label, model in loaded.items()
+                for one in training_row_warnings(replace(model, name=label), rows, everything)
+            ),
             *(one for model in loaded.values() for one in condition_warnings(model, rows)),
         ),
         seconds=time.perf_counter() - begin,

@@ -89,6 +89,9 @@ class FramesInForce:
                 self._values[name] = f"{name} is set by the routine {step.name}"
         elif step.kind == "else" and self._saved:
             self._values = dict(self._saved[-1])
+            # what is called in a condition holds in the parts that follow, too
+            begin = self._open[number][-1] if self._open[number] else number
+            self._doubt(self._set_in(begin, ("call",)), _WAY)
         elif step.kind == "end":
             self._end(number)
         elif step.kind in ("routine", "loop", "branch"):
@@ -110,10 +113,10 @@ class FramesInForce:
         kept = {name for name, places in self._places.items() if places == 1 and not nested}
         self._values = {name: self._values[name] if name in kept else saved[name] for name in saved}
 
-    def _set_in(self, begin: int) -> set[str]:
-        """Names that are set in a block."""
+    def _set_in(self, begin: int, kinds: Sequence[str] = ("set", "call")) -> set[str]:
+        """Names that steps of some kinds set in a block."""
         inside = takewhile(lambda step: begin in self._open[step], range(begin + 1, len(self._steps)))
-        return {name for step in inside for name in self._set_at(step)}
+        return {name for step in inside if self._steps[step].kind in kinds for name in self._set_at(step)}
 
     def _doubt(self, names: set[str], why: str) -> None:
         for name in names:

@@ -44,8 +44,8 @@ _STATEMENT = re.compile(
     r"|\$(?P<system>BASE|TOOL)(?P<part>\.\w+)?\s*=\s*(?P<value>[^\n]*?)[ \t\r]*$"
     r"|BAS\s*\(\s*#(?P<bas>BASE|TOOL)\s*,\s*(?P<number>[^)\n]*?)\s*\)"
     r"|(?P<form>FDAT_ACT)\s*="
-    r"|(?P<move>S?(?:PTP|LIN|CIRC)|SPL)(?P<relative>_REL)?\s+(?P<target>[^\n]*?)[ \t\r]*$"
-    r"|(?P<call>\w+)[ \t]*\()",
+    r"|(?P<move>S?(?:PTP|LIN|CIRC)|SPL)(?P<relative>_REL)?\s+(?P<target>[^\n]*?)[ \t\r]*$)"
+    r"|\b(?P<call>\w+)[ \t]*\(",
     re.MULTILINE | re.IGNORECASE,
 )
 _TURNING = re.compile(r"\$(?:CIRC_TYPE|ORI_TYPE)\b", re.IGNORECASE)

@@ -195,7 +195,7 @@ def _over_time(rows: JudgedRows, errors: dict[str, np.ndarray], judged: np.ndarr
 def _order_remark(rows: JudgedRows) -> tuple[str, ...]:
     """Warn where the rows were measured joint value after joint value."""
     q = rows.measurements.q.numpy()
-    r = [abs(rank_correlation(np.arange(len(q)), values)[0]) for values in q.T]
+    r = [abs(rank_correlation(np.arange(float(len(q))), values)[0]) for values in q.T]
     return () if max(r) < ORDERED else _say("ordered", int(np.argmax(r)) + 1, max(r))
 
 

@@ -19,7 +19,7 @@ from pisigma.measurement.groups import numbers_of_names
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
-from pisigma.model.stored_starts import rows_at_starts
+from pisigma.model.training_rows import training_row_warnings
 from pisigma.reporting.rendering import sentences
 from pisigma.se3 import invert, transform_from_xyzrpy
 
@@ -102,9 +102,9 @@ def rows_of_file(
         models["geometric"] = _errors(poses_of_rows(replace(model, hybrid=None), rows), rows)[0]
     identified = "corrected" if model.calibrated is None else "geometric"
     models["hybrid" if model.hybrid is not None else identified] = errors
-    again = rows_at_starts(model.starts.double().cpu(), rows.q.cpu()) if origin == "other" else 0
+    again = training_row_warnings(model, rows) if origin == "other" else ()
     unknown = int((~torch.isfinite(errors.position)).sum())
-    remarks = _say("remarks_on_rows", rows, left_out, again, len(model.starts), model, own_frames, unknown)
+    remarks = _say("remarks_on_rows", rows, left_out, again, model, own_frames, unknown)
     return _judged(model, rows, models, residual, (origin, origin), remarks)
 
 

@@ -77,7 +77,7 @@ def test_joint_values_of_the_calibration_measured_again_are_said(hybrid, tmp_pat
     again = replace(arm.measurements, position=arm.measurements.position + 1e-5)
     content = report_content(model, tmp_path, again)
     assert content.rows.origin == "other"
-    assert any("200 of these 200 rows have joint values" in line for line in content.rows.remarks)
+    assert any("200 of 200 rows have joint values" in line for line in content.rows.remarks)
 
 
 def test_a_folder_that_keeps_held_out_rows_shows_them(hybrid, tmp_path):
