@@ -15,6 +15,7 @@ from pisigma.hybrid.uncertainty import PositionUncertainty
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.jacobian import joint_jacobian
 from pisigma.kinematics.tolerances import FORWARD_ACCEPTED, FORWARD_ITERATIONS, FORWARD_TOLERANCE
+from pisigma.measurement.copies import RowValues
 from pisigma.model.domain import Domain
 from pisigma.model.hybrid_motion import hybrid_motion, hybrid_poses
 from pisigma.network.correction_network import CorrectionNetwork
@@ -80,6 +81,8 @@ class CalibratedModel:
         hybrid_bases: the bases that go with the hybrid's geometry, by the names of `bases`.
         hybrid_tools: the same for the tools.
         uncertainty: of predicted positions, or None.
+        made_of: joint values and readings of rows that it was made of, by which they are recognised when they come
+            again; None where these were not kept. See `pisigma.model.training_rows`.
         conditions: payload [kg] and temperature [deg C] that it was put under, by name; empty for the usual ones of
             the rows. See `pisigma.model.stated_conditions`.
         measured_conditions: the lowest and the highest value of these that it was calibrated at, of stated ones only.
@@ -101,6 +104,7 @@ class CalibratedModel:
     hybrid_bases: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
     hybrid_tools: dict[str, Float64[np.ndarray, " 6"]] = field(default_factory=dict)
     uncertainty: PositionUncertainty | None = None
+    made_of: RowValues | None = None
     conditions: dict[str, float] = field(default_factory=dict)
     measured_conditions: dict[str, tuple[float, float]] = field(default_factory=dict)
     provenance: Provenance = field(default_factory=Provenance)

@@ -15,6 +15,7 @@ from pisigma.kinematics.closed_form import closed_form_solver
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.stored_starts import nearest_branch, spread_rows
+from pisigma.model.training_rows import kept_rows
 from pisigma.robot.description import Robot
 
 
@@ -50,6 +51,7 @@ def model_of_calibration(
         calibrated=result.robot,
         bases=dict(result.bases),
         tools=dict(result.tools),
+        made_of=kept_rows(nominal, measurements),
         provenance=Provenance(
             recipe=recipe[0],
             recipe_sha256=recipe[1],
@@ -71,34 +73,28 @@ def model_of_hybrid(
 ) -> CalibratedModel:
     """Make the model of a hybrid calibration; without a joint correction that of its geometric calibration.
 
-    For the arguments see `model_of_calibration`. The uncertainty is kept in float32, so that the model is the
-    same before it is written and after it is read.
+    For the arguments see `model_of_calibration`.
     """
     known, learned = result.geometric, result.learned
     model = model_of_calibration(name, nominal, known, measurements, recipe)
     if learned is None:
         geometry = IdentifiedGeometry(known.robot, model.bases, model.tools, known.unknowns)
-        kept = _kept(result.uncertainty, geometry)
-        return replace(model, uncertainty=kept)
+        return replace(model, uncertainty=_kept(result.uncertainty, geometry))
     bases, tools = dict(learned.geometry.bases), dict(learned.geometry.tools)
+    geometry = IdentifiedGeometry(learned.geometry.robot, bases, tools, learned.geometry.unknowns)
     return replace(
         model,
         kind="hybrid_calibration",
         hybrid=result.arm(),
         hybrid_bases=bases,
         hybrid_tools=tools,
-        uncertainty=_kept(
-            result.uncertainty,
-            IdentifiedGeometry(learned.geometry.robot, bases, tools, learned.geometry.unknowns),
-        ),
+        uncertainty=_kept(result.uncertainty, geometry),
     )
 
 
 def _kept(uncertainty: PositionUncertainty, geometry: IdentifiedGeometry) -> PositionUncertainty:
-    """An uncertainty at the geometry of a model, with a root that float32 holds."""
-    return replace(
-        uncertainty, geometry=geometry, covariance_root=CovarianceRoot(uncertainty.root.float().double())
-    )
+    """An uncertainty at the geometry of a model, with a root in the form that a folder holds."""
+    return replace(uncertainty, geometry=geometry, covariance_root=CovarianceRoot(uncertainty.root))
 
 
 def branches_of(nominal: Robot, q: Float64[Tensor, "rows dof"]) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ import torch
 from pydantic import TypeAdapter, ValidationError
 
 from pisigma.errors import OutputError
+from pisigma.measurement.copies import RowValues
 from pisigma.monitoring.session import JointZeros, Session
 
 SUFFIX = ".history.sqlite"
@@ -22,6 +23,7 @@ _TABLE = """CREATE TABLE IF NOT EXISTS sessions (
     model TEXT NOT NULL, rows TEXT NOT NULL, file TEXT NOT NULL, date TEXT NOT NULL, temperature_c REAL,
     session TEXT NOT NULL, zeros BLOB NOT NULL, PRIMARY KEY (model, rows))"""
 _SESSION = TypeAdapter(Session)
+_VALUES = ("numbers", "steps", "kind", "file")
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,6 +37,8 @@ class Record:
         temperature_c: mean of the rows [deg C]; None where they do not state it.
         session: what it says.
         zeros: of the joints.
+        values: joint values and readings of its rows, by which they are recognised when they come again; None in
+            histories of earlier versions.
     """
 
     file: str
@@ -43,6 +47,7 @@ class Record:
     temperature_c: float | None
     session: Session
     zeros: JointZeros
+    values: RowValues | None = None
 
 
 def history_path(model: str | os.PathLike[str]) -> Path:
@@ -76,19 +81,37 @@ def remember(path: Path, model: str, records: Sequence[Record]) -> tuple[Record,
                 [
                     (
                         *(model, one.rows_sha256, one.file, one.date, one.temperature_c),
-                        *(_SESSION.dump_json(one.session).decode(), _packed(one.zeros)),
+                        *(_SESSION.dump_json(one.session).decode(), _packed(one.zeros, one.values)),
                     )
                     for one in records
                 ],
             )
-        rows = database.execute(
-            "SELECT file, date, rows, temperature_c, session, zeros FROM sessions WHERE model = ?", (model,)
-        )
-        records = [
-            Record(file, date, sha256, temperature, _SESSION.validate_json(session), _unpacked(zeros))
+        return _records(database, model)
+
+
+def recall(path: Path, model: str) -> tuple[Record, ...]:
+    """Give all sessions of a model in a history, which may not be there yet, by their dates.
+
+    Raises:
+        OutputError: the file is no history.
+    """
+    if not path.exists():
+        return ()
+    with _opened(path) as database:
+        there = database.execute("SELECT name FROM sqlite_master WHERE name = 'sessions'").fetchall()
+        return _records(database, model) if there else ()
+
+
+def _records(database: sqlite3.Connection, model: str) -> tuple[Record, ...]:
+    rows = database.execute(
+        "SELECT file, date, rows, temperature_c, session, zeros FROM sessions WHERE model = ?", (model,)
+    )
+    return in_order(
+        [
+            Record(file, date, sha256, temperature, _SESSION.validate_json(session), *_unpacked(zeros))
             for file, date, sha256, temperature, session, zeros in rows
         ]
-    return in_order(records)
+    )
 
 
 def in_order(records: Sequence[Record]) -> tuple[Record, ...]:
@@ -108,19 +131,24 @@ def _opened(path: Path) -> Iterator[sqlite3.Connection]:
         ) from None
 
 
-def _packed(zeros: JointZeros) -> bytes:
+def _packed(zeros: JointZeros, values: RowValues | None) -> bytes:
     stream = io.BytesIO()
+    rows = {} if values is None else {f"rows_{name}": getattr(values, name).numpy() for name in _VALUES}
     np.savez(
         stream,
         shift=zeros.shift.numpy(),
         deviation=zeros.deviation.numpy(),
-        influence=zeros.influence.numpy().astype("<f4"),  # seven digits are plenty for a covariance
+        influence=zeros.influence.numpy(),
         own=zeros.own.numpy(),
+        **rows,
     )
     return stream.getvalue()
 
 
-def _unpacked(content: bytes) -> JointZeros:
+def _unpacked(content: bytes) -> tuple[JointZeros, RowValues | None]:
     with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
         names = ("shift", "deviation", "influence", "own")
-        return JointZeros(*(torch.from_numpy(arrays[name].astype(np.float64)) for name in names))
+        zeros = JointZeros(*(torch.from_numpy(arrays[name].astype(np.float64)) for name in names))
+        if not {f"rows_{name}" for name in _VALUES} <= set(arrays):
+            return zeros, None
+        return zeros, RowValues(*(torch.from_numpy(arrays[f"rows_{name}"]) for name in _VALUES))

@@ -113,14 +113,6 @@ class Session:
             return "moved"
         return "unclear" if self.candidates else "unchanged"
 
-    def explains_within(self, limit: float) -> bool:
-        """Whether what is said to have moved explains the rows but for a limit [m], and changed no link by more."""
-        links = (
-            one.moved for one in self.moved if not is_frame(one.moved.what) and "joint" not in one.moved.what
-        )
-        changes = (abs(one.shift) * 1e-3 for one in links if one.unit == "mm")
-        return max(self.rms_after, *changes, 0.0) <= limit
-
     @property
     def recalibrate(self) -> bool:
         """Whether the arm changed so much that recalibrating pays."""

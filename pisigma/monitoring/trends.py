@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.monitoring.changes import Event, Series
 from pisigma.monitoring.charts import Chart, innovations, limits_of
 from pisigma.monitoring.history import Record
 from pisigma.recalibration.drift import NOISE_SPREAD
@@ -59,6 +60,37 @@ class Trend:
         """It in words."""
         half = NORMAL_95 * self.deviation
         return f"{self.what} drifts by {self.slope:.4f} ± {half:.4f} {self.unit} a {self.over}"
+
+
+@dataclass(frozen=True)
+class Jump:
+    """A change of a joint's zero between two sessions, as by a collision, or in one of them alone.
+
+    Attributes:
+        what: changed.
+        unit: of the change.
+        size: the change.
+        deviation: its standard deviation.
+        before: day of the last session before it.
+        after: day of the first session after it.
+        alone: whether that session alone is off.
+    """
+
+    what: str
+    unit: ShownUnit
+    size: float
+    deviation: float
+    before: str
+    after: str
+    alone: bool = False
+
+    @property
+    def sentence(self) -> str:
+        """It in words."""
+        half = NORMAL_95 * self.deviation
+        if self.alone:
+            return f"{self.what} was {self.size:.4f} ± {half:.4f} {self.unit} off on {self.after} alone"
+        return f"{self.what} jumped by {self.size:.4f} ± {half:.4f} {self.unit} between {self.before} and {self.after}"
 
 
 @dataclass(frozen=True)
@@ -117,33 +149,103 @@ def charts_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Char
 def trends_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Trend, ...]:
     """Estimate how the zeros of the joints change with time, and with temperature where the sessions state it.
 
+    Where a zero jumped, or was off in single sessions, its drift is estimated beside that.
+
     Args:
         revolute: per joint of the robot, whether it turns.
         records: by their dates.
     """
-    months = months_of(records)
-    if len(torch.unique(months)) < FEWEST:
+    if len(torch.unique(months_of(records))) < FEWEST:
         return ()
+    overs, trends = _overs(records), list[Trend]()
+    for joint in range(len(revolute)):
+        zero = _Zero.of(records, joint, overs)
+        if zero is None or len(zero.sessions) <= zero.columns.shape[1] + len(zero.events):
+            continue
+        unit, factor = SHOWN_UNITS["rad" if revolute[joint] else "m"]
+        slopes, deviations = zero.fit(drifts=True)
+        trends += [
+            Trend(f"joint {joint + 1}", over, unit, slope * factor, deviation * factor)
+            for (over, _), slope, deviation in zip(overs, slopes[1:], deviations[1:], strict=False)
+        ]
+    return tuple(trends)
+
+
+def jumps_of(revolute: Sequence[bool], records: Sequence[Record]) -> tuple[Jump, ...]:
+    """Find between which sessions the zeros of joints jumped, where that explains them better than a drift.
+
+    Args:
+        revolute: per joint of the robot, whether it turns.
+        records: by their dates.
+    """
+    if len(torch.unique(months_of(records))) < FEWEST:
+        return ()
+    overs, jumps = _overs(records), list[Jump]()
+    for joint in range(len(revolute)):
+        zero = _Zero.of(records, joint, overs)
+        if zero is None or not zero.events:
+            continue
+        unit, factor = SHOWN_UNITS["rad" if revolute[joint] else "m"]
+        sizes, deviations = (those[-len(zero.events) :] for those in zero.fit(zero.drifts))
+        for event, size, deviation in sorted(
+            zip(zero.events, sizes, deviations, strict=True), key=lambda one: one[0].number
+        ):
+            if abs(size) > CLEAR * deviation:
+                before, after = (
+                    records[zero.sessions[number]].date for number in (event.number - 1, event.number)
+                )
+                what, sizes_of = f"joint {joint + 1}", (size * factor, deviation * factor)
+                jumps.append(Jump(what, unit, *sizes_of, before, after, event.alone))
+    return tuple(jumps)
+
+
+def _overs(records: Sequence[Record]) -> list[tuple[Literal["month", "kelvin"], Tensor]]:
+    """What zeros may change with: time and, where the sessions state various ones, temperature."""
     temperature = torch.tensor(
         [math.nan if one.temperature_c is None else one.temperature_c for one in records], dtype=torch.float64
     )
-    overs: list[tuple[Literal["month", "kelvin"], Tensor]] = [("month", months)]
+    overs: list[tuple[Literal["month", "kelvin"], Tensor]] = [("month", months_of(records))]
     if bool(torch.isfinite(temperature).all()) and float(temperature.std()) >= FEWEST_KELVINS:
         overs.append(("kelvin", temperature))
-    trends = []
-    for joint in range(len(revolute)):
-        unit, factor = SHOWN_UNITS["rad" if revolute[joint] else "m"]
+    return overs
+
+
+@dataclass(frozen=True, eq=False)
+class _Zero:
+    """The zero of a joint over the sessions that show it.
+
+    Attributes:
+        series: its shifts [rad or m].
+        sessions: numbers of these sessions.
+        columns: 1, months and, where they vary, temperatures about their means.
+        events: jumps, and sessions that are off.
+        drifts: whether time explains more beside these.
+    """
+
+    series: Series
+    sessions: list[int]
+    columns: Float64[Tensor, "values columns"]
+    events: tuple[Event, ...]
+    drifts: bool
+
+    @staticmethod
+    def of(records: Sequence[Record], joint: int, overs: Sequence[tuple[str, Tensor]]) -> "_Zero | None":
+        """Find its changes; None where too few sessions show it."""
         values, covariance = _joint_values(records, joint)
         there = torch.isfinite(values).nonzero()[:, 0]
         if len(there) < FEWEST + len(overs) - 1:
-            continue
-        columns = torch.stack([torch.ones_like(months), *(over - over.mean() for _, over in overs)], 1)
-        slopes, deviations = _fitted(values[there], columns[there], covariance[there[:, None], there])
-        trends += [
-            Trend(f"joint {joint + 1}", over, unit, slope * factor, deviation * factor)
-            for (over, _), slope, deviation in zip(overs, slopes[1:], deviations[1:], strict=True)
-        ]
-    return tuple(trends)
+            return None
+        columns = [torch.ones(len(records), dtype=torch.float64), *(over - over.mean() for _, over in overs)]
+        A = torch.stack(columns, 1)[there]
+        series = Series(values[there], covariance[there[:, None], there])
+        months = torch.arange(A.shape[1]) == 1
+        events, drifts = series.events(A[:, ~months], A[:, months])
+        return _Zero(series, there.tolist(), A, events, drifts)
+
+    def fit(self, drifts: bool) -> tuple[list[float], list[float]]:
+        """Coefficients and their standard deviations, those of the events last."""
+        columns = self.columns if drifts else self.columns[:, torch.arange(self.columns.shape[1]) != 1]
+        return self.series.fit(self.series.with_events(columns, self.events))
 
 
 def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
@@ -153,13 +255,18 @@ def forecast_of(records: Sequence[Record], limit_mm: float) -> Forecast:
     passed = bool(rms[-1] > limit_mm)
     date = earliest = None
     if not passed and bool((rms > 0).all()) and len(torch.unique(months)) >= FEWEST:
-        columns = torch.stack([torch.ones_like(months), months - months[-1]], 1)
         spread = rms * torch.tensor([math.sqrt(0.5 / one.session.values) for one in records]).double()
-        (now, slope), (_, deviation) = _fitted(rms, columns, spread.square().diag())
-        left = ((rms - columns @ torch.tensor([now, slope]).double()) / spread).square().sum()
-        deviation *= max(
-            1.0, math.sqrt(float(left) / (len(rms) - 2))
-        )  # sessions scatter by more than few rows do
+        usual = rms * torch.tensor([_log_spread(one) for one in records]).double()
+        columns = torch.stack([torch.ones_like(months), months - months[-1]], 1)
+        events, _ = Series(rms, usual.square().diag()).events(columns[:, :1], columns[:, 1:])
+        series = Series(rms, spread.square().diag())
+        columns = series.with_events(columns, events)
+        coefficients, deviations = series.fit(columns)
+        slope, deviation = coefficients[1], deviations[1]
+        now = float((columns[-1] * torch.tensor(coefficients)).sum())
+        left = ((rms - columns @ torch.tensor(coefficients).double()) / spread).square().sum()
+        spare = max(len(rms) - columns.shape[1], 1)
+        deviation *= max(1.0, math.sqrt(float(left) / spare))  # sessions scatter by more than few rows do
         if slope > NORMAL_95 * deviation:
             date = _after(last.date, (limit_mm - now) / slope)
             earliest = _after(last.date, (limit_mm - now) / (slope + NORMAL_95 * deviation))
@@ -191,14 +298,6 @@ def _error_score(record: Record) -> float:
 def _log_spread(record: Record) -> float:
     """Standard deviation of the logarithm of a session's error: that of its noise, and of its few values."""
     return math.sqrt(NOISE_SPREAD**2 + 0.5 / record.session.values)
-
-
-def _fitted(values: Tensor, columns: Tensor, covariance: Tensor) -> tuple[list[float], list[float]]:
-    """Generalised least squares: coefficients of the columns, and their standard deviations."""
-    L = torch.linalg.cholesky(covariance)
-    y, A = (torch.linalg.solve_triangular(L, one, upper=False) for one in (values[:, None], columns))
-    of_coefficients = torch.linalg.inv(A.t() @ A)
-    return (of_coefficients @ A.t() @ y)[:, 0].tolist(), of_coefficients.diagonal().sqrt().tolist()
 
 
 def _after(date: str, months: float) -> str | None:

@@ -1,14 +1,17 @@
 """Rows that a model was made of are named, whole or in part, in any order and among others."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 from testing.calibrated_ur5 import calibrated_ur5, measured
 
+from pisigma.errors import MeasurementError
 from pisigma.measurement.dataset import Measurements
+from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.stored_starts import MAXIMUM_STARTS, rows_at_starts, spread_rows
-from pisigma.model.training_rows import training_row_warnings
+from pisigma.model.training_rows import kept_rows, known_rows, training_row_warnings, without_known_rows
 
 ROWS = 40
 SAME = "At least {} of {} rows have joint values that"
@@ -51,6 +54,35 @@ def test_other_rows_are_not(made):
     assert training_row_warnings(model, replace(own, q=own.q + 1e-5)) == ()
     unknown = replace(model, provenance=replace(model.provenance, data_sha256=""))
     assert training_row_warnings(replace(unknown, starts=others.q[:0]), own) == ()
+
+
+def rounded(rows: Measurements) -> Measurements:
+    step = math.radians(1e-2)
+    return replace(rows, q=(rows.q / step).round() * step, position=(rows.position * 1e5).round() / 1e5)
+
+
+@pytest.mark.parametrize("change", [lambda rows: rows, rounded], ids=["exact", "rounded"])
+def test_rows_that_come_again_are_known_by_their_readings(made, change, tmp_path):
+    model, own, others = made
+    save_model(replace(model, made_of=kept_rows(model.robot, own)), tmp_path)
+    model = load_model(tmp_path)
+    again = change(own.select(torch.tensor([7, 3, 5, 30])))
+    assert known_rows(model, again).all()
+    mixed = joined(again, change(others))
+    assert known_rows(model, mixed).nonzero()[:, 0].tolist() == [0, 1, 2, 3]
+    new, warnings = without_known_rows(model, mixed)
+    assert new.rows == ROWS
+    assert len(warnings) == 1
+    with pytest.raises(MeasurementError, match="new rows"):
+        without_known_rows(model, again)
+
+
+def test_poses_that_were_measured_again_are_new_rows(made):
+    model, own, _ = made
+    model = replace(model, made_of=kept_rows(model.robot, own))
+    later = replace(own, position=own.position + 1e-5 * torch.ones(3))
+    assert not known_rows(model, later).any()
+    assert len(training_row_warnings(model, later)) == 1
 
 
 def test_half_of_many_rows_are_known_by_those_that_are_kept(made):

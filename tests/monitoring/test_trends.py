@@ -8,7 +8,7 @@ from testing.closeness import assert_close
 
 from pisigma.monitoring.history import Record
 from pisigma.monitoring.session import JointZeros, Session
-from pisigma.monitoring.trends import charts_of, forecast_of, trends_of
+from pisigma.monitoring.trends import charts_of, forecast_of, jumps_of, trends_of
 
 REVOLUTE = (True, False)
 DEVIATION = 4e-5
@@ -47,6 +47,48 @@ def test_a_drift_is_charted_and_measured():
     low, high = clear[0].interval
     assert low < 0.01 < high
     assert "joint 1 drifts by 0.01" in clear[0].sentence
+
+
+def test_a_jump_is_no_drift():
+    made = records(10)
+    for record in made[6:]:
+        record.zeros.shift[0] += math.radians(0.05)
+    (jump,) = jumps_of(REVOLUTE, made)
+    assert (jump.what, jump.before, jump.after) == ("joint 1", "2026-06-01", "2026-07-01")
+    assert_close(jump.size, 0.05, atol=0.005)
+    assert not [one for one in trends_of(REVOLUTE, made) if one.clear]
+    assert jumps_of(REVOLUTE, records(8, per_month=0.01)) == jumps_of(REVOLUTE, records(8)) == ()
+
+
+@pytest.mark.parametrize(
+    ("off", "changes"),
+    [
+        ({4: 0.05}, [("2026-05-01", True, 0.05)]),
+        ({9: 0.05}, [("2026-10-01", False, 0.05)]),
+        ({3: 0.05, 4: 0.05, 5: 0.05}, [("2026-04-01", False, 0.05), ("2026-07-01", False, -0.05)]),
+        (
+            {3: 0.05, 4: 0.05, 5: 0.05, 6: 0.05, 7: 0.1, 8: 0.1, 9: 0.1},
+            [("2026-04-01", False, 0.05), ("2026-08-01", False, 0.05)],
+        ),
+    ],
+    ids=["one session", "last session", "three sessions", "twice"],
+)
+@pytest.mark.parametrize("per_month", [0.0, 0.01])
+def test_changes_of_any_kind_are_told_from_a_drift(off, changes, per_month):
+    made = records(10, per_month=per_month)
+    for month, size in off.items():
+        made[month].zeros.shift[0] += math.radians(size)
+    found = jumps_of(REVOLUTE, made)
+    assert [(one.what, one.after, one.alone) for one in found] == [("joint 1", *one[:2]) for one in changes]
+    for one, (_, _, size) in zip(found, changes, strict=True):
+        assert_close(one.size, size, atol=0.012)
+    clear = [one for one in trends_of(REVOLUTE, made) if one.clear]
+    assert len(clear) == (per_month > 0)
+
+
+def test_a_jump_of_the_error_passes_no_limit_by_itself():
+    made = records(10, rms=lambda month: 1e-4 * (1 + 0.1 * math.sin(9 * month)) + 4e-4 * (month >= 7))
+    assert forecast_of(made, 1.0).date is None
 
 
 def test_warming_is_no_drift_in_time():

@@ -1,7 +1,8 @@
 """What a model folder holds of a hybrid calibration: sections of `model.yaml`, and tensors.
 
 Geometry stands in `model.yaml` in mm and deg, for people, and once more in the weights file in SI units, so that
-predictions are the same to the last bit after reading. The root of the covariance is in float32.
+predictions are the same to the last bit after reading. What the rows of the root of the covariance belong to, and in
+which order, stands in `model.yaml`.
 """
 
 import math
@@ -23,12 +24,15 @@ from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.joint_correction.registry import feature_from
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.model_document import LearnedSection, ModelDocument, UncertaintySection
+from pisigma.model.folder.model_document import (
+    LearnedSection,
+    ModelDocument,
+    UncertaintySection,
+    UnknownsSection,
+)
 from pisigma.model.row_poses import Frames
 from pisigma.robot.description import Robot
-from pisigma.sensors.anchor import ANCHOR_COLUMNS
 from pisigma.sensors.sensor import UnknownGroup
-from pisigma.sensors.socket import SOCKET_COLUMNS
 
 Shape = tuple[int | None, ...]
 """Wanted shape of a tensor; None is any length."""
@@ -36,7 +40,7 @@ Shape = tuple[int | None, ...]
 ROUNDING = 1e-9
 """The geometry in `model.yaml` and in the weights file may differ by so much [m or rad]."""
 
-DTYPES = {"uncertainty.root": torch.float32, "coverage.joint": torch.int64}
+DTYPES = {"coverage.joint": torch.int64, "rows.measured": torch.uint8}
 """Tensors that are not in float64."""
 
 _GEOMETRY = ("dh", "base", "tool")
@@ -54,13 +58,13 @@ def hybrid_sections(model: CalibratedModel) -> dict[str, Any]:
         }
     if (known := model.uncertainty) is not None:
         result["uncertainty"] = {
-            **_unknowns_section(known.space.unknowns),
+            "unknowns": [_unknowns_section(group) for group in known.space.unknowns],
             "values": {
                 group: {owner: values.tolist() for owner, values in owners.items()}
                 for group, owners in known.geometry.unknowns.items()
             },
             "free": _free_rows(known),
-            "products": any(isinstance(chosen, InputProducts) for chosen in known.features),
+            "features": [chosen.name for chosen in known.features],
             "prior_scale": known.prior_scale,
             "noise": dict(known.noise),
         }
@@ -81,7 +85,7 @@ def hybrid_tensors(model: CalibratedModel) -> dict[str, Tensor]:
         result |= {f"coverage.{name}": getattr(arm.coverage, name) for name in ("joint", "middle", "half")}
     if (known := model.uncertainty) is not None:
         weights = range(len(known.space.parameters), known.root.shape[0])
-        result["uncertainty.root"] = known.root[[*_free_rows(known), *weights]].float()
+        result["uncertainty.root"] = known.root[[*_free_rows(known), *weights]]
     return result
 
 
@@ -100,7 +104,7 @@ def check_size(document: ModelDocument, robot: Robot, stored: int) -> None:
     if (learned := document.learned) is not None:
         harmonics = sum(getattr(section, "harmonics", 0) for section in learned.features)
         wanted += robot.dof * (robot.dof * sum(learned.orders) + 2 * harmonics)
-    if document.uncertainty is not None and document.uncertainty.products:
+    if document.uncertainty is not None and InputProducts.name in document.uncertainty.features:
         wanted += robot.dof * math.comb(robot.dof, 2)
     if wanted > stored:
         raise ValueError(f"it calls for {wanted:,} weights or more, but the file holds {stored:,} numbers")
@@ -124,9 +128,8 @@ def hybrid_shapes(document: ModelDocument, robot: Robot) -> dict[str, Shape]:
         empty = _empty_correction(learned, robot)
         result |= {f"correction.{key}": tuple(value.shape) for key, value in empty.state_dict().items()}
         result |= {f"coverage.{name}": (None,) for name in ("joint", "middle", "half")}
-        weights = sum(int(chosen.used.sum()) for chosen in empty.features)
-        if known is not None and known.products:
-            weights += InputProducts(robot).used.numel()
+        if known is not None:
+            weights = sum(int(chosen.used.sum()) for chosen in _weighted(known, empty))
     if known is not None:
         result["uncertainty.root"] = (len(known.free) + weights, None)
     return result
@@ -241,12 +244,19 @@ def _uncertainty(
 ) -> PositionUncertainty:
     """The uncertainty, its root with the rows of the parameters that were not free."""
     robot, bases, tools = place
-    space = ParameterSpace(drawn, tuple(bases), tuple(tools), _unknowns(known))
+    groups = [_unknowns(section) for section in known.unknowns]
+    if len({group.name for group in groups}) < len(groups):
+        raise ValueError("a group of sensors' unknowns appears twice")
+    if elsewhere := {frame for group in groups for frame in group.frames} - {*bases}:
+        raise ValueError(
+            f"sensors' unknowns are in the frame '{min(elsewhere)}', which the model does not have"
+        )
+    space = ParameterSpace(drawn, tuple(bases), tuple(tools), tuple(groups))
     count, free = len(space.parameters), list(known.free)
     if sorted(set(free)) != free or (free and free[-1] >= count):
         raise ValueError(f"the free parameters are rising numbers below {count}, got {free}")
     full = torch.zeros(count + len(root) - len(free), root.shape[1], dtype=torch.float64)
-    full[[*free, *range(count, len(full))]] = root.double()
+    full[[*free, *range(count, len(full))]] = root
     unknowns = {
         group: {owner: np.array(values) for owner, values in owners.items()}
         for group, owners in known.values.items()
@@ -256,44 +266,50 @@ def _uncertainty(
         if wrong:
             raise ValueError(f"{len(own.columns)} values of every {own.name} were wanted, got {wrong.pop()}")
     geometry = IdentifiedGeometry(robot, bases, tools, unknowns)
-    features = _weighted(known, hybrid)
+    features = _weighted(known, None if hybrid is None else hybrid.correction)
     return PositionUncertainty(
         space, geometry, features, CovarianceRoot(full), known.prior_scale, known.noise
     )
 
 
-def _unknowns_section(groups: Sequence[UnknownGroup]) -> dict[str, object]:
-    """What the sensors had to find out about themselves: of sockets and anchors the names, of others all."""
-    owners = {group.name: list(group.owners) for group in groups}
-    section: dict[str, object] = {"sockets": owners.get("socket", []), "anchors": owners.get("anchor", [])}
-    others = {
-        group.name: {
-            "columns": list(group.columns),
-            "owners": list(group.owners),
-            "angles": sorted(group.angles),
-        }
-        | ({"units": dict(group.units)} if group.units else {})
-        for group in groups
-        if group.name not in ("socket", "anchor")
+def _unknowns_section(group: UnknownGroup) -> dict[str, object]:
+    """What sensors of one kind had to find out about themselves."""
+    return {
+        "name": group.name,
+        "columns": list(group.columns),
+        "owners": list(group.owners),
+        "frames": list(group.frames),
+        "angles": sorted(group.angles),
+        "units": dict(group.units),
     }
-    return section | ({"others": others} if others else {})
 
 
-def _unknowns(known: UncertaintySection) -> tuple[UnknownGroup, ...]:
-    groups = (
-        UnknownGroup("socket", SOCKET_COLUMNS, known.sockets),
-        UnknownGroup("anchor", ANCHOR_COLUMNS, known.anchors),
-        *(
-            UnknownGroup(name, other.columns, other.owners, angles=frozenset(other.angles), units=other.units)
-            for name, other in known.others.items()
-        ),
+def _unknowns(section: UnknownsSection) -> UnknownGroup:
+    if len(section.frames) not in (0, len(section.owners)):
+        raise ValueError(f"one frame for every {section.name} was wanted, got {len(section.frames)}")
+    return UnknownGroup(
+        section.name,
+        section.columns,
+        section.owners,
+        section.frames,
+        frozenset(section.angles),
+        section.units,
     )
-    return tuple(group for group in groups if group.owners)
 
 
-def _weighted(known: UncertaintySection, hybrid: HybridArm | None) -> tuple[AbstractFeature, ...]:
-    """What the weights in the root belong to: the features, and the products that product units make up."""
-    if hybrid is None:
-        return ()
-    features, robot = hybrid.correction.features, hybrid.correction.robot
-    return (*features, InputProducts(robot)) if known.products else features
+def _weighted(known: UncertaintySection, correction: JointCorrection | None) -> tuple[AbstractFeature, ...]:
+    """What the weights in the root belong to: the features, and the products that product units make up.
+
+    Raises:
+        ValueError: the features are not those of the learned part.
+    """
+    learned = () if correction is None else correction.features
+    of_name = {chosen.name: chosen for chosen in learned}
+    if correction is not None and InputProducts.name in known.features:
+        of_name[InputProducts.name] = InputProducts(correction.robot)
+    if sorted(known.features) != sorted(of_name):
+        raise ValueError(
+            f"the uncertainty is of the features {', '.join(known.features) or 'none'}, "
+            f"but the learned part has {', '.join(chosen.name for chosen in learned) or 'none'}"
+        )
+    return tuple(of_name[name] for name in known.features)

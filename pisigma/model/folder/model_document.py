@@ -15,7 +15,7 @@ from pisigma.robot.robot_file import RobotDocument
 from pisigma.sensors.sensor import OtherUnit
 from pisigma.yaml_file import Section, parse_yaml, yaml_text
 
-FORMAT = 4
+FORMAT = 5
 """Of this version; folders of earlier formats are upgraded by `pisigma.model.folder.upgrade`."""
 MOST_FACTORS, MOST_UNITS = 100, 1000
 """Of a product unit; of a network."""
@@ -57,33 +57,31 @@ class LearnedSection(Section):
 class UnknownsSection(Section):
     """What the sensors of one kind had to find out about themselves; see `pisigma.sensors.sensor.UnknownGroup`."""
 
+    name: str
     columns: tuple[str, ...] = Field(min_length=1)
     owners: tuple[str, ...] = Field(min_length=1)
+    frames: tuple[str, ...] = ()
     angles: tuple[str, ...] = ()
     units: dict[str, OtherUnit] = Field(default_factory=dict)
 
 
 class UncertaintySection(Section):
-    """What the root of the covariance, which stands in the weights file, belongs to.
+    """What the rows of the root of the covariance, which stands in the weights file, belong to, in their order.
 
     Attributes:
-        sockets: names of the fixed points of the calibration.
-        anchors: the same of the ends of distances.
-        others: the unknowns of other sensors by group.
+        unknowns: what the sensors had to find out about themselves, group by group.
         values: by group and owner, the unknowns in the owner's frame [m or rad]; empty in folders that were upgraded
             from a format without them.
         free: which parameters have a row in the root; the others' rows are 0. Behind them come all weights.
-        products: whether the weights of products of inputs stand behind the others: see
-            `pisigma.joint_correction.input_products.InputProducts`.
+        features: names of the features whose weights these are: those of the learned part, and `products` for the
+            products of inputs that its product units make up.
         prior_scale: see `pisigma.hybrid.uncertainty.PositionUncertainty`, as for the noise.
     """
 
-    sockets: tuple[str, ...]
-    anchors: tuple[str, ...]
-    others: dict[str, UnknownsSection] = Field(default_factory=dict)
+    unknowns: tuple[UnknownsSection, ...] = ()
     values: dict[str, dict[str, tuple[FiniteFloat, ...]]] = Field(default_factory=dict)
     free: tuple[Annotated[int, Field(ge=0)], ...]
-    products: bool
+    features: Annotated[tuple[str, ...], Field(max_length=MOST_UNITS)]
     prior_scale: Annotated[float, Field(gt=0)]
     noise: dict[str, Annotated[FiniteFloat, Field(gt=0)]] = Field(default_factory=dict)
 
@@ -107,12 +105,13 @@ class ModelDocument(Section):
 
     model_config = ConfigDict(protected_namespaces=())
 
-    format: Literal[4]
+    format: Literal[5]
     name: str
     kind: str
     branches: tuple[str, ...]
     weights_sha256: str
     compiled_sha256: str | None = None
+    drawing_sha256: str | None = None
     robot: RobotDocument
     calibrated: RobotDocument | None
     bases: dict[str, _Frame]

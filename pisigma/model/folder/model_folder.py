@@ -14,8 +14,9 @@ from safetensors.torch import save as save_tensors
 from torch import Tensor
 
 from pisigma.errors import ModelError, PisigmaError, nearest_choice
-from pisigma.files.model_files import COMPILED, DESCRIPTION, WEIGHTS, content_hash, read_model_file
+from pisigma.files.model_files import COMPILED, DESCRIPTION, DRAWING, WEIGHTS, content_hash, read_model_file
 from pisigma.kinematics.closed_form import closed_form_solver
+from pisigma.measurement.copies import ROW_READINGS, ROW_STEPS, RowValues
 from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.compiled_model import save_compiled
 from pisigma.model.domain import Domain
@@ -36,13 +37,15 @@ from pisigma.robot.description import Robot
 from pisigma.robot.writing import robot_document
 
 _PREFIX = "network."
+_ROWS = ("rows.numbers", "rows.measured", "rows.steps")
+"""Of the rows that a model was made of: what was measured, whether it was, and what it was rounded to."""
 
 
 def save_model(model: CalibratedModel, folder: Path) -> None:
     """Write the files of a model into a folder, such as `staged_folder` gives.
 
     Next to `model.yaml` and `model.safetensors` it gets what the compiled kernels read, where they know the model's
-    kind of correction.
+    kind of correction, and the URDF file that the robot was drawn in, where it was.
 
     Raises:
         ModelError: the model is under given conditions.
@@ -66,6 +69,7 @@ def save_model(model: CalibratedModel, folder: Path) -> None:
         "kind": model.kind,
         "branches": list(model.branches),
         "weights_sha256": hashlib.sha256(weights).hexdigest(),
+        "drawing_sha256": None if model.robot.urdf is None else hashlib.sha256(model.robot.urdf).hexdigest(),
         "robot": robot_document(model.robot),
         "calibrated": robot_document(model.calibrated) if model.calibrated else None,
         "bases": {name: frame.tolist() for name, frame in model.bases.items()},
@@ -76,6 +80,8 @@ def save_model(model: CalibratedModel, folder: Path) -> None:
         "metrics": model.metrics,
     }
     (folder / WEIGHTS).write_bytes(weights)
+    if model.robot.urdf is not None:
+        (folder / DRAWING).write_bytes(model.robot.urdf)
     describe(document_text(document), model, folder)
 
 
@@ -112,9 +118,10 @@ def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:
                 f"{path}: {name} is missing, so this is no whole model folder; train or copy it again."
             )
     document = read_document(path / DESCRIPTION)
-    tensors = _read_weights(path / WEIGHTS, document.weights_sha256)
+    tensors = read_weights(path / WEIGHTS, document.weights_sha256)
+    drawing = document.drawing_sha256 and _read_whole(path / DRAWING, document.drawing_sha256)
     try:
-        return _build_model(document, tensors)
+        return _build_model(document, tensors, drawing or None)
     except (PisigmaError, ValueError) as problem:
         reason = " ".join(str(problem).rstrip(".").split())
         raise ModelError(
@@ -124,19 +131,23 @@ def load_model(folder: str | os.PathLike[str]) -> CalibratedModel:
 
 def _tensors(model: CalibratedModel) -> dict[str, Tensor]:
     tensors = {"starts": model.starts, **hybrid_tensors(model)}
+    if (rows := model.made_of) is not None:
+        there = torch.isfinite(rows.numbers)
+        values = torch.where(there, rows.numbers, 0.0), there.to(torch.uint8), rows.steps
+        tensors |= dict(zip(_ROWS, values, strict=True))
     for prefix, module in (("network", model.network), ("domain", model.domain)):
         if module is not None:
             tensors |= {f"{prefix}.{key}": value for key, value in module.state_dict().items()}
     return {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
 
 
-def _read_weights(path: Path, sha256: str) -> dict[str, Tensor]:
-    content = read_model_file(path.parent, path.name)
-    if hashlib.sha256(content).hexdigest() != sha256:
-        raise ModelError(
-            f"{path}: is truncated, changed or of another model (its hash is not the one in {DESCRIPTION}); "
-            "train or copy the model again."
-        )
+def read_weights(path: Path, sha256: str) -> dict[str, Tensor]:
+    """Read the tensors of a weights file.
+
+    Raises:
+        ModelError: its hash is another one, it is no such file, or it holds numbers that are not finite.
+    """
+    content = _read_whole(path, sha256)
     try:
         tensors: dict[str, Tensor] = load_tensors(content)
     except SafetensorError as problem:
@@ -151,13 +162,30 @@ def _read_weights(path: Path, sha256: str) -> dict[str, Tensor]:
     return tensors
 
 
-def _build_model(document: ModelDocument, tensors: dict[str, Tensor]) -> CalibratedModel:
+def _read_whole(path: Path, sha256: str) -> bytes:
+    """Read a file that the description states the hash of.
+
+    Raises:
+        ModelError: its hash is another one, or it cannot be read.
+    """
+    content = read_model_file(path.parent, path.name)
+    if hashlib.sha256(content).hexdigest() != sha256:
+        raise ModelError(
+            f"{path}: is truncated, changed or of another model (its hash is not the one in {DESCRIPTION}); "
+            "train or copy the model again."
+        )
+    return content
+
+
+def _build_model(
+    document: ModelDocument, tensors: dict[str, Tensor], drawing: bytes | None
+) -> CalibratedModel:
     """Put the model together from parts that fit.
 
     Raises:
         ValueError: a tensor is missing, too many or of another shape or type; or a name or count is wrong.
     """
-    robot = Robot(*document.robot.drawing())
+    robot = Robot(*document.robot.drawing()._replace(urdf=drawing))
     check_size(document, robot, sum(value.numel() for value in tensors.values()))
     _check_branches(robot, document.branches)
     network = _empty_network(document, robot)
@@ -167,6 +195,9 @@ def _build_model(document: ModelDocument, tensors: dict[str, Tensor]) -> Calibra
         expected |= {_PREFIX + key: tuple(value.shape) for key, value in network.state_dict().items()}
         inputs = sum(len(group.inputs.names) for group in network.groups)
         expected |= {"domain.samples": (None, inputs), "domain.radius": ()} if samples else {}
+    if _ROWS[0] in tensors:  # folders do not have to keep them
+        columns = len(robot.axes) + ROW_READINGS
+        expected |= dict(zip(_ROWS, ((None, columns), (None, columns), (None, ROW_STEPS)), strict=True))
     _check_tensors(tensors, expected)
     if network is not None:
         network.load_state_dict(
@@ -188,16 +219,23 @@ def _build_model(document: ModelDocument, tensors: dict[str, Tensor]) -> Calibra
         calibrated=_calibrated_robot(document, robot),
         bases=bases,
         tools=tools,
+        made_of=_made_of(robot, *(tensors[name] for name in _ROWS)) if _ROWS[0] in tensors else None,
         provenance=Provenance(**document.provenance.model_dump()),
         metrics=document.metrics,
     )
     return with_hybrid(model, document, tensors)
 
 
+def _made_of(robot: Robot, numbers: Tensor, measured: Tensor, steps: Tensor) -> RowValues:
+    if not len(numbers) == len(measured) == len(steps):
+        raise ValueError("the rows that the model was made of lack numbers or steps")
+    return RowValues.kept(torch.where(measured.bool(), numbers, torch.nan), steps, robot)
+
+
 def _calibrated_robot(document: ModelDocument, robot: Robot) -> Robot | None:
     if document.calibrated is None:
         return None
-    calibrated = Robot(*document.calibrated.drawing())
+    calibrated = Robot(*document.calibrated.drawing()._replace(urdf=robot.urdf))
     if [(row.name, row.type) for row in calibrated.rows] != [(row.name, row.type) for row in robot.rows]:
         raise ValueError("the calibrated robot has other rows than the nominal one")
     if not (np.array_equal(calibrated.base, robot.base) and np.array_equal(calibrated.tool, robot.tool)):

@@ -1,15 +1,21 @@
 """Model folders of earlier versions made new: keys of `model.yaml` that have another name or form since."""
 
+import hashlib
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from safetensors.torch import save as save_tensors
+
 from pisigma.errors import ModelError
-from pisigma.files.model_files import CARD, COMPILED, DESCRIPTION, MODEL_FILES, read_model_file
+from pisigma.files.model_files import CARD, COMPILED, DESCRIPTION, MODEL_FILES, WEIGHTS, read_model_file
 from pisigma.files.output_folder import staged_folder
+from pisigma.joint_correction.gear_lines import GearLines
+from pisigma.joint_correction.input_products import InputProducts
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_document import (
     FORMAT,
     document_text,
@@ -17,7 +23,9 @@ from pisigma.model.folder.model_document import (
     stated_format,
     write_document,
 )
-from pisigma.model.folder.model_folder import describe, load_model
+from pisigma.model.folder.model_folder import describe, load_model, read_weights
+from pisigma.sensors.anchor import ANCHOR_COLUMNS
+from pisigma.sensors.socket import SOCKET_COLUMNS
 from pisigma.yaml_file import plain_content
 
 _RENAMED = {
@@ -52,6 +60,7 @@ _NO_FADE = (
     "to the geometric calibration beyond the measured ones."
 )
 
+ROOT = "uncertainty.root"
 MOST_SPREADS = 3.0
 """Up to format 3 conditions counted as measured so many standard deviations from their mean."""
 
@@ -73,18 +82,19 @@ class Upgrade:
     changes: tuple[str, ...] = ()
 
 
-def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
+def upgrade_folder(folder: str | os.PathLike[str], check: Callable[[CalibratedModel, Path], None]) -> Upgrade:
     """Rewrite a model folder of an earlier version in the form of this one, whole or not at all.
 
-    Tensors, figures and all other files stay as they are, and so does the card but for what is not true any more; the
-    file for the compiled kernels is made again.
+    Tensors, figures and all other files stay as they are, but for the type of the root of a covariance, and so does the
+    card but for what is not true any more; the file for the compiled kernels is made again.
 
     Args:
         folder: to upgrade.
+        check: raises where a folder does not say what a model in memory says: `pisigma.inverse.written_model`.
 
     Raises:
         ModelError: the folder holds no model, it is truncated, was edited or is of a newer format, or it is a hybrid
-            with product units of an earlier version.
+            with product units of an earlier version, or with an uncertainty whose order cannot be known.
         OutputError: the folder cannot be written.
     """
     path = Path(folder)
@@ -96,12 +106,15 @@ def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
         return Upgrade(load_model(path).name, before, FORMAT)
     document["metrics"] = _metrics(str(document.get("kind")), _renamed(document["metrics"]))
     if "uncertainty" in document:
-        document["uncertainty"] = _without_turns(_renamed(document["uncertainty"]), path)
+        document["uncertainty"] = _in_order(
+            _without_turns(_renamed(document["uncertainty"]), path), document, path
+        )
     changes = (*_without_fade(document), *_with_measured_conditions(document))
     others = {entry.name for entry in path.iterdir() if entry.is_file()} - {COMPILED}
     with staged_folder(path, overwrite=True, names=MODEL_FILES | others) as scratch:
         for name in sorted(others):
             (scratch / name).write_bytes(read_model_file(path, name))
+        document["weights_sha256"] = _with_exact_root(scratch / WEIGHTS, str(document.get("weights_sha256")))
         if changes and (card := scratch / CARD).is_file():
             card.write_bytes(_FADED.sub(_EXTRAPOLATED, card.read_bytes()))
         text = document_text(
@@ -110,6 +123,7 @@ def upgrade_folder(folder: str | os.PathLike[str]) -> Upgrade:
         write_document(text, None, scratch / DESCRIPTION)
         model = load_model(scratch)
         describe(text, model, scratch)
+        check(model, scratch)
     return Upgrade(model.name, before, FORMAT, changes)
 
 
@@ -133,6 +147,61 @@ def _without_turns(uncertainty: dict[str, Any], path: Path) -> dict[str, Any]:
             "version, whose uncertainty cannot be converted; calibrate again."
         )
     return {"products": False, **uncertainty}
+
+
+def _in_order(uncertainty: dict[str, Any], document: Mapping[str, Any], path: Path) -> dict[str, Any]:
+    """State the order of the root's rows, which folders up to format 4 do not.
+
+    Their weights are in the order in which the calibration tried the features: products of inputs behind all others,
+    but for single lines, which were looked for in what all others leave. Sensors' unknowns are in the order of their
+    values.
+
+    Raises:
+        ModelError: rows were added to a model whose weights were read in another order.
+    """
+    features = [feature["name"] for feature in document.get("learned", {}).get("features", ())]
+    if uncertainty.pop("products"):
+        if GearLines.name in features and document.get("kind") != "hybrid_calibration":
+            raise ModelError(
+                f"{path}: expected an uncertainty whose weights are in a known order, got one of products and lines to "
+                "which an earlier version added rows in another order, so that the model itself is wrong; calibrate "
+                "again, or upgrade the calibration and recalibrate that again."
+            )
+        features.insert(
+            features.index(GearLines.name) if GearLines.name in features else len(features),
+            InputProducts.name,
+        )
+    groups = [
+        {
+            "name": name,
+            "columns": list(columns),
+            "owners": uncertainty.pop(f"{name}s"),
+            "angles": [],
+            "units": {},
+        }
+        for name, columns in (("socket", SOCKET_COLUMNS), ("anchor", ANCHOR_COLUMNS))
+    ]
+    groups += [{"name": name, **group} for name, group in uncertainty.pop("others", {}).items()]
+    order = list(uncertainty.get("values", {}))
+    groups.sort(key=lambda group: order.index(group["name"]) if group["name"] in order else len(order))
+    return {
+        "unknowns": [group for group in groups if group["owners"]],
+        **uncertainty,
+        "features": features,
+    }
+
+
+def _with_exact_root(path: Path, sha256: str) -> str:
+    """Write the root of the covariance in float64, which is in float32 up to format 4; gives the new hash of the file.
+
+    Raises:
+        ModelError: the file is not the one that the description states.
+    """
+    tensors = read_weights(path, sha256)
+    if ROOT in tensors:
+        tensors[ROOT] = tensors[ROOT].double()
+        path.write_bytes(save_tensors(tensors))
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _with_measured_conditions(document: Mapping[str, Any]) -> tuple[str, ...]:

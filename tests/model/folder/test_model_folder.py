@@ -169,8 +169,8 @@ def test_weights_of_another_model_are_noticed(folder, tmp_path):
 
 def test_a_newer_format_asks_for_an_upgrade(folder):
     path = folder / "model.yaml"
-    path.write_text(path.read_text().replace("format: 4\n", "format: 5\n", 1))
-    assert "model.yaml: format 5 is newer than this pisigma reads (4); upgrade pisigma." in refused(folder)
+    path.write_text(path.read_text().replace("format: 5\n", "format: 6\n", 1))
+    assert "model.yaml: format 6 is newer than this pisigma reads (5); upgrade pisigma." in refused(folder)
 
 
 def test_an_earlier_format_names_the_command_that_upgrades(folder):

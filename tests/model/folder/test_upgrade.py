@@ -13,6 +13,7 @@ from testing.models import hand_made_model
 from testing.report import hybrid_under_test
 
 from pisigma.errors import ModelError, OutputError
+from pisigma.inverse.written_model import check_written
 from pisigma.joint_correction.conditions import ConditionFeatures
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.model.calibrated_model import CalibratedModel
@@ -41,6 +42,15 @@ def old(values: Any, names: dict[str, str] = OLD) -> Any:
     return [old(value, names) for value in values] if isinstance(values, list) else values
 
 
+def unknowns_before(uncertainty: dict[str, Any]) -> list[str]:
+    """Put what the root belongs to as formats up to 4 did; gives the features, whose order those did not state."""
+    groups = {group.pop("name"): group for group in uncertainty.pop("unknowns")}
+    for name in ("socket", "anchor"):
+        uncertainty[f"{name}s"] = groups.pop(name, {"owners": []})["owners"]
+    uncertainty["others"] = groups
+    return uncertainty.pop("features")
+
+
 def write_old(model: CalibratedModel, folder: Path, turns: Sequence[int] = ()) -> dict[str, bytes]:
     """Write a model folder as the earlier version did, with factors of product units by turns; gives its files."""
     folder.mkdir()
@@ -51,7 +61,7 @@ def write_old(model: CalibratedModel, folder: Path, turns: Sequence[int] = ()) -
     if "uncertainty" in document:
         document["uncertainty"] = old(document["uncertainty"], {"prior_scale": "widening"})
         document["uncertainty"]["unexplained_m"] = 1e-4
-        del document["uncertainty"]["products"]
+        unknowns_before(document["uncertainty"])
         document["uncertainty"]["turns"] = list(turns)
     if "learned" in document:
         document["learned"]["fade_rad"] = 0.17
@@ -72,8 +82,8 @@ def test_a_hybrid_calibration_comes_back_with_all_figures(tmp_path):
     files = write_old(model, tmp_path / "arm")
     with pytest.raises(ModelError, match="run `pisigma upgrade"):
         load_model(tmp_path / "arm")
-    done = upgrade_folder(tmp_path / "arm")
-    assert (done.name, done.before, done.after) == ("arm", 2, 4)
+    done = upgrade_folder(tmp_path / "arm", check_written)
+    assert (done.name, done.before, done.after) == ("arm", 2, 5)
     assert [sentence for sentence in done.changes if "faded" in sentence]
     upgraded = load_model(tmp_path / "arm")
     assert upgraded.metrics == model.metrics
@@ -84,7 +94,7 @@ def test_a_hybrid_calibration_comes_back_with_all_figures(tmp_path):
     assert (tmp_path / "arm" / "compiled.npz").read_bytes() != files["compiled.npz"]
     assert [entry.name for entry in tmp_path.iterdir()] == ["arm"]
     before = (tmp_path / "arm" / "model.yaml").read_bytes()
-    assert upgrade_folder(tmp_path / "arm") == Upgrade("arm", 4, 4)
+    assert upgrade_folder(tmp_path / "arm", check_written) == Upgrade("arm", 5, 5)
     assert (tmp_path / "arm" / "model.yaml").read_bytes() == before
 
 
@@ -94,9 +104,9 @@ def test_what_else_lies_in_a_folder_is_kept(tmp_path):
     (tmp_path / "arm" / "notes.txt").write_text("mine")
     (tmp_path / "arm" / ".git").mkdir()
     with pytest.raises(OutputError, match=r"holds a model, but also '\.git'"):
-        upgrade_folder(tmp_path / "arm")
+        upgrade_folder(tmp_path / "arm", check_written)
     (tmp_path / "arm" / ".git").rmdir()
-    upgrade_folder(tmp_path / "arm")
+    upgrade_folder(tmp_path / "arm", check_written)
     assert (tmp_path / "arm" / "notes.txt").read_text() == "mine"
 
 
@@ -104,7 +114,7 @@ def test_product_units_of_an_earlier_version_are_refused_and_nothing_is_changed(
     _, model = hybrid_under_test()
     files = write_old(model, tmp_path / "arm", turns=(11,))
     with pytest.raises(ModelError, match="cannot be converted; calibrate again"):
-        upgrade_folder(tmp_path / "arm")
+        upgrade_folder(tmp_path / "arm", check_written)
     assert {entry.name: entry.read_bytes() for entry in (tmp_path / "arm").iterdir()} == files
 
 
@@ -114,7 +124,7 @@ def test_measured_conditions_are_about_the_mean_where_a_folder_does_not_say(tmp_
     learned = ConditionFeatures(robot, names, (2.0, 20.0), (1.0, 3.0), ((0.0, 4.0), (15.0, 26.0)))
     model = replace(hybrid_model("kiro4", [learned]), metrics={"parameters": [], "hybrid": {"learned": {}}})
     write_old(model, tmp_path / "arm")
-    done = upgrade_folder(tmp_path / "arm")
+    done = upgrade_folder(tmp_path / "arm", check_written)
     assert "payload_kg 0 to 5 and temperature_c 11 to 29 are taken" in done.changes[1]
     features = load_model(tmp_path / "arm").hybrid.correction.features
     assert features[0].measured == ((0.0, 5.0), (11.0, 29.0))
@@ -126,7 +136,7 @@ def test_figures_of_other_kinds_change_their_form(tmp_path):
     flat = {f"{part}_{name}_deg": 1.0 for part in ("correction", "error") for name in names}
     metrics = {"doubts": ["so"], "gives_up": ["much"], "joints": [{"name": "theta_1", "unit": "deg", **flat}]}
     write_old(replace(network, kind="distilled", metrics=metrics), tmp_path / "small")
-    upgrade_folder(tmp_path / "small")
+    upgrade_folder(tmp_path / "small", check_written)
     figures = dict.fromkeys(names, 1.0)
     assert load_model(tmp_path / "small").metrics == {
         "warnings": ["so"],
@@ -134,7 +144,7 @@ def test_figures_of_other_kinds_change_their_form(tmp_path):
         "joints": [{"name": "theta_1", "unit": "deg", "correction": figures, "error": figures}],
     }
     write_old(replace(network, metrics={"joints": [{"name": "theta_1"}]}), tmp_path / "net")
-    assert upgrade_folder(tmp_path / "net") == Upgrade("hand_made_kiro3", 1, 4)
+    assert upgrade_folder(tmp_path / "net", check_written) == Upgrade("hand_made_kiro3", 1, 5)
     assert load_model(tmp_path / "net").metrics == {"joints": [{"name": "theta_1"}]}
 
 
@@ -142,14 +152,14 @@ def test_a_folder_that_does_not_load_stays_as_it_was(tmp_path):
     files = write_old(hand_made_model("kiro3"), tmp_path / "arm")
     (tmp_path / "arm" / "model.safetensors").write_bytes(files["model.safetensors"][:-8])
     with pytest.raises(ModelError, match="is truncated"):
-        upgrade_folder(tmp_path / "arm")
+        upgrade_folder(tmp_path / "arm", check_written)
     assert (tmp_path / "arm" / "model.yaml").read_bytes() == files["model.yaml"]
     (tmp_path / "arm" / "model.yaml").write_bytes(files["model.yaml"][:-80])
     with pytest.raises(ModelError, match="was edited"):
-        upgrade_folder(tmp_path / "arm")
+        upgrade_folder(tmp_path / "arm", check_written)
     assert [entry.name for entry in tmp_path.iterdir()] == ["arm"]
 
 
 def test_no_model_is_refused(tmp_path):
     with pytest.raises(ModelError, match="cannot be read"):
-        upgrade_folder(tmp_path)
+        upgrade_folder(tmp_path, check_written)
