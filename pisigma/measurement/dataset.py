@@ -3,7 +3,7 @@
 import hashlib
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -288,8 +288,8 @@ class Measurements:
             revolute: the same per joint, without a robot; with neither, all joints turn.
 
         Raises:
-            MeasurementError: the measurements would not read back: no row, a row in which nothing was measured, two
-                equal rows, a name that a CSV cell cannot hold, or joints that do not fit.
+            MeasurementError: the measurements would not read back: no row, a row in which nothing was measured,
+                a name that a CSV cell cannot hold, or joints that do not fit.
             OutputError: the file cannot be written there.
         """
         origin = "'revolute'" if robot is None else f"robot '{robot.name}'"
@@ -310,13 +310,16 @@ class Measurements:
         write_fields(written, path, turning)
 
 
-def join(data: Sequence[Measurements]) -> Measurements:
+def join(
+    data: Sequence[Measurements], cleared: Callable[[MeasuredFields], MeasuredFields] = lambda rows: rows
+) -> Measurements:
     """Put the rows of several data sets behind each other; what one of them lacks is NaN or "" in its rows.
 
     Frames, targets, sockets, anchors and pairs of one name are taken for the same.
 
     Args:
         data: one or more, of robots with equally many joints.
+        cleared: what is left of all rows, before it is checked that they fit together.
 
     Raises:
         MeasurementError: there is no data set, numbers of joints differ, only some of them say which rows are for the
@@ -333,4 +336,4 @@ def join(data: Sequence[Measurements]) -> Measurements:
         raise MeasurementError(
             "join: some data sets have a split and some have none; give it to all or to none."
         )
-    return Measurements.from_fields(joined_fields([one.as_fields() for one in data]))
+    return Measurements.from_fields(cleared(joined_fields([one.as_fields() for one in data])))

@@ -1,6 +1,5 @@
 """The rules that rows of measurements follow, alone and together, in files and in memory."""
 
-import datetime
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.measurement.dates import WANTED, is_date
 from pisigma.measurement.fields import NUMBERS, TEXTS, MeasuredFields
 from pisigma.measurement.readings import READINGS, Unit, from_si, reading_numbers, reading_texts
 
@@ -19,6 +19,8 @@ AXES = ("x", "y", "z")
 SPLITS = ("train", "test")
 SMALLEST_SIGMA = 1e-12
 """[m or rad] Nothing is measured more exactly."""
+PAYLOADS = (0.0, 2500.0)
+"""[kg] The strongest arms that are sold lift 2,300 kg."""
 TEMPERATURES = (-50.0, 150.0)
 """[deg C] Outside these no robot works; 293 is a room in kelvins, and -400 lies below absolute zero."""
 
@@ -158,14 +160,6 @@ def row_faults(data: MeasuredFields, labels: Labels) -> Iterator[Fault]:
         )
 
 
-def is_date(text: str) -> bool:
-    """Whether a text is a day as ISO 8601 writes it, such as "2026-11-22"."""
-    try:
-        return datetime.date.fromisoformat(text).isoformat() == text
-    except ValueError:
-        return False
-
-
 def rows_where(bad: Bool[np.ndarray, " rows"]) -> list[int]:
     """The numbers of the rows where something is true."""
     rows: list[int] = np.flatnonzero(bad).tolist()
@@ -177,15 +171,16 @@ def _value_faults(data: MeasuredFields, labels: Labels) -> Iterator[Fault]:
     for name, least, most in (
         ("sigma_position", SMALLEST_SIGMA, math.inf),
         ("sigma_rotation", SMALLEST_SIGMA, math.inf),
-        ("payload", 0.0, math.inf),
+        ("payload", *PAYLOADS),
         ("temperature", *TEMPERATURES),
     ):
         values = data.array(name)
-        wanted = f"{labels.shown(name, least)} {'or more' if most == math.inf else f'to {most:g} deg C'}"
+        unit = {"temperature": "deg C", "payload": "kg"}.get(name, "")
+        wanted = f"{labels.shown(name, least)} {'or more' if most == math.inf else f'to {most:g} {unit}'}"
         for row in rows_where((values < least) | (values > most)):
             what = (
                 f"{labels(name)}: {labels.shown(name, values[row])} stands where {wanted} was wanted; correct it"
-                f"{'' if most == math.inf else ' (deg C = K - 273.15 = (deg F - 32) / 1.8)'} or leave it empty"
+                f"{' (deg C = K - 273.15 = (deg F - 32) / 1.8)' if unit == 'deg C' else ''} or leave it empty"
             )
             yield row, what
     if "approach" in data.numbers:
@@ -206,8 +201,7 @@ def _value_faults(data: MeasuredFields, labels: Labels) -> Iterator[Fault]:
         if date and not is_date(date):
             yield (
                 row,
-                f"{labels('date')}: '{date}' stands where a day such as 2026-11-22 was wanted; correct it or leave it "
-                "empty",
+                f"{labels('date')}: expected {WANTED}, got '{date}'; correct it or leave it empty",
             )
 
 

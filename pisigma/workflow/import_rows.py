@@ -1,7 +1,7 @@
 """Import what instruments and controllers export as measurements."""
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,9 +9,11 @@ from pisigma.errors import MeasurementError
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.foreign.accounting import FileAccount, LeftOutRow, Place, account, sentences
 from pisigma.measurement.foreign.conversion import ConvertedRows, convert
+from pisigma.measurement.foreign.doubts import doubts
 from pisigma.measurement.foreign.export_file import read_export
-from pisigma.measurement.foreign.joining import WITHIN, JoinBy, append_rows, join_rows
+from pisigma.measurement.foreign.joining import WITHIN, JoinBy, JoinedRows, append_rows, join_rows
 from pisigma.measurement.foreign.mapping import FileMapping, map_columns
 from pisigma.measurement.foreign.measurement_table import MeasurementTable, measurement_table
 from pisigma.measurement.foreign.number_format import Decimal
@@ -92,13 +94,13 @@ class ImportedRows:
     Attributes:
         proposal: what the columns are.
         content: the measurement file.
-        unmatched: sentences on rows that have no partner in the other file.
+        accounts: of every file, what became of its rows.
         warnings: what else should be known, each a sentence.
     """
 
     proposal: ImportProposal
     content: MeasurementTable
-    unmatched: tuple[str, ...]
+    accounts: tuple[FileAccount, ...]
     warnings: tuple[str, ...]
 
     @property
@@ -107,9 +109,14 @@ class ImportedRows:
         return len(self.content.table.records)
 
     @property
+    def left_out(self) -> tuple[LeftOutRow, ...]:
+        """The rows of all files that were not imported."""
+        return tuple(row for file in self.accounts for row in file.left_out)
+
+    @property
     def sentences(self) -> tuple[str, ...]:
-        """What is to be said of the rows: which are left out, which have no partner, and warnings."""
-        return (*self.content.sentences, *self.unmatched, *self.warnings)
+        """What is to be said of the rows: which are left out and why, and warnings."""
+        return (*sentences(self.left_out), *self.warnings)
 
     @property
     def measurements(self) -> Measurements:
@@ -130,9 +137,9 @@ class ImportedRows:
         """Give what was read and left out as plain values."""
         return {
             "rows": self.rows,
+            "files": [file.to_json() for file in self.accounts],
             "columns": self.proposal.columns_json(),
-            "left_out": [{"line": row.line, "reason": row.reason} for row in self.content.left_out],
-            "unmatched": list(self.unmatched),
+            "left_out": [row.to_json() for row in self.left_out],
             "warnings": list(self.warnings),
         }
 
@@ -151,12 +158,27 @@ def propose_import(
     """
     settings = settings or ImportSettings()
     units = parse_units(settings.units)
+    _check_different(files)
     exports = [read_export(path, settings.decimal) for path in files]
     check_used(settings.maps, [file.headings for file in exports])
     mappings = tuple(
         map_columns(file, map_for(settings.maps, file.headings), settings.rotation, units) for file in exports
     )
     return ImportProposal(mappings, settings)
+
+
+def _check_different(files: Sequence[str | os.PathLike[str]]) -> None:
+    """Refuse a file that is given twice, whose rows would count twice.
+
+    Raises:
+        MeasurementError: see above.
+    """
+    paths = [os.path.realpath(path) for path in files]
+    for number, path in enumerate(paths):
+        if path in paths[:number]:
+            raise MeasurementError(
+                f"{files[number]}: expected different files, got this one twice; give it once."
+            )
 
 
 def import_rows(
@@ -177,26 +199,31 @@ def import_rows(
     """
     proposal = files if isinstance(files, ImportProposal) else propose_import(files, settings)
     converted = [(mapping, convert(mapping)) for mapping in proposal.mappings]
-    rows, unmatched, warnings = _joined(converted, proposal.settings)
+    rows, joined = _joined(converted, proposal.settings)
     content = measurement_table(rows)
-    doubts = [sentence for mapping in proposal.mappings for sentence in mapping.doubts]
-    skipped = [
-        f"{file.source}, line {file.skipped[0]}: is no row and is left out"
-        + (f" ({len(file.skipped) - 1} more)." if len(file.skipped) > 1 else ".")
-        for file in (mapping.file for mapping in proposal.mappings)
-        if file.skipped
-    ]
-    return ImportedRows(proposal, content, tuple(unmatched), (*doubts, *warnings, *skipped))
+    exports = [mapping.file for mapping in proposal.mappings]
+    left_out = [*(row for file in exports for row in file.skipped), *content.left_out]
+    used: list[Place] = list(content.places)
+    if joined is not None:
+        left_out += (*joined.unmatched, *joined.unused)
+        used += joined.used
+    warnings = [sentence for mapping in proposal.mappings for sentence in doubts(mapping)]
+    return ImportedRows(
+        proposal,
+        content,
+        account([place for file in exports for place in file.places], used, left_out),
+        (*warnings, *(() if joined is None else joined.warnings)),
+    )
 
 
 def _joined(
     converted: Sequence[tuple[FileMapping, ConvertedRows]], settings: ImportSettings
-) -> tuple[ConvertedRows, Iterable[str], Iterable[str]]:
-    """All rows, sentences on those without a partner, and warnings."""
+) -> tuple[ConvertedRows, JoinedRows | None]:
+    """All rows, and how they were joined."""
     if settings.join is None:
         for _, rows in converted if len(converted) > 1 else ():
             measurement_table(rows)  # so that a fault is named with its file
-        return append_rows([rows for _, rows in converted]), (), ()
+        return append_rows([rows for _, rows in converted]), None
     joints = [rows for mapping, rows in converted if mapping.has_joints]
     measured = [rows for mapping, rows in converted if not mapping.has_joints]
     if not joints or not measured:
@@ -206,4 +233,4 @@ def _joined(
             f"{missing}; give both, or name the columns with --map."
         )
     joined = join_rows(append_rows(measured), append_rows(joints), settings.join, settings.within)
-    return joined.rows, joined.unmatched, joined.warnings
+    return joined.rows, joined

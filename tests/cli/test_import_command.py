@@ -55,7 +55,7 @@ def test_json_is_one_object(run, out):
     result = run("import", LOG, POINTS, "--join", "point", "--out", out, "--yes", "--json")
     printed = json.loads(result.stdout)
     assert result.stderr == ""
-    assert (printed["file"], printed["rows"], len(printed["unmatched"])) == (str(out), 6, 2)
+    assert (printed["file"], printed["rows"], len(printed["left_out"])) == (str(out), 6, 2)
     assert printed["columns"][1] == {
         "file": str(LOG),
         "column": 2,

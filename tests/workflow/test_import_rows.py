@@ -42,7 +42,8 @@ def test_exports_become_what_is_expected(
     rows = import_rows([EXPORTS / name for name in files], settings)
     rows.save(tmp_path / "out.csv")
     assert (tmp_path / "out.csv").read_text() == (EXPORTS / "expected.csv").read_text()
-    assert (rows.warnings, rows.unmatched, rows.content.left_out) == ((), (), ())
+    assert (rows.warnings, rows.left_out) == ((), ())
+    assert all(file.read == file.used == 24 for file in rows.accounts)
 
 
 def write(tmp_path: Path, *texts: str) -> list[Path]:
@@ -57,7 +58,9 @@ def test_rows_without_a_measurement_are_left_out_and_named(tmp_path: Path):
     rows = import_rows(paths)
     assert rows.rows == 2
     assert [row.line for row in rows.content.left_out] == [3, 4]
-    assert rows.to_json()["left_out"] == [{"line": line, "reason": "nothing was measured"} for line in (3, 4)]
+    assert rows.to_json()["left_out"] == [
+        {"file": str(paths[0]), "line": line, "reason": "nothing was measured"} for line in (3, 4)
+    ]
     with pytest.raises(MeasurementError, match="line 2, column 'z_mm': the cell is empty"):
         import_rows(write(tmp_path, f"{HEADER}\np1,1,2,3,4,\np4,1,5,6,7,8\n"))
 

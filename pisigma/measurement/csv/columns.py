@@ -15,6 +15,11 @@ ANCHOR_PLACE = ("anchor_x", "anchor_y", "anchor_z")
 
 REVOLUTE_UNITS: tuple[Unit, ...] = ("deg", "rad")
 PRISMATIC_UNITS: tuple[Unit, ...] = ("mm", "m")
+_METRES = {"metres": 1.0, "millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
+MISNAMED_UNITS = tuple(
+    (_METRES[are] / _METRES[named], are, named) for are in _METRES for named in _METRES if are != named
+)
+"""Factors on lengths, what they are, and what they are taken for."""
 
 CORNERS = ("corner", "u_px", "v_px")
 """Columns of files of corners, which `pisigma.camera` reads."""

@@ -20,7 +20,7 @@ from pisigma.measurement.csv.columns import (
     quoted,
 )
 from pisigma.measurement.csv.header import Layout, read_header
-from pisigma.measurement.csv.rows import CheckedRows, check_cells, check_equal_rows
+from pisigma.measurement.csv.rows import CheckedRows, check_cells
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.fields import TEXTS, LeftOut, MeasuredFields, OnBadRow
 from pisigma.measurement.foreign.import_hint import import_hint
@@ -96,7 +96,6 @@ def _sound_rows(table: Table, layout: Layout, robot: Robot | None) -> MeasuredFi
     rows = check_cells(table, layout, robot)
     data, labels, faults = _fields(table, layout, rows), _labels(layout), rows.faults
     faults.add(row_faults(data, labels))
-    check_equal_rows(rows, layout, table)
     lines = [f"line {line}" for line in table.lines]
     faults.add(group_faults(data, labels, faults.sound(data.rows), lines.__getitem__))
     sound = data.select(torch.from_numpy(np.flatnonzero(faults.sound(data.rows))))
@@ -182,6 +181,16 @@ def read_joints(path: str | os.PathLike[str], robot: Robot) -> Float64[Tensor, "
     for number, column in enumerate(columns):
         values[:, number] = to_si(number_column(table, column.name), column.unit)
     return torch.from_numpy(robot.to_dh(values))
+
+
+def holds_measurements(path: str | os.PathLike[str]) -> bool:
+    """Whether a file holds measured values besides joint values; files that `pisigma ik` writes hold a status.
+
+    Raises:
+        MeasurementError: the file cannot be used.
+    """
+    names = {name.rpartition("_")[0] or name for name in read_table(path).header}
+    return bool({"x", "distance", "socket", "u"} & names) and "status" not in names
 
 
 def _joint_column(table: Table, number: int, robot: Robot) -> Column:

@@ -4,10 +4,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 
-from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
-from pisigma.measurement.csv.columns import PLAN_COLUMNS, QUATERNION, Column, quoted
+from pisigma.kinematics.joint_limits import grossly_beyond
+from pisigma.measurement.csv.columns import QUATERNION, Column, quoted
 from pisigma.measurement.csv.header import Layout
 from pisigma.measurement.csv.table import Faults, Table
 from pisigma.measurement.readings import READINGS, from_si, to_si
@@ -119,7 +119,7 @@ def _number(cell: str) -> float:
 
 
 def _check_joints(values: _Values, layout: Layout, robot: Robot | None, faults: Faults) -> None:
-    """Every joint value is there and within the robot's limits."""
+    """Every joint value is there and can be one of the joint; see `grossly_beyond`."""
     for number, quantity in enumerate(layout.joints):
         column, q = layout.column(quantity), values[:, layout.index[quantity]]
         empty = f"column '{column.name}': the cell is empty; every row needs all joints"
@@ -131,15 +131,14 @@ def _check_joints(values: _Values, layout: Layout, robot: Robot | None, faults: 
 def _check_limits(
     q: Float64[np.ndarray, " rows"], column: Column, joint: Row, robot: str, faults: Faults
 ) -> None:
-    """The values of one joint are within its limits."""
-    q_si = to_si(q, column.unit)
-    outside = (q_si < joint.lower - LIMIT_TOLERANCE) | (q_si > joint.upper + LIMIT_TOLERANCE)
+    """The values of one joint are not so far outside its limits that they must be of another unit or joint."""
+    outside = grossly_beyond(to_si(q, column.unit), joint)
     lower, upper = from_si(np.array([joint.lower, joint.upper]), column.unit).tolist()
     limits = f"the limits {lower:.6g} to {upper:.6g} {column.unit} of joint '{joint.name}' of robot '{robot}'"
     faults.add(
         (
             row,
-            f"column '{column.name}': {q[row]:.10g} {column.unit} is outside {limits}; {_UNIT_DOUBT[column.unit]}",
+            f"column '{column.name}': {q[row]:.10g} {column.unit} is far outside {limits}; {_UNIT_DOUBT[column.unit]}",
         )
         for row in rows_where(outside)
     )
@@ -176,26 +175,3 @@ def _check_whole(missing: Bool[np.ndarray, "rows group"], columns: list[Column],
         first = columns[int(missing[row].argmax())].name
         what = f"the cell is empty, but not all of {quoted(columns)} are; fill all of them or none"
         faults.add([(row, f"column '{first}': {what}")])
-
-
-def check_equal_rows(rows: CheckedRows, layout: Layout, table: Table) -> None:
-    """Find rows that equal another one in all columns but those of a plan; the later one is at fault."""
-    names = {index: column.quantity for index, column in enumerate(layout.columns) if not column.is_number}
-    texts = [rows.texts(index) for index, name in names.items() if name not in PLAN_COLUMNS]
-    first = first_of_equal_rows(rows.values, texts)
-    again = rows.faults.sound(len(rows.values)) & (first != np.arange(len(rows.values)))
-    remedy = "remove one of them (a repeated measurement has other readings)"
-    rows.faults.add(
-        (row, f"all columns: the row equals line {table.lines[first[row]]}; {remedy}")
-        for row in rows_where(again)
-    )
-
-
-def first_of_equal_rows(values: _Values, texts: Sequence[Sequence[str]]) -> Int64[np.ndarray, " rows"]:
-    """For every row, the first row that equals it in all values (NaN equals NaN) and texts."""
-    canonical = np.ascontiguousarray(np.where(np.isnan(values), np.nan, values + 0.0))
-    keys = zip(
-        canonical.view(f"V{canonical.itemsize * canonical.shape[1]}")[:, 0].tolist(), *texts, strict=True
-    )
-    first: dict[tuple[object, ...], int] = {}
-    return np.array([first.setdefault(key, row) for row, key in enumerate(keys)], dtype=np.int64)

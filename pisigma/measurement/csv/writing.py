@@ -14,7 +14,6 @@ from torch import Tensor
 from pisigma.errors import MeasurementError
 from pisigma.files.output_file import write_whole
 from pisigma.measurement.csv.columns import number_fields
-from pisigma.measurement.csv.rows import first_of_equal_rows
 from pisigma.measurement.fields import KINDS, TEXTS, MeasuredFields
 from pisigma.measurement.readings import READINGS, Unit, from_si, reading_texts
 from pisigma.se3 import quaternion_from_rotation
@@ -37,7 +36,7 @@ def write_fields(data: MeasuredFields, path: str | os.PathLike[str], revolute: S
     numbers = _numbers(data, revolute)
     names = (*TEXTS, *reading_texts())
     texts = {"set" if name == "split" else name: data.text(name) for name in names if any(data.text(name))}
-    _check(data, numbers, texts)
+    _check(data, texts)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow([*numbers, *texts])
@@ -75,24 +74,13 @@ def _numbers(data: MeasuredFields, revolute: Sequence[bool]) -> dict[str, Float6
     return columns
 
 
-def _check(
-    data: MeasuredFields, columns: Mapping[str, np.ndarray], texts: Mapping[str, Sequence[str]]
-) -> None:
+def _check(data: MeasuredFields, texts: Mapping[str, Sequence[str]]) -> None:
     """Refuse what would not read back."""
-    values = np.stack(list(columns.values()), axis=1)
     nothing = ~torch.stack([data.measured(kind) for kind in (*KINDS, *READINGS)]).any(0).cpu()
     if bool(nothing.any()):
         raise MeasurementError(
             f"{data.label(int(nothing.nonzero()[0]))}: nothing was measured in this row; leave it out with select "
             "before writing."
-        )
-    first = first_of_equal_rows(values, list(texts.values()))
-    equal = first != np.arange(len(first))
-    if equal.any():
-        row = int(equal.argmax())
-        raise MeasurementError(
-            f"{data.label(row)}: equals row {int(first[row])} in everything; leave one of them out "
-            "with select before writing."
         )
     for name, names in texts.items():
         for text in set(names):

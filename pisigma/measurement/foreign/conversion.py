@@ -10,12 +10,20 @@ from torch import Tensor
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement.csv.columns import QUATERNION, RPY, find_column
+from pisigma.measurement.foreign.accounting import Place
 from pisigma.measurement.foreign.export_file import ExportFile
-from pisigma.measurement.foreign.mapping import FileMapping, angles, coordinates, joint_columns
+from pisigma.measurement.foreign.mapping import (
+    FileMapping,
+    ambiguous_spelling,
+    angles,
+    coordinates,
+    joint_columns,
+)
 from pisigma.measurement.foreign.number_format import is_missing
 from pisigma.measurement.foreign.quantities import KEYS, LEFT_OUT, MappedColumn, measurement_column
 from pisigma.measurement.foreign.rotations import ROTATIONS, RotationEncoding
-from pisigma.measurement.foreign.units import UNITS, scaled
+from pisigma.measurement.foreign.time_stamps import day_first, has_open_date, iso_day
+from pisigma.measurement.foreign.units import AMBIGUOUS, UNITS, scaled
 from pisigma.se3 import quaternion_from_rotation
 
 
@@ -27,11 +35,18 @@ class ConvertedRows:
         source: the file.
         lines: where the rows stand in it.
         cells: texts of every row by column, such as "q1_deg", and by the keys "point" and "time".
+        origins: the file of every row; () where all are of the source.
     """
 
     source: str
     lines: tuple[int, ...]
     cells: Mapping[str, tuple[str, ...]]
+    origins: tuple[str, ...] = ()
+
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """File and line of every row."""
+        return tuple(zip(self.origins or (self.source,) * len(self.lines), self.lines, strict=True))
 
 
 def check_complete(mapping: FileMapping) -> None:
@@ -60,13 +75,22 @@ def check_complete(mapping: FileMapping) -> None:
             f"{source}: the headings do not say how the rotation is written; state --rotation "
             f"{', '.join(mapping.rotations)}, or none to leave it out."
         )
+    if mapping.incomplete:
+        names = " and ".join(f"'{column.heading}'" for column in mapping.incomplete)
+        raise MeasurementError(
+            f"{source}, line {mapping.file.header_line}, columns {names}: expected all values of a rotation, got "
+            f"{len(mapping.incomplete)}; add the missing column, or leave the rotation out with --rotation none."
+        )
     if lacking := mapping.without_unit:
         names, many = ", ".join(f"'{one.heading}'" for one in lacking), "s" if len(lacking) > 1 else ""
         likely = mapping.likely_units
         first = next(replace(one.target, unit=likely[kind]) for one in lacking if (kind := one.target.needs))
+        spellings = {ambiguous_spelling(mapping.file, one.index, one.target.needs) for one in lacking} - {""}
+        meanings = "".join(f" ('{spelling}' means {AMBIGUOUS[spelling]})" for spelling in sorted(spellings))
         raise MeasurementError(
-            f"{source}: no unit is stated of the column{many} {names}; state it, --unit {','.join(likely.values())} if "
-            f"that is right, or --map '{mapping.key(lacking[0])}={first.text}'."
+            f"{source}, line {mapping.file.header_line}: no unit is stated of the column{many} {names}{meanings}; "
+            f"state it, --unit {','.join(likely.values())} if that is right, or "
+            f"--map '{mapping.key(lacking[0])}={first.text}'."
         )
 
 
@@ -114,10 +138,31 @@ def _column(file: ExportFile, quantity: str, column: MappedColumn) -> tuple[str,
     if quantity in RPY and written == "rad":
         numbers = _numbers(file, column)
         return f"{quantity}_deg", tuple(repr(math.degrees(float(text))) if text else "" for text in numbers)
+    if quantity == "date":
+        return quantity, _dates(file, column)
     name = measurement_column(quantity, written)
     kept = find_column(name)
     assert kept is not None  # as parse_target and the proposals make it
     return name, _numbers(file, column) if kept.is_number else tuple(file.column(column.index))
+
+
+def _dates(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:
+    """The days of a column as ISO 8601 writes them, in whatever order of day, month and year; the reader checks others.
+
+    Raises:
+        MeasurementError: the day or the month may be first.
+    """
+    texts = file.column(column.index)
+    first, dates = day_first(texts), []
+    for line, text in zip(file.lines, texts, strict=True):
+        day = "" if is_missing(text) else iso_day(text, first)
+        if day is None and has_open_date(text) and iso_day(text, True) is not None:
+            raise MeasurementError(
+                f"{file.source}, line {line}, column '{column.heading}': expected a date of one meaning, got '{text}', "
+                "which may have the day or the month first; write dates as 2026-03-02 or 02.03.2026."
+            )
+        dates.append(text if day is None else day)
+    return tuple(dates)
 
 
 def _numbers(file: ExportFile, column: MappedColumn) -> tuple[str, ...]:

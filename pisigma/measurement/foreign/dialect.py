@@ -20,6 +20,9 @@ SAMPLE = 300
 MOST_COLUMNS = 2000
 _BLANKS = 0.8
 """Blanks stand in names, too: they separate cells only where no other separator explains nearly as much."""
+_SMALL, _FAR = 20.0, 200.0
+"""A number such as 2.104 that is below may be a length in mm with a group of thousands; 20,000 mm and more is none of a
+robot, and 200,000 mm and more none of a position alone."""
 COMMENT = re.compile(r"\s*(?://|#|%|!|\*\*|--|;|'|REM\b)\s*")
 """What begins lines that are no rows; a line of cells may begin so, too."""
 
@@ -66,20 +69,21 @@ class Dialect:
         return self.numbers.text(cell) is not None
 
 
-def sniff(lines: Sequence[str], source: str, decimal: Decimal | None = None) -> Dialect:
+def sniff(lines: Sequence[tuple[int, str]], source: str, decimal: Decimal | None = None) -> Dialect:
     """Find the separator and the decimal sign by which most cells of most lines are numbers.
 
     Of readings that explain equally much the first wins, in the order of `SEPARATORS` and with points.
 
     Args:
-        lines: of the file, without blank ones.
+        lines: of the file with their numbers, without blank ones.
         source: the file, as complaints call it.
         decimal: the decimal sign where it is stated.
 
     Raises:
-        MeasurementError: no reading gives a table of numbers, or its commas may be either sign.
+        MeasurementError: no reading gives a table of numbers, or its points or commas may be either sign.
     """
-    sample = [*lines[: SAMPLE // 2], *lines[SAMPLE // 2 :][-SAMPLE // 2 :]]
+    sampled = [*lines[: SAMPLE // 2], *lines[SAMPLE // 2 :][-SAMPLE // 2 :]]
+    sample = [line for _, line in sampled]
     signs = (decimal,) if decimal else get_args(Decimal)
     choices = [
         Dialect(separator, NumberFormat(sign)) for separator, sign in itertools.product(SEPARATORS, signs)
@@ -92,16 +96,64 @@ def sniff(lines: Sequence[str], source: str, decimal: Decimal | None = None) -> 
             "wanted, its cells separated by tabs, semicolons, commas or blanks."
         )
     dialect = choices[scores.index(best)]
-    rows = filter(dialect.is_row, map(dialect.split, sample))
-    if decimal is None and dialect.separator == dialect.numbers.decimal == ",":
-        cells = [cell for row in rows for cell in row if dialect.is_number(cell)]
-        if dialect.numbers.is_ambiguous(cells):
-            example = next(cell for cell in cells if "," in cell)
-            raise MeasurementError(
-                f"{source}: the comma of '{example}', which also separates the cells, may set thousands apart or "
-                "decimals; state --decimal point or --decimal comma."
-            )
+    if decimal is None:
+        rows = [(number, row) for number, line in sampled if dialect.is_row(row := dialect.split(line))]
+        _check_decimal(dialect, rows, source)
     return dialect
+
+
+def _check_decimal(dialect: Dialect, rows: Sequence[tuple[int, list[str]]], source: str) -> None:
+    """Refuse a table whose numbers may have groups of thousands instead of decimals.
+
+    That is where every number with the sign looks like 2.104, and either the sign separates the cells, too, or a column
+    has whole numbers besides, or all of these numbers are small and another column holds whole numbers; and where a
+    column holds such numbers and else whole ones of hundreds.
+
+    Raises:
+        MeasurementError: see above; the message names line and column.
+    """
+    sign, width = dialect.numbers.decimal, Counter(len(row) for _, row in rows).most_common(1)[0][0]
+    columns = [
+        [(number, row[k]) for number, row in rows if len(row) == width and dialect.is_number(row[k])]
+        for k in range(width)
+    ]
+    signed = [[(number, cell) for number, cell in column if sign in cell] for column in columns]
+    is_ambiguous = dialect.numbers.is_ambiguous
+    if not is_ambiguous(cell for column in columns for _, cell in column):
+        signed = [
+            ours
+            if is_ambiguous(cell for _, cell in column) and _has_hundreds([cell for _, cell in column])
+            else []
+            for ours, column in zip(signed, columns, strict=True)
+        ]
+        if not any(signed):
+            return
+    largest = max(float(cell.replace(sign, ".").strip("+-")) for column in signed for _, cell in column)
+    is_mixed = [0 < len(ours) < len(column) for ours, column in zip(signed, columns, strict=True)]
+    has_whole = any(
+        column and not ours and not _counts([cell for _, cell in column])
+        for ours, column in zip(signed, columns, strict=True)
+    )
+    bound = _FAR if sum(map(bool, signed)) <= 3 else _SMALL
+    if dialect.separator != sign and not any(is_mixed) and (largest >= bound or not has_whole):
+        return
+    k = is_mixed.index(True) if any(is_mixed) else next(k for k, ours in enumerate(signed) if ours)
+    number, cell = signed[k][0]
+    raise MeasurementError(
+        f"{source}, line {number}, column {k + 1}: '{cell}' may have decimals or a group of thousands; state --decimal "
+        "point or --decimal comma."
+    )
+
+
+def _has_hundreds(cells: Sequence[str]) -> bool:
+    """Whether cells are whole numbers of three digits, among others."""
+    return any(re.fullmatch(r"[-+]?[1-9]\d\d", cell) for cell in cells)
+
+
+def _counts(cells: Sequence[str]) -> bool:
+    """Whether cells count the rows."""
+    numbers = [int(cell) if cell.isdigit() and len(cell) < 9 else -1 for cell in cells]
+    return all(after - before == 1 for before, after in itertools.pairwise(numbers))
 
 
 def _score(dialect: Dialect, lines: Sequence[str]) -> float:

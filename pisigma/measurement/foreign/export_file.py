@@ -8,11 +8,13 @@ from dataclasses import dataclass
 from pisigma.errors import MeasurementError, printable
 from pisigma.files.input_file import MOST_BYTES, read_input
 from pisigma.measurement.csv.table import SPREADSHEET_ERRORS
+from pisigma.measurement.foreign.accounting import LeftOutRow, Place
 from pisigma.measurement.foreign.dialect import COMMENT, Dialect, sniff
 from pisigma.measurement.foreign.headings import is_recognised
 from pisigma.measurement.foreign.number_format import Decimal
+from pisigma.measurement.foreign.summary_rows import summary_rows
 from pisigma.measurement.foreign.text_encoding import decoded
-from pisigma.measurement.foreign.units import unit_symbol
+from pisigma.measurement.foreign.units import ambiguous_unit, unit_symbol
 
 LONGEST_LINE = 100_000
 """Characters of a line; a thousand columns have fewer."""
@@ -27,23 +29,35 @@ class ExportFile:
         source: the file, as complaints call it.
         headings: of the columns; their numbers from "1" on where the file has none.
         has_header: whether it has headings.
-        units: symbols of the units of its unit row, "" for columns without.
+        header_line: line of the headings; that of the first row where it has none.
+        units: symbols of the units of its unit row, "" for columns without; units with several meanings as they are
+            spelt.
         comments: titles and comments, as they stand there.
         records: the cells of every row, in the order of the file.
         lines: where the rows stand.
         dialect: how it is written.
-        skipped: lines after the first row that are no rows.
+        skipped: lines with numbers that are no rows, those after the first row that are neither rows nor blank, and
+            rows that summarise others.
     """
 
     source: str
     headings: tuple[str, ...]
     has_header: bool
+    header_line: int
     units: tuple[str, ...]
     comments: tuple[str, ...]
     records: list[list[str]]
     lines: tuple[int, ...]
     dialect: Dialect
-    skipped: tuple[int, ...]
+    skipped: tuple[LeftOutRow, ...]
+
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """Where all rows stand, with those that are left out."""
+        return (
+            *((self.source, line) for line in self.lines),
+            *((one.file, one.line) for one in self.skipped),
+        )
 
     def column(self, index: int) -> list[str]:
         """The cells of a column."""
@@ -71,34 +85,41 @@ def read_export(
     """
     source = printable(str(path), cut=False)
     lines = _lines_of(decoded(read_input(path, MeasurementError, most), source), source)
-    dialect = sniff([line for _, line in lines], source, decimal)
+    dialect = sniff(lines, source, decimal)
     cells = [dialect.split(line) for _, line in lines]
     width = Counter(len(row) for row in cells if dialect.is_row(row)).most_common(1)[0][0]
     is_row = [len(row) == width and dialect.is_row(row) for row in cells]
-    first = is_row.index(True)
     ends_empty = not any(row[-1] for row, sure in zip(cells, is_row, strict=True) if sure)
-    headings, units, comments = _read_top(lines[:first], dialect, width - ends_empty, source)
-    rows, skipped = [], []
-    for i in range(first, len(lines)):
-        if is_row[i] or (len(cells[i]) == width and _is_content(lines[i][1], cells[i], headings)):
+    top = _read_top(lines[: is_row.index(True)], dialect, width - ends_empty, source)
+    rows, skipped = [], list(top.skipped)
+    for i in range(top.end, len(lines)):
+        number, line = lines[i]
+        if is_row[i] or (len(cells[i]) == width and _is_content(line, cells[i], top.headings)):
             rows.append(i)
-        elif any(cells[i]) and cells[i][: len(headings)] != headings:
-            if not _is_comment(lines[i][1], cells[i]):
-                _check_skipped(cells[i], dialect, width, f"{source}, line {lines[i][0]}")
-            skipped.append(i)
+        elif any(cells[i]) and cells[i][: len(top.headings)] != top.headings:
+            if not _is_comment(line, cells[i]):
+                _check_skipped(cells[i], dialect, width, f"{source}, line {number}")
+            skipped.append(LeftOutRow(source, number, "it is no row of the table"))
+    headings, units = top.headings, top.units
     used = [
         k for k in range(width - ends_empty) if (headings and headings[k]) or any(cells[i][k] for i in rows)
     ]
+    summaries = summary_rows([[cells[i][k] for k in used] for i in rows], dialect.numbers)
+    skipped += [LeftOutRow(source, lines[rows[row]][0], why) for row, why in sorted(summaries.items())]
+    text_of = dict(lines)
+    comments = [text_of[row.line] for row in skipped if row.line not in {lines[i][0] for i in rows}]
+    rows = [i for row, i in enumerate(rows) if row not in summaries]
     return ExportFile(
         source=source,
         headings=tuple(headings[k] if headings and headings[k] else str(k + 1) for k in used),
         has_header=bool(headings),
+        header_line=top.header_line or (lines[rows[0]][0] if rows else 1),
         units=tuple(units[k] if units else "" for k in used),
-        comments=(*comments, *(lines[i][1] for i in skipped)),
+        comments=(*top.comments, *comments),
         records=[[cells[i][k] for k in used] for i in rows],
         lines=tuple(lines[i][0] for i in rows),
         dialect=dialect,
-        skipped=tuple(lines[i][0] for i in skipped),
+        skipped=tuple(sorted(skipped, key=lambda row: row.line)),
     )
 
 
@@ -136,38 +157,101 @@ def _check_skipped(row: list[str], dialect: Dialect, width: int, place: str) -> 
     )
 
 
-def _read_top(
-    lines: _Lines, dialect: Dialect, width: int, source: str
-) -> tuple[list[str], list[str], list[str]]:
-    """What stands before the first row: headings, the unit row (each [] where there is none), and comments."""
-    headings: list[str] = []
-    units: list[str] = []
-    comments: list[str] = []
-    for number, line in reversed(lines):
-        cells = _heading_cells(line, dialect, width)
-        symbols = [unit_symbol(cell) for cell in cells]
-        others = [cell for cell, symbol in zip(cells, symbols, strict=True) if cell and not symbol]
-        count = sum(map(bool, symbols))
-        is_units = count >= (max(2, len(others)) if others else 1) and not any(map(is_recognised, others))
-        if headings or not any(cells) or set(line) <= set("-=+|_ \t"):
-            comments.append(line)
-        elif len(cells) == width and is_units and not units:
-            units = symbols
-        elif len(cells) == width and (not COMMENT.match(line) or _recognised(cells) >= 0.5):
-            headings = cells
-        elif len(cells) > 2 and _recognised(cells) >= 0.5:
-            commas = dialect.separator == "," and len(cells) < width
-            raise MeasurementError(
-                f"{source}, line {number}: {len(cells)} headings stand over rows of {width} cells; "
-                + (
-                    "export decimal points, or semicolons between cells."
-                    if commas
-                    else "give every column one heading."
-                )
-            )
+@dataclass
+class _Top:
+    """What stands before the first row.
+
+    Attributes:
+        headings: of the columns, [] where there are none.
+        header_line: line of the headings, 0 where there are none.
+        units: of the unit row, see `ExportFile.units`; [] where there is none.
+        comments: titles and comments.
+        skipped: lines with numbers that are neither headings nor rows.
+        end: how many of the lines these are; what follows them is content.
+    """
+
+    headings: list[str]
+    header_line: int
+    units: list[str]
+    comments: list[str]
+    skipped: list[LeftOutRow]
+    end: int
+
+
+def _read_top(lines: _Lines, dialect: Dialect, width: int, source: str) -> _Top:
+    """Tell headings, unit row and comments apart in the lines before the first row.
+
+    Raises:
+        MeasurementError: there are more or fewer headings than columns, or a row before the first one lacks a cell.
+    """
+    cells = [_heading_cells(line, dialect, width) for _, line in lines]
+    is_units = [len(row) == width and _is_unit_row(row) for row in cells]
+    heading = _heading_row(lines, cells, is_units, width)
+    if heading is None:
+        for (number, _), row in zip(lines, cells, strict=True):
+            if len(row) > 2 and _recognised(row) >= 0.5:
+                raise _wrong_headings(row, dialect, width, f"{source}, line {number}")
+    units = next((i for i in reversed(range(len(lines))) if is_units[i]), None)
+    table = max(
+        -1 if i is None else i for i in (heading, units)
+    )  # the last line that is surely above the rows
+    top = _Top(
+        headings=[] if heading is None else cells[heading],
+        header_line=0 if heading is None else lines[heading][0],
+        units=[] if units is None else [unit_symbol(cell) or ambiguous_unit(cell) for cell in cells[units]],
+        comments=[],
+        skipped=[],
+        end=len(lines),
+    )
+    is_certain = heading is not None and _recognised(top.headings) >= 0.5
+    for i, (number, line) in enumerate(lines):
+        numeric = sum(map(dialect.is_number, cells[i]))
+        is_plain = any(cells[i]) and not set(line) <= set("-=+|_ \t") and not COMMENT.match(line)
+        if i in (heading, units):
+            continue
+        if is_certain and i > table and is_plain:
+            top.end = i  # what is below the headings is accounted for like what is further down
+            break
+        if is_plain and numeric >= max(2, width // 2) and (heading is None or i > table):
+            _check_skipped(cells[i], dialect, width, f"{source}, line {number}")
+        if numeric >= 2:
+            top.skipped.append(LeftOutRow(source, number, "it is no row of the table"))
         else:
-            comments.append(line)
-    return headings, units, comments[::-1]
+            top.comments.append(line)
+    return top
+
+
+def _heading_row(lines: _Lines, cells: list[list[str]], is_units: list[bool], width: int) -> int | None:
+    """The line of the headings: of those of the table's width the one with most names that instruments use."""
+    possible = [
+        (_recognised(row), i)
+        for i, row in enumerate(cells)
+        if len(row) == width
+        and any(row)
+        and not is_units[i]
+        and not set(lines[i][1]) <= set("-=+|_ \t")
+        and (not COMMENT.match(lines[i][1]) or _recognised(row) >= 0.5)
+    ]
+    return max(possible)[1] if possible else None
+
+
+def _is_unit_row(cells: list[str]) -> bool:
+    """Whether cells are units, and perhaps texts beside them that are no names of columns."""
+    symbols = [unit_symbol(cell) or ambiguous_unit(cell) for cell in cells]
+    others = [cell for cell, symbol in zip(cells, symbols, strict=True) if cell and not symbol]
+    count = sum(map(bool, symbols))
+    return count >= (max(2, len(others)) if others else 1) and not any(map(is_recognised, others))
+
+
+def _wrong_headings(cells: list[str], dialect: Dialect, width: int, place: str) -> MeasurementError:
+    """Say that there are more or fewer headings than columns."""
+    commas = dialect.separator == "," and len(cells) < width
+    action = (
+        "export decimal points, or semicolons between cells" if commas else "give every column one heading"
+    )
+    return MeasurementError(
+        f"{place}: expected {width} headings as the rows have {width} cells, got {len(cells)}; {action}."
+    )
 
 
 def _heading_cells(line: str, dialect: Dialect, width: int) -> list[str]:

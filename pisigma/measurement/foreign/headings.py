@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pisigma.errors import LONGEST_WORD
 from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.foreign.rotations import ROTATIONS
-from pisigma.measurement.foreign.units import unit_symbol
+from pisigma.measurement.foreign.units import ambiguous_unit, unit_symbol
 
 _SIDES = {
     "commanded": "target cmd command commanded setpoint soll nominal nom ref reference desired robot",
@@ -68,6 +68,8 @@ def _unit_apart(text: str) -> tuple[str, str, str]:
     match = _TRAILING.match(text)
     if match and match[1] and (symbol := unit_symbol(match[2])):
         return match[1], symbol, ""
+    if match and match[1] and (spelling := ambiguous_unit(match[2])):
+        return match[1], "", spelling
     return text, "", ""
 
 

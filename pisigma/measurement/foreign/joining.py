@@ -3,25 +3,22 @@
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
 
 from pisigma.errors import MeasurementError
+from pisigma.measurement.foreign.accounting import LeftOutRow, Place
 from pisigma.measurement.foreign.conversion import ConvertedRows
 from pisigma.measurement.foreign.quantities import KEYS, is_measured, joints_of
+from pisigma.measurement.foreign.time_stamps import date_of, day_first, has_open_date, is_clock, seconds_of
 
 JoinBy = Literal["point", "order", "time"]
 WITHIN = 0.2
 """[s] Two time stamps of one pose differ by no more, where nothing is said."""
 _MOVED = 0.05
 """[deg or mm] A joint that moves by more around a time stamp did not stand."""
-_NAMED = 5
-"""Rows that a message names."""
-_DAY = re.compile(r"(\d{1,2})\.(\d{1,2})\.(\d{4})[ T]+(.*)")
-_CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,12 +27,16 @@ class JoinedRows:
 
     Attributes:
         rows: what was measured, in its order, with the joint values.
-        unmatched: sentences on the rows that have no partner.
+        used: file and line of the rows of the log whose joint values were joined.
+        unmatched: rows of both that have no partner.
+        unused: rows of the log that need none, as another one has their point or nothing was measured at their time.
         warnings: what else should be known, each a sentence.
     """
 
     rows: ConvertedRows
-    unmatched: tuple[str, ...]
+    used: tuple[Place, ...]
+    unmatched: tuple[LeftOutRow, ...]
+    unused: tuple[LeftOutRow, ...]
     warnings: tuple[str, ...]
 
 
@@ -56,7 +57,7 @@ def join_rows(
 
     Raises:
         MeasurementError: there is nothing to join by, numbers of rows differ, a name stands at different joint values,
-            or no row has a partner.
+            no row has a partner, or names of points contradict the order or the time.
     """
     if by == "order":
         partner = _by_order(measured, joints)
@@ -69,24 +70,42 @@ def join_rows(
         raise MeasurementError(
             f"{measured.source} and {joints.source}: {_nothing(measured, joints, by, within)}"
         )
-    left_out = [name for name in joints.cells if is_measured(name)]
-    kept = [name for name in joints.cells if name not in (*left_out, *KEYS, *measured.cells)]
+    warnings = [] if by == "point" else _check_names(measured, joints, partner, by)
+    commanded = [name for name in joints.cells if is_measured(name)]
+    kept = [name for name in joints.cells if name not in (*commanded, *KEYS, *measured.cells)]
     cells = {name: tuple(joints.cells[name][row] for row in partner[matched]) for name in kept}
     cells |= {name: tuple(texts[row] for row in matched) for name, texts in measured.cells.items()}
-    rows = ConvertedRows(measured.source, tuple(measured.lines[row] for row in matched), cells)
-    warnings = []
-    if left_out:
-        names = ", ".join(left_out)
+    rows = ConvertedRows(
+        measured.source,
+        tuple(measured.lines[row] for row in matched),
+        cells,
+        tuple(measured.places[row][0] for row in matched),
+    )
+    if commanded:
+        names = ", ".join(commanded)
         warnings.append(
             f"{joints.source}: {names} are left out, as the measurements are those of {measured.source}."
         )
     if by == "time":
         warnings += _moving(joints, partner[matched], within)
-    unmatched = (
-        *_alone(measured, np.flatnonzero(partner < 0), joints),
-        *_alone(joints, np.setdiff1d(np.arange(len(joints.lines)), _partners(joints, partner, by)), measured),
+    alone = np.setdiff1d(np.arange(len(joints.lines)), partner)
+    known = np.intersect1d(alone, _partners(joints, partner, by))
+    why = "nothing was measured at its time" if by == "time" else "another row has its point and joint values"
+    return JoinedRows(
+        rows=rows,
+        used=tuple(joints.places[row] for row in np.unique(partner[matched])),
+        unmatched=(
+            *_left_out(measured, np.flatnonzero(partner < 0), f"it has no partner in {joints.source}"),
+            *_left_out(joints, np.setdiff1d(alone, known), f"it has no partner in {measured.source}"),
+        ),
+        unused=tuple(_left_out(joints, known, why)),
+        warnings=tuple(warnings),
     )
-    return JoinedRows(rows, unmatched, tuple(warnings))
+
+
+def _left_out(rows: ConvertedRows, which: Int64[np.ndarray, " _which"], reason: str) -> list[LeftOutRow]:
+    places = [(*rows.places[row], _point(rows, row)) for row in which.tolist()]
+    return [LeftOutRow(file, line, reason, point) for file, line, point in places]
 
 
 def append_rows(rows: Sequence[ConvertedRows]) -> ConvertedRows:
@@ -101,7 +120,51 @@ def append_rows(rows: Sequence[ConvertedRows]) -> ConvertedRows:
             name: tuple(text for one in rows for text in one.cells.get(name, ("",) * len(one.lines)))
             for name in names
         },
+        origins=tuple(place[0] for one in rows for place in one.places),
     )
+
+
+def _check_names(
+    measured: ConvertedRows, joints: ConvertedRows, partner: Int64[np.ndarray, " rows"], by: JoinBy
+) -> list[str]:
+    """Refuse rows that are put together although both files name points and the names say otherwise.
+
+    Where no name is in both, the numbers at their ends are compared, which may count from another number on.
+
+    Returns:
+        Sentences on names that cannot be compared.
+
+    Raises:
+        MeasurementError: see above.
+    """
+    if "point" not in measured.cells or "point" not in joints.cells:
+        return []
+    ours, theirs = ([_plain_name(text) for text in one.cells["point"]] for one in (measured, joints))
+    if not set(ours) & set(theirs):
+        ours, theirs = ([_number_of(name) for name in names] for names in (ours, theirs))
+        is_clear = (
+            len(set(ours)) == len(ours) and len(set(theirs)) == len(theirs) and "" not in (*ours, *theirs)
+        )
+        pairs = [(row, other) for row, other in enumerate(partner.tolist()) if other >= 0]
+        offsets = {int(theirs[other]) - int(ours[row]) for row, other in pairs} if is_clear else set[int]()
+        if not set(ours) & set(theirs) or (len(offsets) == 1 and offsets != {0}) or not is_clear:
+            row = int(np.flatnonzero(partner >= 0)[0])
+            return [
+                f"{measured.source}, line {measured.lines[row]}: the point '{_point(measured, row)}' is put together "
+                f"with '{_point(joints, int(partner[row]))}' ({joints.source}, line {joints.lines[partner[row]]}), and "
+                "no name is the same in both files; check that their rows belong together."
+            ]
+    lines = dict(zip(theirs, joints.lines, strict=True))
+    for row, other in enumerate(partner.tolist()):
+        name = ours[row]
+        if other >= 0 and name in lines and theirs[other] and theirs[other] != name:
+            raise MeasurementError(
+                f"{measured.source}, line {measured.lines[row]}: joining by {by} puts the point "
+                f"'{_point(measured, row)}' together with '{_point(joints, other)}' ({joints.source}, line "
+                f"{joints.lines[other]}), but that file names it in line {lines[name]}; join by point, or leave the "
+                "column of the names out with --map."
+            )
+    return []
 
 
 def _by_order(measured: ConvertedRows, joints: ConvertedRows) -> Int64[np.ndarray, " rows"]:
@@ -134,8 +197,13 @@ def _plain_name(text: str) -> str:
     return re.sub(r"(?<![\d.])0+(?=\d)", "", text.rpartition("::")[2].strip().casefold())
 
 
+def _number_of(name: str) -> str:
+    """The number at the end of a plain name, "" where there is none."""
+    return _plain_name(re.sub(r".*?(\d*)$", r"\1", name, flags=re.DOTALL))
+
+
 def _by_time(measured: ConvertedRows, joints: ConvertedRows, within: float) -> Int64[np.ndarray, " rows"]:
-    times, logged = _times(measured), _times(joints)
+    times, logged = _times(measured, joints), _times(joints, measured)
     order = np.argsort(logged, kind="stable")
     after = (
         np.clip(np.searchsorted(logged[order], times), 1, len(order) - 1)
@@ -148,36 +216,41 @@ def _by_time(measured: ConvertedRows, joints: ConvertedRows, within: float) -> I
     return np.where(np.abs(logged[partner] - times) <= within, partner, -1)
 
 
-def _times(rows: ConvertedRows) -> Float64[np.ndarray, " rows"]:
-    """Time stamps [s]."""
-    _check_key(rows, "time", "time stamps")
+def _times(rows: ConvertedRows, other: ConvertedRows) -> Float64[np.ndarray, " rows"]:
+    """Time stamps [s].
+
+    Raises:
+        MeasurementError: one is none, or has an order of day and month that neither its file nor the other one tells.
+    """
+    texts, others = _stamps(rows), _stamps(other)
+    first = day_first(texts)
+    if first is None and len({date_of(text) for text in (*texts, *others)}) == 1:
+        first = True  # on one and the same day the order does not matter
     times = np.empty(len(rows.lines))
-    for row, text in enumerate(rows.cells["time"]):
-        seconds = seconds_of(text)
+    for row, text in enumerate(texts):
+        seconds = seconds_of(text, first)
+        if seconds is None and has_open_date(text) and seconds_of(text, True) is not None:
+            raise MeasurementError(
+                f"{rows.source}, line {rows.lines[row]}: '{text}' may have the day or the month first; write dates as "
+                "2026-03-02 or 02.03.2026."
+            )
         if seconds is None:
             raise MeasurementError(
-                f"{rows.source}, line {rows.lines[row]}: '{text}' is no time stamp; seconds, 10:31:02.5, or "
-                "2026-03-02 10:31:02.5 were wanted."
+                f"{rows.source}, line {rows.lines[row]}: expected a time stamp such as 12.5, 10:31:02.5, 10:31:02 PM "
+                f"or 2026-03-02 10:31:02.5, got '{text}'; correct it, or remove the row."
             )
         times[row] = seconds
     return times
 
 
-def seconds_of(text: str) -> float | None:
-    """Seconds of a number, of a clock, or of a date with a clock (in UTC where no zone is named); None for others."""
-    try:
-        return number if np.isfinite(number := float(text)) else None
-    except ValueError:
-        pass
-    if match := _CLOCK.fullmatch(text.strip()):
-        return int(match[1]) * 3600 + int(match[2]) * 60 + float((match[3] or "0").replace(",", "."))
-    if match := _DAY.fullmatch(text.strip()):
-        text = f"{match[3]}-{match[2]:0>2}-{match[1]:0>2}T{match[4]}"
-    try:
-        stamp = datetime.fromisoformat(text.strip().replace("/", "-"))
-    except ValueError:
-        return None
-    return (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp()
+def _stamps(rows: ConvertedRows) -> list[str]:
+    """The texts of time stamps; a clock gets the date of its row where a column holds one."""
+    _check_key(rows, "time", "time stamps")
+    dates = rows.cells.get("date", ("",) * len(rows.lines))
+    return [
+        f"{date} {text}" if date and is_clock(text) else text
+        for date, text in zip(dates, rows.cells["time"], strict=True)
+    ]
 
 
 def _check_key(rows: ConvertedRows, key: str, what: str) -> None:
@@ -205,28 +278,13 @@ def _partners(
     return np.arange(len(joints.lines)) if len(joints.lines) > 2 * len(partner) else partner
 
 
-def _alone(rows: ConvertedRows, alone: Int64[np.ndarray, " _alone"], other: ConvertedRows) -> list[str]:
-    """A sentence on rows without a partner."""
-    if not len(alone):
-        return []
-    named = [
-        f"line {rows.lines[row]}" + (f" ({point})" if (point := _point(rows, row)) else "")
-        for row in alone[:_NAMED].tolist()
-    ]
-    more = f" and {len(alone) - _NAMED} more" if len(alone) > _NAMED else ""
-    have, are = ("1 row has", "is") if len(alone) == 1 else (f"{len(alone)} rows have", "are")
-    return [
-        f"{rows.source}: {have} no partner in {other.source} and {are} left out: {', '.join(named)}{more}."
-    ]
-
-
 def _point(rows: ConvertedRows, row: int) -> str:
     return rows.cells["point"][row] if "point" in rows.cells else ""
 
 
 def _moving(joints: ConvertedRows, partner: Int64[np.ndarray, " _rows"], within: float) -> list[str]:
     """A sentence where joints moved around the time at which something was measured."""
-    times = _times(joints)
+    times = _times(joints, joints)
     try:
         q = np.array([[float(text) for text in joints.cells[name]] for name in _joint_columns(joints)]).T
     except ValueError:
@@ -247,7 +305,7 @@ def _moving(joints: ConvertedRows, partner: Int64[np.ndarray, " _rows"], within:
 def _nothing(measured: ConvertedRows, joints: ConvertedRows, by: JoinBy, within: float) -> str:
     """Say why no row has a partner."""
     if by == "time":
-        times, logged = _times(measured), _times(joints)
+        times, logged = _times(measured, joints), _times(joints, measured)
         apart = np.abs(times[:1000, None] - logged[None, :1000]).min()
         return (
             f"no time stamps are within {within:g} s of each other, the nearest are {apart:.6g} s apart; check the "

@@ -5,9 +5,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from pisigma.errors import MeasurementError, nearest_choice
+from pisigma.measurement.csv.columns import POSITION
 from pisigma.measurement.foreign.export_file import ExportFile
 from pisigma.measurement.foreign.headings import Maker, parse_heading
-from pisigma.measurement.foreign.proposal import NO_ROTATION, UNRECOGNISED, Proposal, propose
+from pisigma.measurement.foreign.proposal import (
+    NO_ROTATION,
+    UNRECOGNISED,
+    Proposal,
+    incomplete_rotation,
+    propose,
+)
 from pisigma.measurement.foreign.quantities import (
     KEYS,
     LEFT_OUT,
@@ -20,7 +27,15 @@ from pisigma.measurement.foreign.quantities import (
     unit_kind,
 )
 from pisigma.measurement.foreign.rotations import ROTATIONS
-from pisigma.measurement.foreign.units import UNITS, UnitKind, doubt, is_certain, stated_units
+from pisigma.measurement.foreign.units import (
+    AMBIGUOUS,
+    UNITS,
+    UnitKind,
+    ambiguous_unit,
+    is_certain,
+    stated_units,
+    unit_symbol,
+)
 
 _JOINT_LIKE = re.compile(r"e(?:ax|xt)?[1-6a-f]|[qj]\d.*")
 """How external axes are called, and what begins like a joint."""
@@ -34,11 +49,13 @@ class FileMapping:
         file: the export.
         columns: all of them, in its order.
         rotations: encodings between which the headings do not decide; () where nothing is open.
+        incomplete: columns that hold some values of a rotation and not all; () where there is no such rotation.
     """
 
     file: ExportFile
     columns: tuple[MappedColumn, ...]
     rotations: tuple[str, ...] = ()
+    incomplete: tuple[MappedColumn, ...] = ()
 
     @property
     def quantities(self) -> dict[str, MappedColumn]:
@@ -78,6 +95,10 @@ class FileMapping:
         """What was read, and how it is written."""
         return f"{self.file.source}: {len(self.file.records)} rows, {self.file.dialect}"
 
+    def place(self, column: MappedColumn, line: int = 0) -> str:
+        """File, line and column, as messages name them; the line of the headings where none is given."""
+        return f"{self.file.source}, line {line or self.file.header_line}, column '{column.heading}'"
+
     def example(self, column: MappedColumn) -> str:
         """The first cell of a column that is not empty."""
         return next(filter(None, self.file.column(column.index)), "")
@@ -90,38 +111,15 @@ class FileMapping:
         ]
         return [one for one in left_out if _JOINT_LIKE.fullmatch(parse_heading(one.heading).name)]
 
-    @property
-    def doubts(self) -> tuple[str, ...]:
-        """Why its values can hardly be in their units, each a sentence."""
-        sentences = [self._left_out(one) for one in self.possible_joints]
-        for name, columns in (
-            ("joint values", joint_columns(self.columns)),
-            ("coordinates", coordinates(self.columns)),
-        ):
-            for symbol in dict.fromkeys(one.target.unit for one in columns):
-                of_unit = [one for one in columns if one.target.unit == symbol]
-                if reason := doubt(symbol, largest(self.file, of_unit), len(self.file.records)):
-                    sentences.append(f"{self.file.source}: the {name} have {reason}; check their unit.")
-        return tuple(filter(None, sentences))
-
-    def _left_out(self, column: MappedColumn) -> str:
-        """A sentence on an external axis that moves and is left out."""
-        values = self.file.numbers(column.index)
-        if not values or min(values) == max(values):
-            return ""
-        return (
-            f"{self.file.source}: '{column.heading}' moves from {min(values):g} to {max(values):g} and is left out; "
-            "if it is a joint of the robot, name it with --map."
-        )
-
 
 def map_columns(
     file: ExportFile, stated: Mapping[str, str], rotation: str | None, units: Mapping[UnitKind, str]
 ) -> FileMapping:
     """Find out what the columns of a file are and in which units.
 
-    A unit is taken from the mapping, the heading, the unit row, the comments, from `units`, and last from the maker
-    whose names these are, where the values can be in no other unit.
+    A unit is taken from the mapping, the heading, the unit row, the comments, from `units`, of a coordinate from the
+    others where these are stated, and last from the maker whose names these are, where the values can be in no other
+    unit.
 
     Args:
         file: the export.
@@ -141,7 +139,10 @@ def map_columns(
         _take_stated(proposal, name, text)
     propose(proposal, rotation)
     columns = tuple(proposal.columns[index] for index in range(len(file.headings)))
-    return FileMapping(file, _with_units(columns, proposal, units), proposal.rotations)
+    incomplete = (
+        () if rotation == NO_ROTATION else tuple(columns[index] for index in incomplete_rotation(proposal))
+    )
+    return FileMapping(file, _with_units(columns, proposal, units), proposal.rotations, incomplete)
 
 
 def _take_stated(proposal: Proposal, name: str, text: str) -> None:
@@ -164,7 +165,7 @@ def _take_stated(proposal: Proposal, name: str, text: str) -> None:
 
 def _written_unit(proposal: Proposal, index: int) -> str:
     """The unit that heading or unit row state."""
-    return proposal.headings[index].unit or proposal.file.units[index]
+    return proposal.headings[index].unit or unit_symbol(proposal.file.units[index])
 
 
 def _with_units(
@@ -174,26 +175,55 @@ def _with_units(
     file = proposal.file
     written = stated_units(file.comments)
     for stated, symbol in units.items():
-        if written.get(stated, symbol) != symbol:
+        if written.get(stated, symbol) not in (symbol, *AMBIGUOUS):
             raise MeasurementError(
                 f"{file.source}: --unit says {symbol}, but the file says {written[stated]}; leave {symbol} away, or "
                 "state the units of single columns with --map."
             )
+    others = {one.target.unit for one in coordinates(columns) if one.is_stated and one.target.unit}
+    of_others: dict[UnitKind, str] = {"length": next(iter(others))} if len(others) == 1 else {}
+    of_comments = {kind: symbol for kind, symbol in written.items() if symbol not in AMBIGUOUS}
     of_maker = _units_of_maker(proposal.maker, file, columns)
     completed = []
     for column in columns:
         target, kind = column.target, column.target.needs
-        unit_row = file.units[column.index]
+        unit_row, ambiguous = (
+            unit_symbol(file.units[column.index]),
+            ambiguous_spelling(file, column.index, kind),
+        )
         if kind is not None and unit_row and fits(target.quantity, unit_row):
             completed.append(replace(column, target=replace(target, unit=unit_row)))
             continue
-        open_unit = not unit_row and not proposal.headings[column.index].unknown_unit
-        for source, by_kind in (("a comment", written), ("--unit", units), ("the maker", of_maker)):
+        open_unit = not unit_row and (bool(ambiguous) or not proposal.headings[column.index].unknown_unit)
+        sources = (
+            ("a comment", of_comments),
+            ("--unit", units),
+            ("the other coordinates", of_others if target.quantity in POSITION else {}),
+            ("the maker", of_maker),
+        )
+        for source, by_kind in sources:
+            if ambiguous and source != "--unit":
+                continue  # only the caller knows which one is meant
             if kind is not None and kind in by_kind and open_unit and not target.unit:
                 target = replace(target, unit=by_kind[kind])
                 column = replace(column, target=target, reason=f"{column.reason}; unit by {source}")
         completed.append(column)
     return tuple(completed)
+
+
+def ambiguous_spelling(file: ExportFile, index: int, kind: UnitKind | None) -> str:
+    """Give the unit of several meanings that a file states of a column; "" where there is none.
+
+    Args:
+        file: whose heading, unit row or comments state it.
+        index: of the column.
+        kind: of the unit that the column needs.
+    """
+    if kind is None:
+        return ""
+    stated = stated_units(file.comments).get(kind, "")
+    spellings = (parse_heading(file.headings[index]).unknown_unit, file.units[index], stated)
+    return next(filter(None, map(ambiguous_unit, spellings)), "")
 
 
 def _units_of_maker(
@@ -219,7 +249,7 @@ def joint_columns(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
 
 def coordinates(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:
     """The columns of the position."""
-    return [one for one in columns if one.target.quantity in ("x", "y", "z")]
+    return [one for one in columns if one.target.quantity in POSITION]
 
 
 def angles(columns: tuple[MappedColumn, ...]) -> list[MappedColumn]:

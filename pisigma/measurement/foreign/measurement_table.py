@@ -8,7 +8,7 @@ from pisigma.errors import MeasurementError
 from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY, find_column
 from pisigma.measurement.csv.reading import fields_of
 from pisigma.measurement.csv.table import Table
-from pisigma.measurement.fields import LeftOut
+from pisigma.measurement.foreign.accounting import LeftOutRow, Place
 from pisigma.measurement.foreign.conversion import ConvertedRows
 from pisigma.measurement.foreign.quantities import KEYS, is_measured
 
@@ -19,22 +19,13 @@ class MeasurementTable:
 
     Attributes:
         table: of the rows in which something was measured.
+        places: file and line of these rows.
         left_out: the other rows, and why.
     """
 
     table: Table
-    left_out: tuple[LeftOut, ...]
-
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """What is to be said of the rows that are left out."""
-        if not self.left_out:
-            return ()
-        lines = ", ".join(str(row.line) for row in self.left_out[:5]) + (
-            ", ..." if len(self.left_out) > 5 else ""
-        )
-        are = "1 row is" if len(self.left_out) == 1 else f"{len(self.left_out)} rows are"
-        return (f"{are} left out, as nothing was measured there (line {lines}).",)
+    places: tuple[Place, ...]
+    left_out: tuple[LeftOutRow, ...]
 
     def text(self) -> str:
         """The measurement file."""
@@ -77,8 +68,9 @@ def measurement_table(rows: ConvertedRows) -> MeasurementTable:
         broken={},
     )
     fields_of(table)
-    left_out = (line for line, used in zip(rows.lines, filled, strict=True) if not used)
-    return MeasurementTable(table, tuple(LeftOut(line, "nothing was measured") for line in left_out))
+    places = list(zip(rows.places, filled, strict=True))
+    left_out = (LeftOutRow(place[0], place[1], "nothing was measured") for place, used in places if not used)
+    return MeasurementTable(table, tuple(place for place, used in places if used), tuple(left_out))
 
 
 def _order(name: str) -> tuple[int, int]:

@@ -1,11 +1,12 @@
 """What the columns of an export probably are, by their headings, or by their order where there are none."""
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 from pisigma.errors import MeasurementError
-from pisigma.measurement.csv.columns import POSITION
+from pisigma.measurement.csv.columns import POSITION, QUATERNION, RPY
 from pisigma.measurement.foreign.export_file import ExportFile
 from pisigma.measurement.foreign.headings import (
     JOINT_NAMES,
@@ -19,6 +20,7 @@ from pisigma.measurement.foreign.headings import (
 )
 from pisigma.measurement.foreign.quantities import LEFT_OUT, MappedColumn, Target, joints_of
 from pisigma.measurement.foreign.rotations import MATRIX_ROWS, ROTATIONS, encodings_of
+from pisigma.measurement.foreign.time_stamps import seconds_of
 from pisigma.measurement.foreign.units import UNITS, UnitKind
 
 NO_ROTATION = "none"
@@ -27,6 +29,14 @@ UNRECOGNISED = "not recognised"
 """Why a column is left out whose heading means nothing."""
 
 _JOINTS_WITHOUT_HEADINGS = (6, 7)
+_RISING = 5
+"""Rows whose first numbers rise by chance in one of 120 files."""
+_ORDERED = 8
+"""Rows whose numbers in one of ten columns rise or fall by chance in one of 2,000 files."""
+_MANY, _SET_BACK = 20, 0.1
+"""From so many rows on, so few of the steps may go the other way."""
+_MOVING = 0.4
+"""Share of the steps that times take; joints that stand in many rows take fewer."""
 _Side = Literal["commanded", "measured"]
 
 
@@ -103,7 +113,7 @@ def propose(proposal: Proposal, rotation: str | None) -> None:
     Raises:
         MeasurementError: there are no headings, and the number of columns does not tell either.
     """
-    if not proposal.file.has_header and not proposal.columns:
+    if not proposal.file.has_header:
         _take_by_order(proposal, rotation)
     for index, heading in enumerate(proposal.headings):
         if heading.is_column and index not in proposal.columns:
@@ -111,37 +121,102 @@ def propose(proposal: Proposal, rotation: str | None) -> None:
     _take_joints(proposal)
     _take_position(proposal)
     _take_rotation(proposal, rotation)
+    _take_third_coordinate(proposal)
     ranks = {name: rank for rank, name in enumerate(MEANINGS)}
     for name, indices in sorted(proposal.names().items(), key=lambda one: ranks.get(one[0], len(ranks))):
         for index in indices:
             _take_other(proposal, name, index)
+    _take_names(proposal)
 
 
 def _take_by_order(proposal: Proposal, rotation: str | None) -> None:
-    """Columns without headings: joints and a position, a point and its position, or a position."""
-    width, leading = len(proposal.headings), int(_is_counter(proposal.file))
+    """Columns without headings: joints and a position, a point and its position, or a position.
+
+    Columns that are stated to be something else, such as a time, are passed over.
+    """
+    stated = {index: one.target.quantity for index, one in proposal.columns.items()}
+    order = [index for index in range(len(proposal.headings)) if _has_place(stated.get(index))]
+    width = len(order)
+    leading = int(0 not in stated and _is_counter(proposal.file))
     measured: tuple[str, ...] = POSITION
     if _ends_with_matrices(proposal.file, leading):
         measured = (*MATRIX_ROWS, *(LEFT_OUT,) * 4)
     elif rotation in ROTATIONS:
         measured = (*POSITION, *(ROTATIONS[rotation].columns or ROTATIONS[rotation].quantities()))
     joints = width - leading - len(measured)
-    if joints not in _JOINTS_WITHOUT_HEADINGS and (joints != 0 or measured != POSITION):
-        raise MeasurementError(
-            f"{proposal.file.source}: the file has no headings, and its {width} columns are not six or seven joints "
-            "and a position; say what they are by their numbers, such as --map 1=q1_deg,2=q2_deg,3=x_mm,4=-, and by "
-            "--rotation where three angles or a quaternion follow the position."
-        )
     quantities = (*("point",) * leading, *(f"q{number + 1}" for number in range(joints)), *measured)
-    for index, quantity in enumerate(quantities):
-        proposal.put(index, quantity, "its order, as there is no heading")
+    of_index = dict(zip(order, quantities, strict=False))
+    is_usual = joints in _JOINTS_WITHOUT_HEADINGS or (joints == 0 and measured == POSITION)
+    is_otherwise = any(of_index.get(index, quantity) != quantity for index, quantity in stated.items())
+    if is_otherwise or (not is_usual and len(set(stated) & set(order)) > 1):
+        return  # whoever states columns otherwise has to state all of them
+    if joints > 0:
+        _check_times(proposal, of_index)
+    if not is_usual:
+        raise MeasurementError(
+            f"{proposal.file.source}: the file has no headings, and its {len(proposal.headings)} columns are not six "
+            "or seven joints and a position; say what they are by their numbers, such as --map "
+            "1=q1_deg,2=q2_deg,3=x_mm,4=-, and by --rotation where three angles or a quaternion follow the position."
+        )
+    for index, quantity in of_index.items():
+        if index not in proposal.columns:
+            proposal.put(index, quantity, "its order, as there is no heading")
+
+
+def _has_place(stated: str | None) -> bool:
+    """Whether the order says what a column is, of which the caller says nothing else."""
+    rotations = {name for one in ROTATIONS.values() for name in (*one.columns, *one.quantities())}
+    return stated is None or bool(joints_of([stated])) or stated in {*POSITION, *RPY, *QUATERNION, *rotations}
 
 
 def _is_counter(file: ExportFile) -> bool:
-    """Whether the first column holds names, or counts the rows."""
+    """Whether the first column holds names, or counts the rows from any number on."""
     cells = file.column(0)
-    counts = [cell.isdigit() and len(cell) < 9 and int(cell) == i for i, cell in enumerate(cells, start=1)]
-    return not any(map(file.dialect.is_number, cells)) or (len(cells) > 1 and all(counts))
+    numbers = [int(cell) if cell.isdigit() and len(cell) < 9 else -1 for cell in cells]
+    counts = len(cells) > 1 and all(number == i for i, number in enumerate(numbers, start=numbers[0]))
+    return not any(map(file.dialect.is_number, cells)) or (counts and numbers[0] >= 0)
+
+
+def _check_times(proposal: Proposal, of_index: Mapping[int, str]) -> None:
+    """Refuse a column whose numbers rise or fall from row to row: it may hold times.
+
+    Args:
+        proposal: of a file without headings.
+        of_index: what its columns are by their order.
+
+    Raises:
+        MeasurementError: see above.
+    """
+    file = proposal.file
+    for index, quantity in of_index.items():
+        numbers = file.numbers(index)
+        if index in proposal.columns or quantity == "point" or len(numbers) < len(file.records):
+            continue
+        if not _is_ordered(numbers, 0 if index else _RISING):
+            continue
+        unit = "mm" if quantity in POSITION else "deg"
+        raise MeasurementError(
+            f"{file.source}, line {file.lines[0]}, column {index + 1}: the file has no headings, and the numbers of "
+            f"this column go from {numbers[0]:g} to {numbers[-1]:g} row by row, as times do; say what it is with --map "
+            f"{index + 1}=time_s or --map {index + 1}={quantity}_{unit}."
+        )
+
+
+def _is_ordered(numbers: Sequence[float], rising: int) -> bool:
+    """Whether numbers rise or fall from row to row as chance hardly lets them, but for a clock that was set.
+
+    Args:
+        numbers: of a column.
+        rising: from so many numbers on it is enough that all rise; 0 where it is not.
+    """
+    steps = [after - before for before, after in itertools.pairwise(numbers)]
+    up, down = (sum(sign * step > 0 for step in steps) for sign in (1, -1))
+    few, most = sorted((up, down))
+    if most < _MOVING * len(steps) or len(numbers) < min(rising or _ORDERED, _ORDERED):
+        return False
+    if len(numbers) >= _MANY:
+        return few <= _SET_BACK * most
+    return few == 0 and (len(numbers) >= _ORDERED or most == len(steps) == up)
 
 
 def _ends_with_matrices(file: ExportFile, leading: int) -> bool:
@@ -165,7 +240,7 @@ def _take_joints(proposal: Proposal) -> None:
     makers = [one for one in MAKERS if one.joints and (not one.position or one.position in names)]
     general = (Maker("", f"{name}#") for name in JOINT_NAMES)
     best: dict[str, int] = {}
-    shift = 0
+    shift, most = 0, 1
     for maker in (*makers, *general):
         numbers = {name: number for name in names if (number := joint_of(name, maker.joints)) is not None}
         beside = [joint_of(proposal.headings[one.index].name, maker.joints) for one in stated]
@@ -175,8 +250,8 @@ def _take_joints(proposal: Proposal) -> None:
         ]
         counted = sorted([*numbers.values(), *others])
         consecutive = counted in (list(range(1, len(counted) + 1)), list(range(len(counted))))
-        if consecutive and numbers and len(counted) > max(1, len(best)):
-            best, proposal.maker = numbers, maker if maker.name else None
+        if consecutive and numbers and len(counted) > most:
+            best, most, proposal.maker = numbers, len(counted), maker if maker.name else None
             shift = 1 - counted[0]
     reason = f"name of {proposal.maker.name}" if proposal.maker else "heading"
     reason += ", counted from 0" if shift else ""
@@ -187,20 +262,12 @@ def _take_joints(proposal: Proposal) -> None:
 def _take_position(proposal: Proposal) -> None:
     """The coordinates that were measured; a position that was only commanded is none."""
     for group in POSITIONS:
-        names = proposal.names("length")
-        decided = {
-            proposal.headings[index].name: column.target.quantity
-            for index, column in proposal.columns.items()
-            if column.target.quantity in POSITION
-        }
-        wanted = {name: one for name, one in zip(group, POSITION, strict=True) if decided.get(name) != one}
-        there = {name: names[name] for name in wanted if name in names}
-        if not there or len(there) < len(wanted) or len(wanted) + len(decided) > len(POSITION):
+        names, taken = proposal.names("length"), proposal.quantities
+        wanted = {name: one for name, one in zip(group, POSITION, strict=True) if one not in taken}
+        if not wanted or not set(wanted) <= set(names):
             continue
-        if {proposal.headings[index].side for indices in there.values() for index in indices} == {
-            "commanded"
-        }:
-            proposal.leave_out(there, names, "commanded, not measured")
+        if {proposal.headings[index].side for name in wanted for index in names[name]} == {"commanded"}:
+            proposal.leave_out(wanted, names, "commanded, not measured")
         else:
             proposal.put_group(wanted, names, "measured", "heading")
 
@@ -230,6 +297,82 @@ def _take_rotation(proposal: Proposal, rotation: str | None) -> None:
         proposal.put_group(group, names, "measured", f"{chosen}: {encoding.meaning}")
     elif rotation is None:
         proposal.rotations = tuple(matches)
+
+
+def _take_names(proposal: Proposal) -> None:
+    """Where no column is called so, the first one with a name of its own in every row names the points."""
+    file = proposal.file
+    if "point" in proposal.quantities:
+        return
+    for index, column in sorted(proposal.columns.items()):
+        cells = file.column(index)
+        is_open = column.reason == UNRECOGNISED or (
+            column.target.quantity == "target" and not column.is_stated
+        )
+        is_name = all(
+            cell and not file.dialect.is_number(cell) and seconds_of(cell) is None for cell in cells
+        )
+        if file.has_header and is_open and is_name and len(set(cells)) == len(cells) > 1:
+            proposal.columns[index] = MappedColumn(
+                index, file.headings[index], Target("point"), "a name of its own in every row"
+            )
+            return
+
+
+def _take_third_coordinate(proposal: Proposal) -> None:
+    """Of two stated coordinates the third: the only length that is left, or else the column in its place."""
+    place = {
+        one.target.quantity: index
+        for index, one in proposal.columns.items()
+        if one.target.quantity in POSITION and one.is_stated
+    }
+    missing = [one for one in POSITION if one not in proposal.quantities]
+    if len(place) != 2 or len(missing) != 1:
+        return
+    open_rotations = [
+        name
+        for one in proposal.rotations
+        for names in (ROTATIONS[one].values, *ROTATIONS[one].aliases)
+        for name in names
+    ]
+    free = {
+        index: proposal.headings[index].unit
+        for name, indices in proposal.names("length").items()
+        if name not in (*MEANINGS, *open_rotations)
+        for index in indices
+        if proposal.file.numbers(index)
+    }
+    lengths = [index for index, unit in free.items() if unit]
+    number, (first, second) = POSITION.index(missing[0]), sorted(place.items())
+    step = (second[1] - first[1]) / (POSITION.index(second[0]) - POSITION.index(first[0]))
+    in_place = first[1] + step * (number - POSITION.index(first[0]))
+    if len(lengths) == 1:
+        proposal.put(lengths[0], missing[0], "the only length left beside two stated coordinates")
+    elif abs(step) == 1 and in_place in free:
+        proposal.put(int(in_place), missing[0], "stands beside two stated coordinates")
+
+
+def incomplete_rotation(proposal: Proposal) -> list[int]:
+    """Find columns that are named like all values of a rotation but one, with no other numbers between them.
+
+    Args:
+        proposal: in which everything is decided; columns that are stated or used do not count.
+    """
+    headings, file = proposal.headings, proposal.file
+    free = [
+        index
+        for index, column in proposal.columns.items()
+        if column.target.quantity == LEFT_OUT and column.reason == UNRECOGNISED and file.numbers(index)
+    ]
+    index_of = {headings[index].name: index for index in sorted(free)}
+    numeric = [index for index in range(len(headings)) if file.numbers(index)]
+    for encoding in ROTATIONS.values():
+        for names in (encoding.values, *encoding.aliases):
+            there = sorted(index_of[name] for name in names if name in index_of)
+            apart = numeric.index(there[-1]) - numeric.index(there[0]) if there else 0
+            if len(there) == len(names) - 1 and apart == len(there) - 1:
+                return there
+    return []
 
 
 def _take_other(proposal: Proposal, name: str, index: int) -> None:

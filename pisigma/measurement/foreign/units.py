@@ -10,6 +10,8 @@ from typing import Literal
 from pisigma.errors import MeasurementError, nearest_choice
 
 UnitKind = Literal["length", "angle", "time", "mass", "temperature"]
+_FEWEST = 3
+"""Rows from which on values that are all small tell their unit."""
 _LONGEST_PLAIN = 40
 """Digits that a scaled number is written out with; longer ones keep their exponent."""
 
@@ -38,10 +40,10 @@ UNITS: dict[str, ForeignUnit] = {
     "um": ForeignUnit("length", "mm", "1e-3", "µm μm micron microns micrometer micrometers"),
     "in": ForeignUnit("length", "mm", "25.4", 'inch inches "'),
     "ft": ForeignUnit("length", "mm", "304.8", "foot feet"),
-    "deg": ForeignUnit("angle", "deg", "1", "° degree degrees deg. grad"),
+    "deg": ForeignUnit("angle", "deg", "1", "° degree degrees deg."),
     "rad": ForeignUnit("angle", "rad", "1", "radian radians"),
     "mrad": ForeignUnit("angle", "rad", "1e-3", "milliradian milliradians"),
-    "gon": ForeignUnit("angle", "deg", "0.9", "gons"),
+    "gon": ForeignUnit("angle", "deg", "0.9", "gons gradian gradians grads ᵍ"),
     "s": ForeignUnit("time", "s", "1", "sec second seconds"),
     "ms": ForeignUnit("time", "s", "1e-3", "msec millisecond milliseconds"),
     "kg": ForeignUnit("mass", "kg", "1", "kilogram kilograms"),
@@ -50,12 +52,18 @@ UNITS: dict[str, ForeignUnit] = {
 }
 """By symbol; a unit more is one line."""
 
+AMBIGUOUS = {
+    "grad": "degrees in German, gradians in other languages",
+    "grade": "degrees in Italian, gradians in French",
+}
+"""Spellings that are units of several meanings, and which; `--unit` or `--map` has to say which one is meant."""
 _LONGEST_COMMENT = 500
 """Characters of a comment that are looked at."""
 
 _SYMBOLS = {name: symbol for symbol, unit in UNITS.items() for name in (symbol, *unit.spellings.split())}
 _SAID = re.compile(
-    r"(?i)\b(?:units?|einheit(?:en)?|lengths?|angles?|distances?|joints?|coordinates?|positions?|values)\b(.*)"
+    r"(?i)\b(?:units?|einheit(?:en)?|lengths?|längen?|angles?|winkel|distances?|joints?|gelenke?|coordinates?|positions?|"
+    r"values)\b(.*)"
 )
 _BETWEEN = frozenset(("", "in", "and", "und", "are", "is"))
 """Words between such a word and its unit; an inch has to be spelt out in a comment."""
@@ -66,10 +74,17 @@ def unit_symbol(text: str) -> str:
     return _SYMBOLS.get(text.strip().strip("[]()<>{}").strip().lower(), "")
 
 
+def ambiguous_unit(text: str) -> str:
+    """Give the spelling of a unit with several meanings, see `AMBIGUOUS`; "" where it is none."""
+    bare = text.strip().strip("[]()<>{}").strip().lower()
+    return bare if bare in AMBIGUOUS else ""
+
+
 def stated_units(comments: Sequence[str]) -> dict[UnitKind, str]:
     """Give the units that comments and titles state, such as "units mm, deg" or "angles: degrees".
 
-    The units follow their word; of several for one kind the first counts.
+    The units follow their word; of several for one kind the first counts. A unit of several meanings stays as it is
+    spelt, see `AMBIGUOUS`.
     """
     stated: dict[UnitKind, str] = {}
     for comment in comments:
@@ -81,6 +96,8 @@ def stated_units(comments: Sequence[str]) -> dict[UnitKind, str]:
                     continue
                 if symbol := unit_symbol(word):
                     stated.setdefault(UNITS[symbol].kind, symbol)
+                elif spelling := ambiguous_unit(word):
+                    stated.setdefault("angle", spelling)
                 else:
                     break
     return stated
@@ -134,7 +151,7 @@ def doubt(symbol: str, largest: float, rows: int) -> str:
         largest: absolute value among all joint values, or among all coordinates.
         rows: number of rows.
     """
-    few = rows < 6
+    few = rows < _FEWEST
     doubts = {
         "rad": (largest > 4 * math.pi, "degrees"),
         "deg": (not few and 0 < largest <= math.pi, "radians"),
@@ -145,7 +162,7 @@ def doubt(symbol: str, largest: float, rows: int) -> str:
     doubted, other = doubts.get(symbol, (False, ""))
     if symbol == "deg" and largest > 1000:
         doubted, other = True, "lengths"
-    return f"values up to {largest:.6g} {symbol} look like {other}" if doubted else ""
+    return f"values up to {largest:.6g} {symbol}, which look like {other}" if doubted else ""
 
 
 def is_certain(symbol: str, largest: float) -> bool:

@@ -172,7 +172,6 @@ CASES: dict[str, tuple[str, tuple[str, ...]]] = {
     "touch and distance": (f"{ALL}\n1,,,,,left,x,2,3,w\n", ("line 2", "'touch_mm' and column 'distance_mm'")),
     "nothing": (f"{ALL}\n1,,,,,left,,,,\n", ("line 2", "nothing was measured", "'socket'", "'touch_mm'")),
     "no socket": ("q1_deg,socket\n1,a\n2,\n", ("line 3", "columns 'socket'", "nothing was measured")),
-    "equal sockets": ("q1_deg,socket\n1,a\n1,b\n1,a\n", ("line 4", "equals line 2")),
     "no number": (f"{TOUCH}\n1,left,x,here\n", ("line 2", "column 'touch_mm'", "'here'")),
     "touch of zero sigma": (
         f"{TOUCH},sigma_mm\n1,left,x,1,0\n",

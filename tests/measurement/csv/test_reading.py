@@ -51,8 +51,6 @@ def test_what_a_plan_says_of_its_poses_is_not_read(write):
         Measurements.read_csv(write(rows)).content_hash()
         == Measurements.read_csv(write(plain)).content_hash()
     )
-    with pytest.raises(MeasurementError, match="line 4, all columns: the row equals line 2"):
-        Measurements.read_csv(write(rows + "1,3,1,2,3,18\n"))
 
 
 def test_columns_stand_in_any_order(write):
@@ -146,24 +144,21 @@ def test_repeated_joints_with_other_readings_or_targets_are_measurements(write):
     assert Measurements.read_csv(path).rows == 3
 
 
-def test_rounding_at_a_limit_is_no_fault(write):
+def test_only_what_is_far_outside_a_limit_is_a_fault(write):
     robot = Robot.load("ur10")
     upper = float(robot.limits[0, 1])
-    row = ",".join(repr(upper + 9e-10) for _ in range(6))
     text = "q1_rad,q2_rad,q3_rad,q4_rad,q5_rad,q6_rad,x_mm,y_mm,z_mm\n"
-    assert Measurements.read_csv(write(f"{text}{row},1,2,3\n"), robot).rows == 1
-    with pytest.raises(MeasurementError, match="outside the limits"):
-        Measurements.read_csv(
-            write(f"{text}{row},1,2,3\n".replace(repr(upper + 9e-10), repr(upper + 2e-9))), robot
-        )
+    assert Measurements.read_csv(write(f"{text}{upper + 0.7},0,0,0,0,0,1,2,3\n"), robot).rows == 1
+    with pytest.raises(MeasurementError, match="far outside the limits"):
+        Measurements.read_csv(write(f"{text}{upper + 0.8},0,0,0,0,0,1,2,3\n"), robot)
 
 
 def test_leaves_out_rows_on_request_and_says_why(write):
     path = write(
         "q1_deg,q2_deg,q3_mm,q4_deg,x_mm,y_mm,z_mm,sigma_mm,set\n"
         "1,2,-3,4,1,2,3,0.1,train\n"
-        "1,2,-3,4,1,2,3,0.1,train\n"
-        "1,2,3,4,1,2,3,0.1,train\n"
+        "1,2,-3,4,1,2,inf,0.1,train\n"
+        "1,2,300,4,1,2,3,0.1,train\n"
         "1,2,-3,4,1,2,3,0.1\n"
         "1,two,-3,4,1,2,3,0.1,train\n"
         "1,2,-3,4,,,,0.1,train\n"
@@ -178,11 +173,11 @@ def test_leaves_out_rows_on_request_and_says_why(write):
     assert measurements.split == ("train", "test")
     assert_close(measurements.q[:, 2], [-3e-3, -4e-3])
     assert [left.line for left in measurements.left_out] == list(range(3, 12))
-    words = ("line 2", "q3_mm", "set", "q2_deg", "nothing was measured", "y_mm", "sigma_mm", "set", "quotes")
+    words = ("z_mm", "q3_mm", "set", "q2_deg", "nothing was measured", "y_mm", "sigma_mm", "set", "quotes")
     for left, word in zip(measurements.left_out, words, strict=True):
         assert word in left.reason
     with pytest.raises(
-        MeasurementError, match=r"data\.csv, line 3, all columns: .*\(8 more rows have a fault\)\.$"
+        MeasurementError, match=r"data\.csv, line 3, column 'z_mm': .*\(8 more rows have a fault\)\.$"
     ):
         Measurements.read_csv(path, Robot.load("kiro3"))
 

@@ -89,7 +89,6 @@ def assert_same(actual: Measurements, expected: Measurements) -> None:
 @given(st.data(), st.integers(1, 5), st.lists(st.booleans(), min_size=1, max_size=7))
 def test_reads_back_what_was_written(tmp_path: Path, data: st.DataObject, rows: int, revolute: list[bool]):
     given_fields = data.draw(written_fields(rows, len(revolute)))
-    assume(len(torch.unique(given_fields["q"], dim=0)) == rows)  # equal rows are refused
     if given_fields["rotation"] is not None:
         given_fields["rotation"] = rotation_from_quaternion(given_fields["rotation"])
     measurements = Measurements(**given_fields)
@@ -145,7 +144,6 @@ def test_measured_poses_read_back(tmp_path: Path, shared_data: Path):
     [
         ({"position": None}, r"tracker, row 0: nothing was measured"),
         ({"position": tensor([[1, 2, 3], [torch.nan] * 3])}, r"tracker, row 1: nothing was measured"),
-        ({"q": tensor([[0.0] * 4] * 2), "position": tensor([[1.0] * 3] * 2)}, r"row 1: equals row 0"),
         ({"target": ("A", " B")}, r"row 1, column 'target': the name ' B'"),
         ({"frame": ("A\nB", "A")}, r"row 0, column 'frame'"),
         ({"frame": ("A", "\udc80")}, r"row 1, column 'frame'"),

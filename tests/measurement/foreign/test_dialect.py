@@ -3,7 +3,12 @@
 import pytest
 
 from pisigma.errors import MeasurementError
-from pisigma.measurement.foreign.dialect import sniff
+from pisigma.measurement.foreign.dialect import Dialect, sniff
+from pisigma.measurement.foreign.number_format import Decimal
+
+
+def sniffed(lines: list[str], decimal: Decimal | None = None) -> Dialect:
+    return sniff(list(enumerate(lines, start=1)), "a.csv", decimal)
 
 
 @pytest.mark.parametrize(
@@ -25,23 +30,46 @@ from pisigma.measurement.foreign.dialect import sniff
     ],
 )
 def test_separator_and_decimal_sign(lines: list[str], separator: str, decimal: str):
-    dialect = sniff(lines, "a.csv")
+    dialect = sniffed(lines)
     assert (dialect.separator, dialect.numbers.decimal) == (separator, decimal)
 
 
 def test_a_stated_sign_counts():
-    assert sniff(["1,250;2,125"], "a.csv", ".").numbers.decimal == "."
+    assert sniffed(["1,250;2,125"], ".").numbers.decimal == "."
 
 
 def test_commas_that_may_set_thousands_apart_are_refused_where_they_separate_cells():
     lines = ["q1,x", '10,"1,234"', '11,"-2,345"']
     with pytest.raises(MeasurementError, match="state --decimal point or --decimal comma"):
-        sniff(lines, "a.csv")
-    assert sniff(lines, "a.csv", ".").numbers.text("1,234") == "1234"
-    assert sniff([*lines, '12,"0,345"'], "a.csv").numbers.text("1,234") == "1.234"
+        sniffed(lines)
+    assert sniffed(lines, ".").numbers.text("1,234") == "1234"
+    assert sniffed([*lines, '12,"0,345"']).numbers.text("1,234") == "1.234"
 
 
 @pytest.mark.parametrize("lines", [[], ["only words here", "and here"], ["1.5", "2.5"]])
 def test_no_table_is_refused(lines: list[str]):
     with pytest.raises(MeasurementError, match="table with one measurement per line"):
-        sniff(lines, "a.csv")
+        sniffed(lines)
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        ["x;y", "2.104;12", "3.210;800", "951;1.200"],
+        ["x;y", "2,104;12", "3,210;800", "951;1,200"],
+        ["q1;x;y", "170;2.104;3.200", "30;1.950;1.100"],
+        ["q1;x;y", "170;22.104;300", "30;21.950;1100"],
+        ["q1;x;y", "17.5;1.104;300", "30.25;950;1100"],
+    ],
+)
+def test_groups_of_thousands_that_may_be_decimals_are_refused_with_line_and_column(lines: list[str]):
+    with pytest.raises(
+        MeasurementError, match=r"a\.csv, line 2, column [12]: '.*' may have decimals or a group"
+    ):
+        sniffed(lines)
+    assert sniffed(lines, ".").numbers.decimal == "."
+
+
+def test_numbers_of_points_do_not_make_three_decimals_doubtful():
+    assert sniffed(["n;x;y", "1;2.104;3.200", "2;1.950;1.100", "3;1.1;2.5"]).numbers.decimal == "."
+    assert sniffed(["n;x;y", "7;2.104;3.200", "8;1.950;1.100"]).numbers.decimal == "."

@@ -24,7 +24,7 @@ def test_what_stands_around_the_rows(tmp_path: Path):
     assert file.units == ("", "mm", "mm")
     assert file.records == [["p1", "1,5", "2,5"], ["p2", "-", "3,5"]]
     assert file.lines == (7, 9)
-    assert file.skipped == (11,)
+    assert [row.line for row in file.skipped] == [11]
     assert file.comments[:2] == ("Report of 2 March", "// units mm")
 
 
@@ -44,7 +44,7 @@ def test_a_row_of_another_width_is_refused(tmp_path: Path):
         read(tmp_path, "a,b,c\n1,2,3\n4,5\n6,7,8\n")
     with pytest.raises(MeasurementError, match="export decimal points, or semicolons between cells"):
         read(tmp_path, "q1_deg,x_mm,y_mm\n1,5,2,5,3,5\n2,5,3,5,4,5\n")
-    with pytest.raises(MeasurementError, match="line 1: 4 headings stand over rows of 3 cells"):
+    with pytest.raises(MeasurementError, match="line 1: expected 3 headings as the rows have 3 cells, got 4"):
         read(tmp_path, "j1,j2,x,y\n1,2,3\n4,5,6\n")
 
 

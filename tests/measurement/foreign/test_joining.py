@@ -1,11 +1,11 @@
 """Joint logs and lists of measurements: partners by name, order and time, and rows without."""
 
 import pytest
-from testing.closeness import assert_close
 
 from pisigma.errors import MeasurementError
+from pisigma.measurement.foreign.accounting import sentences
 from pisigma.measurement.foreign.conversion import ConvertedRows
-from pisigma.measurement.foreign.joining import join_rows, seconds_of
+from pisigma.measurement.foreign.joining import join_rows
 
 
 def rows(source: str, **cells: tuple[str, ...]) -> ConvertedRows:
@@ -25,8 +25,11 @@ def test_names_differ_in_groups_case_and_zeros():
     assert joined.rows.cells["q1_deg"] == ("10", "20")
     assert joined.rows.cells["x_mm"] == ("1", "2")
     assert joined.rows.lines == (2, 3)
-    assert [sentence.partition(":")[0] for sentence in joined.unmatched] == ["points", "log"]
-    assert "line 4 (p9)" in joined.unmatched[0]
+    assert [(row.file, row.line, row.point) for row in joined.unmatched] == [
+        ("points", 4, "p9"),
+        ("log", 4, "p3"),
+    ]
+    assert "line 4 (p9)" in sentences(joined.unmatched)[0]
     assert joined.warnings == ("log: roll_deg are left out, as the measurements are those of points.",)
     assert joined.rows.cells["payload_kg"] == ("2", "1")
     assert "roll_deg" not in joined.rows.cells
@@ -56,7 +59,7 @@ def test_the_nearest_time_stamp_counts():
     log = rows("log", time=("10:00:02.1", "10:00:01.0", "10:00:05"), q1_deg=("20", "10", "50"))
     joined = join_rows(measured, log, "time", 0.2)
     assert joined.rows.cells["q1_deg"] == ("10", "20")
-    assert [("line 4" in sentence) for sentence in joined.unmatched] == [True, True]
+    assert [(row.file, row.line) for row in joined.unmatched] == [("points", 4), ("log", 4)]
     with pytest.raises(MeasurementError, match="the clocks and their zones"):
         join_rows(rows("points", time=("11:00:02.1",), x_mm=("1",)), log, "time", 0.2)
 
@@ -67,24 +70,51 @@ def test_joints_that_move_while_it_is_measured():
     assert "move by up to 1 (deg or mm) within 0.2 s" in join_rows(measured, log, "time", 0.2).warnings[0]
 
 
+def test_names_of_points_that_contradict_the_order_or_the_time_are_refused():
+    measured = rows("points", point=("p1", "p2"), time=("1", "2"), x_mm=("1", "2"))
+    log = rows("log", point=("p2", "P1"), time=("1", "2"), q1_deg=("20", "10"))
+    for by in ("order", "time"):
+        with pytest.raises(
+            MeasurementError, match=r"points, line 2: .* 'p1' together with 'p2' .* in line 3"
+        ):
+            join_rows(measured, log, by)
+    same = rows("log", point=("P01", "p2"), time=("1", "2"), q1_deg=("10", "20"))
+    others = rows("log", point=("1", "2"), time=("1", "2"), q1_deg=("10", "20"))
+    for one in (same, others):
+        assert join_rows(measured, one, "order").rows.cells["q1_deg"] == ("10", "20")
+
+
 @pytest.mark.parametrize(
-    ("text", "seconds"),
+    ("ours", "theirs"),
     [
-        ("12.5", 12.5),
-        ("10:31:02.5", 37862.5),
-        ("10:31", 37860.0),
-        ("2026-03-02T10:31:02.5Z", 1772447462.5),
-        ("2026/03/02 10:31:02.5", 1772447462.5),
-        ("02.03.2026 10:31:02.5", 1772447462.5),
+        (("13/03/2026 10:00:01", "02/03/2026 10:00:02"), ("2026-03-13 10:00:01", "2026-03-02 10:00:02")),
+        (
+            ("03/13/2026 10:00:01 PM", "03/02/2026 12:00:02 AM"),
+            ("2026-03-13 22:00:01", "2026-03-02 00:00:02"),
+        ),
+        (("02/03/2026 10:00:01", "02/03/2026 10:00:02"), ("02/03/2026 10:00:01", "02/03/2026 10:00:02")),
+        (("10:00:01 AM", "1:00:02 p.m."), ("10:00:01", "13:00:02")),
     ],
 )
-def test_time_stamps(text: str, seconds: float):
-    assert_close(seconds_of(text), seconds, atol=0.0)
+def test_stamps_of_other_countries(ours: tuple[str, str], theirs: tuple[str, str]):
+    log = rows("log", time=theirs[::-1], q1_deg=("20", "10"))
+    assert join_rows(rows("points", time=ours, x_mm=("1", "2")), log, "time").rows.cells["q1_deg"] == (
+        "10",
+        "20",
+    )
 
 
-def test_what_is_no_time_stamp():
-    assert seconds_of("noon") is None
-    assert seconds_of("nan") is None
+def test_a_day_that_may_be_a_month_is_refused_with_its_line():
+    log = rows("log", time=("2026-03-02 10:00:01", "2026-03-04 10:00:02"), q1_deg=("10", "20"))
+    measured = rows("points", time=("02/03/2026 10:00:01", "04/03/2026 10:00:02"), x_mm=("1", "2"))
+    with pytest.raises(MeasurementError, match=r"points, line 2: .* may have the day or the month first"):
+        join_rows(measured, log, "time")
+
+
+def test_a_column_of_dates_belongs_to_the_clock():
+    measured = rows("points", time=("10:00:01",) * 2, date=("2026-03-02", "2026-03-03"), x_mm=("1", "2"))
+    log = rows("log", time=("2026-03-03 10:00:01", "2026-03-02 10:00:01"), q1_deg=("20", "10"))
+    assert join_rows(measured, log, "time").rows.cells["q1_deg"] == ("10", "20")
 
 
 @pytest.mark.parametrize(("by", "said"), [("point", "names of the points"), ("time", "time stamps")])
@@ -98,3 +128,16 @@ def test_no_common_name():
         join_rows(
             rows("points", point=("p1",), x_mm=("1",)), rows("log", point=("k1",), q1_deg=("1",)), "point"
         )
+
+
+def test_where_no_name_is_the_same_the_numbers_are_compared():
+    def joined(*names: str):
+        log = rows("log", point=names, q1_deg=("10", "20", "30"))
+        return join_rows(rows("points", point=("P1", "P2", "P3"), x_mm=("1", "2", "3")), log, "order")
+
+    assert not joined("Pose 01", "Pose 02", "Pose 03").warnings
+    with pytest.raises(MeasurementError, match=r"points, line 2: .* 'P1' together with '2' .* in line 4"):
+        joined("2", "3", "1")
+    for names in (("0", "1", "2"), ("a", "b", "c"), ("A1", "B1", "C1")):
+        (warning,) = joined(*names).warnings
+        assert f"points, line 2: the point 'P1' is put together with '{names[0]}' (log, line 2)" in warning

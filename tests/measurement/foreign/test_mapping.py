@@ -6,6 +6,7 @@ import pytest
 
 from pisigma.errors import MeasurementError
 from pisigma.measurement.foreign.conversion import convert
+from pisigma.measurement.foreign.doubts import doubts
 from pisigma.measurement.foreign.export_file import read_export
 from pisigma.measurement.foreign.mapping import FileMapping, map_columns
 
@@ -186,9 +187,60 @@ def test_cells_that_are_no_numbers_are_named(tmp_path: Path):
 
 def test_doubts_about_units_and_external_axes(tmp_path: Path):
     rows = "".join(f"{170 - i},-20,{i}.5,1200.5,{i},400\n" for i in range(8))
-    doubts = mapped(tmp_path, f"J1 [rad],J2 [rad],E1 [mm],X [m],Y [m],Z [m]\n{rows}").doubts
-    assert len(doubts) == 3
-    assert "'E1 [mm]' moves from 0.5 to 7.5" in doubts[0]
-    assert "values up to 170 rad look like degrees" in doubts[1]
-    assert "values up to 1200.5 m look like millimetres" in doubts[2]
-    assert not mapped(tmp_path, f"J1 [deg],J2 [deg],-,X [mm],Y [mm],Z [mm]\n{rows}").doubts
+    found = doubts(mapped(tmp_path, f"J1 [rad],J2 [rad],E1 [mm],X [m],Y [m],Z [m]\n{rows}"))
+    assert len(found) == 3
+    assert "line 1, column 'E1 [mm]': it moves from 0.5 to 7.5" in found[0]
+    assert (
+        "line 2, column 'J1 [rad]': the joint values have values up to 170 rad, which look like degrees"
+        in found[1]
+    )
+    assert "values up to 1200.5 m, which look like millimetres" in found[2]
+    assert not doubts(mapped(tmp_path, f"J1 [deg],J2 [deg],-,X [mm],Y [mm],Z [mm]\n{rows}"))
+
+
+@pytest.mark.parametrize(
+    ("heading", "cells", "target"),
+    [
+        ("Bezeichnung", "ab", "point"),
+        ("target", "ab", "point"),
+        ("Bezeichnung", "aa", "-"),
+        ("target", "aa", "target"),
+    ],
+)
+def test_a_name_of_its_own_in_every_row_is_that_of_the_point(tmp_path: Path, heading, cells, target):
+    rows = "\n".join(f"{cell},{ROW}" for cell in cells)
+    assert targets(mapped(tmp_path, f"{heading},{','.join(DEGREES_MM)}\n{rows}"))[0] == target
+
+
+def test_a_joint_that_is_stated_leaves_the_others_to_their_maker(tmp_path: Path):
+    file = mapped(tmp_path, f"A1,A2,A3,A4,A5,A6,X,Y,Z\n{ROW}", {"A1": "q1_deg", "X": "x_mm"})
+    assert targets(file) == DEGREES_MM
+
+
+@pytest.mark.parametrize(
+    "headings",
+    [
+        "north [mm],east [mm],Z [mm]",
+        "north [mm],east [mm],height [mm]",
+        "north,east,up",
+        "north,east,up,quality",
+    ],
+)
+@pytest.mark.parametrize("left", [0, 1, 2])
+def test_of_two_stated_coordinates_the_third_is_proposed(tmp_path: Path, headings: str, left: int):
+    text = f"A1 [deg],A2 [deg],{headings}\n" + "1,2,100,200,300,0.1\n2,3,110,210,310,0.2\n"
+    text = text if "quality" in headings else text.replace(",0.1", "").replace(",0.2", "")
+    names = dict(zip(headings.split(","), ["x_mm", "y_mm", "z_mm"], strict=False))
+    stated = {name: one for i, (name, one) in enumerate(names.items()) if i != left}
+    assert targets(mapped(tmp_path, text, stated))[2:5] == ["x_mm", "y_mm", "z_mm"]
+
+
+@pytest.mark.parametrize(
+    "stated", [{"7": "x_mm", "8": "y_mm"}, {"7": "x_mm", "9": "z_mm"}, {"2": "q2_deg"}, {"10": "-"}]
+)
+def test_without_headings_the_rest_follows_the_order(tmp_path: Path, stated: dict[str, str]):
+    more = [",0.1", ",0.3"] if "10" in stated else ["", ""]
+    text = "".join(f"{ROW}{end}\n" for end in more)
+    assert targets(mapped(tmp_path, text, stated, length="mm", angle="deg"))[:9] == DEGREES_MM
+    against = mapped(tmp_path, text, {"7": "y_mm", "8": "x_mm"}, length="mm", angle="deg")
+    assert not against.has_joints

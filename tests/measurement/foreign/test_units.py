@@ -17,7 +17,16 @@ from pisigma.measurement.foreign.units import (
 
 @pytest.mark.parametrize(
     ("text", "symbol"),
-    [("[Millimeters]", "mm"), ("µm", "um"), ("°", "deg"), ('"', "in"), ("furlong", ""), ("", "")],
+    [
+        ("[Millimeters]", "mm"),
+        ("µm", "um"),
+        ("°", "deg"),
+        ('"', "in"),
+        ("furlong", ""),
+        ("", ""),
+        ("gradians", "gon"),
+        ("[Grad]", ""),
+    ],
 )
 def test_spellings(text: str, symbol: str):
     assert unit_symbol(text) == symbol

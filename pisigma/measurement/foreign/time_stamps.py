@@ -1,0 +1,106 @@
+"""Time stamps as instruments and controllers write them."""
+
+import math
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime
+
+_DATE = re.compile(r"(\d{1,4})([./-])(\d{1,2})\2(\d{1,4})(?:$|[ T,]+(.*))")
+_CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2}(?:[.,]\d+)?))?(?:\s*([AaPp])\.?[Mm]\.?)?")
+
+
+def seconds_of(text: str, day_first: bool | None = None) -> float | None:
+    """Seconds of a number, of a clock, or of a date with a clock (in UTC where no zone is named); None for others.
+
+    Args:
+        text: such as "12.5", "10:31:02.5", "10:31:02 PM", "2026-03-02 10:31:02.5", "02.03.2026 10:31" or
+            "02/03/2026 10:31".
+        day_first: whether the day is before the month in dates such as 02/03/2026; None where that is not known: such
+            dates are read if only one order is possible.
+    """
+    text = text.strip()
+    try:
+        return number if math.isfinite(number := float(text)) else None
+    except ValueError:
+        pass
+    if match := _CLOCK.fullmatch(text):
+        return _clock(match)
+    if match := _DATE.fullmatch(text):
+        clock, day = _CLOCK.fullmatch((match[5] or "").strip()), _day(match, day_first)
+        seconds = _clock(clock) if clock else None
+        if day is not None and seconds is not None:
+            return day.timestamp() + seconds
+    try:
+        stamp = datetime.fromisoformat(text.replace("/", "-"))
+    except ValueError:
+        return None
+    return (stamp if stamp.tzinfo else stamp.replace(tzinfo=UTC)).timestamp()
+
+
+def iso_day(text: str, day_first: bool | None = None) -> str | None:
+    """The day of a date, or of a date with a clock, as ISO 8601 writes it; None for others, see `seconds_of`."""
+    match = _DATE.fullmatch(text.strip())
+    if match is None or (match[5] and not is_clock(match[5])):
+        return None
+    day = _day(match, day_first)
+    return None if day is None else day.date().isoformat()
+
+
+def date_of(text: str) -> str:
+    """The date of a time stamp as it is written; "" where it has none."""
+    match = _DATE.match(text.strip())
+    return text.strip()[: match.start(5) if match[5] is not None else None].strip(" T,") if match else ""
+
+
+def is_clock(text: str) -> bool:
+    """Say whether a time stamp is a clock without a date."""
+    return bool(_CLOCK.fullmatch(text.strip()))
+
+
+def day_first(texts: Sequence[str]) -> bool | None:
+    """Say whether dates such as 13/03/2026 have the day first; None where no date tells, or dates contradict."""
+    matches = [match for match in map(_DATE.match, map(str.strip, texts)) if match and _is_open(match)]
+    is_day, is_month = (any(int(match[group]) > 12 for match in matches) for group in (1, 3))
+    return is_day if is_day != is_month else None
+
+
+def has_open_date(text: str) -> bool:
+    """Say whether the order of day and month matters for a time stamp."""
+    match = _DATE.match(text.strip())
+    return bool(match and _is_open(match) and match[1] != match[3])
+
+
+def _is_open(match: re.Match[str]) -> bool:
+    """Whether a date has slashes or dashes and its year last; with points the day is first."""
+    return match[2] != "." and len(match[4]) == 4
+
+
+def _day(match: re.Match[str], first: bool | None) -> datetime | None:
+    """Midnight of a date; None where it is none, or has two meanings."""
+    one, two, last = int(match[1]), int(match[3]), int(match[4])
+    if len(match[1]) == 4:
+        year, month, day = one, two, last
+    elif len(match[4]) == 2 and match[2] == ".":
+        year, month, day = 2000 + last, two, one
+    elif len(match[4]) != 4:
+        return None
+    elif match[2] == "." or first or (first is None and one > 12):
+        year, month, day = last, two, one
+    elif first is False or two > 12 or one == two:
+        year, month, day = last, one, two
+    else:
+        return None
+    try:
+        return datetime(year, month, day, tzinfo=UTC)
+    except ValueError:
+        return None
+
+
+def _clock(match: re.Match[str]) -> float | None:
+    """Seconds since midnight; None where there is no such time."""
+    hours, minutes, seconds = int(match[1]), int(match[2]), float((match[3] or "0").replace(",", "."))
+    if half := match[4]:
+        if not 1 <= hours <= 12:
+            return None
+        hours = hours % 12 + (12 if half in "pP" else 0)
+    return hours * 3600 + minutes * 60 + seconds if hours < 24 and minutes < 60 and seconds < 61 else None

@@ -1,0 +1,98 @@
+"""Joint values of rows beyond the limits of a drawing: warned of, and the limits widened; another unit is refused."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float64
+
+from pisigma.kinematics.joint_limits import beyond_limits, grossly_beyond
+from pisigma.measurement.copies import copy_warnings
+from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.rules import rows_where
+from pisigma.robot.coupling import hull
+from pisigma.robot.description import Robot
+from pisigma.robot.row import Row
+
+_NAMED = 5
+"""Rows that are named."""
+
+
+@dataclass(frozen=True, eq=False)
+class JointRange:
+    """The values of one axis that lie beyond its limits.
+
+    Attributes:
+        axis: as drawn.
+        q: the values of all rows [rad or m].
+        rows: numbers of the rows outside.
+    """
+
+    axis: Row
+    q: Float64[np.ndarray, " rows"]
+    rows: tuple[int, ...]
+
+    @property
+    def widened(self) -> Row:
+        """The axis with limits that hold the rows."""
+        outside = self.q[list(self.rows)]
+        lower, upper = min(self.axis.lower, outside.min()), max(self.axis.upper, outside.max())
+        return replace(self.axis, lower=float(lower), upper=float(upper))
+
+    def sentence(self, rows: Measurements, robot: Robot) -> str:
+        """Name the joint, its limits, and the rows outside."""
+        axis, unit = self.axis, self.axis.file_unit
+        lower, upper = axis.in_file_unit(axis.lower), axis.in_file_unit(axis.upper)
+        beyond = np.maximum(axis.lower - self.q, self.q - axis.upper)
+        farthest = int(beyond.argmax())
+        named = ", ".join(rows.place(row) for row in self.rows[:_NAMED])
+        more = f" and {len(self.rows) - _NAMED} more" if len(self.rows) > _NAMED else ""
+        gross = bool(grossly_beyond(self.q, axis).any())
+        meaning = (
+            "This is too far for the limits of a drawing: these are values of another joint or in another unit."
+            if gross
+            else "Measured rows show where the arm can go, so a calibration widens the limits to them; check the "
+            "limits of the robot file, and the order and unit of the joints."
+        )
+        return (
+            f"{len(self.rows)} of {rows.rows} rows are outside the limits {lower:.6g} to {upper:.6g} {unit} of joint "
+            f"'{axis.name}' of robot '{robot.name}', by up to {axis.in_file_unit(beyond[farthest]):.3g} {unit} "
+            f"({rows.place(farthest)}): {named}{more}. {meaning}"
+        )
+
+
+def joint_ranges(robot: Robot, rows: Measurements) -> tuple[JointRange, ...]:
+    """The axes of a robot whose limits rows exceed."""
+    values = robot.to_controller(rows.q.detach().cpu().double().numpy())
+    found = []
+    for axis, q in zip(robot.axes, np.moveaxis(values, -1, 0), strict=True):
+        if outside := rows_where(beyond_limits(q, axis)):
+            found.append(JointRange(axis, q, tuple(outside)))
+    return tuple(found)
+
+
+def limit_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
+    """A sentence for every joint whose limits rows exceed."""
+    return tuple(one.sentence(rows, robot) for one in joint_ranges(robot, rows))
+
+
+def row_warnings(robot: Robot, rows: Measurements) -> tuple[str, ...]:
+    """A sentence for rows that stand there twice, and one for every joint whose limits rows exceed."""
+    return (*copy_warnings(rows.left_out), *limit_warnings(robot, rows))
+
+
+def with_limits_of_rows(robot: Robot, rows: Measurements) -> Robot:
+    """The robot with limits that are wide enough for rows; the same where they are."""
+    wider = {one.axis.name: one.widened for one in joint_ranges(robot, rows)}
+    if not wider:
+        return robot
+    if robot.coupling is None:
+        return replace(robot, rows=tuple(wider.get(row.name, row) for row in robot.rows))
+    coupling = replace(robot.coupling, axes=tuple(wider.get(axis.name, axis) for axis in robot.coupling.axes))
+    limits = iter(hull(coupling).tolist())
+    joints = tuple(
+        row
+        if row.type == "fixed"
+        else replace(row, **dict(zip(("lower", "upper"), next(limits), strict=True)))
+        for row in robot.rows
+    )
+    return replace(robot, rows=joints, coupling=coupling)
