@@ -31,7 +31,7 @@ class FramesInForce:
     A value is certain where every way through the program leads to the same one. A value that is set in a loop or a
     branch holds there from its place on, but neither after it nor earlier in the same loop. Values that a called
     routine sets are not certain, nor those that a routine finds when it is called, if the program sets them in several
-    places.
+    places. A routine of another file may set all of them.
     """
 
     def __init__(self, steps: Sequence[Step], before: dict[str, Frame | str]) -> None:
@@ -66,6 +66,8 @@ class FramesInForce:
             for first, inside in self._of_routine.items()
             if first >= 0
         }
+        self._called = {step.name for step in steps if step.kind == "call"}
+        self._certain_before = {name for name, value in before.items() if not isinstance(value, str)}
         for _ in acting:  # a name passes through all routines at most
             for first, inside in acting.items():
                 self._set_by[steps[first].name].update(*map(self._set_at, inside))
@@ -85,8 +87,10 @@ class FramesInForce:
         if step.kind == "set":
             self._values[step.name] = f"{step.name} {_WAY}" if self._is_reached_twice(number) else value
         elif step.kind == "call":
-            for name in self._set_by.get(step.name, ()):
-                self._values[name] = f"{name} is set by the routine {step.name}"
+            where = "is" if step.name in self._set_by else "may be"
+            whose = "" if step.name in self._set_by else " of another file"
+            for name in self._set_at(number):
+                self._values[name] = f"{name} {where} set by the routine {step.name}{whose}"
         elif step.kind == "else" and self._saved:
             self._values = dict(self._saved[-1])
             # what is called in a condition holds in the parts that follow, too
@@ -99,7 +103,7 @@ class FramesInForce:
             if step.kind == "loop":
                 self._doubt(self._set_in(number), _WAY)
             elif step.kind == "routine":
-                self._doubt({name for name, places in self._places.items() if places > 1}, _CALLER)
+                self._doubt(self._set_elsewhere(step.name), _CALLER)
 
     def _end(self, number: int) -> None:
         """Leave a block."""
@@ -112,6 +116,14 @@ class FramesInForce:
         nested = bool(self._open[number])
         kept = {name for name, places in self._places.items() if places == 1 and not nested}
         self._values = {name: self._values[name] if name in kept else saved[name] for name in saved}
+
+    def _set_elsewhere(self, routine: str) -> set[str]:
+        """Names whose values in a routine depend on where it is called from."""
+        several = {name for name, places in self._places.items() if places > 1}
+        if routine not in self._called:
+            return several
+        foreign = any(step.kind == "call" and step.name not in self._set_by for step in self._steps)
+        return several | {name for name in self._certain_before if foreign or self._places[name]}
 
     def _set_in(self, begin: int, kinds: Sequence[str] = ("set", "call")) -> set[str]:
         """Names that steps of some kinds set in a block."""
@@ -134,6 +146,8 @@ class FramesInForce:
         return jumps and sum(self._steps[number].name in self._set_at(other) for other in inside) > 1
 
     def _set_at(self, number: int) -> set[str]:
-        """Names that a step sets, itself or by what it calls."""
+        """Names that a step sets, itself or by what it calls; a routine of another file may set all."""
         step = self._steps[number]
-        return {step.name} if step.kind == "set" else self._set_by.get(step.name, set())
+        if step.kind == "set":
+            return {step.name}
+        return self._set_by.get(step.name, set(self._values)) if step.kind == "call" else set()

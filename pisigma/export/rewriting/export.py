@@ -29,6 +29,7 @@ SCANNERS: dict[str, Callable[[str, FrameFile], ScannedProgram]] = {
 
 TOLERANCE_MM = 0.1
 MOST_BYTES = 2**24
+MOST_JOINTS = 6
 TEST = (
     "TEST IT AT LOW SPEED FIRST: the poses are commanded to a controller that computes with the robot as drawn, with "
     "any accuracy option of its own off, and its origin and flange have to be those of the robot description. Targets "
@@ -76,6 +77,11 @@ def rewrite_program(request: ExportRequest) -> Exported:
     solver = load(request.model)
     if request.conditions:
         solver = solver.under(**request.conditions)
+    if solver.model.robot.dof > MOST_JOINTS:
+        raise OutputError(
+            f"--program: expected a robot of at most {MOST_JOINTS} joints, got {solver.model.robot.dof}: the poses of "
+            "a program do not say where the further joints are; export --poses with joint values instead."
+        )
     tolerance = TOLERANCE_MM if request.tolerance_mm is None else request.tolerance_mm
     corrected = ProgramCorrection(solver, request.branch, tolerance / 1e3).correct(scanned)
     return _exported(request, solver.model, scanned, corrected, tolerance)
@@ -98,6 +104,7 @@ def _exported(
         content=corrected.text.encode("latin-1"),
         facts={
             "robot": model.robot.name,
+            "program": str(request.program),
             "targets": len(corrected.statuses),
             "statuses": dict(Counter(status.name.lower() for _, status in corrected.statuses)),
             "unreached": [
@@ -112,7 +119,11 @@ def _exported(
             "diff": diff,
         },
         remarks=(*condition_remarks(model), *frame_remarks(model)),
-        doubts=(TEST, *(language.cartesian_cautions if language else ()), *_in_doubt(corrected)),
+        doubts=(
+            TEST,
+            *(language.cartesian_cautions if language else ()),
+            *_in_doubt(corrected, str(request.program)),
+        ),
         summary=f"Program with {reached} corrected targets (by {shift:.3f} mm at most) "
         f"and {corrected.way_points} way points",
         shortfall=_shortfall(corrected, str(request.program)),
@@ -120,14 +131,16 @@ def _exported(
     )
 
 
-def _in_doubt(corrected: CorrectedProgram) -> tuple[str, ...]:
+def _in_doubt(corrected: CorrectedProgram, source: str) -> tuple[str, ...]:
     """On which branches targets were corrected, and what was left alone."""
     said = [
         f"Targets are corrected for the branch {' and '.join(corrected.branches) or 'of the model'}. The program's "
         "configuration was not compared: where the arm stands otherwise, state --branch."
     ]
     if corrected.left:
-        said.append(f"Left alone: {'; '.join(f'line {line}: {reason}' for line, reason in corrected.left)}.")
+        said.append(
+            f"Left alone in {source}: {'; '.join(f'line {line}: {reason}' for line, reason in corrected.left)}."
+        )
     return tuple(said)
 
 

@@ -1,5 +1,6 @@
 """Poses of FANUC TP programs in ASCII: positions `P[n]` in millimetres and degrees."""
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -19,6 +20,8 @@ from pisigma.export.rewriting.scan import (
     Pose,
     Scan,
     ScannedProgram,
+    axes_in_use,
+    external_axes,
     groups_of,
 )
 from pisigma.se3 import transform_from_xyzrpy
@@ -34,10 +37,13 @@ _SIX = r"\s*,\s*".join(
     for letter in letters
 )
 _VALUES = re.compile(rf"(?P<config>\s*CONFIG\s*:\s*'[^']*'\s*,\s*)(?P<six>{_SIX})")
+_EXTERNAL = re.compile(r"\b(E[1-6])\s*=\s*([^\s,}]+)")
 _VALUE = re.compile(rf"(=\s*)({NUMBER})")
 _FLOW = re.compile(r"[ \t]*(LBL|JMP|IF|ELSE|ENDIF|FOR|ENDFOR|SELECT|CALL|RUN|END|ABORT)\b")
-_REDEFINED = re.compile(r"\b(UFRAME|UTOOL)\[(\d+)?[^\]]*\]+(?:\.\w+)?\s*=")
-_MODIFIED = re.compile(r"\b(Offset|Tool_Offset|INC|VOFFSET|TOOL_OFFSET|Skip|OFFSET)\b")
+_CALL = re.compile(r"\b(?:CALL|RUN)[ \t]+(\w+)")
+_AGAIN = re.compile(r"\b(?:LBL|JMP|FOR)\b")
+_REDEFINED = re.compile(r"\b(UFRAME|UTOOL)\[(\d+)?[^\]]*\]+(?:\.\w+)?\s*=|\$MN(UFRAME|UTOOL)\[")
+_MODIFIED = re.compile(r"\b(Offset|Tool_Offset|INC|VOFFSET|TOOL_OFFSET|Skip|OFFSET|COORD|RTCP)\b")
 
 
 def scan_fanuc(text: str, stated: FrameFile) -> ScannedProgram:
@@ -60,12 +66,25 @@ class _Reader:
     positions: dict[str, re.Match[str]] = field(default_factory=dict)
     numbers: Iterator[int] = field(default_factory=count)
     redefined: list[re.Match[str]] = field(default_factory=list)
+    axes_in_use: dict[str, int] = field(default_factory=dict)
+    call: re.Match[str] | None = None
+    """The first call of a routine of another file, and where it makes frames and tools uncertain from."""
+    uncertain: float = math.inf
 
     def read(self) -> ScannedProgram:
         self.positions = {match["number"]: match for match in _POSITION.finditer(self.text)}
+        for position in self.positions.values():
+            for name in axes_in_use(dict(_EXTERNAL.findall(position["body"]))):
+                self.axes_in_use.setdefault(name, self.scan.line(position.start()))
         self.numbers = count(1 + max(map(int, self.positions), default=0))
-        lines = (re.sub(r"!.*", "", line["body"]) for line in _LINE.finditer(self.text))
-        self.redefined = [match for line in lines for match in _REDEFINED.finditer(line)]
+        lines = [(line.start(), re.sub(r"!.*", "", line["body"])) for line in _LINE.finditer(self.text)]
+        self.redefined = [match for _, body in lines for match in _REDEFINED.finditer(body)]
+        for start, body in lines:
+            for match in _CALL.finditer(body):
+                if self.call is None and not self.stated.sets_neither(match[1]):
+                    self.call, self.uncertain = match, start
+        if self.call and any(_AGAIN.search(body) for _, body in lines):
+            self.uncertain = 0
         computed: set[str] = set()
         for line in _LINE.finditer(self.text):
             body = re.sub(r"!.*", "", line["body"])
@@ -93,8 +112,8 @@ class _Reader:
             tool: Frame | str = ""
             if index and match is not None:
                 pose = self._pose(index[1])
-                frame = IDENTITY if match["uf"] == "0" else self._stated("UFRAME", match["uf"])
-                tool = IDENTITY if match["ut"] == "0" else self._stated("UTOOL", match["ut"])
+                frame = IDENTITY if match["uf"] == "0" else self._stated("UFRAME", match["uf"], line.start())
+                tool = IDENTITY if match["ut"] == "0" else self._stated("UTOOL", match["ut"], line.start())
                 if modified := _MODIFIED.search(move["rest"]):
                     if isinstance(pose, Pose):
                         self.scan.blur(pose)
@@ -106,11 +125,13 @@ class _Reader:
             cut = partial(self._way_points, line, move, match, len(names)) if cuttable and match else None
             self.scan.move(line.start(), pose, frame, tool, cut, circular)
 
-    def _stated(self, kind: str, index: str) -> Frame | str:
-        """A frame or tool as stated, unless the program sets it."""
-        if any(match[1] == kind and match[2] in (None, index) for match in self.redefined):
+    def _stated(self, kind: str, index: str, position: int) -> Frame | str:
+        """A frame or tool as stated, unless the program sets it, or what it has called may."""
+        if any(kind in (match[1], match[3]) and match[2] in (None, index) for match in self.redefined):
             return f"the program sets {kind} {index}"
         name = f"{kind} {index}"
+        if self.call and position > self.uncertain:
+            return f"{name} may be set by the routine {self.call[1]} of another file"
         return self.stated.frame(name) if kind == "UFRAME" else self.stated.tool(name)
 
     def _pose(self, name: str) -> Pose | str:
@@ -118,6 +139,8 @@ class _Reader:
         values = _VALUES.match(self.text, match.start("body"))
         if values is None or "GP2" in match["body"]:
             return f"the values of P[{name}] are not understood"
+        if used := external_axes(dict(_EXTERNAL.findall(match["body"])), self.axes_in_use):
+            return f"{used} (P[{name}], line {self.scan.line(match.start())})"
         six = torch.tensor([float(match[2]) for match in _VALUE.finditer(values["six"])], dtype=torch.float64)
         x, y, z, w, p, r = torch.cat([six[:3] / 1e3, torch.deg2rad(six[3:])])
         T = transform_from_xyzrpy(torch.stack([x, y, z, r, p, w]))

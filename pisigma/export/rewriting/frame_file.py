@@ -17,11 +17,13 @@ class FrameFile(Section):
     """What a program names: frames in the origin of the robot description, tools in its flange (the last row).
 
     Names are the program's, such as `UFRAME 1`, `BASE_DATA[3]` or `wobj_table`; `tcp` is the tool that a URScript
-    program does not set.
+    program does not set. `routines` are those of other files that set neither frame nor tool: a program that calls any
+    other one leaves its poses until it sets them again.
     """
 
     frames: dict[str, FrameSection] = Field(default_factory=dict)
     tools: dict[str, FrameSection] = Field(default_factory=dict)
+    routines: tuple[str, ...] = ()
 
     @staticmethod
     def read(path: Path | None) -> "FrameFile":
@@ -35,6 +37,10 @@ class FrameFile(Section):
     def frame(self, name: str) -> Float64[Tensor, "4 4"] | str:
         """The frame of a name, or why it is not known."""
         return _lookup(self.frames, name, "frame")
+
+    def sets_neither(self, routine: str) -> bool:
+        """Say whether a routine of another file is stated to set neither frame nor tool."""
+        return routine.upper() in map(str.upper, self.routines)
 
     def tool(self, name: str) -> Float64[Tensor, "4 4"] | str:
         """The tool of a name, or why it is not known."""

@@ -1,7 +1,7 @@
 """Poses of KRL programs: `{X .., Y .., Z .., A .., B .., C ..}` in millimetres and degrees."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -10,6 +10,7 @@ import torch
 from pisigma.export.programs.text import labelled, millimetres_and_euler
 from pisigma.export.rewriting.control_flow import FramesInForce, Step
 from pisigma.export.rewriting.frame_file import FrameFile
+from pisigma.export.rewriting.known_routines import KRL
 from pisigma.export.rewriting.scan import (
     COMPUTED,
     IDENTITY,
@@ -21,6 +22,8 @@ from pisigma.export.rewriting.scan import (
     Scan,
     ScannedProgram,
     arguments,
+    axes_in_use,
+    external_axes,
     groups_of,
     masked,
     numbers_in,
@@ -29,7 +32,10 @@ from pisigma.se3 import transform_from_xyzrpy
 
 _HIDDEN = re.compile(r';[^\n]*|"[^"\n]*"')
 _SIX = r"\s*,\s*".join(rf"{letter}\s*{NUMBER}" for letter in "XYZABC")
-_AGGREGATE = re.compile(rf"\{{\s*(?:(?:FRAME|E?\d?POS)\s*:\s*)?({_SIX})\s*(?:,[^{{}}]*)?\}}", re.IGNORECASE)
+_AGGREGATE = re.compile(rf"\{{\s*(?:(?:FRAME|E?\d?POS)\s*:\s*)?({_SIX})\s*((?:,[^{{}}]*)?)\}}", re.IGNORECASE)
+_EXTERNAL = re.compile(r"(?:[{,]\s*|\.)(E[1-6])\s*[\s=]\s*([^,}\n]+)", re.IGNORECASE)
+"""Of an aggregate, or of the component of a variable."""
+_WITH = re.compile(r"\$(BASE|TOOL)\b[^=\n]*=", re.IGNORECASE)
 _ASSIGNMENT = re.compile(
     r"(?im)^[ \t]*(?:DECL\s+|GLOBAL\s+)*(?:(?:E6|E3)?POS\s+|FRAME\s+)?(\w+)\s*=\s*(?=\{)"
 )
@@ -82,6 +88,7 @@ def scan_krl_data(text: str, stated: FrameFile) -> ScannedProgram:
     """
     scan, visible = Scan(text), masked(text, _HIDDEN)
     frames = {match[1].upper(): match for match in _FRAMES.finditer(visible)}
+    in_use = _axes_in_use(scan, visible)
     for match in _POINT.finditer(visible):
         literal, data = _AGGREGATE.match(visible, match.end()), frames.get(match[1].upper())
         if data is None or literal is None or data[4].upper() != "BASE":
@@ -90,7 +97,7 @@ def scan_krl_data(text: str, stated: FrameFile) -> ScannedProgram:
             continue
         tool = IDENTITY if data[2] == "0" else stated.tool(f"TOOL_DATA[{data[2]}]")
         frame = IDENTITY if data[3] == "0" else stated.frame(f"BASE_DATA[{data[3]}]")
-        scan.move(match.start(), _pose(literal), frame, tool)
+        scan.move(match.start(), _target_pose(literal, in_use), frame, tool)
     return scan.program()
 
 
@@ -102,16 +109,20 @@ class _Reader:
     text: str
     stated: FrameFile
     frames: FramesInForce = field(init=False)
+    axes_in_use: dict[str, int] = field(init=False)
 
     def __post_init__(self) -> None:
         self.names = NamedPoses(self.text, _SET, str.upper)
+        self.axes_in_use = _axes_in_use(self.scan, self.text)
 
     def read(self) -> ScannedProgram:
         for match in _ASSIGNMENT.finditer(self.text):
             literal = _AGGREGATE.match(self.text, match.end())
             if literal and self.names.is_set_once(match[1]):
-                self.names.add(match[1], _pose(literal))
-        steps = [(match, step) for match in _STATEMENT.finditer(self.text) for step in _steps(match)]
+                pose = _target_pose(literal, self.axes_in_use)
+                where = f" (line {self.scan.line(match.start())})"
+                self.names.add(match[1], pose if isinstance(pose, Pose) else pose + where)
+        steps = [(match, step) for match in _STATEMENT.finditer(self.text) for step in self._steps(match)]
         unknown = "the tool stands still and the workpiece moves" if _FIXED_TOOL.search(self.text) else ""
         self.frames = FramesInForce(
             [step for _, step in steps],
@@ -124,6 +135,15 @@ class _Reader:
                 self._move(match)
             self.frames.advance(place, unknown or self._value(match, step))
         return self.scan.program(self.names)
+
+    def _steps(self, match: re.Match[str]) -> list[Step]:
+        """What a statement means for the order."""
+        return [
+            Step("other")
+            if step.kind == "call" and (step.name in KRL or self.stated.sets_neither(step.name))
+            else step
+            for step in _steps(match)
+        ]
 
     def _value(self, match: re.Match[str], step: Step) -> Frame | str:
         """What a statement sets a frame or the tool to, or why that is not known."""
@@ -155,13 +175,21 @@ class _Reader:
                     self.scan.leave(match.start(), "the angle of the arc, or how the tool turns, is stated")
                 else:
                     cut = partial(self._way_points, match, operands)
-            self.scan.move(match.start(), pose, self.frames["$BASE"], self.frames["$TOOL"], cut, circular)
+            self.scan.move(match.start(), pose, *self._frames(match["target"]), cut, circular)
+
+    def _frames(self, target: str) -> tuple[Frame | str, Frame | str]:
+        """Frame and tool of a move, which it may state for itself behind WITH."""
+        own = {f"${match[1].upper()}" for match in _WITH.finditer(target)}
+        base, tool = (
+            f"the move states {name}" if name in own else self.frames[name] for name in _FRAMES_OF_MOVES
+        )
+        return base, tool
 
     def _target(self, start: int) -> Pose | str:
         if literal := _AGGREGATE.match(self.text, start):
-            return _pose(literal)
+            return _target_pose(literal, self.axes_in_use)
         name = _NAME.match(self.text, start)
-        return (self.names.get(name[0]) if name else None) or COMPUTED
+        return self.names.target(name[0]) if name else COMPUTED
 
     def _way_points(self, move: re.Match[str], operands: Sequence[int], poses: Sequence[Frame]) -> list[Edit]:
         """Straight moves or arcs to all way points, which are passed by distance."""
@@ -200,6 +228,21 @@ def _steps(match: re.Match[str]) -> list[Step]:
     if word.startswith("END") or word == "UNTIL":
         return [Step("end")]
     return [Step("jump" if word == "GOTO" or word.endswith(":") else "other")]
+
+
+def _axes_in_use(scan: Scan, visible: str) -> dict[str, int]:
+    """Lines in which a text moves external axes, by their names; the first one of each."""
+    lines: dict[str, int] = {}
+    for match in _EXTERNAL.finditer(visible):
+        for name in axes_in_use({match[1].upper(): match[2].strip()}):
+            lines.setdefault(name, scan.line(match.start()))
+    return lines
+
+
+def _target_pose(literal: re.Match[str], in_use: Mapping[str, int]) -> Pose | str:
+    """The pose of a target, or why external axes leave it alone."""
+    values = {match[1].upper(): match[2].strip() for match in _EXTERNAL.finditer(literal[2])}
+    return external_axes(values, in_use) or _pose(literal)
 
 
 def _pose(literal: re.Match[str]) -> Pose:

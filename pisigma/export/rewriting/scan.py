@@ -15,6 +15,7 @@ Frame = Float64[Tensor, "4 4"]
 _Item = TypeVar("_Item")
 
 NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_NO_AXIS = 8.9e9
 COMPUTED = "the target is computed or not stated in this file"
 IDENTITY = torch.eye(4, dtype=torch.float64)
 
@@ -119,14 +120,22 @@ class NamedPoses:
         self._set = Counter(fold(match[1]) for match in assignment.finditer(text))
         self._uses: Counter[str] = Counter()
         self._poses: dict[str, Pose] = {}
+        self._reasons: dict[str, str] = {}
 
     def is_set_once(self, name: str) -> bool:
         """Whether one statement sets the name."""
         return self._set[self._fold(name)] == 1
 
-    def add(self, name: str, pose: Pose) -> None:
-        """A pose that is set once."""
-        self._poses[self._fold(name)] = pose
+    def add(self, name: str, pose: Pose | str) -> None:
+        """A pose that is set once, or why it is left alone."""
+        if isinstance(pose, str):
+            self._reasons[self._fold(name)] = pose
+        else:
+            self._poses[self._fold(name)] = pose
+
+    def target(self, name: str) -> Pose | str:
+        """The pose of a name as the target of a move, or why it is not known."""
+        return self.get(name) or self._reasons.get(self._fold(name), COMPUTED)
 
     def get(self, name: str, target: bool = True) -> Pose | None:
         """The pose of a name; as the target of a move, or as a frame."""
@@ -278,6 +287,53 @@ def _stripped(text: str, start: int, end: int) -> tuple[int, int]:
 def groups_of(poses: Sequence[_Item], count: int) -> list[Sequence[_Item]]:
     """The way points, or their names, of every move that is put in: one each, or two for arcs; see `PathMove`."""
     return [poses[first : first + count] for first in range(0, len(poses) - count + 1, count)]
+
+
+def axes_in_use(values: Mapping[str, str]) -> dict[str, str]:
+    """The external axes that stand elsewhere than at 0, or nobody knows where.
+
+    Args:
+        values: texts by name of the axis; 9E9 says that there is none, or that it stays where it is.
+    """
+    return {name: text for name, text in values.items() if not _is_zero(text) and not _is_absent(text)}
+
+
+def external_axes(values: Mapping[str, str], in_use: Mapping[str, int]) -> str:
+    """Why a pose with values of external axes is left alone; "" where none of them is in use.
+
+    The robot description has no external axes: it is the robot as it stands where all of them are 0. A pose that does
+    not state one leaves it where the program has moved it before.
+
+    Args:
+        values: texts by name of the axis, see `axes_in_use`.
+        in_use: line in which the program moves each of them.
+    """
+    if used := axes_in_use(values):
+        names = ", ".join(f"{name} = {_plain(text)}" for name, text in used.items())
+        return f"the external axes {names} move robot or workpiece, and are not drawn"
+    open_axes = [name for name in in_use if name not in values or _is_absent(values[name])]
+    if not open_axes:
+        return ""
+    names = ", ".join(f"{name} (in use in line {in_use[name]})" for name in open_axes)
+    return f"the external axes {names} may stand elsewhere than at 0, as the pose does not state them"
+
+
+def _is_zero(text: str) -> bool:
+    return _number(text) == 0
+
+
+def _is_absent(text: str) -> bool:
+    number = _number(text)
+    return number is not None and abs(number) >= _NO_AXIS
+
+
+def _number(text: str) -> float | None:
+    return float(text) if re.fullmatch(NUMBER, text) else None
+
+
+def _plain(text: str) -> str:
+    number = _number(text)
+    return text if number is None else f"{number:g}"
 
 
 def numbers_in(text: str) -> list[float]:

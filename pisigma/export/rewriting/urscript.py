@@ -10,6 +10,7 @@ import torch
 from pisigma.export.programs.text import metres_and_rotation_vector, number, numbers
 from pisigma.export.rewriting.control_flow import FramesInForce, Step
 from pisigma.export.rewriting.frame_file import FrameFile
+from pisigma.export.rewriting.known_routines import URSCRIPT
 from pisigma.export.rewriting.scan import (
     COMPUTED,
     IDENTITY,
@@ -73,7 +74,9 @@ class _Reader:
             if literal and self.names.is_set_once(match[1]):
                 self.names.add(match[1], _pose(self.text, literal.span()))
         statements = list(_STATEMENT.finditer(self.text))
-        self.frames = FramesInForce([_step(match) for match in statements], {_TOOL: self.stated.tool("tcp")})
+        self.frames = FramesInForce(
+            [self._step(match) for match in statements], {_TOOL: self.stated.tool("tcp")}
+        )
         for place, match in enumerate(statements):
             tool: Frame | str = f"{_TOOL} is computed"
             if match["routine"] or match["flow"]:
@@ -84,6 +87,12 @@ class _Reader:
                 tool = _pose(self.text, literal.span()).T
             self.frames.advance(place, tool)
         return self.scan.program(self.names)
+
+    def _step(self, match: re.Match[str]) -> Step:
+        """What a statement means for the order."""
+        step = _step(match)
+        is_harmless = step.name in URSCRIPT or self.stated.sets_neither(step.name)
+        return Step("other") if step.kind == "call" and is_harmless else step
 
     def _move(self, call: re.Match[str]) -> None:
         spans = list(arguments(self.text, call.end()))
