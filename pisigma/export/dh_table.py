@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
-from pisigma.export.geometry import calibrated_geometry, remarks
+from pisigma.export.geometry import check_geometry, chosen_geometry
 from pisigma.robot.coupling_section import coupling_document
 from pisigma.robot.description import Robot
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, in_file_units
@@ -80,8 +80,11 @@ def head(sentences: tuple[str, ...]) -> str:
 
 def _write(request: ExportRequest) -> Exported:
     model = request.load()
-    robot, said = calibrated_geometry(model), remarks(model)
-    return Exported((dh_csv if request.as_csv else dh_yaml)(robot, said), model_facts(model), said)
+    chosen = chosen_geometry(model, request.geometry)
+    write = dh_csv if request.as_csv else dh_yaml
+    return Exported(
+        write(chosen.robot, chosen.said), model_facts(model) | {"geometry": chosen.name}, chosen.said
+    )
 
 
-FORMAT = ExportFormat("dh", "a DH table", TABLE_SUFFIXES, _write)
+FORMAT = ExportFormat("dh", "a DH table", TABLE_SUFFIXES, _write, frozenset(("geometry",)), check_geometry)

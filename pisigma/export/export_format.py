@@ -16,8 +16,9 @@ class ExportRequest:
     Attributes:
         model: the model folder.
         out: the file to write.
-        like: the file whose other content stays: with urdf and xacro the URDF file that the robot was loaded from.
+        like: the file whose other content stays; with urdf and xacro a URDF file, else the one in the model folder.
         tip: with `like`, the link that is the tool.
+        geometry: with urdf and dh, "geometric" or "hybrid".
         poses: with targets, the file of poses.
         targets: with targets, "joints" or "cartesian".
         branch: with targets, the branch to take instead of the trained one.
@@ -35,6 +36,7 @@ class ExportRequest:
     out: Path
     like: Path | None = None
     tip: str | None = None
+    geometry: str | None = None
     poses: Path | None = None
     targets: str | None = None
     branch: str | None = None
@@ -79,6 +81,7 @@ class ExportRequest:
 OPTIONS = (
     "like",
     "tip",
+    "geometry",
     "poses",
     "targets",
     "branch",

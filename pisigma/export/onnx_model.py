@@ -9,6 +9,7 @@ import numpy as np
 
 from pisigma.errors import ModelError
 from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
+from pisigma.export.geometry import HYBRID
 from pisigma.files.model_files import model_hash
 from pisigma.hybrid.arm import HybridArm, JointCoverage
 from pisigma.joint_correction.conditions import learned_conditions
@@ -182,8 +183,9 @@ def onnx_remarks(model: CalibratedModel) -> tuple[str, ...]:
             "domain are not refused.",
         )
     return (
-        "The graph corrects joint values on the way forward: the pose is that of the hybrid geometry in model.yaml at "
-        "q + correction. For nominal to commanded joint values export a model of `pisigma distill`.",
+        "The graph corrects joint values on the way forward: the pose is that of the hybrid geometry (--format urdf or "
+        "dh --geometry hybrid), not of the geometric fit, at q + correction. For nominal to commanded "
+        "joint values export a model of `pisigma distill`.",
     )
 
 
@@ -222,13 +224,15 @@ def _forward(model: CalibratedModel, arm: HybridArm, sha256: str) -> bytes:
     )
     doc = (
         f"Joint corrections of robot {model.robot.name}, model {model.name}, under the usual conditions. The pose is "
-        "that of the hybrid geometry at q + correction."
+        "that of the hybrid geometry (pisigma export --geometry hybrid), not of the geometric fit, at q + correction."
     )
     return graph.finish(f"pisigma {model.name}", doc, _metadata(model, FORWARD, sha256))
 
 
 def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, str]:
-    """Everything as text, lists and tables as JSON."""
+    """Everything as text, lists and tables as JSON; base and tool go with the graph."""
+    arm = model.hybrid if computes == FORWARD else None
+    robot = model.robot if arm is None else arm.robot
     values: dict[str, Any] = {
         "model": model.name,
         "kind": model.kind,
@@ -239,12 +243,12 @@ def _metadata(model: CalibratedModel, computes: str, sha256: str) -> dict[str, s
         "joint_units": ["rad" if turns else "m" for turns in model.robot.revolute],
         "length_unit": "m",
         "pose_frame": "T_base_tool maps coordinates of the tool into the base frame",
-        "base_xyzrpy": model.robot.base.tolist(),
-        "tool_xyzrpy": model.robot.tool.tolist(),
+        "geometry": "nominal" if arm is None else HYBRID,
+        "base_xyzrpy": robot.base.tolist(),
+        "tool_xyzrpy": robot.tool.tolist(),
         "branches": list(model.branches),
         "domain": _domain(model),
     }
-    arm = model.hybrid if model.network is None else None
     learned = None if arm is None else learned_conditions(arm.correction)
     if learned is not None:
         values["usual_conditions"] = dict(zip(learned.names, learned.mean, strict=True))

@@ -207,16 +207,14 @@ class Projection:
 
 
 def departure_from_drawn(robot: Robot, drawn: Robot) -> Departure:
-    """How far a robot's tool is from where the robot as drawn has it on the best base and with the best tool.
+    """How far a robot's tool is from where the robot as drawn has it, on the bases and with the tools that they have.
 
     Judged at random joint values within the limits of the drawn robot, and within 180 deg (3 m).
     """
     low, high = torch.from_numpy(drawn.limits.clip(-torch.pi, torch.pi)).unbind(1)
     share = torch.rand((POSES, drawn.dof), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     q = low + share * (high - low)
-    T = forward_kinematics(robot, q)
-    fitted, observable = solve_projection(ProjectionProblem(drawn, q, T, ()))
-    return Projection(fitted, observable, q, T).departure(fitted)
+    return Projection(robot, (), q, forward_kinematics(robot, q)).departure(drawn)
 
 
 def project_model(

@@ -52,7 +52,7 @@ def robot_of_origins(
         for row, origin in zip(like.joints, origins, strict=True)
     )
     drawing = rows_of_chain(Chain(like.name, "", "", joints, end, ""), nearly_parallel).drawing
-    moved = replace(like, rows=like.joints, dh=drawing.dh)
+    moved = replace(like, rows=like.joints, dh=drawing.dh, urdf=None)
     base, tool = frame_of(like.base) @ frame_of(drawing.base), frame_of(drawing.tool) @ frame_of(like.tool)
     return moved.with_geometry(base=xyzrpy_of(base), tool=xyzrpy_of(tool))
 

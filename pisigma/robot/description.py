@@ -35,6 +35,7 @@ class Robot:
         coupling: how the joints of the rows follow the controller's values; None where these are the same. Joint values
             are DH values everywhere but in files, in answers of `CorrectedIK` and where a name or docstring says that
             they are the controller's.
+        urdf: the content of the URDF file that it was drawn in, for exports; None where it was drawn otherwise.
     """
 
     name: str
@@ -45,6 +46,7 @@ class Robot:
     base: Float64[np.ndarray, " 6"] = field(default_factory=lambda: np.zeros(6))
     tool: Float64[np.ndarray, " 6"] = field(default_factory=lambda: np.zeros(6))
     coupling: Coupling | None = None
+    urdf: bytes | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         """Check that the parts fit together and make the arrays read-only."""

@@ -21,6 +21,7 @@ class Drawing(NamedTuple):
         base: as `FRAME_COLUMNS`.
         tool: as `FRAME_COLUMNS`.
         coupling: how the joints follow the controller's values; None where they are the same.
+        urdf: the content of the URDF file that it is; None where it is none.
     """
 
     name: str
@@ -31,3 +32,4 @@ class Drawing(NamedTuple):
     base: Float64[np.ndarray, " 6"]
     tool: Float64[np.ndarray, " 6"]
     coupling: Coupling | None = None
+    urdf: bytes | None = None

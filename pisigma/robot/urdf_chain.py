@@ -27,8 +27,12 @@ _KEPT |= {"limit": ("lower", "upper"), "mimic": ("joint", "multiplier", "offset"
 _VECTORS = {("origin", "xyz"), ("origin", "rpy"), ("axis", "xyz")}
 
 
-def read_urdf(path: str | os.PathLike[str]) -> tuple[Any, Callable[[str], str]]:
+def read_urdf(path: str | os.PathLike[str], root: Any = None) -> tuple[Any, Callable[[str], str]]:
     """Read a URDF file.
+
+    Args:
+        path: the file.
+        root: of its XML where that was read already; see `parse_xml`.
 
     Returns:
         The robot as pytorch-kinematics' URDF parser gives it, of links and joints only; and a function that
@@ -40,7 +44,7 @@ def read_urdf(path: str | os.PathLike[str]) -> tuple[Any, Callable[[str], str]]:
     """
     from lxml import etree
 
-    root = parse_xml(path)
+    root = parse_xml(path) if root is None else root
     reduced = etree.Element("robot", name=root.get("name") or Path(path).stem)
     lines: dict[tuple[str, str], int] = {}
     for element in root.iterchildren("{*}link", "{*}joint"):
@@ -231,6 +235,7 @@ class Chain:
         joints: those that move, from base to tip.
         end: the tip in the frame behind the last joint.
         source: the file.
+        content: of the file, with the values of its properties; None where it is of none.
     """
 
     name: str
@@ -239,6 +244,7 @@ class Chain:
     joints: tuple[ChainJoint, ...]
     end: Frame
     source: str
+    content: bytes | None = None
 
 
 def read_chain(path: str | os.PathLike[str], base: str | None = None, tip: str | None = None) -> Chain:
@@ -253,7 +259,10 @@ def read_chain(path: str | os.PathLike[str], base: str | None = None, tip: str |
         RobotError: the file cannot be used, there is no such link or no way between them, or a joint of the
             chain mimics one outside of it, floats, is planar, or lacks its axis or limits.
     """
-    urdf, place = read_urdf(path)
+    from lxml import etree
+
+    root = parse_xml(path, everything=True)
+    urdf, place = read_urdf(path, root)
     links = list(urdf.link_map)
     _check_tree(urdf, place)
     for option, link in (("base", base), ("tip", tip)):
@@ -272,7 +281,8 @@ def read_chain(path: str | os.PathLike[str], base: str | None = None, tip: str |
         raise RobotError(
             f"{path}: no joint moves between the links '{base}' and '{tip}'; choose others with base and tip."
         )
-    return Chain(urdf.name, base, tip, tuple(joints), origin, printable(str(path), cut=False))
+    content = etree.tostring(root.getroottree(), xml_declaration=True, encoding="UTF-8")
+    return Chain(urdf.name, base, tip, tuple(joints), origin, printable(str(path), cut=False), content)
 
 
 def _check_tree(urdf: Any, place: _Place) -> None:

@@ -49,6 +49,10 @@ class ChainRows:
     frames: tuple[Frame, ...]
 
 
+URDF_SOURCE = "URDF file "
+"""Beginning of the `source` of robots that were drawn in one, before its name."""
+
+
 def rows_of_chain(chain: Chain, nearly_parallel: float = NEARLY_PARALLEL) -> ChainRows:
     """The chain as DH + Hayati rows, base and tool, equal in its forward kinematics to rounding.
 
@@ -79,12 +83,13 @@ def rows_of_chain(chain: Chain, nearly_parallel: float = NEARLY_PARALLEL) -> Cha
     drawing = Drawing(
         name=chain.name,
         maker="not stated",
-        source=f"URDF file {Path(chain.source).name}, from link '{chain.base}' to link '{chain.tip}'",
+        source=f"{URDF_SOURCE}{Path(chain.source).name}, from link '{chain.base}' to link '{chain.tip}'",
         rows=coupled_rows,
         dh=np.array(dh),
         base=xyzrpy_of(frame),
         tool=xyzrpy_of(inverse(row_frame(*dh[-1])) @ T_row_tip),
         coupling=coupling,
+        urdf=chain.content,
     )
     return ChainRows(drawing, tuple(frames))
 

@@ -1,6 +1,5 @@
-"""A robot as the text of a file: YAML, URDF, or the URDF that it was drawn in with other origins."""
+"""A robot as the text of a file: YAML or URDF."""
 
-import os
 from collections.abc import Collection
 from dataclasses import replace
 from typing import Any
@@ -12,11 +11,8 @@ from jaxtyping import Float64
 from pisigma.errors import OutputError, RobotError
 from pisigma.robot.coupling_section import coupling_document
 from pisigma.robot.description import Robot
-from pisigma.robot.drawing import Drawing
 from pisigma.robot.row import DH_COLUMNS, FRAME_COLUMNS, Row, in_file_units
-from pisigma.robot.urdf_chain import Chain, origin_of, parse_xml, read_chain, read_urdf
-from pisigma.robot.urdf_frames import Frame, frame_of, inverse, row_frame, shift, turn, xyzrpy_of
-from pisigma.robot.urdf_rows import ChainRows, rows_of_chain
+from pisigma.robot.urdf_frames import Frame, frame_of, row_frame, shift, turn, xyzrpy_of
 from pisigma.yaml_file import yaml_text
 
 
@@ -66,6 +62,11 @@ def _limits_entry(row: Row) -> dict[str, list[float]]:
 
 BASE_LINK = "base_link"
 TOOL_LINK = "tool0"
+MASS, INERTIA, EFFORT, VELOCITY = "1", "0.01", "1000", "10"
+PLACEHOLDERS = (
+    f"Masses ({MASS} kg), inertias ({INERTIA} kg m2), efforts ({EFFORT}) and velocities ({VELOCITY}) are placeholders "
+    "and not the robot's: only the kinematics was calibrated. Put in the maker's before you simulate forces."
+)
 
 
 def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
@@ -75,7 +76,8 @@ def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
     axis, or the other way round where its direction is -1; `Trans(a, 0, 0) · RotX(alpha) · RotY(beta)` leads
     on to the next. No common normal is needed, so parallel axes stay where they are. Base and tool are fixed
     joints, links are named `link_1` and so on, joints like the rows. `effort` and `velocity`, which the
-    format asks for, are written as 0: not known. A coupled joint is followed by joints about or along the same axis,
+    format asks for, and masses and inertias, without which MuJoCo refuses the file, are `PLACEHOLDERS`, which a comment
+    says. A coupled joint is followed by joints about or along the same axis,
     one for each axis of the controller that moves it too, which mimic that axis.
 
     Args:
@@ -86,7 +88,7 @@ def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
         OutputError: a joint has limits, or a linkage drives it, so that the format cannot say it.
     """
     root = ElementTree.Element("robot", name=robot.name)
-    for sentence in comments:
+    for sentence in (*comments, PLACEHOLDERS):
         root.append(ElementTree.Comment(comment_text(sentence)))
     names = {row.name for row in robot.rows}
     link = "link_0"
@@ -100,6 +102,9 @@ def robot_to_urdf(robot: Robot, comments: tuple[str, ...] = ()) -> str:
             links = link, f"link_{number}"
             element = _joint(root, moving.name, _type(moving, robot.name), links, behind)
             _add_motion(element, moving, mimic)
+            if moving.type != "fixed":
+                made = next(one for one in root.iter("link") if one.get("name") == links[1])
+                add_inertia(ElementTree.SubElement(made, "inertial"))
             link, behind = links[1], np.eye(4)
         behind = row_frame(0.0, 0.0, a, alpha, beta)
     tool = behind @ frame_of(robot.tool)
@@ -156,10 +161,22 @@ def _add_motion(element: ElementTree.Element, row: Row, mimic: _Mimic | None) ->
         ElementTree.SubElement(element, "axis", xyz=f"0 0 {row.direction}")
     if np.isfinite(row.upper):
         ElementTree.SubElement(
-            element, "limit", lower=repr(row.lower), upper=repr(row.upper), effort="0", velocity="0"
+            element, "limit", lower=repr(row.lower), upper=repr(row.upper), effort=EFFORT, velocity=VELOCITY
         )
     if mimic is not None:
         ElementTree.SubElement(element, "mimic", joint=mimic[0], multiplier=repr(mimic[1]))
+
+
+def add_inertia(inertial: Any) -> None:
+    """Put the mass and the inertia of the placeholders into an element."""
+    for name, values in (
+        ("mass", {"value": MASS}),
+        (
+            "inertia",
+            dict.fromkeys(("ixy", "ixz", "iyz"), "0") | dict.fromkeys(("ixx", "iyy", "izz"), INERTIA),
+        ),
+    ):
+        inertial.append(inertial.makeelement(name, values))
 
 
 def _joint(
@@ -203,104 +220,3 @@ def unused_name(name: str, names: Collection[str]) -> str:
 def comment_text(sentence: str) -> str:
     """A sentence as the content of an XML comment."""
     return f" {' '.join(sentence.split()).replace('--', '- -')} "
-
-
-CALIBRATED_FRAME = "calibrated_frame"
-CALIBRATED_TOOL = "calibrated_tool"
-SAME = 1e-9
-"""Largest difference [m or rad] of rows that are taken for those of the file."""
-
-
-def robot_into_urdf(
-    calibrated: Robot,
-    nominal: Robot,
-    path: str | os.PathLike[str],
-    tip: str | None = None,
-    comments: tuple[str, ...] = (),
-) -> str:
-    """The file with the origins of a calibrated robot; links, meshes, limits and all else stay.
-
-    Every joint after the first stands in the link before it where the calibration has it. Links keep their
-    places at the joints that carry them, so meshes still fit. Two links are added: `calibrated_frame`, the
-    parent of the root, is the frame that the model's poses are given in, and `calibrated_tool`, a child of the
-    tip, is the model's tool; from one to the other the forward kinematics is the calibrated robot's.
-
-    Args:
-        calibrated: the robot as identified.
-        nominal: the robot as loaded from the file, base and tool apart.
-        path: the file.
-        tip: the link that was the tool.
-        comments: sentences to write at the top.
-
-    Raises:
-        RobotError: the file cannot be used, or is of another robot.
-    """
-    from lxml import etree
-
-    chain = read_chain(path, tip=tip)
-    rows = rows_of_chain(chain)
-    _check_same(rows.drawing, nominal, str(path))
-    urdf, _ = read_urdf(path)
-    root = parse_xml(path, everything=True)
-    elements = {element.get("name"): element for element in root.iterchildren("{*}joint")}
-    for name, origin in _new_origins(chain, rows, calibrated, urdf).items():
-        _set_origin(elements[name], origin)
-    T_frame_base = frame_of(calibrated.base) @ inverse(frame_of(rows.drawing.base))
-    last = row_frame(*calibrated.dh[-1].tolist()) @ frame_of(calibrated.tool)
-    _add_link(root, CALIBRATED_FRAME, None, chain.base, T_frame_base)
-    _add_link(root, CALIBRATED_TOOL, chain.tip, None, inverse(chain.end) @ rows.frames[-1] @ last)
-    for sentence in reversed(comments):
-        root.insert(0, etree.Comment(comment_text(sentence)))
-    etree.indent(root)
-    return f'<?xml version="1.0"?>\n{etree.tostring(root, encoding="unicode")}\n'
-
-
-def _check_same(drawn: Drawing, nominal: Robot, path: str) -> None:
-    """Refuse a file of another robot."""
-    kinds, wanted = ([(row.name, row.type, row.direction) for row in r.rows] for r in (drawn, nominal))
-    if kinds != wanted:
-        joints, other = (", ".join(row.name for row in r.rows) for r in (drawn, nominal))
-        raise RobotError(
-            f"{path}: has the joints {joints}, but the model those of {other}; give the file that the robot was "
-            "loaded from, and the same tip."
-        )
-    far = float(np.abs(drawn.dh - nominal.dh)[:-1].max(initial=0.0))
-    if far > SAME:
-        raise RobotError(
-            f"{path}: its nominal geometry is not the model's (off by {far:.2g} m or rad); give the file that the "
-            "robot was loaded from."
-        )
-
-
-def _new_origins(chain: Chain, rows: ChainRows, calibrated: Robot, urdf: Any) -> dict[str, Frame]:
-    """Origins of the joints that move, in the links before them; that of the first stays."""
-    origins: dict[str, Frame] = {}
-    for i, joint in enumerate(chain.joints[1:], 1):
-        whole = rows.frames[i - 1] @ row_frame(*calibrated.dh[i - 1].tolist()) @ inverse(rows.frames[i])
-        # Fixed joints between the two stay; what is before the joint's own origin is their product.
-        before = joint.origin @ inverse(origin_of(urdf.joint_map[joint.name]))
-        origins[joint.name] = inverse(before) @ whole
-    return origins
-
-
-def _set_origin(element: Any, origin: Frame) -> None:
-    from lxml import etree
-
-    part = next(element.iterchildren("{*}origin"), None)
-    if part is None:
-        part = etree.SubElement(element, "origin")
-        element.insert(0, part)
-    part.attrib.update(origin_attributes(origin))
-
-
-def _add_link(root: Any, name: str, parent: str | None, child: str | None, origin: Frame) -> None:
-    """A link with a fixed joint to the one that is given."""
-    from lxml import etree
-
-    name = unused_name(name, {element.get("name") for element in root.iterchildren("{*}link")})
-    joints = {element.get("name") for element in root.iterchildren("{*}joint")}
-    etree.SubElement(root, "link", name=name)
-    joint = etree.SubElement(root, "joint", name=unused_name(f"{name}_joint", joints), type="fixed")
-    _set_origin(joint, origin)
-    etree.SubElement(joint, "parent", link=parent or name)
-    etree.SubElement(joint, "child", link=child or name)

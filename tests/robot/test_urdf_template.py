@@ -12,7 +12,7 @@ from testing.urdf import DrawnJoint, peer_poses, urdf_text
 from pisigma.errors import RobotError
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot
-from pisigma.robot.writing import robot_into_urdf
+from pisigma.robot.urdf_template import robot_into_urdf
 
 TEXT = """\
 <robot name="arm">
@@ -135,3 +135,28 @@ def test_files_of_other_robots_are_refused(path):
         robot_into_urdf(longer, longer, path, "tool0")
     with pytest.raises(RobotError, match="has 2 ends"):
         robot_into_urdf(drawn, drawn, path)
+
+
+def test_what_simulators_ask_for_is_filled_in_where_it_is_missing(path, tmp_path):
+    mass = '<inertial><mass value="3"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+    text = TEXT.replace('<link name="bracket"/>', f'<link name="bracket">{mass}</link>')
+    path.write_text(text.replace('effort="7"', 'effort="0"'))
+    drawn = Robot.load(path, tip="tool0")
+    after = etree.fromstring(robot_into_urdf(drawn, drawn, path, "tool0").encode())
+    masses = {link.get("name"): link.find("inertial/mass") for link in after.iter("link")}
+    stated = {name: mass.get("value") for name, mass in masses.items() if mass is not None}
+    assert stated == {"bracket": "3", "b": "1", "c": "1"}  # the bracket is fixed to link a
+    limits = [(limit.get("effort"), limit.get("velocity")) for limit in after.iter("limit")]
+    assert limits == [("10", "3"), ("1000", "2")]
+
+
+def test_a_base_that_is_not_the_root(path, tmp_path):
+    drawn = Robot.load(path, base="bracket", tip="tool0")
+    robot, out = calibrated_like(drawn, 2), tmp_path / "out.urdf"
+    out.write_text(robot_into_urdf(robot, drawn, path, "tool0", base="bracket"))
+    q = joint_values(robot)
+    again = Robot.load(out, base="calibrated_frame", tip="calibrated_tool")
+    assert_close(forward_kinematics(again, q), forward_kinematics(robot, q), atol=1e-12)
+    whole = torch.cat([q[:, :1], q], 1)
+    base, before = (Robot.load(one, base="world", tip="bracket") for one in (out, path))
+    assert_close(forward_kinematics(base, whole[:, :1]), forward_kinematics(before, whole[:, :1]), atol=1e-12)

@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 
 import numpy as np
+from jaxtyping import Float64
 
 from pisigma.errors import RobotError
 from pisigma.export.export_format import Exported, ExportFormat, ExportRequest, model_facts
@@ -35,6 +36,53 @@ class FileText:
     said: tuple[str, ...] = ()
 
 
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """How the frames of a controller lie to those that a robot is drawn in.
+
+    Attributes:
+        said: it as a sentence.
+        base: the controller's base frame in the frame of the drawing's poses, as `FRAME_COLUMNS`.
+        tool: the drawing's tool on the controller's flange.
+    """
+
+    said: str
+    base: Float64[np.ndarray, " 6"]
+    tool: Float64[np.ndarray, " 6"]
+
+    def to_json(self) -> dict[str, object]:
+        """The plain values for `--json`."""
+        parts = {part: in_file_units(FRAME_COLUMNS, getattr(self, part)) for part in ("base", "tool")}
+        return {"said": self.said, **parts}
+
+
+@dataclass(frozen=True, eq=False)
+class Convention:
+    """How a controller has a robot.
+
+    Attributes:
+        nominal: the robot as the controller has it without the file, in its own frames and parameters.
+        frames: how these lie to the frames of the robot's drawing; None where they are the same.
+        published: values that the maker or a user published of this robot and that the file was tried against, with
+            their source; None where there are none.
+    """
+
+    nominal: Robot
+    frames: Frames | None = None
+    published: str | None = None
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """What the file was tried against, and in which frames its poses are, as sentences."""
+        tried = (
+            f"Reading and writing were tried against {self.published}."
+            if self.published
+            else f"No published values were found to try this file against for robot '{self.nominal.name}': compare "
+            "the controller's position with pisigma's at several joint values before you use it."
+        )
+        return (tried, self.frames.said) if self.frames else (tried,)
+
+
 @dataclass(frozen=True)
 class ControllerFile:
     """One kind of file.
@@ -44,6 +92,8 @@ class ControllerFile:
         contents: what a file holds, with its article.
         suffixes: endings that its files may have.
         source: where it is described, and where it was tried, as a sentence; see `untried`.
+        convention: how the controller has a robot that is drawn otherwise; raises a `PisigmaError` where it cannot have
+            it.
         relies: sentences on what has to be true of the controller.
         text: gives the text of a file.
         read: gives the robot that a text says, from the nominal one; the second argument is the file's name. None where
@@ -62,6 +112,7 @@ class ControllerFile:
     text: Callable[[FileText], str]
     read: Callable[[str, str, Robot], Robot] | None
     check: Callable[[Robot], None]
+    convention: Callable[[Robot], Convention] = Convention
     parameters: Callable[[Robot], Sequence[int]] = whole_geometry
     options: frozenset[str] = field(default_factory=frozenset)
     refuse: Callable[[ExportRequest], None] = lambda request: None
@@ -90,14 +141,17 @@ class ControllerFile:
             held = self.read(self.text(draft), str(request.out), nominal)
         lost, drawn = fit.departure(held), fit.departure(nominal)
         title = f"{self.contents[0].upper()}{self.contents[1:]} of model {model.name} (robot {nominal.name})."
-        said = [title, self.source, departure_sentence("This file is", lost, drawn)]
+        convention = self.convention(model.drawn or nominal)
+        said = [title, self.source, *convention.remarks, departure_sentence("This file is", lost, drawn)]
         if corrects_joints(model):
             said.append(
                 "It holds no learned joint correction: its geometry is the one that comes nearest to both."
             )
         said += [*self.relies, *condition_remarks(model), *frame_remarks(model)]
-        frames = {part: in_file_units(FRAME_COLUMNS, getattr(held, part)) for part in ("base", "tool")}
-        facts = {"off_the_whole_model": asdict(lost), "robot_as_drawn": asdict(drawn), **frames}
+        facts = {"off_the_whole_model": asdict(lost), "robot_as_drawn": asdict(drawn)}
+        facts |= {part: in_file_units(FRAME_COLUMNS, getattr(held, part)) for part in ("base", "tool")}
+        if convention.frames:
+            facts["frames"] = convention.frames.to_json()
         text = self.text(replace(draft, said=tuple(said)))
         return Exported(text, model_facts(model) | facts, tuple(said))
 

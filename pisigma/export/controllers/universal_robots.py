@@ -9,16 +9,16 @@ from pisigma.errors import RobotError
 from pisigma.export.controllers.controller_file import (
     ControllerFile,
     FileText,
-    check_plain_joints,
     frame_sentences,
     untried,
     with_frames,
 )
+from pisigma.export.controllers.ur_models import JOINTS, check_robot, convention, own_geometry
 from pisigma.export.dh_table import head
 from pisigma.files.input_file import read_text
-from pisigma.robot.chains import in_few_rows, joint_origins, robot_of_origins
+from pisigma.robot.chains import in_few_rows, robot_of_origins
 from pisigma.robot.description import Robot
-from pisigma.robot.urdf_frames import frame_of, xyzrpy_of
+from pisigma.robot.urdf_frames import Frame
 
 KEYS = {"delta_theta": 0, "delta_a": 2, "delta_d": 1, "delta_alpha": 3}
 """By the file's key the column of `DH_COLUMNS`; radians and metres."""
@@ -30,24 +30,22 @@ away, and the rounding of a number as large moves the tool."""
 _LINE = r"(?m)^[ \t]*{key}[ \t]*=[ \t]*\[([^\]\n]*)\]"
 
 
-def without_beta(robot: Robot, nominal: Robot) -> Robot:
-    """The same robot with beta 0 in all rows, and with neither a nor alpha in the last one.
+def without_beta(origins: list[Frame], own: Robot) -> Robot:
+    """A robot in the maker's rows: beta is 0 in all of them, and neither a nor alpha is in the last one.
 
     Two lines have one common normal: where they are nearly parallel it is far away, so d of that row and the next are
     large and nearly cancel each other, as in the files of the maker. Of the two directions of a normal the one is taken
     that changes theta by less than 90 deg.
 
     Args:
-        robot: the robot, with one row a joint that turns.
-        nominal: the robot that the directions are taken from.
+        origins: frames of the joints, see `OwnGeometry.origins`.
+        own: the nominal robot with the base and the tool that belong to them.
     """
-    origins, end = joint_origins(robot)
-    tool = robot.with_geometry(tool=xyzrpy_of(end @ frame_of(robot.tool)))
-    plain = robot_of_origins(tool, origins, np.eye(4), TILTED)
+    plain = robot_of_origins(own, origins, np.eye(4), TILTED)
     dh = plain.dh.copy()
     dh[:, 4] = 0.0  # of axes that are parallel but for `TILTED`
     turned = 0.0
-    for joint, (row, theta) in enumerate(zip(dh, nominal.dh[:, 0].tolist(), strict=True), 1):
+    for joint, (row, theta) in enumerate(zip(dh, own.dh[:, 0].tolist(), strict=True), 1):
         row[0] = theta + math.remainder(row[0] + turned - theta, 2 * math.pi)
         turned = 0.0
         if abs(row[0] - theta) > math.pi / 2 and joint < len(dh):
@@ -60,8 +58,9 @@ def without_beta(robot: Robot, nominal: Robot) -> Robot:
 
 def write_calibration(content: FileText) -> str:
     """The text of `calibration.conf`; with a file of the controller its other lines stay."""
-    robot = without_beta(content.robot, content.nominal)
-    difference = robot.dh - content.nominal.dh
+    own = own_geometry(content.nominal)
+    robot = without_beta(*own.origins(content.robot))
+    difference = robot.dh - own.robot.dh
     lines = {
         key: f"{key} = [{', '.join(repr(value) for value in difference[:, column].tolist())}]"
         for key, column in KEYS.items()
@@ -81,18 +80,19 @@ def write_calibration(content: FileText) -> str:
 
 
 def read_calibration(text: str, source: str, nominal: Robot) -> Robot:
-    """The robot that a `calibration.conf` makes of the nominal one, in rows without large lengths.
+    """The robot that a `calibration.conf` makes of the maker's nominal one, in rows without large lengths.
 
-    Base and tool are those of the comments that pisigma writes, else the nominal robot's.
+    Poses are those of the flange in the controller's frame `base`, or of the tool and in the base of the comments that
+    pisigma writes.
 
     Raises:
         RobotError: a line is missing or does not hold one number a joint, or the robot cannot have such a file.
     """
-    check_robot(nominal)
-    dh = nominal.dh.copy()
+    own = own_geometry(nominal).robot
+    dh = own.dh.copy()
     for key, column in KEYS.items():
         dh[:, column] += _numbers(text, key, source)
-    return in_few_rows(with_frames(nominal.with_geometry(dh=dh), text))
+    return in_few_rows(with_frames(own.with_geometry(dh=dh), text))
 
 
 def _numbers(text: str, key: str, source: str) -> list[float]:
@@ -106,36 +106,22 @@ def _numbers(text: str, key: str, source: str) -> list[float]:
     return values
 
 
-JOINTS = 6
-
-
-def check_robot(robot: Robot) -> None:
-    """Refuse robots that the maker's files cannot hold.
-
-    Raises:
-        RobotError: there are other than six joints that turn, or a row has beta.
-    """
-    check_plain_joints(robot, "a file of Universal Robots", JOINTS)
-    if robot.dh[:, 4].any():
-        raise RobotError(
-            f"robot '{robot.name}' is drawn with beta, which files of Universal Robots do not know; take --format urdf."
-        )
-
-
 FILE = ControllerFile(
     name="ur-calibration",
     contents="the calibration.conf of a Universal Robots controller",
     suffixes=(".conf",),
     source=untried("forum.universal-robots.com/t/18921 and /t/1638"),
     relies=(
-        "The controller adds these differences to its nominal DH parameters, which have to be those of this robot's "
-        "description; check them in urcontrol.conf.",
-        "The file holds neither base nor tool: set the tool below as TCP, and poses in the base below as a feature.",
+        "The controller adds these differences to its own nominal DH parameters, which are in urcontrol.conf.",
+        "The file holds neither base nor tool. The line 'base' below is where the controller's frame 'base' is in the "
+        "frame of the model's poses (set its inverse as a feature), the line 'tool' where the tool is on the flange "
+        "(set it as TCP).",
         "With --like the other lines of the controller's own file stay; joint checksums and raw offsets are not known.",
     ),
     text=write_calibration,
     read=read_calibration,
     check=check_robot,
+    convention=convention,
     options=frozenset(("like",)),
 )
 FORMAT = FILE.export_format()

@@ -11,12 +11,13 @@ from pisigma.export.controllers.controller_file import (
     untried,
     with_frames,
 )
-from pisigma.export.controllers.universal_robots import JOINTS, check_robot, without_beta
+from pisigma.export.controllers.universal_robots import without_beta
+from pisigma.export.controllers.ur_models import JOINTS, check_robot, convention, own_geometry
 from pisigma.export.dh_table import head
-from pisigma.robot.chains import joint_origins, robot_of_origins
+from pisigma.robot.chains import robot_of_origins
 from pisigma.robot.description import Robot
 from pisigma.robot.row import Bounded
-from pisigma.robot.urdf_frames import Frame, frame_of, xyzrpy_of
+from pisigma.robot.urdf_frames import Frame, frame_of, shift, turn, xyzrpy_of
 from pisigma.yaml_file import Section, parse_yaml, yaml_text
 
 COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
@@ -24,7 +25,7 @@ COLUMNS = ("x", "y", "z", "yaw", "pitch", "roll")
 
 
 class LinkSection(Section):
-    """A joint's frame in that of the joint before: x, y, z [m], then `RotZ(yaw) · RotY(pitch) · RotX(roll)` [rad]."""
+    """A joint's frame in that of the joint before: x, y, z [m], then roll about x, pitch about y, yaw about z [rad]."""
 
     x: Bounded = 0.0
     y: Bounded = 0.0
@@ -33,9 +34,19 @@ class LinkSection(Section):
     pitch: Bounded = 0.0
     yaw: Bounded = 0.0
 
-    def frame(self) -> Frame:
-        """The frame."""
-        return frame_of([getattr(self, column) for column in COLUMNS])
+    def frame(self, as_urdf: bool) -> Frame:
+        """The frame.
+
+        Args:
+            as_urdf: the rotation is `RotZ(yaw) · RotY(pitch) · RotX(roll)`, as URDF reads the numbers, else
+                `RotX(roll) · RotY(pitch) · RotZ(yaw)`, as the driver writes them.
+        """
+        if as_urdf:
+            return frame_of([getattr(self, column) for column in COLUMNS])
+        T: Frame = (
+            shift(self.x, self.y, self.z) @ turn(0, self.roll) @ turn(1, self.pitch) @ turn(2, self.yaw)
+        )
+        return T
 
 
 class KinematicsSection(Section):
@@ -59,30 +70,41 @@ class KinematicsDocument(Section):
 LINKS = tuple(KinematicsSection.model_fields)[:JOINTS]
 
 
+ORDER = "Rotations are RotZ(yaw) RotY(pitch) RotX(roll), as URDF reads them."
+"""Sentence in the files of pisigma, by which it knows them."""
+
+
 def write_kinematics(content: FileText) -> str:
     """The text of the file; what is behind the last joint goes into the tool of the comments."""
-    origins, end = joint_origins(content.robot)
-    tool = content.robot.with_geometry(tool=xyzrpy_of(end @ frame_of(content.robot.tool)))
+    origins, own = own_geometry(content.nominal).origins(content.robot)
     links: dict[str, object] = {
         link: {column: float(value) + 0.0 for column, value in zip(COLUMNS, xyzrpy_of(origin), strict=True)}
         for link, origin in zip(LINKS, origins, strict=True)
     }
-    links["hash"] = calibration_hash(without_beta(content.robot, content.nominal))
-    return head((*content.said, *frame_sentences(tool))) + yaml_text({"kinematics": links})
+    links["hash"] = calibration_hash(without_beta(origins, own))
+    return head((*content.said, *frame_sentences(own))) + yaml_text({"kinematics": links})
 
 
 def read_kinematics(text: str, source: str, nominal: Robot) -> Robot:
     """The robot that the file describes, with the names and limits of the nominal one.
 
-    Base and tool are those of the comments that pisigma writes, else the nominal robot's.
+    The driver extracts angles in one order and URDF reads them in the other (ur_calibration/src/calibration.cpp,
+    `eulerAngles(0, 1, 2)`), which makes some 0.1 mm. The order is taken that gives the hash of the file; where none
+    does, URDF's if pisigma wrote the file, else the driver's.
+
+    Poses are those of the link `tool0` in the controller's frame `base` (the driver's `base_link_inertia`), or of the
+    tool and in the base of the comments that pisigma writes.
 
     Raises:
         RobotError: the file is no such YAML, or the robot has other joints.
     """
-    check_robot(nominal)
+    own = own_geometry(nominal).robot
     links = parse_yaml(text, KinematicsDocument, RobotError, source).kinematics
-    origins = [getattr(links, link).frame() for link in LINKS]
-    return robot_of_origins(with_frames(nominal, text), origins, np.eye(4))
+    first = ORDER in " ".join(text.replace("#", " ").split())
+    candidates = [[getattr(links, link).frame(order) for link in LINKS] for order in (first, not first)]
+    found = (c for c in candidates if calibration_hash(without_beta(c, own)) == links.hash)
+    origins = next(found, candidates[0])
+    return robot_of_origins(with_frames(own, text), origins, np.eye(4))
 
 
 def calibration_hash(robot: Robot) -> str:
@@ -92,7 +114,7 @@ def calibration_hash(robot: Robot) -> str:
     them, to 6 digits and with nothing between.
     """
     text = "".join(
-        f"{value:g}" for theta, d, a, alpha, _ in robot.dh.tolist() for value in (theta, d, a, alpha)
+        f"{value + 0.0:g}" for theta, d, a, alpha, _ in robot.dh.tolist() for value in (theta, d, a, alpha)
     )
     return f"calib_{_murmur_hash(text.encode())}"
 
@@ -127,10 +149,13 @@ FILE = ControllerFile(
     relies=(
         "The driver warns where the hash is not that of the robot it connects to: it is that of the calibration.conf "
         "which --format ur-calibration writes of the same model.",
-        "The file holds neither base nor tool: it leads from the link base to the link tool0.",
+        ORDER,
+        "The file holds neither base nor tool: it leads from the controller's frame 'base' (the driver's link "
+        "base_link_inertia) to the link tool0. The lines 'base' and 'tool' below say where these two are.",
     ),
     text=write_kinematics,
     read=read_kinematics,
     check=check_robot,
+    convention=convention,
 )
 FORMAT = FILE.export_format()

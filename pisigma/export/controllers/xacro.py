@@ -4,9 +4,8 @@ import re
 
 from pisigma.errors import OutputError
 from pisigma.export.controllers.controller_file import ControllerFile, FileText
-from pisigma.export.export_format import ExportRequest
+from pisigma.export.urdf import drawn_into
 from pisigma.robot.urdf_chain import XACRO
-from pisigma.robot.writing import robot_into_urdf
 
 
 def with_properties(urdf: str) -> str:
@@ -30,19 +29,17 @@ def with_properties(urdf: str) -> str:
 
 
 def write_overlay(content: FileText) -> str:
-    """The text of the overlay over the URDF file that the nominal robot was loaded from."""
-    request = content.request
-    assert request.like is not None
-    return with_properties(
-        robot_into_urdf(content.robot, content.nominal, request.like, request.tip, content.said)
-    )
+    """The text of the overlay over the URDF file that the nominal robot was loaded from.
 
-
-def _refuse(request: ExportRequest) -> None:
-    if request.like is None:
+    Raises:
+        OutputError: there is none.
+    """
+    urdf = drawn_into(content.request, content.robot, content.nominal, content.said)
+    if urdf is None:
         raise OutputError(
             "--format xacro lays origins over a URDF file; give the one of the robot with --like."
         )
+    return with_properties(urdf)
 
 
 FILE = ControllerFile(
@@ -58,6 +55,5 @@ FILE = ControllerFile(
     read=None,
     check=lambda robot: None,
     options=frozenset(("like", "tip")),
-    refuse=_refuse,
 )
 FORMAT = FILE.export_format()

@@ -28,7 +28,7 @@ def planned_program(plan: StoredPlan, path: Path) -> str:
     check_program(path, robot, False, None)
     language = LANGUAGES[path.suffix.lower()]
     q, labels, waits = [], [], []
-    for order, (pose, points) in enumerate(zip(plan.q, plan.way_points, strict=True), start=1):
+    for order, pose, points in zip(plan.numbers, plan.q, plan.way_points, strict=True):
         q += [*points, pose]
         labels += ["way point"] * len(points) + [f"pose {order}"]
         waits += [0.0] * len(points) + [plan.settings.settling_s]

@@ -9,7 +9,8 @@ from pisigma.errors import RobotError
 from pisigma.export.controllers.xacro import with_properties
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.robot import Robot
-from pisigma.robot.writing import CALIBRATED_FRAME, CALIBRATED_TOOL, robot_into_urdf, robot_to_urdf
+from pisigma.robot.urdf_template import CALIBRATED_FRAME, CALIBRATED_TOOL, robot_into_urdf
+from pisigma.robot.writing import robot_to_urdf
 
 
 @pytest.fixture

@@ -1,0 +1,148 @@
+"""How large errors usually are, how large they can be, and what wear or a collision changes, by class of robots."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+from pisigma.robot.description import Robot
+
+ClassName = Literal["industrial", "cobot", "hobby"]
+
+COBOT_MAKERS: Final = (
+    "Franka",
+    "Rainbow Robotics",
+    "UFACTORY",
+    "Kinova",
+    "Doosan",
+    "Techman",
+    "Neuromeka",
+)
+HOBBY_MAKERS: Final = ("Trossen", "ROBOTIS", "Niryo", "AR4", "Elephant Robotics", "Dobot")
+
+
+@dataclass(frozen=True)
+class GeometricSizes:
+    """One size for each kind of geometric parameter.
+
+    The order is that of `pisigma.identification.problem.prior_sizes.PriorGroup`.
+
+    Attributes:
+        joint_offset: of theta [rad].
+        length: of d and a that are drawn [m].
+        no_length: of d and a that are drawn as 0 [m].
+        between_axes: of alpha and beta [rad].
+    """
+
+    joint_offset: float
+    length: float
+    no_length: float
+    between_axes: float
+
+    def of(self, group: int) -> float:
+        """The size of a group of parameters [m or rad]."""
+        return (self.joint_offset, self.length, self.no_length, self.between_axes)[group]
+
+
+@dataclass(frozen=True)
+class ChangeLimits:
+    """What wear or a collision can change in an arm that still works, by kind of parameter.
+
+    A belt that jumps a tooth or a brake that slips moves the zero of a joint by some degrees; a casting that has bent
+    by more than these lengths and angles is visibly broken. A base, a tool, or the zero of a single joint may move by
+    anything: they are moved, or zeroed again.
+
+    Attributes:
+        joint_zero: of several joints at once [rad].
+        length: of d and a, and the zero of a joint that slides [m].
+        angle: of alpha and beta [rad].
+    """
+
+    joint_zero: float
+    length: float
+    angle: float
+
+
+@dataclass(frozen=True)
+class RobotClass:
+    """Standard deviations of the errors of the robots of a class, before anything is measured, and their limits.
+
+    Attributes:
+        name: what `--class` states.
+        usual: standard deviations of geometric errors.
+        gravity: of the weights of `GravityTorques` [rad].
+        bands: of the weights of `FourierSeries` [rad], by band of `BAND_STARTS`.
+        harmonics: of the series.
+        largest: standard deviations of geometric errors that no robot of the class surely exceeds.
+        change: what wear or a collision can change.
+    """
+
+    name: ClassName
+    usual: GeometricSizes
+    gravity: float
+    bands: tuple[float, ...]
+    harmonics: int
+    largest: GeometricSizes
+    change: ChangeLimits
+
+    @staticmethod
+    def of(robot: Robot) -> "RobotClass":
+        """The class of a robot's maker, or else `INDUSTRIAL`."""
+        if robot.maker.startswith("Universal Robots"):
+            return UNIVERSAL_ROBOTS
+        if robot.maker.startswith(COBOT_MAKERS):
+            return COBOT
+        return HOBBY if robot.maker.startswith(HOBBY_MAKERS) else INDUSTRIAL
+
+    def holds(self, sizes: Sequence[tuple[int, float]]) -> bool:
+        """Say whether errors of these sizes [m or rad], by group of parameters, are possible in this class."""
+        return all(size <= self.largest.of(group) for group, size in sizes)
+
+
+INDUSTRIAL: Final = RobotClass(
+    name="industrial",
+    usual=GeometricSizes(joint_offset=1.5e-3, length=0.55e-3, no_length=0.37e-3, between_axes=0.7e-3),
+    gravity=2.7e-4,
+    bands=(2.4e-4, 2.4e-4, 4e-6, 4e-6, 1.5e-4, 2e-6, 2e-6),
+    harmonics=15,
+    largest=GeometricSizes(joint_offset=10e-3, length=10e-3, no_length=10e-3, between_axes=10e-3),
+    change=ChangeLimits(joint_zero=0.1, length=0.005, angle=0.01),
+)
+"""Arms with one eccentricity, one ovality and one gear ripple a joint.
+
+1.5 times the medians of the sizes that maximise the evidence of hybrid calibrations of simulated kr10, irb120, arm7 and
+scara arms (two each, 400 positions) and of the measured FANUC R-2000iC (720). The factor makes predicted errors right
+for few poses, from which a calibration has to estimate the sizes as well: with 15 such arms the median of predicted
+over true RMS is 1.05 after 15 chosen poses, 1.1 after 30 and 1.1 after 60; without it 0.74, 0.93 and 1.1. The largest
+sizes are twice those of the worst healthy arm that was measured."""
+
+COBOT: Final = replace(
+    INDUSTRIAL,
+    name="cobot",
+    largest=replace(INDUSTRIAL.largest, joint_offset=20e-3),
+    change=ChangeLimits(joint_zero=0.1, length=0.008, angle=0.02),
+)
+"""Light arms with harmonic drives, whose zeros are set by hand after a repair and slip in a collision. Their gears are
+taken for those of industrial arms where none of the maker was measured."""
+
+UNIVERSAL_ROBOTS: Final = replace(
+    COBOT,
+    usual=GeometricSizes(joint_offset=0.9e-3, length=0.45e-3, no_length=0.1e-3, between_axes=1.5e-3),
+    gravity=4e-4,
+    bands=(2e-4, 2e-4, 6e-5, 3e-5, 5e-5, 5e-5, 5e-5, 4e-5, 3e-5),
+    harmonics=31,
+)
+"""Between the sizes that maximise the evidence of hybrid calibrations of the measured UR5 (1,000 positions) and UR10
+(1,941 poses). Their gears err with many harmonics, which poses for other robots cannot distinguish."""
+
+HOBBY: Final = replace(
+    COBOT,
+    name="hobby",
+    usual=GeometricSizes(joint_offset=30e-3, length=1e-3, no_length=1e-3, between_axes=5e-3),
+    largest=GeometricSizes(joint_offset=100e-3, length=20e-3, no_length=20e-3, between_axes=20e-3),
+    change=ChangeLimits(joint_zero=0.3, length=0.02, angle=0.1),
+)
+"""Arms without a reliable zero: built by hobbyists or in a laboratory, surgical arms with potentiometers, and old ones
+that were put together again. Their zeros are 20 to 50 mrad off."""
+
+CLASSES: Final[dict[str, RobotClass]] = {one.name: one for one in (INDUSTRIAL, COBOT, HOBBY)}
+"""By name, the narrowest first."""
