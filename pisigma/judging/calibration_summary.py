@@ -173,6 +173,22 @@ class HybridFigures(Section):
     trials: tuple[TrialFigures, ...]
 
 
+class ScaleFigures(Section):
+    """How far one factor on all measured lengths explains what a calibration found.
+
+    Attributes:
+        factor: lengths of the arm over drawn ones.
+        sigma: its standard deviation.
+        odds: of such a factor against links that err each by itself, at most 1e6.
+        rms_mm: error of true positions, about their mean, where the factor is that of the sensor [mm].
+    """
+
+    factor: float
+    sigma: float
+    odds: float
+    rms_mm: float
+
+
 class HeldOutFile(Section):
     """SHA-256 of the file of held-out rows in the model folder, and of the measurements that it is of."""
 
@@ -195,6 +211,7 @@ class CalibrationSummary(AbstractSummary):
         parameters: the parameter table.
         redundancy: which parameters the data determine.
         weak_directions: directions that the data hardly determine, a sentence each.
+        scale: of the lengths, where positions were measured.
         outliers: rows that counted for less than half, the worst first.
         warnings: what to check or to measure next, a sentence each.
         rmse_mm: RMS of the first sensor's residuals at every iteration, the initial guess first.
@@ -203,6 +220,8 @@ class CalibrationSummary(AbstractSummary):
         calibrated: errors of the rows that were calibrated with.
         test: errors of the rows that the file marks as test.
         held_out: errors of other simulated rows.
+        predicted_rms_mm: errors that the calibration predicts at other poses, see `predicted_at_other_poses`, where no
+            row was held out [mm].
         held_out_rows: hashes of the file with every held-out row.
         learning_curve: errors of held-out rows by the number of training rows.
         redundant_sets: of a recipe: sets of parameters that are redundant by pairs.
@@ -224,6 +243,7 @@ class CalibrationSummary(AbstractSummary):
     parameters: tuple[ParameterFigures, ...]
     redundancy: RedundancyFigures
     weak_directions: tuple[str, ...]
+    scale: ScaleFigures | None = None
     outliers: tuple[OutlierFigures, ...]
     warnings: tuple[str, ...]
     rmse_mm: tuple[float, ...]
@@ -232,6 +252,7 @@ class CalibrationSummary(AbstractSummary):
     cross_validation: ValidationFigures | None = None
     test: ValidationFigures | None = None
     held_out: ValidationFigures | None = None
+    predicted_rms_mm: float | None = None
     held_out_rows: HeldOutFile | None = None
     learning_curve: tuple[LearningPoint, ...] | None = None
     redundant_sets: tuple[tuple[str, ...], ...] | None = None

@@ -18,9 +18,12 @@ from pisigma.judging.progress import Progress, silent, stage
 from pisigma.judging.side_by_side import in_processes, side_by_side
 from pisigma.judging.trained_calibrations import (
     Calibrator,
+    DistanceErrors,
     Result,
+    distance_figures,
     geometric_of,
     judgeable,
+    left_out_of_folds,
     trained,
     with_frames,
     without_missing,
@@ -29,6 +32,7 @@ from pisigma.judging.validation_figures import LearningPoint, ValidationFigures
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.splits import TrainTest, with_fewer
 from pisigma.sensors.registry import SENSORS
+from pisigma.sensors.socket import PairOfSockets
 
 FEW_ROWS = 500
 """Folds of up to so many rows are calibrated side by side; more need their memory for themselves."""
@@ -45,7 +49,7 @@ class CalibrationValidation:
         models: by name: "nominal" (the nominal arm, base and tool fitted to the training rows), "geometric" and
             "hybrid" where it was asked for, which chooses its features on the training rows alone.
         spread: errors of positions beside what the hybrid predicts of them; None without one.
-        distances: by model, predicted minus known distances of sockets that were held out [m].
+        distances: errors of stated distances of sockets that were left out.
         frames_fitted: how many frames were held out whole; where the base stands in them was fitted to the
             held-out rows themselves, under either arm.
         sockets_held_out: how many sockets were held out whole; their errors are from where their rows put the
@@ -57,7 +61,7 @@ class CalibrationValidation:
     folds: int
     models: Mapping[str, PoseErrors]
     spread: PredictedSpread | None = None
-    distances: Mapping[str, Float64[Tensor, " _pairs"]] = field(default_factory=dict)
+    distances: DistanceErrors = field(default_factory=DistanceErrors)
     frames_fitted: int = 0
     sockets_held_out: int = 0
     not_judged: int = 0
@@ -99,13 +103,8 @@ class CalibrationValidation:
         figures |= {name: errors.figures for name, errors in self.all_errors.items()}
         if self.all_spread is not None:
             figures |= self.all_spread.in_file_units()
-        count = max((len(errors) for errors in self.distances.values()), default=0)
-        if count:
-            sizes = {
-                name: _sizes(torch.cat([one.distances[name] for one in self.repeats]))
-                for name in self.distances
-            }
-            figures["socket_distance"] = {"count": count, **sizes}
+        if (distances := distance_figures([one.distances for one in self.repeats])) is not None:
+            figures["socket_distance"] = distances.model_dump(exclude_unset=True)
         counts = {"frames_fitted": self.frames_fitted, "sockets_held_out": self.sockets_held_out}
         counts["rows_not_judged"] = max(repeat.not_judged for repeat in self.repeats)
         figures |= {name: count for name, count in counts.items() if count}
@@ -126,7 +125,7 @@ class JudgedFold:
     Attributes:
         test: numbers of these rows.
         errors: by model.
-        distances: by model, of known distances of held-out sockets.
+        distances: of stated distances of sockets that it did without.
         spread: errors of positions beside what a hybrid predicts of them.
         frames: held out whole.
         sockets: held out whole.
@@ -135,7 +134,7 @@ class JudgedFold:
 
     test: Int64[Tensor, " rows"]
     errors: Mapping[str, PoseErrors]
-    distances: Mapping[str, Float64[Tensor, " _pairs"]]
+    distances: DistanceErrors
     spread: PredictedSpread | None
     frames: int = 0
     sockets: int = 0
@@ -154,7 +153,7 @@ def _joined(measurements: Measurements, judged: Sequence[JudgedFold], folds: int
         if fold.spread is not None:
             spread = spread or PredictedSpread.none(measurements.rows)
             spread.error[fold.test], spread.sigma[fold.test] = fold.spread.error, fold.spread.sigma
-    distances = {name: torch.cat([fold.distances[name] for fold in judged]) for name in errors}
+    distances = DistanceErrors.joined([fold.distances for fold in judged])
     frames, sockets, left_out = (
         sum(getattr(fold, count) for fold in judged) for count in ("frames", "sockets", "left_out")
     )
@@ -218,9 +217,10 @@ def fold_tasks(
         of_repeat = progress
         if len(repeats) > 1:
             of_repeat = stage(progress, f"repeat {number} of {len(repeats)}", ", ")
-        for fold, split in enumerate(splits, 1):
+        left_out = left_out_of_folds(geometric_of(calibrator).socket_distances, measurements, splits)
+        for fold, (split, without) in enumerate(zip(splits, left_out, strict=True), 1):
             name = f"fold {fold} of {len(splits)}"
-            tasks.append(partial(_judged_fold, calibrator, measurements, name, split, of_repeat))
+            tasks.append(partial(_judged_fold, calibrator, measurements, name, split, without, of_repeat))
     return tasks
 
 
@@ -233,15 +233,20 @@ def joined_repeats(
 
 
 def _judged_fold(
-    calibrator: Calibrator, measurements: Measurements, fold: str, split: TrainTest, progress: Progress
+    calibrator: Calibrator,
+    measurements: Measurements,
+    fold: str,
+    split: TrainTest,
+    distances: Mapping[PairOfSockets, float],
+    progress: Progress,
 ) -> JudgedFold:
-    """Calibrate on the training rows of one split and judge on its test rows."""
+    """Calibrate on the training rows of one split, without some distances, and judge on these and its test rows."""
     progress(fold)
     train, test = split
     training = measurements.select(train)
     judged_rows = test[judgeable(measurements, test, training)]
     held_out = measurements.select(judged_rows)
-    chosen = without_missing(calibrator, training, measurements)
+    chosen = without_missing(calibrator, training, measurements, distances)
     try:
         results = trained(chosen, training, stage(progress, fold))
     except IdentificationError as problem:
@@ -249,7 +254,8 @@ def _judged_fold(
             f"{fold}, calibrated with {training.rows} of the {measurements.rows} rows: {problem} All rows at once "
             "may do: leave out the cross-validation, or ask for more folds."
         ) from None
-    judged = _judge(geometric_of(calibrator), results, training, held_out)
+    everything = measurements.select(torch.cat([train, judged_rows]))
+    judged = _judge(geometric_of(calibrator), results, held_out, distances, everything)
     return replace(
         judged,
         test=judged_rows,
@@ -317,25 +323,28 @@ def judge(
         IdentificationError: a test row has a frame or target that was not calibrated.
     """
     results = trained(calibrator, training, result=result)
-    return _joined(test, [_judge(None, results, training, test)], 0)
+    return _joined(test, [_judge(None, results, test, {}, test)], 0)
 
 
 def _judge(
     calibrator: GeometricCalibrator | None,
     results: Mapping[str, Result],
-    training: Measurements,
     held_out: Measurements,
+    distances: Mapping[PairOfSockets, float],
+    rows: Measurements,
 ) -> JudgedFold:
-    """Judge all models on held-out rows, with frames that they lack fitted by a calibrator, if there is one."""
-    stated = {} if calibrator is None else calibrator.socket_distances
-    errors, distances, spread = {}, {}, None
-    for name, fitted in results.items():
-        result = fitted if calibrator is None else with_frames(calibrator, fitted, held_out)
-        errors[name] = errors_under(result, held_out)
-        distances[name] = _distance_errors(stated, result, training, held_out)
-        if isinstance(result, HybridResult):
-            spread = predicted_spread(result, held_out)
-    return JudgedFold(torch.arange(held_out.rows), errors, distances, spread)
+    """Judge all models on held-out rows, with frames that they lack fitted by a calibrator, if there is one.
+
+    Distances of sockets that they were made without are judged on all rows.
+    """
+    if calibrator is not None:
+        results = {name: with_frames(calibrator, fitted, held_out) for name, fitted in results.items()}
+    errors = {name: errors_under(result, held_out) for name, result in results.items()}
+    hybrid = results.get("hybrid")
+    spread = predicted_spread(hybrid, held_out) if isinstance(hybrid, HybridResult) else None
+    poses = {name: result.predicted_poses(rows) for name, result in results.items() if distances}
+    apart = DistanceErrors.of(poses, distances, rows)
+    return JudgedFold(torch.arange(held_out.rows), errors, apart, spread)
 
 
 @runtime_checkable
@@ -367,34 +376,9 @@ def errors_under(result: PredictsErrors, measurements: Measurements) -> PoseErro
     return PoseErrors(lengths, rotation)
 
 
-def _distance_errors(
-    stated: Mapping[tuple[str, str], float], result: Result, training: Measurements, rows: Measurements
-) -> Float64[Tensor, " pairs"]:
-    """Predicted minus known distance of sockets that are in these rows but not in the training rows [m].
-
-    A socket is where its rows put the ball on average.
-    """
-    names, held_out = rows.socket or (), _sockets(rows) - _sockets(training)
-    pairs = {pair: distance for pair, distance in stated.items() if set(pair) <= held_out}
-    if not pairs:
-        return torch.zeros(0, dtype=torch.float64)
-    T = result.predicted_poses(rows)
-    ball = T[:, :3, 3].detach().cpu()
-    centre = {
-        name: ball[torch.tensor([other == name for other in names])].mean(0)
-        for name in {name for pair in pairs for name in pair}
-    }
-    return torch.stack([(centre[a] - centre[b]).norm() - distance for (a, b), distance in pairs.items()])
-
-
 def _sockets(rows: Measurements) -> set[str]:
     return set(rows.socket or ()) - {""}
 
 
 def _rms_mm(errors: Float64[Tensor, " rows"]) -> float:
     return error_statistics(errors)["rms"] * 1e3
-
-
-def _sizes(errors: Float64[Tensor, " pairs"]) -> dict[str, float]:
-    """Mean and largest of the errors' sizes [mm]."""
-    return {"mean_mm": float(errors.abs().mean()) * 1e3, "max_mm": float(errors.abs().max()) * 1e3}

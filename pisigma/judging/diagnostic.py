@@ -15,8 +15,10 @@ class Diagnostic(Section):
         kind: such as "search" or "prior_ratio"; one check may have several.
         severity: "implausible": the calibration must not be trusted, commands end with status 3; or "warning".
         sentence: what is wrong, where, and what to do.
+        rows: places of the rows that it is about, file and line; none where it is about all of them.
     """
 
     kind: str
     severity: Severity
     sentence: str
+    rows: tuple[str, ...] = ()

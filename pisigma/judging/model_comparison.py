@@ -1,7 +1,8 @@
 """Any number of models on the same measured rows: their errors, confidence intervals and differences."""
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -12,16 +13,22 @@ from torch import Tensor
 from pisigma.errors import MeasurementError
 from pisigma.judging.bootstrap import STATISTICS, Bootstrap, Intervals, statistics
 from pisigma.judging.frames.fitted_frames import FrameKind, errors_in_fitted_frames
+from pisigma.judging.frames.row_errors import has_position, other_lengths
 from pisigma.judging.pose_statistics import axis_statistics, error_statistics
 from pisigma.judging.rank_tests import SignedRank, signed_rank
+from pisigma.judging.trained_calibrations import DistanceErrors, distance_figures
+from pisigma.judging.validation_figures import SocketDistances
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
 from pisigma.model.calibrated_model import CalibratedModel
+from pisigma.model.row_poses import poses_of_rows
+from pisigma.sensors.socket import PairOfSockets
 
 Interval = tuple[float, float]
 """Lower and upper end."""
 
+NOTHING_TO_JUDGE = "expected positions, balls in sockets, wires, pairs or touches, got none; give x, y and z."
 UNITS = {"position": ("mm", 1e3), "orientation": ("deg", float(np.rad2deg(1.0)))}
 """Of every quantity the unit of tables and files, and what an SI value is multiplied by."""
 
@@ -79,8 +86,8 @@ class ModelFigures:
 
     Attributes:
         name: what the model is called.
-        rows_not_predicted: rows with a measured position for which this model predicts nothing.
-        position: errors of positions.
+        rows_not_predicted: rows with a measured length for which this model predicts nothing.
+        position: errors of positions, and of the lengths of other sensors in rows without one.
         orientation: errors of orientations; None where none was measured.
         rows_inside: compared rows inside the model's domain; None where it knows no domain.
         rows_outside: the same outside it.
@@ -132,10 +139,11 @@ class ModelComparison:
 
     Attributes:
         models: in the order in which they were given.
-        rows: rows whose positions are compared.
-        rows_without_position: rows that hold no position.
+        rows: rows that are compared.
+        rows_without_position: rows that hold no position, and no other length that could be judged.
         configurations: number of different configurations of these rows.
         bootstrap: how the intervals were computed.
+        socket_distance: errors of stated distances of sockets; None where none is stated.
     """
 
     models: tuple[ModelFigures, ...]
@@ -143,15 +151,20 @@ class ModelComparison:
     rows_without_position: int
     configurations: int
     bootstrap: Bootstrap
+    socket_distance: SocketDistances | None = None
 
     def to_json(self) -> dict[str, object]:
         """Return the comparison as plain values."""
+        distances = (
+            {} if self.socket_distance is None else self.socket_distance.model_dump(exclude_unset=True)
+        )
         return {
             "rows_compared": self.rows,
             "rows_without_position": self.rows_without_position,
             "configurations": self.configurations,
             "bootstrap": asdict(self.bootstrap),
             "models": [model.to_json() for model in self.models],
+            **({"socket_distance": distances} if distances else {}),
         }
 
 
@@ -161,6 +174,7 @@ def compare_models(
     measurements: Measurements,
     bootstrap: Bootstrap | None = None,
     fitted: Collection[FrameKind] = (),
+    socket_distances: Mapping[PairOfSockets, float] = MappingProxyType({}),
 ) -> ModelComparison:
     """Judge models on measurements; rows for which one of them predicts nothing count for none.
 
@@ -169,23 +183,26 @@ def compare_models(
         measurements: the rows, in the frames that the models were fitted in.
         bootstrap: how confidence intervals are computed. None: `Bootstrap()`.
         fitted: frames or targets that are fitted to the rows, for every model; see `errors_in_fitted_frames`.
+        socket_distances: stated distances of sockets of the rows [m].
 
     Raises:
-        MeasurementError: no positions were measured, or in a frame or of a target that a model does not know, or no
+        MeasurementError: no lengths were measured, or in a frame or of a target that a model does not know, or no
             row is predicted by all models, or a frame or target that is fitted has too few rows.
         PoseError: the joint values do not fit a model's robot.
     """
     bootstrap = bootstrap or Bootstrap()
     vectors = {name: errors_in_fitted_frames(model, measurements, fitted) for name, model in models.items()}
-    assert measurements.position is not None  # or there were no errors
-    measured = torch.isfinite(measurements.position).all(-1)
+    measured, others = has_position(measurements), other_lengths(measurements)
+    if not bool((measured | others).any()):
+        raise MeasurementError(f"{measurements.source}: {NOTHING_TO_JUDGE}")
     predicted = {name: torch.isfinite(errors.position).all(-1) for name, errors in vectors.items()}
     common = torch.stack(list(predicted.values())).all(0)
     if not common.any():
         raise MeasurementError(
-            f"{measurements.source}: there is no row with a measured position that {', '.join(models)} predict; give "
-            "rows nearer to what was calibrated with."
+            f"{measurements.source}: there is no row with a measured length that {', '.join(models)} predict; give "
+            "rows nearer to what was calibrated with, and two or more of every socket."
         )
+    measured = measured | (others & torch.stack(list(predicted.values())).any(0))
     domains = [inside_domain(model, measurements) for model in models.values()]
     group = groups_to_keep_whole(measurements)
     positions = _quantity(
@@ -206,8 +223,21 @@ def compare_models(
         )
         for name, position, orientation, inside in zip(models, positions, orientations, domains, strict=True)
     ]
+    if bool((common & others).any()):
+        figures = [replace(one, position=replace(one.position, axes={})) for one in figures]
     unmeasured, configurations = int((~measured).sum()), len(set(group[common].tolist()))
-    return ModelComparison(tuple(figures), int(common.sum()), unmeasured, configurations, bootstrap)
+    distances = _distances(models, measurements.select(common.nonzero()[:, 0]), socket_distances)
+    return ModelComparison(
+        tuple(figures), int(common.sum()), unmeasured, configurations, bootstrap, distances
+    )
+
+
+def _distances(
+    models: Mapping[str, CalibratedModel], rows: Measurements, stated: Mapping[PairOfSockets, float]
+) -> SocketDistances | None:
+    """Figures of stated distances of sockets, each where its rows put the ball."""
+    poses = {name: poses_of_rows(model, rows) for name, model in models.items() if stated}
+    return distance_figures([DistanceErrors.of(poses, stated, rows)])
 
 
 def inside_domain(model: CalibratedModel, measurements: Measurements) -> Bool[Tensor, " rows"] | None:

@@ -138,9 +138,8 @@ def _no_positions(measurements: Measurements) -> str:
     if not kinds:
         return "no positions were measured; give x, y and z."
     return (
-        f"no positions were measured, but {' and '.join(sorted(kinds))} values; a model does not keep where sockets, "
-        "anchors and jigs stand, so these rows cannot be judged by themselves; give x, y and z, or hold rows out "
-        "with `pisigma calibrate --hold-out`."
+        f"no positions were measured, but {' and '.join(sorted(kinds))} values, which `pisigma evaluate` and "
+        "`pisigma verify` judge; give x, y and z, or hold rows out with `pisigma calibrate --hold-out`."
     )
 
 

@@ -1,19 +1,25 @@
 """Predicted standard deviations of positions beside the errors that were made."""
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Float64
 from torch import Tensor
 
+from pisigma.hybrid.covariance_root import CovarianceRoot
 from pisigma.hybrid.result import HybridResult
+from pisigma.hybrid.uncertainty import PositionUncertainty
+from pisigma.identification.result import CalibrationResult
 from pisigma.measurement.dataset import Measurements
 from pisigma.sensors.corner import position_deviations
 from pisigma.sensors.intrinsics import NOISE_COLUMN
 
 WITHIN = 1.96
 """95 % of a normal value lie within so many standard deviations."""
+OTHER_POSES = 5
+"""Poses for every row, with the values of its joints from any rows, at which a calibration predicts its errors."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +98,38 @@ def predicted_spread(result: HybridResult, measurements: Measurements) -> Predic
     return spread
 
 
+def predicted_at_other_poses(
+    result: CalibrationResult | HybridResult, measurements: Measurements
+) -> float | None:
+    """RMS of the position errors, with the noise, that a calibration predicts where it was not measured [m].
+
+    Every joint takes the values of the rows, in an order of its own: at the rows themselves a calibration knows more
+    than at any other pose between them, of few rows several times as much.
+
+    Args:
+        result: the calibration.
+        measurements: the rows that it was calibrated with.
+
+    Returns:
+        None where it predicts no positions.
+    """
+    q, generator = measurements.q.detach().cpu(), torch.Generator().manual_seed(0)
+    orders = torch.rand(OTHER_POSES, *q.shape, generator=generator).argsort(1)
+    every = torch.arange(measurements.rows).repeat(OTHER_POSES)
+    others = replace(
+        measurements.select(every), q=q[None].take_along_dim(orders, 1).flatten(0, 1).to(measurements.q)
+    )
+    if isinstance(result, HybridResult):
+        deviation = result.deviation(others)
+    else:
+        solved = result.solved
+        root = CovarianceRoot(solved.root)
+        known = PositionUncertainty(solved.problem.space, solved.geometry, (), root, 1.0)
+        deviation = known.deviation(others, others.q)
+    rms = float((deviation.square() + _noise(result, others).square()).sum(1).mean().sqrt())
+    return rms if math.isfinite(rms) else None
+
+
 def image_deviation(measurements: Measurements) -> float:
     """Root mean square error of the positions that images give by themselves [m]; 0 without images."""
     noise = measurements.readings.get(NOISE_COLUMN)
@@ -112,11 +150,14 @@ def image_remark(measurements: Measurements) -> tuple[str, ...]:
     )
 
 
-def _noise(result: HybridResult, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
+def _noise(result: CalibrationResult | HybridResult, measurements: Measurements) -> Float64[Tensor, "rows 3"]:
     """Standard deviations of the measured coordinates of every row [m]."""
     deviation = torch.zeros(measurements.rows, 3, dtype=torch.float64)
-    for one in result.geometric.noise:
-        sigma = one.sigma if result.learned is None else result.learned.noise[one.sensor]
+    geometric, learned = (
+        (result.geometric, result.learned) if isinstance(result, HybridResult) else (result, None)
+    )
+    for one in geometric.noise:
+        sigma = one.sigma if learned is None else learned.noise[one.sensor]
         stated = measurements.sigma_position
         if one.sensor == "corner":
             by_image = position_deviations(measurements).cpu()

@@ -1,6 +1,7 @@
-"""Calibrations that are judged side by side, trained on the same rows, and what of held-out rows they can predict."""
+"""Calibrations that are judged side by side, trained on the same rows, and what of the others they can predict."""
 
-from dataclasses import replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -14,8 +15,11 @@ from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import SquaredLoss
 from pisigma.identification.result import CalibrationResult
 from pisigma.judging.progress import Progress
+from pisigma.judging.validation_figures import MODELS, DistanceFigures, SocketDistances, StatedDistance
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.splits import TrainTest
 from pisigma.robot.description import Robot
+from pisigma.sensors.socket import PairOfSockets, SocketSensor
 
 Calibrator = GeometricCalibrator | HybridCalibrator
 Result = CalibrationResult | HybridResult
@@ -76,16 +80,22 @@ def base_and_tool(calibrator: GeometricCalibrator) -> GeometricCalibrator:
     return replace(calibrator, free=(), loss=SquaredLoss())
 
 
-def without_missing(calibrator: Calibrator, rows: Measurements, of: Measurements) -> Calibrator:
+def without_missing(
+    calibrator: Calibrator,
+    rows: Measurements,
+    of: Measurements,
+    left_out: Collection[PairOfSockets] = (),
+) -> Calibrator:
     """Give the calibrator without stated frames and socket distances that some of the rows lack.
 
     Args:
         calibrator: for all rows.
         rows: those that it will be fitted to.
         of: all rows; what these lack too stays, so that the calibrator refuses it.
+        left_out: socket distances that it is to do without, too.
     """
     if isinstance(calibrator, HybridCalibrator):
-        geometric = without_missing(calibrator.geometric, rows, of)
+        geometric = without_missing(calibrator.geometric, rows, of, left_out)
         assert isinstance(geometric, GeometricCalibrator)
         return replace(calibrator, robot=geometric)
     no_frame = set(of.frame) - set(rows.frame)
@@ -96,7 +106,7 @@ def without_missing(calibrator: Calibrator, rows: Measurements, of: Measurements
         socket_distances={
             pair: distance
             for pair, distance in calibrator.socket_distances.items()
-            if not no_socket & set(pair)
+            if not no_socket & set(pair) and pair not in left_out
         },
     )
 
@@ -185,3 +195,99 @@ def judgeable(measurements: Measurements, test: Tensor, training: Measurements) 
             "an anchor that other rows have; measure more poses with each, or leave out the cross-validation."
         )
     return torch.tensor(rows_judged, device=test.device)
+
+
+@dataclass(frozen=True, eq=False)
+class DistanceErrors:
+    """Errors of stated distances.
+
+    Attributes:
+        stated: by the names of two sockets [m].
+        errors: by model, predicted minus stated, in the same order [m].
+    """
+
+    stated: Mapping[PairOfSockets, float] = field(default_factory=dict)
+    errors: Mapping[str, Float64[Tensor, " pairs"]] = field(default_factory=dict)
+
+    @staticmethod
+    def of(
+        poses: Mapping[str, Float64[Tensor, "rows 4 4"]],
+        stated: Mapping[PairOfSockets, float],
+        rows: Measurements,
+    ) -> "DistanceErrors":
+        """Under several calibrations; a socket is where its rows put the ball.
+
+        Args:
+            poses: where calibrations without these distances have the target in every row, by name.
+            stated: the distances.
+            rows: of their sockets, and others.
+        """
+        errors, sockets = {}, tuple({one for pair in stated for one in pair})
+        for model, T in poses.items():
+            centre = {name: SocketSensor.uncalibrated(rows, name, T.detach().cpu(), ()) for name in sockets}
+            errors[model] = torch.tensor(
+                [float((centre[a] - centre[b]).norm()) - distance for (a, b), distance in stated.items()],
+                dtype=torch.float64,
+            )
+        return DistanceErrors(stated, errors)
+
+    @staticmethod
+    def joined(parts: "Sequence[DistanceErrors]") -> "DistanceErrors":
+        """Those of several folds."""
+        there = [part for part in parts if part.stated]
+        stated = {pair: distance for part in there for pair, distance in part.stated.items()}
+        names = there[0].errors if there else ()
+        return DistanceErrors(
+            stated, {name: torch.cat([part.errors[name] for part in there]) for name in names}
+        )
+
+
+def left_out_of_folds(
+    stated: Mapping[PairOfSockets, float], measurements: Measurements, splits: Sequence[TrainTest]
+) -> tuple[dict[PairOfSockets, float], ...]:
+    """Assign every stated distance to one fold, whose calibration does without it.
+
+    That is the fold without rows of one of the sockets, or else, of several folds, each in turn, as long as one
+    distance is left there: without any, a calibration does not determine the scale. One of a socket that no row has is
+    none's, so that the calibrations refuse it.
+    """
+    names = measurements.socket or ()
+    known = [{names[row] for row in train.tolist()} if names else set() for train, _ in splits]
+    folds: tuple[dict[PairOfSockets, float], ...] = tuple({} for _ in splits)
+    for number, (pair, distance) in enumerate(stated.items()):
+        if not set(pair) <= set(names):
+            continue
+        lacking = [fold for fold, sockets in enumerate(known) if not set(pair) <= sockets]
+        fold = lacking[0] if lacking else number % len(splits)
+        left = [one for one in stated if set(one) <= known[fold] and one != pair and one not in folds[fold]]
+        if lacking or (left and len(splits) > 1):
+            folds[fold][pair] = distance
+    return folds
+
+
+def distance_figures(repeats: Sequence[DistanceErrors]) -> SocketDistances | None:
+    """Figures of several repeats in mm; None where no distance was judged."""
+    repeats = [one for one in repeats if one.stated]
+    if not repeats:
+        return None
+    of_each: dict[PairOfSockets, dict[str, list[float]]] = {}
+    for one in repeats:
+        for number, pair in enumerate(one.stated):
+            for name, errors in one.errors.items():
+                of_each.setdefault(pair, {}).setdefault(name, []).append(float(errors[number]) * 1e3)
+    stated = {pair: distance * 1e3 for one in repeats for pair, distance in one.stated.items()}
+    sizes = {
+        name: DistanceFigures(mean_mm=float(errors.mean()) * 1e3, max_mm=float(errors.max()) * 1e3)
+        for name in repeats[0].errors
+        if name in MODELS
+        for errors in [torch.cat([one.errors[name] for one in repeats]).abs()]
+    }
+    each = tuple(
+        StatedDistance(
+            sockets=pair,
+            stated_mm=stated[pair],
+            errors_mm={name: sum(values) / len(values) for name, values in errors.items()},
+        )
+        for pair, errors in sorted(of_each.items())
+    )
+    return SocketDistances.model_validate({"count": len(each), **sizes, "each": each})

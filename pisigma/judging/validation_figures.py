@@ -31,10 +31,26 @@ class DistanceFigures(Section):
     max_mm: float
 
 
+class StatedDistance(Section):
+    """A stated distance of two sockets [mm], and by calibration without it the predicted one minus it [mm].
+
+    In several repeats of a cross-validation, the mean of these errors.
+    """
+
+    sockets: tuple[str, str]
+    stated_mm: float
+    errors_mm: dict[str, float]
+
+
 class SocketDistances(Section):
-    """Errors of the distances of held-out sockets, per calibration; `count` distances are known."""
+    """Errors of stated distances of sockets under calibrations without them; `count` distances were left out in turn.
+
+    Attributes:
+        each: one by one.
+    """
 
     count: int
+    each: tuple[StatedDistance, ...] = ()
     nominal: DistanceFigures | None = None
     geometric: DistanceFigures | None = None
     hybrid: DistanceFigures | None = None
@@ -57,7 +73,7 @@ class AbstractValidationFigures(Section):
         hybrid: geometry and joint correction.
         coverage: share of the held-out coordinates that lie within the 95 % intervals that the hybrid predicts.
         predicted_rms_mm: RMS of the position errors that it predicts [mm].
-        socket_distance: errors of distances between held-out sockets.
+        socket_distance: errors of stated distances between sockets that were left out.
         frames_fitted: number of frames that were held out whole; their bases were fitted to the held-out rows.
         sockets_held_out: number of sockets that were held out whole.
         rows_not_judged: number of held-out rows whose target or anchor no training row has.

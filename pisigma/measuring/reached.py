@@ -1,7 +1,7 @@
 """How accurate a calibration with the rows so far is, and what the poses that are left would bring."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -33,10 +33,12 @@ class Reached:
     Attributes:
         point: accuracy of a calibration with them.
         knowledge: what is known after them.
+        rows: that were calibrated with; None with a model, to which they are added whatever their values.
     """
 
     point: AccuracyPoint
     knowledge: Knowledge
+    rows: Measurements | None = None
 
 
 def reached(
@@ -60,41 +62,58 @@ def reached(
     """
     if not rows.rows:
         return None
-    judged: tuple[float, ...] = ()
+    checked = (math.nan, math.nan)
     if plan.model is not None:
         knowledge = before.informed(rows.q)
     else:
         try:
-            knowledge, judged = _calibrated(plan.arm.robot, before, rows, check, progress)
+            knowledge, checked = _calibrated(plan.arm.robot, before, rows, check, progress)
         except (IdentificationError, MeasurementError):
             return None
     D = knowledge.tool(task)
-    return Reached(AccuracyPoint(rows.rows, rms_of(D), p95_of(D), *judged), knowledge)
+    point = AccuracyPoint(rows.rows, rms_of(D), p95_of(D), checked_rms=checked[0], checked_p95=checked[1])
+    return Reached(point, knowledge, rows if plan.model is None else None)
 
 
 def _calibrated(
     robot: Robot, before: Knowledge, rows: Measurements, check: Measurements | None, progress: Progress
-) -> tuple[Knowledge, tuple[float, ...]]:
-    """Calibrate, and judge that by left-out rows and by rows that check it: RMS and 95 % of either [m].
+) -> tuple[Knowledge, tuple[float, float]]:
+    """Calibrate, and judge that by rows that check it: RMS and 95 % [m].
 
     Raises:
         IdentificationError: the rows are too few, or contradict each other.
         MeasurementError: too few of them can be left out.
     """
-    calibrator = HybridCalibrator(robot)
-    result = fit_where_it_helps(calibrator, rows, progress)
+    result = fit_where_it_helps(HybridCalibrator(robot), rows, progress)
     assert isinstance(result, HybridResult)
     if result.learned is None and np.array_equal(result.geometric.robot.dh, robot.dh):
         # Too few rows left the arm as drawn, so that the posterior says nothing of its errors.
         knowledge = before.informed(rows.q)
     else:
         knowledge = Knowledge.of_result(result, before.instrument)
-    folds = k_folds(rows, min(FOLDS, rows.rows), seed=0)
-    errors = validate(calibrator, rows, folds, progress).models["hybrid"].position
-    checked = torch.full((1,), math.nan, dtype=torch.float64)
-    if check is not None:
-        checked = errors_under(result, check).position
-    return knowledge, (*_rms_p95(errors), *_rms_p95(checked))
+    if check is None:
+        return knowledge, (math.nan, math.nan)
+    return knowledge, _rms_p95(errors_under(result, check).position)
+
+
+def cross_validated(robot: Robot, so_far: Reached, progress: Progress = lambda what: None) -> AccuracyPoint:
+    """Return the accuracy with the errors of rows that are left out, where they can be.
+
+    Args:
+        robot: as drawn.
+        so_far: what the rows came to.
+        progress: called with what is being done; what it raises ends the calculation.
+    """
+    rows = so_far.rows
+    if rows is None:
+        return so_far.point
+    try:
+        folds = k_folds(rows, min(FOLDS, rows.rows), seed=0)
+        errors = validate(HybridCalibrator(robot), rows, folds, progress).models["hybrid"].position
+    except (IdentificationError, MeasurementError):
+        return so_far.point
+    rms, p95 = _rms_p95(errors)
+    return replace(so_far.point, cross_validated_rms=rms, cross_validated_p95=p95)
 
 
 def expected(

@@ -15,19 +15,19 @@ from pisigma.robot.description import Robot
 
 SAME_READING = 2e-6
 """[m] Readings of two poses never agree so well, not even with a robot that stands still."""
+SAME_VALUE = 1e-9
+"""[SI] Numbers that were written twice differ by no more."""
 SAME_POSE, NEAR_POSE = 0.1, 3.0
 """[deg or mm] Joint values so near to those of a pose are that pose, or are meant to be."""
 SWAPPED = 0.2
 """A point is that of another pose where it is nearer to it than this share of its error."""
 CONTRADICTION = 6
 """Up to so many rows, an error may as well be one of the others."""
-EQUAL_ROW = "all columns: the row equals"
 
 
 def unreadable(row: LeftOut) -> Alarm:
     """Complain of a row that cannot be read."""
-    kind, repeat = ("duplicate", False) if row.reason.startswith(EQUAL_ROW) else ("unreadable", True)
-    return Alarm(row.line, kind, f"line {row.line}, {row.reason}.", repeat)  # type: ignore[arg-type]
+    return Alarm(row.line, "unreadable", f"line {row.line}, {row.reason}.", repeat=True)
 
 
 def of_all_rows(sentence: str) -> Alarm:
@@ -42,17 +42,22 @@ def cleared(line: int) -> Alarm:
 
 
 def stale_readings(rows: Measurements, start: int) -> Iterator[Alarm]:
-    """Find rows from one on whose positions are those of an earlier row: written twice, or from a frozen sensor."""
-    if rows.position is None:
-        return
+    """Find rows from one on whose readings are those of an earlier row: written twice, or from a frozen sensor."""
+    fields = rows.as_fields().numbers.values()
+    numbers = torch.cat([values.reshape(rows.rows, -1) for values in fields], 1)
+    position = torch.full((rows.rows, 3), torch.nan) if rows.position is None else rows.position
     for row in range(start, rows.rows):
-        same = (rows.position[:row] - rows.position[row]).norm(dim=1) < SAME_READING
+        frozen = (position[:row] - position[row]).norm(dim=1) < SAME_READING
+        off = (numbers[:row] - numbers[row]).abs() < SAME_VALUE
+        same = frozen | (off | (numbers[:row].isnan() & numbers[row].isnan())).all(1)
         if not bool(same.any()):
             continue
         earlier = int(same.nonzero()[0])
         here, there = rows.line[row], rows.line[earlier]
-        if float((rows.q[row] - rows.q[earlier]).abs().max()) < 1e-9:
-            text = f"line {here}: the joint values and the position are those of line {there}; the row does not count."
+        if float((rows.q[row] - rows.q[earlier]).abs().max()) < SAME_VALUE:
+            text = (
+                f"line {here}: joint values and readings are those of line {there}; the row does not count."
+            )
             yield Alarm(here, "duplicate", text, repeat=False)
         else:
             text = (

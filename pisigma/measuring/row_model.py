@@ -12,14 +12,15 @@ from pisigma.hybrid.design import Design
 from pisigma.hybrid.gravity import USUAL, in_first_row
 from pisigma.hybrid.sensor_values import SensorValues, sensor_values
 from pisigma.identification.calibrator import GeometricCalibrator
+from pisigma.identification.identifiability.sufficiency import floating_bases
 from pisigma.identification.problem.parameters import USUAL_LENGTH
 from pisigma.identification.problem.prior_sizes import PriorGroup
 from pisigma.identification.problem.setup import CalibrationSetup, IdentifiedGeometry, identified_geometry
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.measurement.dataset import Measurements
-from pisigma.planning.robot_class import RobotClass
 from pisigma.robot.description import Robot
+from pisigma.robot.robot_class import RobotClass
 from pisigma.se3 import (
     invert,
     rotation_from_rpy,
@@ -103,7 +104,9 @@ class RowModel:
         """
         calibrator = GeometricCalibrator(robot)
         setup = calibrator.build(with_held_camera(rows, REPEATABILITY["m"], REPEATABILITY["rad"]))
-        active = [*setup.free_unknowns, *calibrator.candidates(setup.problem.space)]
+        floating = set(floating_bases(setup))
+        chosen = [index for index in calibrator.candidates(setup.problem.space) if index not in floating]
+        active = [*setup.free_unknowns, *chosen]
         setup = replace(setup, problem=setup.problem.with_active(active))
         gravity = GravityTorques(robot, in_first_row(robot, USUAL))
         design = Design(setup.problem, (gravity, FourierSeries(robot, RobotClass.of(robot).harmonics)))
@@ -232,10 +235,10 @@ class RowModel:
     @cached_property
     def _size(self) -> Float64[Tensor, " unknowns"]:
         """Standard deviation of the unknowns before anything is measured; infinite where nothing is known."""
-        usual = RobotClass.of(self.setup.problem.space.robot)
-        prior = self.design.prior([usual.geometric(group) / USUAL_LENGTH for group in PriorGroup])
+        of_class = RobotClass.of(self.setup.problem.space.robot)
+        prior = self.design.prior([of_class.usual.of(group) / USUAL_LENGTH for group in PriorGroup])
         sizes = torch.cat(
-            [prior.sizes[: prior.classes], prior.sizes.new_tensor([usual.gravity, *usual.bands])]
+            [prior.sizes[: prior.classes], prior.sizes.new_tensor([of_class.gravity, *of_class.bands])]
         )
         return replace(prior, sizes=sizes).precision.rsqrt()
 

@@ -59,8 +59,8 @@ class NextPose:
     """The pose to be measured next.
 
     Attributes:
-        number: of the pose in the plan that holds now, from 1.
-        count: of all poses in that plan.
+        number: of the pose, which it keeps when the rest is planned again.
+        count: largest number of a pose so far.
         q: joint values [rad or m].
         check: whether it judges the calibration.
         commanded: the same as the controller counts, where its values are others.

@@ -27,8 +27,8 @@ from pisigma.measurement.conditions import JointState
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.planning.board_sight import BoardSight
-from pisigma.planning.robot_class import RobotClass
 from pisigma.robot.description import Robot
+from pisigma.robot.robot_class import RobotClass
 from pisigma.se3 import rotation_vector, skew
 
 SensorKind = Literal["position", "pose", "distance", "camera"]
@@ -271,11 +271,11 @@ class Knowledge:
 
 def _geometric_sizes(space: ParameterSpace) -> Float64[Tensor, " parameters"]:
     """Standard deviations of all parameters of a robot that was never measured [m or rad]."""
-    usual, sizes = RobotClass.of(space.robot), []
+    of_class, sizes = RobotClass.of(space.robot), []
     arm = zip(space.parameters[: space.arm_size], space.robot.dh.ravel().tolist(), strict=True)
     for parameter, value in arm:
-        group = PriorGroup(prior_group_of(parameter.group, abs(value) > usual.length))
-        sizes.append(usual.geometric(group))
+        group = PriorGroup(prior_group_of(parameter.group, abs(value) > of_class.usual.length))
+        sizes.append(of_class.usual.of(group))
     return torch.tensor([*sizes, *WIDE], dtype=torch.float64)
 
 

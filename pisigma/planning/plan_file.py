@@ -3,7 +3,7 @@
 import csv
 import io
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -74,6 +74,7 @@ class StoredPlan:
         check: whether a pose judges the calibration (set "test") or is calibrated with ("train").
         candidate: row of the file of candidates, or number of the pose that was drawn; from 1.
         way_points: per pose, the joint values by way of which the robot goes there [rad or m]; mostly none.
+        number: of every pose, which it keeps in parts of the plan; () where they count from 1.
     """
 
     arm: ArmInCell
@@ -83,6 +84,23 @@ class StoredPlan:
     check: Bool[Tensor, " poses"]
     candidate: Int64[Tensor, " poses"]
     way_points: tuple[Float64[Tensor, "_points dof"], ...]
+    number: tuple[int, ...] = ()
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """Of every pose its number."""
+        return self.number or tuple(range(1, len(self.q) + 1))
+
+    def part(self, poses: Int64[Tensor, " some"]) -> "StoredPlan":
+        """Return some poses, which keep their numbers."""
+        return replace(
+            self,
+            q=self.q[poses],
+            check=self.check[poses],
+            candidate=self.candidate[poses],
+            way_points=tuple(self.way_points[pose] for pose in poses.tolist()),
+            number=tuple(self.numbers[pose] for pose in poses.tolist()),
+        )
 
     def write(self, path: Path) -> None:
         """Write the CSV, and the YAML beside it; both are replaced where they are there.
@@ -95,7 +113,7 @@ class StoredPlan:
         writer.writerow([*joint_columns(self.arm.robot), "set", *PLAN_COLUMNS])
         sets = ["test" if check else "train" for check in self.check.tolist()]
         rows = zip(self._in_file_units(self.q), sets, self.candidate.tolist(), strict=True)
-        for order, (joints, name, candidate) in enumerate(rows, start=1):
+        for order, (joints, name, candidate) in zip(self.numbers, rows, strict=True):
             writer.writerow([*joints, name, order, candidate])
         write_whole(path, text.getvalue())
         write_whole(yaml_of(path), yaml_text(self._document(path)))
@@ -118,7 +136,7 @@ class StoredPlan:
         if self.model is not None:
             document["model"] = os.path.relpath(self.model, folder)
         document["cell"] = self.arm.cell.model_dump(mode="json", exclude_none=True)
-        points = enumerate(map(self._in_file_units, self.way_points), start=1)
+        points = zip(self.numbers, map(self._in_file_units, self.way_points), strict=True)
         document["way_points"] = [{"before": n, "joints": joints} for n, rows in points for joints in rows]
         return document | {"robot": robot_document(self.arm.drawn)}
 
@@ -172,6 +190,7 @@ def read_plan(path: str | os.PathLike[str]) -> StoredPlan:
             )
             for number in order
         ),
+        tuple(order),
     )
 
 

@@ -12,7 +12,9 @@ from jaxtyping import Float64
 from pydantic import ConfigDict
 from torch import Tensor
 
+from pisigma.camera.corner_file import read_rows
 from pisigma.errors import PlanningError, nearest_choice
+from pisigma.measurement.csv.reading import holds_measurements, read_joints
 from pisigma.measurement.dataset import Measurements
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.camera_settings import CameraSettings
@@ -52,7 +54,8 @@ class PlanSettings:
             `pisigma.planning.knowledge.Instrument`.
         criterion: "D": what lowers the uncertainty of all unknowns most; "I": what lowers that of the tool's position
             over the task most.
-        limit_mm: RMS of the tool's position that is wanted [mm]; None for no limit.
+        limit_mm: 95 % of the tool's position errors over the task are to stay below [mm], as in `measure`; None for no
+            limit.
         candidates: poses that are drawn to choose from.
         candidates_from: file of joint values to choose from instead.
         box_mm: lowest and then highest x, y, z in the robot's base frame where the reflector is measured [mm].
@@ -154,6 +157,16 @@ class PlanSettings:
             return candidates
         return with_workspace(arm, candidates, draw_candidates(arm, REACHABLE, self.seed, workspace))
 
+    def with_measured(self, arm: ArmInCell) -> ArmInCell:
+        """The arm, for which candidates that were measured are free of self-collision.
+
+        Raises:
+            MeasurementError: the file of candidates cannot be used.
+        """
+        if self.candidates_from is None or not holds_measurements(self.candidates_from):
+            return arm
+        return arm.with_measured(read_joints(self.candidates_from, arm.robot))
+
     @property
     def workspace(self) -> Workspace | None:
         """Where the reflector is measured, or the target of a camera; None for anywhere."""
@@ -167,9 +180,7 @@ class PlanSettings:
         Raises:
             MeasurementError: the file cannot be used.
         """
-        if self.camera is not None:
-            return self.camera.files.read(path, robot)
-        return Measurements.read_csv(path, robot)
+        return read_rows(path, robot, None if self.camera is None else self.camera.files)
 
     def views(self, arm: ArmInCell) -> BoardViews | None:
         """From where the camera has to see its board; None without a camera.

@@ -1,22 +1,27 @@
 """Setup faults that show with the robot as drawn, base and tool being fitted under every hypothesis."""
 
+import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
 
+from pisigma.errors import IdentificationError
+from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.judging.frames.frame_fits import LEVER_SHARE, MeasuredPoses
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.kinematics.parameter_jacobian import identification_jacobian
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.robot.description import Robot
+from pisigma.robot.robot_class import HOBBY
 from pisigma.verification.arm import PredictingArm
 from pisigma.verification.cause import Cause
-from pisigma.verification.explanations import hypotheses, in_frames, largest_explained, simplest
+from pisigma.verification.explanations import AS_GOOD, hypotheses, in_frames, largest_explained, simplest
 from pisigma.verification.free_joint import freed_joints
 from pisigma.verification.hypothesis import Hypothesis
 from pisigma.verification.row_faults import MARGIN, explains_nothing, shifted_rows
@@ -29,6 +34,10 @@ MOST_ROWS_AS_DRAWN = 150
 """The same of the robot as drawn, where base and tool are fitted to them under every hypothesis."""
 FEWEST_ROWS_AS_DRAWN = 24
 """Base and tool, as 39 unknowns of an affine fit, leave too few of the values of fewer rows."""
+LARGEST_ZERO = 3 * HOBBY.largest.joint_offset
+"""[rad] Zeros of joints are not further off."""
+LARGEST_SLIDE = 3 * HOBBY.largest.length
+"""[m] The same of joints that slide."""
 USUAL = 1e-3
 """Usual prior standard deviation of geometric errors [m and rad]."""
 
@@ -71,7 +80,41 @@ def find_faults_as_drawn(robot: Robot, measurements: Measurements) -> tuple[Setu
     if not faults and not are_unrelated(robot, rows):
         freed = ((q, measured, cause) for q, cause in freed_joints(arm, some, measured))
         faults = simplest(_with_joints(arm, freed, most, values=1) + _labelled(robot, some, measured), most)
+    if faults:
+        faults = _better_than_zeros(faults, _error_with_zeros(robot, some, measured), usual)
     return tuple(fault_of(here, other, float("nan")) for other in faults)
+
+
+def _better_than_zeros(faults: Sequence[Hypothesis], error: float, usual: float) -> list[Hypothesis]:
+    """Keep the faults that explain the rows better than other zeros of all joints do, which a calibration finds.
+
+    Zeros of single joints are kept too where they leave no more than usual errors.
+
+    Args:
+        faults: that were found.
+        error: what is left with other zeros [m].
+        usual: errors of a healthy robot as drawn [m].
+    """
+    return [
+        fault
+        for fault in faults
+        if AS_GOOD * fault.error < error
+        or (all(cause.kind == "joint_zero" for cause in fault.causes) and fault.error <= max(usual, error))
+    ]
+
+
+def _error_with_zeros(robot: Robot, rows: Measurements, measured: MeasuredPoses) -> float:
+    """Root mean square of the errors [m] with the zeros of all joints fitted; infinite where they move too far."""
+    try:
+        fitted = GeometricCalibrator(robot, free="joint_offsets", prior=None).fit(rows).robot
+    except IdentificationError:
+        return math.inf
+    moved = (fitted.dh - robot.dh)[:, :2]
+    if np.abs(moved[:, 0]).max() > LARGEST_ZERO or np.abs(moved[:, 1]).max() > LARGEST_SLIDE:
+        return math.inf
+    arm = PredictingArm(robot.with_geometry(dh=fitted.dh))
+    here = next(in_frames(arm, rows, Hypothesis(rows.q, arm.poses(rows), measured)))
+    return replace(here, fitted=here.fitted + robot.dof).error
 
 
 def _named_otherwise(robot: Robot, measurements: Measurements, usual: float) -> tuple[SetupFault, ...]:

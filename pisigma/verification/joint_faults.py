@@ -74,6 +74,19 @@ class JointMaps:
         return JointMaps(self.matrix[index], self.offset[index])
 
 
+def signs_and_exchanges(dof: int) -> JointMaps:
+    """List a reversed sign of every joint, and an exchange of two neighbours."""
+    signs = JointMaps.scaled(1 - 2 * torch.eye(dof, dtype=torch.float64))
+    order = torch.arange(dof).repeat(dof - 1, 1)
+    pairs = torch.stack([torch.arange(dof - 1), torch.arange(1, dof)], 1)
+    order = order.scatter(1, pairs, pairs.flip(1))
+    eye = torch.eye(dof, dtype=torch.float64)
+    return JointMaps(
+        torch.cat([signs.matrix, eye[order]]),
+        torch.cat([signs.offset, torch.zeros(dof - 1, dof, dtype=torch.float64)]),
+    )
+
+
 def reversed_signs(dof: int) -> JointMaps:
     """List all ways to reverse signs."""
     choices = list(itertools.product((1.0, -1.0), repeat=dof))[1:]

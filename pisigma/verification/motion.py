@@ -7,6 +7,7 @@ from dataclasses import replace
 import torch
 
 from pisigma.errors import IdentificationError, ModelError
+from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.frames.fitted_frames import FrameKind
 from pisigma.judging.model_comparison import ModelComparison
 from pisigma.measurement.dataset import Measurements
@@ -17,6 +18,8 @@ from pisigma.recalibration.recalibration_problem import owners_in
 from pisigma.verification.cause import joined, length_text
 from pisigma.verification.explanations import PLAUSIBLE_SHARE
 from pisigma.verification.faults_as_drawn import measured_rows, spread
+from pisigma.verification.rows.mixed_rows import MOST_WRONG, many_wrong
+from pisigma.verification.rows.wear import beyond_wear
 from pisigma.verification.setup_faults import judged_values
 
 MOST_ROWS = 60
@@ -30,24 +33,49 @@ def judged_motion(
 
     Args:
         model: the model.
-        rows: with positions, in frames and of targets that the model has or that are fitted.
+        rows: in frames and of targets that the model has or that are fitted.
         fitted: what stands elsewhere for certain.
 
     Returns:
         What it says, without what is fitted; None where the model holds no posterior, where the rows do not determine
-        what is fitted, and where no motion explains the rows: errors of more than 1 % of the reach are left, or a link
-        would have changed by so much.
+        what is fitted, and where it is not to be trusted, see `session_diagnostics`.
     """
     with suppress(IdentificationError, ModelError):
         posterior = ModelPosterior.of(model)
-        some = judged_values(model, rows).select(spread(measured_rows(rows), MOST_ROWS))
-        some = posterior.renamed(replace(some, pair=None, distance=None))
+        some = judged_values(model, rows)
+        if rows.position is not None:
+            some = replace(some.select(spread(measured_rows(rows), MOST_ROWS)), pair=None, distance=None)
+        some = posterior.renamed(some)
         with torch.no_grad():
             session, _ = judge_session(model, posterior, some, owners_in(some, fitted) if fitted else None)
         moved = tuple(one for one in session.moved if one.moved.what.split()[0] not in fitted)
-        if session.explains_within(PLAUSIBLE_SHARE * model.robot.reach):
+        if not session_diagnostics(model, some, session):
             return replace(session, moved=moved)
     return None
+
+
+def session_diagnostics(
+    model: CalibratedModel, rows: Measurements, session: Session
+) -> tuple[Diagnostic, ...]:
+    """Say why what a session shows is not to be trusted, although the checks of its rows found nothing.
+
+    Args:
+        model: that it was compared with.
+        rows: of the session.
+        session: what it says.
+    """
+    if len(session.outliers) > MOST_WRONG * rows.rows:
+        wrong = [rows.place(row) in session.outliers for row in range(rows.rows)]
+        return (many_wrong(rows, torch.tensor(wrong)),)
+    limit = PLAUSIBLE_SHARE * model.robot.reach
+    if session.rms_after > limit:
+        sentence = (
+            f"{rows.source}: the errors are {session.rms * 1e3:.4g} mm, and no motion explains them that leaves less "
+            f"than {limit * 1e3:.3g} mm: another robot than that of model '{model.name}' was measured, or a column or "
+            "a unit is wrong; run `pisigma verify` on them."
+        )
+        return (Diagnostic(kind="implausible_errors", severity="implausible", sentence=sentence),)
+    return beyond_wear(model.robot, [one.moved for one in session.moved])
 
 
 def motion_sentence(motion: Session, comparison: ModelComparison) -> str:

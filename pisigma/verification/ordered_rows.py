@@ -36,6 +36,7 @@ class OrderedRows:
         residual: three values a sensor, 0 where nothing was measured.
         derivative: by all parameters.
         values: how many values were measured.
+        noise: of every column of values [m or rad], or the factor on what the rows state.
     """
 
     result: CalibrationResult
@@ -44,6 +45,7 @@ class OrderedRows:
     residual: Float64[np.ndarray, "rows values"]
     derivative: Float64[np.ndarray, "rows values parameters"]
     values: int
+    noise: Float64[np.ndarray, " values"]
 
     @staticmethod
     def of(result: CalibrationResult | HybridResult) -> "OrderedRows | None":
@@ -65,7 +67,7 @@ class OrderedRows:
         motion = problem.motion(solved.refined.point, whole, every)
         unknowns = problem.space.sensor_unknowns(solved.refined.point)
         R = solved.setup.anchors.bases[:, :3, :3][problem.frame]
-        residuals, derivatives, values = [], [], 0
+        residuals, derivatives, values, noise = [], [], 0, []
         for k, sensor in enumerate(problem.sensors):
             sigma = float(view.noise[k]) if learned is None else learned.noise[sensor.name]
             if sensor.name not in SENSORS or sigma <= ALWAYS_GOOD:
@@ -78,18 +80,26 @@ class OrderedRows:
             residuals.append(torch.where(sensor.present, residual * root, 0.0).t().cpu().numpy())
             derivatives.append((J * root).permute(2, 1, 0).cpu().numpy())
             values += int(sensor.present.sum()) * sensor.components
+            noise += [sigma] * sensor.components
         if not residuals:
             return None
         flat = (np.concatenate(residuals, 1), np.concatenate(derivatives, 1))
-        return OrderedRows(geometric, problem, rows[some].numpy(), *flat, values)
+        return OrderedRows(geometric, problem, rows[some].numpy(), *flat, values, np.array(noise))
+
+    @cached_property
+    def by_joints(self) -> Float64[np.ndarray, "rows values dof"]:
+        """Derivative by the joint values."""
+        robot = self.problem.space.robot
+        theta_or_d = 5 * np.array(robot.joint_rows) + ~np.array(robot.revolute)
+        derivative: np.ndarray = self.derivative[:, :, theta_or_d] * robot.directions
+        return derivative
 
     @cached_property
     def X(self) -> Float64[np.ndarray, "rows values unknowns"]:
         """Derivative by the parameters of the calibration, and by weights of a series for the joints' errors."""
         robot = self.problem.space.robot
-        theta_or_d = 5 * np.array(robot.joint_rows) + ~np.array(robot.revolute)
         series = FourierSeries(robot, HARMONICS).columns(self.problem.state).cpu().numpy()
-        by_weights = self.derivative[:, :, theta_or_d, None] * series[:, None]
+        by_weights = self.by_joints[..., None] * series[:, None]
         by_weights = by_weights.reshape(*self.residual.shape, -1)
         return np.concatenate([self.derivative[:, :, self.problem.active.cpu().numpy()], by_weights], 2)
 
@@ -108,6 +118,13 @@ class OrderedRows:
         """Of the parameters, every row counting in full."""
         flat = self.X.reshape(-1, self.X.shape[2])
         return inverse_of(flat.T @ flat + np.diag(self.precision))
+
+    @cached_property
+    def left(self) -> Float64[np.ndarray, "rows values"]:
+        """What the series of the joints' errors leaves of the residuals."""
+        X, r = self.X.reshape(-1, self.X.shape[2]), self.residual.ravel()
+        left: np.ndarray = r - X @ (self.covariance @ (X.T @ r))
+        return left.reshape(self.residual.shape)
 
     @cached_property
     def used(self) -> float:

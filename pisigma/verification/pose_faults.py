@@ -11,19 +11,12 @@ from jaxtyping import Float64
 from torch import Tensor
 
 from pisigma.judging.frames.frame_fits import MeasuredPoses
-from pisigma.measurement.csv.columns import RPY
+from pisigma.measurement.csv.columns import MISNAMED_UNITS, RPY
 from pisigma.verification.cause import Cause
 
 if TYPE_CHECKING:
     from scipy.spatial.transform import Rotation
 
-UNITS = (
-    (1e-3, "millimetres", "metres"),
-    (1e3, "metres", "millimetres"),
-    (10.0, "centimetres", "millimetres"),
-    (25.4, "inches", "millimetres"),
-)
-"""Factors on positions, what they are, and what they are named."""
 EULER_ORDERS = ("ZYX", "XYZ", "XZY", "YXZ", "YZX", "ZXY", "ZYZ", "ZXZ", "XYX", "XZX", "YXY", "YZY")
 READ_ORDER = EULER_ORDERS[0]
 """Order of the turns roll, pitch and yaw in measurement files."""
@@ -49,7 +42,7 @@ def units_and_frames(
         yield replace(measured, position=measured.position * factor), cause
         advice = "take the images as the sensor of the camera has them, not flipped"
     else:
-        for factor, are, named in UNITS:
+        for factor, are, named in MISNAMED_UNITS:
             clause = f"x, y and z are {are} that are named {named}"
             yield (
                 replace(measured, position=measured.position * factor),

@@ -22,6 +22,8 @@ MOST_USED = 0.8
 """Share of the values that parameters and motions may use up, or the fit follows the noise, whose size it finds."""
 DEGREES = (1, 3, 6)
 """Of the polynomials in the share of the rows that were measured which slow motions follow."""
+AS_LIKELY = 0.5
+"""Share of the largest log Bayes factor from which on a motion where a frame begins explains the residuals as well."""
 CAP = 3.0
 """Residuals longer than so many times their upper quartile count as so long while the row of a motion is sought."""
 ROUNDS = 6
@@ -46,6 +48,7 @@ class Motion:
         turn: angle by which frame or tool are turned [rad]; of a slow motion likewise.
         log_bayes_factor: logarithm of the odds of the motion against none, if both were as likely before.
         factor: how many times as large as without the motion the errors of the rows are.
+        begins_frame: whether a target or the tool has moved just where rows of another frame begin.
     """
 
     moved: _Moved
@@ -56,6 +59,7 @@ class Motion:
     turn: float
     log_bayes_factor: float
     factor: float
+    begins_frame: bool = False
 
 
 def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
@@ -83,8 +87,14 @@ def find_motion(result: CalibrationResult | HybridResult) -> Motion | None:
     search = _Search(rows)
     fits = [search.fit(candidate) for candidate in search.candidates()]
     # Which one it is: as if values were independent, as what a wrong candidate leaves is correlated.
-    best = max(fits, key=lambda fit: search.log_bayes_factor(fit, 1.0), default=None)
-    return None if best is None else search.motion(best)
+    odds = [search.log_bayes_factor(fit, 1.0) for fit in fits]
+    if not fits:
+        return None
+    best = int(np.argmax(odds))
+    motion, chosen = search.motion(fits[best]), fits[best].candidate
+    starts = search.frame_starts(chosen)
+    alike = (search.log_bayes_factor(search.reweighted(one), 1.0) > AS_LIKELY * odds[best] for one in starts)
+    return replace(motion, begins_frame=any(alike))
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,6 +190,13 @@ class _Search:
                 for degree in DEGREES:
                     yield replace(candidate, course=legvander(time, degree)[:, 1:])
 
+    def frame_starts(self, candidate: _Candidate) -> Iterator[_Candidate]:
+        """The same motion at once of a target or the tool, where rows of another frame begin."""
+        frame = self.rows.problem.frame.cpu().numpy()[candidate.index]
+        changes = np.flatnonzero(np.diff(frame)) + 1
+        if candidate.moved != "frame" and len(changes) < len(self.rows.problem.space.frames):
+            yield from (candidate.from_row(int(first)) for first in changes)
+
     def _rigid(self) -> Iterator[_Candidate]:
         """Frames, targets where there are several, and the tool with all of them."""
         space = self.rows.problem.space
@@ -225,7 +242,7 @@ class _Search:
 
     def fit(self, candidate: _Candidate) -> _Fit:
         """Fit a candidate together with the parameters; where it moved at once, the row is sought once more."""
-        fit = self._reweighted(candidate)
+        fit = self.reweighted(candidate)
         if candidate.first is None:
             return fit
         still = fit.after.copy()
@@ -235,16 +252,16 @@ class _Search:
         moved[candidate.index] -= candidate.full @ fit.motion[:size]
         gain = (fit.costs(still) - fit.costs(moved))[candidate.index][::-1].cumsum()[::-1]
         first = FEWEST_ROWS + int(gain[FEWEST_ROWS : len(gain) - FEWEST_ROWS].argmax())
-        return fit if first == candidate.first else self._reweighted(candidate.from_row(first))
+        return fit if first == candidate.first else self.reweighted(candidate.from_row(first))
 
     @cached_property
     def still(self) -> _Fit:
         """The same without a motion."""
         nothing = np.zeros((len(self.rows.residual), self.rows.residual.shape[1], 0))
         index = np.arange(len(self.rows.residual))
-        return self._reweighted(_Candidate("frame", 0, index, nothing, np.zeros((len(index), 1))))
+        return self.reweighted(_Candidate("frame", 0, index, nothing, np.zeros((len(index), 1))))
 
-    def _reweighted(self, candidate: _Candidate) -> _Fit:
+    def reweighted(self, candidate: _Candidate) -> _Fit:
         """Iteratively reweighted least squares, from rows of full weight on."""
         size, motions = self.rows.X.shape[2], candidate.columns.shape[2]
         A = np.concatenate([self.rows.X, np.zeros((*self.rows.X.shape[:2], motions))], 2)

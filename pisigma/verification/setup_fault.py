@@ -24,6 +24,7 @@ class SetupFault:
         before_rotation: as `before`, of the rotation errors [rad]; NaN where none was measured.
         after_rotation: what it falls to [rad].
         moved: how far the zeros of joints have moved at most [rad or m]; infinite where it is about something else.
+        joints: those that it is about, from 0.
     """
 
     kinds: tuple[str, ...]
@@ -35,6 +36,7 @@ class SetupFault:
     before_rotation: float
     after_rotation: float
     moved: float = math.inf
+    joints: tuple[int, ...] = ()
 
     @property
     def explains_orientation(self) -> bool:
@@ -90,4 +92,5 @@ def fault_of(here: Hypothesis, other: Hypothesis, after_nominal: float) -> Setup
         before_rotation=before_rotation,
         after_rotation=after_rotation,
         moved=max(cause.moved for cause in other.causes),
+        joints=tuple(joint for cause in other.causes for joint in cause.joints),
     )

@@ -2,7 +2,6 @@
 
 import math
 import os
-import re
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -17,22 +16,28 @@ from pisigma.hybrid.result import HybridResult
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import HampelLoss, SquaredLoss
 from pisigma.identification.problem.parameters import Prior
+from pisigma.joint_correction.registry import features_from_outside
 from pisigma.judging.calibration_summary import CalibrationSummary, summarise
 from pisigma.judging.calibration_validation import CalibrationValidation, joined_repeats, judge
 from pisigma.judging.fit_beside_folds import fit_beside_folds
 from pisigma.judging.held_out_rows import HeldOutRows
+from pisigma.judging.predicted_spread import predicted_at_other_poses
 from pisigma.judging.progress import Progress
 from pisigma.judging.trained_calibrations import Calibrator, Result, geometric_of, trained
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole
+from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
 from pisigma.measurement.new_frames import with_new_frames
 from pisigma.measurement.splits import SplitBy, TrainTest, draw_rows, holdout, repeats, with_fewer
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.geometric_model import model_of_calibration, model_of_hybrid
 from pisigma.reporting.cards import CardTexts, write_calibration_card
 from pisigma.robot.description import Robot
+from pisigma.robot.robot_class import ClassName
+from pisigma.sensors.socket import matching_sockets
 from pisigma.verification.checks.check import CheckedCalibration
 from pisigma.verification.checks.registry import diagnostics_of
+from pisigma.verification.checks.scale import scale_figures
 from pisigma.verification.checks.setup_fault import explained, setup_diagnostics
 from pisigma.workflow.result import AbstractModelResult
 
@@ -66,7 +71,11 @@ class CalibrationSettings:
         free: "identifiable", "joint_offsets", or names of parameters.
         prior_length: prior standard deviation of length errors [m]; 0 for no prior.
         prior_angle: prior standard deviation of angle errors [rad]; 0 for no prior.
+        robot_class: how large errors of the geometry can be: "industrial", "cobot" or "hobby"; None: as the maker and
+            the data say.
         robust: whether rows that are far off count less.
+        features: of the joint correction, by name, that are tried; None for the usual ones and those of
+            plug-ins.
         gravity: direction in which things fall, in the frame of the robot's base; None for the axis of the base that
             the data show.
         new_frame_at: lines of the file of measurements at which new frames begin, because the instrument was moved.
@@ -91,7 +100,9 @@ class CalibrationSettings:
     free: Literal["identifiable", "joint_offsets"] | tuple[str, ...] = "identifiable"
     prior_length: float = 1e-3
     prior_angle: float = 1e-3
+    robot_class: ClassName | None = None
     robust: bool = True
+    features: tuple[str, ...] | None = None
     gravity: tuple[float, float, float] | None = None
     new_frame_at: tuple[int, ...] = ()
     socket_distances: Mapping[tuple[str, str], float] = field(default_factory=dict)
@@ -121,10 +132,11 @@ class CalibrationSettings:
             )
         if self.jobs is not None and self.jobs < 1:
             raise MeasurementError(f"jobs: 1 or more were wanted, got {self.jobs}.")
-        if self.gravity is not None and self.model != "hybrid":
-            raise IdentificationError(
-                f"gravity {self.gravity}: a geometric calibration has no use for it; leave it out, or take the hybrid."
-            )
+        for name in ("features", "gravity"):
+            if (value := getattr(self, name)) is not None and self.model != "hybrid":
+                raise IdentificationError(
+                    f"{name} {value}: a geometric calibration has no use for it; leave it out, or take the hybrid."
+                )
         prior = (self.prior_length, self.prior_angle)
         if not all(map(math.isfinite, prior)) or min(prior) < 0 or (prior[0] == 0) != (prior[1] == 0):
             raise IdentificationError(
@@ -163,9 +175,15 @@ class CalibrationSettings:
             free=self.free,
             prior=Prior(theta=angle, d=length, a=length, alpha=angle, beta=angle) if length else None,
             loss=HampelLoss() if self.robust else SquaredLoss(),
-            socket_distances=_matching_sockets(self.socket_distances, sockets),
+            robot_class=self.robot_class,
+            socket_distances=matching_sockets(self.socket_distances, sockets),
         )
-        return HybridCalibrator(geometric, gravity=self.gravity) if self.model == "hybrid" else geometric
+        if self.model != "hybrid":
+            return geometric
+        features = (*features_from_outside(), *HybridCalibrator.features)
+        return HybridCalibrator(
+            geometric, features=features if self.features is None else self.features, gravity=self.gravity
+        )
 
     def splits(self, measurements: Measurements) -> Sequence[Sequence[TrainTest]]:
         """Give training and test rows of every fold, per repeat; nothing without a validation.
@@ -261,6 +279,7 @@ def calibrate(
     nominal = robot if isinstance(robot, Robot) else Robot.load(os.fspath(robot))
     measurements = read_rows(data, nominal, settings.cameras)
     measurements = with_new_frames(measurements, settings.new_frame_at)
+    beyond, nominal = row_warnings(nominal, measurements), with_limits_of_rows(nominal, measurements)
     training, test_rows = measurements.split_sets()
     splits = settings.splits(training)
     rows = training
@@ -277,9 +296,8 @@ def calibrate(
     validation = joined_repeats(training, splits, judged) if splits else None
     test = None if test_rows is None else judge(calibrator, result, rows, test_rows)
     summary = summarise(result)
-    if faulty:
-        summary = summary.having(warnings=(*summary.warnings, ONLY_GEOMETRY))
     summary = summary.having(
+        warnings=(*summary.warnings, *((ONLY_GEOMETRY,) if faulty else ()), *beyond),
         command=_call(nominal, measurements, settings),
         rows=rows.rows,
         cross_validation=None if validation is None else validation.figures(),
@@ -326,41 +344,24 @@ def compose(
     diagnostics, nominal = diagnostics_of(checked), checked.robot
     warnings = tuple(one.sentence for one in diagnostics if one.severity == "warning")
     summary = summary.having(
-        calibrated=checked.figures, diagnostics=diagnostics, warnings=summary.warnings + warnings
+        calibrated=checked.figures,
+        scale=scale_figures(checked),
+        diagnostics=diagnostics,
+        warnings=summary.warnings + warnings,
     )
     name = recipe[0] or nominal.name
     if isinstance(result, HybridResult):
         model = model_of_hybrid(name, nominal, result, rows, recipe)
     else:
         model = model_of_calibration(name, nominal, result, rows, recipe)
+    if validation is None and summary.test is None and summary.held_out is None:
+        predicted = predicted_at_other_poses(result, rows)
+        summary = summary.having(predicted_rms_mm=None if predicted is None else predicted * 1e3)
     kept = None if validation is None or held_out is None else HeldOutRows.of(validation, held_out)
     if kept is not None:
         summary = summary.having(held_out_rows=kept.hashes(kept.to_csv(nominal)))
     model = replace(model, metrics=summary.to_json())
     return Calibration(model, result, rows, validation, test, kept, summary, texts)
-
-
-def _matching_sockets(
-    distances: Mapping[tuple[str, str], float], sockets: Iterable[str]
-) -> dict[tuple[str, str], float]:
-    """Distances by names of sockets in the data; see `CalibrationSettings.socket_distances`."""
-    names = dict.fromkeys(name for name in sockets if name)
-    matching: dict[tuple[str, str], float] = {}
-    for (first, second), distance in distances.items():
-        pattern = re.compile(re.escape(first).replace(r"\*", "(.*)", 1))
-        pairs = []
-        for name in names:
-            match = pattern.fullmatch(name)
-            other = second.replace("*", match[1], 1) if match and "*" in first else second
-            if match and other in names:
-                pairs.append((name, other))
-        if not pairs:
-            raise IdentificationError(
-                f"no two sockets of the data are called '{first}' and '{second}'; there are "
-                f"{', '.join(names) or 'none'}."
-            )
-        matching |= dict.fromkeys(pairs, distance)
-    return matching
 
 
 def _call(robot: Robot, measurements: Measurements, settings: CalibrationSettings) -> str:

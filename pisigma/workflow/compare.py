@@ -20,13 +20,17 @@ from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
 from pisigma.judging.bootstrap import Bootstrap
+from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.frames.fitted_frames import fitted_kinds
 from pisigma.judging.model_comparison import Difference, ModelComparison, compare_models
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.planning.task import read_task
+from pisigma.verification.gate import check_rows
+from pisigma.verification.rows.wrong_rows import without_wrong_rows
 from pisigma.workflow.evaluate import (
     REFERENCES,
     labelled,
@@ -81,6 +85,7 @@ class ComparedModels:
         rows: errors of both models on the same rows; None where none were given.
         program: the same along a program that was taught with the first: what it misses under the second; None where
             none was given.
+        diagnostics: why nothing is to be concluded from the rows; see `pisigma.verification.gate`.
         warnings: what to heed, a sentence each.
         seconds: that it took [s].
     """
@@ -91,15 +96,16 @@ class ComparedModels:
     workspace: Displacement
     rows: ModelComparison | None
     program: Displacement | None
+    diagnostics: tuple[Diagnostic, ...]
     warnings: tuple[str, ...]
     seconds: float
 
     @property
     def better(self) -> str | None:
-        """Name of the model that predicts the rows better, by more than chance; None where neither does, or no rows."""
+        """Name of the model that predicts trusted rows better, by more than chance; None where neither does."""
         difference = self._difference
         interval = None if difference is None else difference.intervals["rms"]
-        if interval is None or interval[0] <= 0.0 <= interval[1]:
+        if interval is None or interval[0] <= 0.0 <= interval[1] or self.diagnostics:
             return None
         first, second = self.models
         return second if interval[1] < 0.0 else first
@@ -133,6 +139,7 @@ class ComparedModels:
             "remainder": None if differences.remainder is None else vars(differences.remainder),
             "workspace": self.workspace.to_json(first.robot),
             "rows": None if self.rows is None else {**self.rows.to_json(), "better": self.better},
+            "diagnostics": [one.model_dump() for one in self.diagnostics],
             "program": None if self.program is None else self.program.to_json(first.robot),
             "says": list(self.sentences),
             "warnings": list(self.warnings),
@@ -181,6 +188,9 @@ class ComparedModels:
         errors = " and ".join(
             f"{one.position.statistics['rms']:.3f} mm under {one.name}" for one in self.rows.models
         )
+        if self.diagnostics:
+            doubts = " ".join(one.sentence for one in self.diagnostics)
+            return (f"The RMS error of {self.rows.rows} rows is {errors}, which shows nothing: {doubts}",)
         which = (
             f"{self.better} predicts them better" if self.better else "neither predicts them clearly better"
         )
@@ -225,13 +235,21 @@ def compare(
     one, other = models.values()
     pair = ModelPair.of(one, other, settings.frames)
     compared, warnings = None, _warnings(pair, list(sources.values()))
+    diagnostics: tuple[Diagnostic, ...] = ()
     if rows is not None:
         data = read_rows(rows, pair.first.robot, settings.cameras)
+        warnings += row_warnings(pair.first.robot, data)
         for label, model in loaded.items():
             warnings += training_row_warnings(replace(model, name=label), test_rows(data), data)
         free = settings.frames == "fitted"
         fitted = fitted_kinds(free, free)
-        compared = compare_models(models, test_rows(data), settings.bootstrap, fitted)
+        right = without_wrong_rows(loaded.values(), test_rows(data), fitted)
+        warnings += right.warnings
+        compared = compare_models(models, right.rows, settings.bootstrap, fitted)
+        found = [
+            check_rows(right.rows, model, fitted, {"joint_zero"}).implausible for model in loaded.values()
+        ]
+        diagnostics = found[0] if all(found) else ()  # what one model predicts is of this robot
     return ComparedModels(
         models=models,
         settings=settings,
@@ -241,6 +259,7 @@ def compare(
         program=None
         if program is None
         else Displacement.at(pair, read_task(program, pair.first), Path(program).name),
+        diagnostics=diagnostics,
         warnings=warnings,
         seconds=time.perf_counter() - begin,
     )

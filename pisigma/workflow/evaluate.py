@@ -14,18 +14,23 @@ from pisigma.errors import MeasurementError, ModelError
 from pisigma.judging.bootstrap import Bootstrap
 from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.frames.fitted_frames import FrameKind, fitted_kinds, fitted_remark
+from pisigma.judging.frames.row_errors import places_remark
 from pisigma.judging.model_comparison import ModelComparison, ModelFigures, compare_models
 from pisigma.judging.predicted_spread import image_remark
 from pisigma.judging.reference_models import geometric_model, nominal_model
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.reporting.tables import figure_text
-from pisigma.verification.setup_fault import either
-from pisigma.verification.setup_faults import find_setup_faults, is_implausible, unexplained
+from pisigma.sensors.socket import matching_sockets
+from pisigma.verification.gate import check_rows
+from pisigma.verification.rows.other_sensors import missed_distances
+from pisigma.verification.rows.wrong_rows import without_wrong_rows
+from pisigma.verification.setup_faults import is_implausible, unexplained
 
 REFERENCES = ("nominal", "geometric")
 """Names of what a model is compared with: the robot as drawn, and the geometry under a hybrid. Neither has to meet
@@ -104,6 +109,7 @@ class EvaluationSettings:
         fit_tool: fit the targets of the rows to them, as after another reflector was mounted.
         bootstrap: how confidence intervals are computed.
         cameras: what the pixels mean where files of measurements hold corners of boards in images.
+        socket_distances: stated distances of sockets [m], see `pisigma.workflow.calibrate.CalibrationSettings`.
     """
 
     limits: Limits = field(default_factory=Limits)
@@ -111,6 +117,7 @@ class EvaluationSettings:
     fit_tool: bool = False
     bootstrap: Bootstrap = field(default_factory=Bootstrap)
     cameras: CameraFiles | None = None
+    socket_distances: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     @property
     def fitted(self) -> tuple[FrameKind, ...]:
@@ -231,8 +238,11 @@ def evaluate(
     everything = read_rows(data, next(iter(loaded.values())).robot, settings.cameras)
     rows = test_rows(everything)
     compared = with_references(list(sources), loaded, rows.rotation is not None)
-    comparison = compare_models(compared, rows, settings.bootstrap, settings.fitted)
     hashes = everything.content_hash(), rows.content_hash()
+    distances = matching_sockets(settings.socket_distances, rows.socket or ())
+    right = without_wrong_rows(loaded.values(), rows, settings.fitted)
+    rows = right.rows
+    comparison = compare_models(compared, rows, settings.bootstrap, settings.fitted, distances)
     evaluated = {
         label: EvaluatedModel(_text(sources[label]), model.kind, model.provenance.data_sha256 in hashes)
         for label, model in loaded.items()
@@ -248,10 +258,15 @@ def evaluate(
         diagnostics=tuple(
             diagnostic
             for figures in judged
-            for diagnostic in _diagnostics(loaded[figures.name], figures, rows, settings.fitted)
+            for diagnostic in (
+                *_diagnostics(loaded[figures.name], figures, rows, settings.fitted),
+                *missed_distances(comparison, figures),
+            )
         ),
         warnings=(
+            *right.warnings,
             *fitted_remark(rows, settings.fitted),
+            *places_remark(rows),
             *image_remark(rows),
             *_warnings(comparison),
             *(
@@ -260,6 +275,7 @@ def evaluate(
                 for one in training_row_warnings(replace(model, name=label), rows, everything)
             ),
             *(one for model in loaded.values() for one in condition_warnings(model, rows)),
+            *row_warnings(next(iter(loaded.values())).robot, rows),
         ),
         seconds=time.perf_counter() - begin,
     )
@@ -338,17 +354,20 @@ def _diagnostics(
     """Say why errors are too large to be those of a calibrated robot, or those of a base or a tool that has moved."""
     implausible = is_implausible(figures, model)
     nominal = nominal_model(model, rows.rotation is not None) if implausible else None
-    faults = find_setup_faults(model, nominal, rows, fitted, frames_only=not implausible)
-    if faults or implausible:
-        sentence = either(faults).sentence if faults else unexplained(model)
-        kind = "setup_fault" if faults else "implausible_errors"
-        yield Diagnostic(kind=kind, severity="implausible", sentence=f"{figures.name}: {sentence}")
+    found = check_rows(rows, model, fitted, nominal=nominal).implausible
+    if implausible and not found:
+        found = (Diagnostic(kind="implausible_errors", severity="implausible", sentence=unexplained(model)),)
+    for one in found:
+        yield one.model_copy(update={"sentence": f"{figures.name}: {one.sentence}"})
 
 
 def _warnings(comparison: ModelComparison) -> list[str]:
     warnings = []
     if comparison.rows_without_position:
-        warnings.append(f"{comparison.rows_without_position} rows hold no position and are not judged.")
+        warnings.append(
+            f"{comparison.rows_without_position} rows hold no position, or are alone in their socket, and are not "
+            "judged."
+        )
     for model in comparison.models:
         if model.rows_not_predicted:
             warnings.append(

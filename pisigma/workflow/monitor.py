@@ -2,7 +2,6 @@
 
 import datetime
 import os
-import re
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -15,25 +14,29 @@ from pisigma.camera.corner_file import CameraFiles, read_rows
 from pisigma.errors import IdentificationError, MeasurementError, ModelError
 from pisigma.files.model_files import model_hash
 from pisigma.files.output_file import check_page, write_whole
+from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.progress import Progress
+from pisigma.measurement.copies import RowValues
 from pisigma.measurement.dataset import Measurements
-from pisigma.measurement.rules import is_date
+from pisigma.measurement.dates import WANTED, date_in_name, is_date
+from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
 from pisigma.monitoring.charts import FALSE_ALARMS_PER_YEAR, SESSIONS_PER_YEAR, Chart
-from pisigma.monitoring.history import Record, history_path, in_order, remember
+from pisigma.monitoring.history import Record, history_path, in_order, recall, remember
+from pisigma.monitoring.rows_again import new_rows, rows_hash
 from pisigma.monitoring.session import judge_session
-from pisigma.monitoring.trends import Forecast, Trend, charts_of, forecast_of, trends_of
+from pisigma.monitoring.trends import Forecast, Jump, Trend, charts_of, forecast_of, jumps_of, trends_of
 from pisigma.recalibration.model_posterior import FLEET_PRIOR, ModelPosterior
 from pisigma.recalibration.recalibration_problem import owners_in
-from pisigma.verification.explanations import PLAUSIBLE_SHARE
+from pisigma.verification.gate import check_rows
+from pisigma.verification.motion import session_diagnostics
 from pisigma.workflow.recalibrate import RecalibrationSettings
 
 FEWEST_ROWS = 5
 """Rows of a session below which it says little."""
-_DATE = re.compile(r"(?<!\d)(\d{4})[-_.]?(\d{2})[-_.]?(\d{2})(?!\d)")
 
 
 @dataclass(frozen=True)
@@ -64,11 +67,39 @@ class MonitorSettings:
         RecalibrationSettings(self.moved)
         for date in self.dates:
             if not is_date(date):
-                raise MeasurementError(f"dates: a day such as 2026-11-22 was wanted, got '{date}'.")
+                raise MeasurementError(f"dates: expected {WANTED}, got '{date}'; correct it.")
         if self.limit_mm is not None and not self.limit_mm > 0:
             raise IdentificationError(
                 f"limit_mm: a length above 0 was wanted, got {self.limit_mm:g}; give the RMS error to stay below."
             )
+
+
+@dataclass(frozen=True)
+class UntrustedSession:
+    """A session of which nothing is concluded, so that it is in no chart and no history.
+
+    Attributes:
+        file: that the rows came from.
+        date: of the measurement, as ISO 8601 writes it.
+        diagnostics: why.
+    """
+
+    file: str
+    date: str
+    diagnostics: tuple[Diagnostic, ...]
+
+    @property
+    def sentence(self) -> str:
+        """Which session it is, and why it is left out."""
+        return f"{self.file} of {self.date} is left out: {' '.join(one.sentence for one in self.diagnostics)}"
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as plain values."""
+        return {
+            "file": self.file,
+            "date": self.date,
+            "diagnostics": [one.model_dump() for one in self.diagnostics],
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,9 +112,11 @@ class Monitoring:
         records: all sessions of the model, those of its history among them, by their dates.
         charts: of the zeros of all joints and of the error, over all sessions.
         trends: of the zeros of all joints.
+        jumps: of these between two sessions.
         forecast: of the error; None where no limit was stated.
         warnings: what to heed, a sentence each.
         cameras: what the pixels of its files of corners mean.
+        untrusted: sessions of this call of which nothing is concluded.
         seconds: time it took [s].
     """
 
@@ -92,17 +125,35 @@ class Monitoring:
     records: tuple[Record, ...]
     charts: tuple[Chart, ...]
     trends: tuple[Trend, ...]
+    jumps: tuple[Jump, ...]
     forecast: Forecast | None
     warnings: tuple[str, ...]
     cameras: CameraFiles | None = None
+    untrusted: tuple[UntrustedSession, ...] = ()
     seconds: float = field(default=0.0)
 
     @property
     def action(self) -> bool:
-        """Whether something is to be done: recalibrating pays, a chart is outside its limits, or an error above its."""
+        """Whether something is to be done: rows are implausible, recalibrating pays, or a limit is passed."""
         alarmed = any(chart.alarm is not None for chart in self.charts)
         passed = self.forecast is not None and self.forecast.passed
-        return alarmed or passed or any(one.session.recalibrate for one in self.sessions)
+        return (
+            bool(self.untrusted) or alarmed or passed or any(one.session.recalibrate for one in self.sessions)
+        )
+
+    @property
+    def advised(self) -> Record | None:
+        """The session that a recalibration pays with: the last one, as frames and arm stand today.
+
+        None where none pays, or where a later one that shows as many joints is as the model says.
+        """
+        paying = [one for one in self.sessions if one.session.recalibrate]
+        if not paying:
+            return None
+        known = sum(paying[-1].session.observable)
+        later = [one for one in self.records if one.date > paying[-1].date]
+        outdated = any(not one.session.recalibrate and sum(one.session.observable) >= known for one in later)
+        return None if outdated else paying[-1]
 
     @property
     def sentences(self) -> tuple[str, ...]:
@@ -113,18 +164,18 @@ class Monitoring:
             for chart in self.charts
             if chart.alarm is not None
         )
-        trends = (f"{one.sentence}." for one in self.trends if one.clear)
+        changes: tuple[Jump | Trend, ...] = (*self.jumps, *(one for one in self.trends if one.clear))
+        trends = (f"{one.sentence}." for one in changes)
         forecast = () if self.forecast is None else (self.forecast.sentence,)
         advice: tuple[str, ...] = ()
-        if any(one.session.recalibrate for one in self.sessions):
-            best = max(self.sessions, key=lambda one: one.session.gain)
+        if (best := self.advised) is not None:
             command = RecalibrationSettings(cameras=self.cameras).command(self.model.name, best.file)
             advice = (
                 f"Recalibrating pays: errors like those of {best.file} are expected to fall from "
                 f"{best.session.rms * 1e3:.3f} to {best.session.rms_after * 1e3:.3f} mm; run "
                 f"`{command}`.",
             )
-        lines = (*alarms, *trends, *forecast, *advice)
+        lines = (*(one.sentence for one in self.untrusted), *alarms, *trends, *forecast, *advice)
         return tuple(f"{line[:1].upper()}{line[1:]}" for line in lines)
 
     def to_json(self) -> dict[str, Any]:
@@ -134,6 +185,7 @@ class Monitoring:
             "model": self.model.name,
             "action": self.action,
             "sessions": [_session_json(one) for one in self.sessions],
+            "untrusted": [one.to_json() for one in self.untrusted],
             "history": [_session_json(one) for one in self.records],
             "charts": [_chart_json(one, self.records) for one in self.charts],
             "false_alarms_per_year": FALSE_ALARMS_PER_YEAR,
@@ -146,6 +198,17 @@ class Monitoring:
                     "clear": one.clear,
                 }
                 for one in self.trends
+            ],
+            "jumps": [
+                {
+                    "what": one.what,
+                    f"size_{one.unit}": one.size,
+                    f"deviation_{one.unit}": one.deviation,
+                    "before": one.before,
+                    "after": one.after,
+                    "alone": one.alone,
+                }
+                for one in self.jumps
             ],
             "forecast": None if self.forecast is None else vars(self.forecast),
             "says": list(self.sentences),
@@ -182,8 +245,7 @@ def monitor(
     Raises:
         ModelError: the folder holds no model, or the model holds no posterior, or is the prior of a fleet.
         MeasurementError: the rows cannot be read, or there are more or fewer dates than sessions.
-        IdentificationError: the rows do not determine where something stands, or no motion explains errors of more
-            than 1 % of the reach.
+        IdentificationError: the rows do not determine where something stands.
         PoseError: the joint values do not fit the robot.
         OutputError: the history cannot be used.
     """
@@ -198,10 +260,24 @@ def monitor(
     posterior = ModelPosterior.of(loaded)
     rows = [read_rows(one, posterior.space.robot, settings.cameras) for one in sessions]
     warnings: list[str] = []
-    judged = []
+    judged: list[Record] = []
+    untrusted: list[UntrustedSession] = []
+    folder = source if settings.history and not isinstance(source, CalibratedModel) else None
+    earlier = () if folder is None else recall(history_path(folder), model_hash(folder))
     for date, day in _by_day(rows, settings.dates):
         progress(f"{Path(day.source).name}, {date}")
-        judged.append(_record(loaded, posterior, day, date, settings.moved))
+        warnings += row_warnings(loaded.robot, day)
+        right = RecalibrationSettings(settings.moved).right_rows(loaded, posterior.renamed(day))
+        warnings += right.warnings
+        day, again = new_rows(loaded, right.rows, date, earlier, judged)
+        warnings += again
+        if not day.rows:
+            continue
+        record = _record(loaded, posterior, day, date, settings)
+        if isinstance(record, UntrustedSession):
+            untrusted.append(record)
+            continue
+        judged.append(record)
         warnings += [f"{judged[-1].file}: {one}" for one in condition_warnings(loaded, day)]
         warnings += [
             f"{place} was left out: it does not go with the other rows of its session; measure it again."
@@ -211,18 +287,29 @@ def monitor(
             warnings.append(
                 f"{judged[-1].file}: {day.rows} rows say little of what moved; measure {FEWEST_ROWS} poses or more."
             )
+    if not (judged or untrusted):
+        raise MeasurementError(f"expected new rows, got none: {' '.join(warnings)}")
     records = new = in_order(judged)
-    if settings.history and not isinstance(source, CalibratedModel):
-        records = remember(history_path(source), model_hash(source), new)
+    if folder is not None:
+        records = remember(history_path(folder), model_hash(folder), new)
+        warnings += [
+            f"{one.file}: its session in the history was left out: expected {WANTED}, got {one.date}; monitor its rows "
+            "again with --dates, and its date is corrected."
+            for one in records
+            if not is_date(one.date)
+        ]
+        records = tuple(one for one in records if is_date(one.date))
     return Monitoring(
         model=loaded,
         sessions=new,
         records=records,
-        charts=charts_of(loaded.robot.revolute, records),
-        trends=trends_of(loaded.robot.revolute, records),
-        forecast=None if settings.limit_mm is None else forecast_of(records, settings.limit_mm),
+        charts=charts_of(loaded.robot.revolute, records) if records else (),
+        trends=trends_of(loaded.robot.revolute, records) if records else (),
+        jumps=jumps_of(loaded.robot.revolute, records) if records else (),
+        forecast=forecast_of(records, settings.limit_mm) if settings.limit_mm and records else None,
         warnings=tuple(dict.fromkeys(warnings)),
         cameras=settings.cameras,
+        untrusted=tuple(untrusted),
         seconds=time.perf_counter() - started,
     )
 
@@ -246,12 +333,14 @@ def _by_day(sessions: Sequence[Measurements], dates: Sequence[str]) -> list[tupl
 
 def _date_of_file(source: str) -> str:
     """The day in the name of a file, or that of its last change; today for rows that come from no file."""
-    match = _DATE.search(Path(source).name)
-    if match and is_date("-".join(match.groups())):
-        return "-".join(match.groups())
     path = Path(source)
+    if date := date_in_name(path.name):
+        return date
     moment = path.stat().st_mtime if path.is_file() else time.time()
-    return datetime.date.fromtimestamp(moment).isoformat()
+    date = datetime.date.fromtimestamp(moment).isoformat()
+    if not is_date(date):
+        raise MeasurementError(f"{source}: expected {WANTED} as the file's change, got {date}; give --dates.")
+    return date
 
 
 def _record(
@@ -259,21 +348,20 @@ def _record(
     posterior: ModelPosterior,
     rows: Measurements,
     date: str,
-    moved: tuple[str, ...] | None,
-) -> Record:
+    settings: MonitorSettings,
+) -> Record | UntrustedSession:
     """Judge a session."""
-    rows = posterior.renamed(rows)
-    stated = None if moved is None else owners_in(rows, moved)
-    session, zeros = judge_session(model, posterior, rows, stated)
-    limit = PLAUSIBLE_SHARE * model.robot.reach
-    if not session.explains_within(limit):
-        raise IdentificationError(
-            f"{rows.source}: the errors are {session.rms * 1e3:.4g} mm, and no motion explains them that leaves less "
-            f"than {limit * 1e3:.3g} mm and changes no link of model '{model.name}' by more: another robot was "
-            "measured, or a column or a unit is wrong. `pisigma verify` names what; correct the file."
-        )
+    stated = RecalibrationSettings(settings.moved)
+    file = Path(rows.source).name
+    if implausible := check_rows(rows, model, stated.fitted, stated.may_move).implausible:
+        return UntrustedSession(file, date, implausible)
+    elsewhere = None if settings.moved is None else owners_in(rows, settings.moved)
+    session, zeros = judge_session(model, posterior, rows, elsewhere)
+    if implausible := session_diagnostics(model, rows, session):
+        return UntrustedSession(file, date, implausible)
     temperature = None if rows.temperature is None else float(rows.temperature.nanmean())
-    return Record(Path(rows.source).name, date, rows.content_hash(), temperature, session, zeros)
+    values = RowValues.of(rows.as_fields(), model.robot)
+    return Record(file, date, rows_hash(rows), temperature, session, zeros, values)
 
 
 def _session_json(record: Record) -> dict[str, Any]:

@@ -18,10 +18,10 @@ from pisigma.export.programs.planned import planned_program
 from pisigma.files.conflicts import Input
 from pisigma.files.output_file import check_output, write_whole
 from pisigma.judging.progress import Progress
-from pisigma.measuring.setup_sentence import setup_sentence
+from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.model_source import HoldsModel
-from pisigma.model.training_rows import training_row_warnings
+from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.planning.board_views import BoardViews
 from pisigma.planning.camera_prospects import CameraProspects
 from pisigma.planning.candidates import Candidates, spread
@@ -38,6 +38,8 @@ from pisigma.planning.task import task_poses
 from pisigma.planning.tour import Tour, order_of_use, stages_of, tour
 from pisigma.robot.description import Robot
 from pisigma.verification.checks.camera import view_warnings
+from pisigma.verification.gate import check_rows
+from pisigma.verification.rows.row_check import MOVES
 
 STEP = 10
 """Poses between two points of the curve."""
@@ -187,7 +189,7 @@ def plan(
     subject = subject if isinstance(subject, Subject) else Subject.of(subject)
     if cell is not None and not isinstance(cell, Cell):
         cell = read_cell(cell, subject.robot)
-    arm = subject.arm(cell)
+    arm = settings.with_measured(subject.arm(cell))
     progress("candidates")
     candidates = settings.find_candidates(arm)
     candidates.check_count(settings.count + settings.check)
@@ -291,7 +293,7 @@ class _Problem:
     def needed(self, chosen: Int64[Tensor, " chosen"], points: Sequence[ExpectedAccuracy]) -> int | None:
         """The least number of the chosen poses with which the limit is expected to be reached."""
         limit = (self.settings.limit_mm or 0.0) / 1e3  # without a limit one that nothing reaches
-        reached = next((index for index, point in enumerate(points) if point.rms <= limit), None)
+        reached = next((index for index, point in enumerate(points) if point.p95 <= limit), None)
         if reached is None:
             return None
         high = points[reached].poses
@@ -299,7 +301,7 @@ class _Problem:
         while high - low > 1:
             middle = (low + high) // 2
             (point,) = self._curve(chosen, [middle])
-            low, high = (low, middle) if point.rms <= limit else (middle, high)
+            low, high = (low, middle) if point.p95 <= limit else (middle, high)
         return high
 
     def prospects(self, chosen: Int64[Tensor, " chosen"]) -> CameraProspects | None:
@@ -354,15 +356,17 @@ def _check_measured(model: CalibratedModel | None, settings: PlanSettings, robot
     if settings.measured is None:
         return ()
     rows = settings.read_rows(settings.measured, robot).split_sets()[0]
-    if mistake := setup_sentence(robot, rows, torch.ones(rows.rows, dtype=torch.bool)):
-        raise MeasurementError(f"{settings.measured}: {mistake}")
-    if model is not None and model.provenance.data_sha256 == rows.content_hash():
+    against = robot if model is None else model
+    if implausible := check_rows(rows, against, may_move=MOVES).implausible:
+        raise MeasurementError(f"{settings.measured}: {implausible[0].sentence}")
+    if model is not None and bool(known_rows(model, rows).all()):
         raise MeasurementError(
             f"{settings.measured}: rows that model '{model.name}' does not know yet were wanted; it was made of these, "
             "and they would count twice. Plan with the model alone."
         )
     twice = "they count twice, and the expected errors are too small"
-    return () if model is None else training_row_warnings(model, rows, consequence=twice)
+    known = () if model is None else training_row_warnings(model, rows, consequence=twice)
+    return (*row_warnings(robot, rows), *known)
 
 
 def _warnings(way: Tour) -> tuple[str, ...]:

@@ -4,7 +4,7 @@ import datetime
 import math
 import shlex
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,20 +17,21 @@ from pisigma.errors import IdentificationError, ModelError, nearest_choice
 from pisigma.files.model_files import model_hash
 from pisigma.hybrid.calibrator import HybridCalibrator
 from pisigma.hybrid.result import HybridResult
-from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.judging.calibration_validation import errors_under
-from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.distillation_summary import ParentFigures
 from pisigma.judging.few_rows import fit_where_it_helps
-from pisigma.judging.predicted_spread import image_deviation
+from pisigma.judging.frames.fitted_frames import FrameKind, fitted_kinds
 from pisigma.judging.progress import Progress, stage
 from pisigma.judging.trained_calibrations import fit
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.geometric_model import model_of_hybrid
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
 from pisigma.model.stated_conditions import condition_warnings
+from pisigma.model.training_rows import without_known_rows
+from pisigma.model.wide_limits import with_wide_limits
 from pisigma.recalibration.adaptation import Adaptation, adapt
 from pisigma.recalibration.candidates import FAR_BETTER, Gate, gate
 from pisigma.recalibration.elsewhere import owners_elsewhere
@@ -46,8 +47,11 @@ from pisigma.recalibration.summary import (
 )
 from pisigma.reporting.recalibration_card import write_recalibration_card
 from pisigma.robot.description import Robot
-from pisigma.verification.checks.other_robot import other_robot_diagnostics
-from pisigma.verification.checks.registry import diagnostics_of_rows
+from pisigma.verification.explanations import PLAUSIBLE_SHARE
+from pisigma.verification.gate import check_rows
+from pisigma.verification.recalibrated import recalibration_diagnostics
+from pisigma.verification.rows.row_check import MOVES, Move
+from pisigma.verification.rows.wrong_rows import WithoutWrongRows, without_wrong_rows
 from pisigma.workflow.result import AbstractModelResult
 
 if TYPE_CHECKING:
@@ -55,11 +59,8 @@ if TYPE_CHECKING:
 
 FEW_ROWS = 5
 """Different poses below which nothing can be said of left-out rows."""
-IMPLAUSIBLE = 0.01
-"""Share of the reach that errors of left-out rows have where the rows are not of this robot."""
 UNBELIEVABLE = "What has moved cannot be said: the recalibrated model does not predict left-out rows."
-SUSPICIOUS = 5.0
-"""Left-out errors that are so many times the noise of the calibration are warned of."""
+NOT_TRUSTED = "What has moved cannot be said: these rows must not be trusted."
 
 
 @dataclass(frozen=True)
@@ -79,9 +80,26 @@ class RecalibrationSettings:
 
     def command(self, model: str, data: str) -> str:
         """The line that recalibrates a model with a file in this way."""
-        stated = ["--moved", ",".join(self.moved)] if self.moved else []
+        stated = [] if self.moved is None else ["--moved", ",".join(self.moved)]
         stated += self.cameras.options if self.cameras else []
         return shlex.join(["pisigma", "recalibrate", model, data, *stated, "--out", "DIR"])
+
+    @property
+    def fitted(self) -> tuple[FrameKind, ...]:
+        """What is stated to stand elsewhere."""
+        return fitted_kinds("base" in (self.moved or ()), "tool" in (self.moved or ()))
+
+    @property
+    def may_move(self) -> frozenset[Move]:
+        """What may have moved without being stated: a joint, and base and tool where nothing is stated of them."""
+        return MOVES if self.moved is None else frozenset({"joint_zero"})
+
+    def right_rows(self, model: CalibratedModel, rows: Measurements) -> WithoutWrongRows:
+        """The rows without single ones that are wrong, wherever base and tool may stand by now."""
+        right = without_wrong_rows([model], rows, self.fitted)
+        if right.warnings or self.moved is not None:
+            return right
+        return without_wrong_rows([model], rows, fitted_kinds(fit_frame=True, fit_tool=True))
 
     def __post_init__(self) -> None:
         """Refuse what cannot stand elsewhere."""
@@ -160,42 +178,58 @@ def recalibrate(
         )
     drawn = posterior.space.robot
     measurements = read_rows(data, drawn, settings.cameras)
-    rows = posterior.renamed(measurements.split_sets()[0])
+    rows, again = without_known_rows(parent, posterior.renamed(measurements.split_sets()[0]))
+    progress("checking the rows")
+    right = WithoutWrongRows(rows) if parent.kind == FLEET_PRIOR else settings.right_rows(parent, rows)
+    verdict = check_rows(right.rows, parent, settings.fitted, settings.may_move)
     progress("what has moved")
     elsewhere = _elsewhere(parent, posterior, rows, settings)
-    rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere)
+    every = rows
+    rows, adaptation, outliers = _adapted(parent, posterior, rows, elsewhere, right.numbers)
     calibrator = HybridCalibrator(drawn)
     judged = gate(parent, adaptation, elsewhere, rows, calibrator, stage(progress, "cross-validation"))
     likeness = _likeness(parent, rows)
     odd = likeness is not None and likeness.odd
     from_scratch = stage(progress, "from scratch")
     judged, kept = _kept(judged, odd, parent, adaptation, rows, calibrator, from_scratch)
-    believable = likeness is None and _believable(judged, drawn)
-    moved = moved_by(adaptation) if believable else None
-    summary = _summary(parent, rows, adaptation, judged, moved).having(
+    moved = moved_by(adaptation) if likeness is None and _believable(judged, drawn) else None
+    wrong = [one.row for one in outliers]
+    diagnostics = verdict.implausible or recalibration_diagnostics(parent, judged, every, wrong, moved or ())
+    moved = None if diagnostics else moved
+    summary = _summary(parent, rows, adaptation, judged, moved)
+    summary = summary.having(
+        diagnostics=diagnostics,
+        warnings=(*again, *summary.warnings),
         parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=sha256),
         outliers=outliers,
         elsewhere=tuple(" ".join(owner).strip() for owner in sorted(elsewhere)),
     )
+    if diagnostics:
+        summary = summary.having(changed=NOT_TRUSTED)
     if likeness is not None:
         summary = summary.having(changed=likeness.sentence)
-    kept = replace(kept, metrics=summary.to_json())
+    kept = with_wide_limits(replace(kept, metrics=summary.to_json()), rows)
     return Recalibration(
         kept, parent, adaptation, judged, moved or (), summary, seconds=time.perf_counter() - started
     )
 
 
 def _adapted(
-    parent: CalibratedModel, posterior: ModelPosterior, rows: Measurements, elsewhere: frozenset[Owner]
+    parent: CalibratedModel,
+    posterior: ModelPosterior,
+    rows: Measurements,
+    elsewhere: frozenset[Owner],
+    far: Sequence[int],
 ) -> tuple[Measurements, Adaptation, tuple[WrongRowFigures, ...]]:
-    """The rows that are not wrong, the model adapted to them, and the wrong ones."""
-    adaptation = adapt(recalibration_problem(parent, posterior, rows, elsewhere), posterior.noise)
-    wrong = adaptation.wrong_rows
-    if not wrong:
-        return rows, adaptation, ()
-    right = rows.select(torch.tensor([row for row in range(rows.rows) if row not in wrong]))
+    """The rows that are not wrong, the model adapted to them, and the wrong ones, those that are far off among them."""
+    left = [row for row in range(rows.rows) if row not in far]
+    right = rows.select(torch.tensor(left)) if far else rows
     adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere), posterior.noise)
-    return right, adaptation, _outliers(adaptation, rows, wrong)
+    wrong = [left[row] for row in adaptation.wrong_rows]
+    if wrong:
+        right = rows.select(torch.tensor([row for row in left if row not in wrong]))
+        adaptation = adapt(recalibration_problem(parent, posterior, right, elsewhere), posterior.noise)
+    return right, adaptation, _outliers(adaptation, rows, sorted((*far, *wrong)))
 
 
 def _kept(
@@ -258,7 +292,7 @@ def _believable(judged: Gate, robot: Robot) -> bool:
     error, kept = judged.rms["recalibrated"], judged.rms[judged.kept]
     if error is None or kept is None:
         return not judged.rows
-    return error <= min(IMPLAUSIBLE * robot.reach, FAR_BETTER * kept)
+    return error <= min(PLAUSIBLE_SHARE * robot.reach, FAR_BETTER * kept)
 
 
 def _summary(
@@ -271,7 +305,6 @@ def _summary(
     """All figures; `moved` is None where nothing can be said of it."""
     return RecalibrationSummary(
         command=f"pisigma.recalibrate({parent.name!r}, {rows.file_names!r})",
-        diagnostics=_diagnostics(adaptation.problem.design.problem.space.robot, judged, rows),
         parent=ParentFigures(name=parent.name, kind=parent.kind, sha256=""),
         date=datetime.datetime.now(datetime.UTC).date().isoformat(),
         rows=rows.rows,
@@ -287,7 +320,7 @@ def _summary(
         elsewhere=(),
         effective_parameters=adaptation.effective,
         noise=adaptation.noise,
-        warnings=_warnings(parent, judged, rows, adaptation.problem.posterior.noise),
+        warnings=_warnings(parent, judged, rows),
     )
 
 
@@ -314,52 +347,12 @@ def _elsewhere(
     return owners_in(rows, settings.moved)
 
 
-def _diagnostics(robot: Robot, judged: Gate, rows: Measurements) -> tuple[Diagnostic, ...]:
-    """Rows that no candidate predicts, or that another robot does, are not of this robot.
-
-    A calibration from scratch is checked as `calibrate` checks it.
-    """
-    if judged.kept == "scratch":
-        found = diagnostics_of_rows(GeometricCalibrator(robot), rows)
-    else:
-        found = other_robot_diagnostics(robot, rows)
-    if implausible := tuple(one for one in found if one.severity == "implausible"):
-        return implausible
-    error = judged.rms[judged.kept]
-    if error is None or error <= IMPLAUSIBLE * robot.reach:
-        return ()
-    return (
-        Diagnostic(
-            kind="residual",
-            severity="implausible",
-            sentence=f"{rows.source}: left-out rows are missed by {error * 1e3:.3g} mm, more than {IMPLAUSIBLE:.0%} "
-            f"of the reach of robot '{robot.name}': they are not of this robot, or their columns or units are wrong; "
-            "run `pisigma verify` on them.",
-        ),
-    )
-
-
-def _warnings(
-    model: CalibratedModel, judged: Gate, rows: Measurements, noise: Mapping[str, float]
-) -> tuple[str, ...]:
-    """What to heed, a sentence each; `noise` is that of the calibration, per sensor."""
-    warnings = list(condition_warnings(model, rows))
-    error = judged.rms[judged.kept]
-    usual = max(math.sqrt(3) * noise.get("position", 0.0), image_deviation(rows))
-    if error is not None and error > SUSPICIOUS * usual > 0 and model.kind != FLEET_PRIOR:
-        warnings.append(
-            f"Left-out rows are missed by {error * 1e3:.3g} mm, while single positions scattered by "
-            f"{usual * 1e3:.2g} mm when the model was made, so that what is said to have moved may be wrong: rows "
-            "may be wrong or of another specimen, or more has changed than so few rows can say. Check the rows with "
-            "`pisigma verify`, or measure more of them."
-        )
+def _warnings(model: CalibratedModel, judged: Gate, rows: Measurements) -> tuple[str, ...]:
+    """What to heed, a sentence each."""
+    warnings = [*row_warnings(model.robot, rows), *condition_warnings(model, rows)]
     if judged.rows < FEW_ROWS:
         warnings.append(
             f"Only {judged.rows} of {rows.rows} rows could be left out and predicted, which says little of the "
             f"candidates; measure {2 * FEW_ROWS} poses or more."
-        )
-    if model.provenance.data_sha256 == rows.content_hash():
-        warnings.append(
-            "The model was made of these rows already: they count twice, and its uncertainty is too small."
         )
     return tuple(warnings)

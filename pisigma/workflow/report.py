@@ -10,12 +10,17 @@ from typing import Any
 from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.files.conflicts import Input
 from pisigma.files.output_file import check_output, write_whole
+from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.progress import Progress
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joint_range import limit_warnings
+from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.reporting.page.content import ReportContent, report_content
 from pisigma.reporting.page.figures import ReportFigures, check_figures, draw_figures, write_figures
 from pisigma.reporting.page.page import render_page
+from pisigma.verification.gate import check_rows
+from pisigma.verification.rows.wrong_rows import without_wrong_rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,11 +30,13 @@ class Report:
     Attributes:
         content: figures and sentences.
         figures: drawings of them.
+        diagnostics: why nothing is to be concluded from the rows; see `pisigma.verification.gate`.
         seconds: that it took.
     """
 
     content: ReportContent
     figures: ReportFigures
+    diagnostics: tuple[Diagnostic, ...]
     seconds: float
 
     @property
@@ -39,7 +46,8 @@ class Report:
 
     def to_json(self) -> dict[str, Any]:
         """Return figures and sentences as plain values, without single rows."""
-        return self.content.to_json() | {"seconds": self.seconds}
+        diagnostics = [one.model_dump() for one in self.diagnostics]
+        return self.content.to_json() | {"diagnostics": diagnostics, "seconds": self.seconds}
 
     def save(
         self, page: str | os.PathLike[str], figures: str | os.PathLike[str] | None = None
@@ -102,8 +110,22 @@ def report(
     """
     begin, loaded = time.perf_counter(), load_model(model)
     progress("judging rows")
-    rows = None if data is None else read_rows(data, loaded.robot, cameras)
-    content = report_content(loaded, Path(model), rows)
+    rows: Measurements | None = None
+    remarks: tuple[str, ...] = ()
+    diagnostics: tuple[Diagnostic, ...] = ()
+    if data is not None:
+        rows, remarks = _right_rows(loaded, read_rows(data, loaded.robot, cameras))
+        diagnostics = check_rows(rows, loaded).implausible
+    content = report_content(loaded, Path(model), rows, (*(one.sentence for one in diagnostics), *remarks))
     progress("drawing")
     figures = draw_figures(content)
-    return Report(content, figures, time.perf_counter() - begin)
+    return Report(content, figures, diagnostics, time.perf_counter() - begin)
+
+
+def _right_rows(model: CalibratedModel, rows: Measurements) -> tuple[Measurements, tuple[str, ...]]:
+    """Rows without single ones that are wrong, unless the model was made of just these, and what to heed."""
+    remarks = limit_warnings(model.robot, rows)
+    if model.provenance.data_sha256 == rows.content_hash():
+        return rows, remarks
+    right = without_wrong_rows([model], rows)
+    return right.rows, (*right.warnings, *remarks)

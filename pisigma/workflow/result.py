@@ -8,10 +8,10 @@ from typing import Any
 
 from pisigma.errors import AcceptanceError, printable
 from pisigma.files.output_folder import staged_folder
+from pisigma.inverse.written_model import write_model
 from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.summary import AbstractSummary
 from pisigma.model.calibrated_model import CalibratedModel
-from pisigma.model.folder.model_folder import save_model
 
 
 class AbstractModelResult(ABC):
@@ -75,7 +75,7 @@ class AbstractModelResult(ABC):
         name = printable(name or Path(folder).resolve().name, cut=False)
         model = replace(self.model, name=name, metrics=summary.to_json())
         with staged_folder(folder, overwrite) as scratch:
-            save_model(model, scratch)
+            write_model(model, scratch)
             self._describe(model, summary, scratch)
         return model
 

@@ -2,21 +2,22 @@
 
 import os
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
-import torch
 
 from pisigma.camera.corner_file import CameraFiles, MeasurementFiles, read_rows
 from pisigma.judging.bootstrap import Bootstrap
+from pisigma.judging.diagnostic import Diagnostic
 from pisigma.judging.frames.fitted_frames import FrameKind, fitted_kinds, fitted_remark
+from pisigma.judging.frames.row_errors import places_remark
 from pisigma.judging.model_comparison import Difference, ModelComparison, compare_models
 from pisigma.judging.predicted_spread import image_remark
 from pisigma.judging.reference_models import geometric_model, nominal_model
-from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joint_range import row_warnings
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import load_model
 from pisigma.model.model_source import HoldsModel, ModelSource, model_or_folder
@@ -24,10 +25,14 @@ from pisigma.model.stated_conditions import condition_warnings
 from pisigma.model.training_rows import training_row_warnings
 from pisigma.monitoring.session import Session
 from pisigma.robot.row import Row
+from pisigma.sensors.socket import matching_sockets
 from pisigma.verification.cause import length_text
+from pisigma.verification.gate import check_rows
 from pisigma.verification.motion import judged_motion, motion_sentence, motion_warnings
+from pisigma.verification.rows.other_sensors import missed_distances
+from pisigma.verification.rows.wrong_rows import without_wrong_rows
 from pisigma.verification.setup_fault import SetupFault
-from pisigma.verification.setup_faults import find_setup_faults, is_implausible, unexplained
+from pisigma.verification.setup_faults import is_implausible, unexplained
 from pisigma.workflow.evaluate import test_rows
 from pisigma.workflow.recalibrate import RecalibrationSettings
 
@@ -47,12 +52,13 @@ MOTIONS = {"joint_zero", "frame", "tool"}
 
 Verdict = Literal["better", "not_better", "undecided", "moved", "setup_fault", "implausible"]
 
+NOTHING_SHOWN = "These measurements do not show whether the correction is right"
+
 _BEGIN: dict[Verdict, str] = {
     "better": "The corrected model explains these measurements better than the nominal robot",
     "not_better": "The nominal robot explains these measurements at least as well as the corrected model",
     "undecided": "These measurements do not show whether the corrected model or the nominal robot is nearer",
-    "implausible": "These measurements do not show whether the correction is right, as their errors are too large to "
-    "be those of a calibration",
+    "implausible": f"{NOTHING_SHOWN}, as their errors are too large to be those of a calibration",
 }
 
 
@@ -65,12 +71,14 @@ class VerificationSettings:
         fit_tool: fit the targets to the rows, as after another reflector was mounted; then any target will do.
         seed: of the resamples for confidence intervals.
         cameras: what the pixels mean where the file holds corners of boards in images.
+        socket_distances: stated distances of sockets [m], see `pisigma.workflow.calibrate.CalibrationSettings`.
     """
 
     fit_frame: bool = False
     fit_tool: bool = False
     seed: int = 0
     cameras: CameraFiles | None = None
+    socket_distances: Mapping[tuple[str, str], float] = field(default_factory=dict)
 
     @property
     def fitted(self) -> tuple[FrameKind, ...]:
@@ -96,6 +104,7 @@ class Verification:
         ratio: mean position error of the corrected model over that of the nominal robot; NaN where that is 0.
         better_share: share of the configurations in which the corrected model is nearer.
         comparison: figures of "nominal", "geometric" (of a hybrid) and "corrected".
+        diagnostics: why nothing is to be concluded from the rows, see `pisigma.verification.gate`.
         setup_faults: what explains large errors; nothing where `motion` explains them.
         motion: what has moved since the model was made; None where the model or the rows do not say.
         recalibration: the command that brings the model up to date; empty where that does not pay.
@@ -112,6 +121,7 @@ class Verification:
     ratio: float
     better_share: float
     comparison: ModelComparison
+    diagnostics: tuple[Diagnostic, ...]
     setup_faults: tuple[SetupFault, ...]
     motion: Session | None
     recalibration: str
@@ -137,6 +147,7 @@ class Verification:
             "ratio": None if np.isnan(self.ratio) else self.ratio,
             "better_share": self.better_share,
             **self.comparison.to_json(),
+            "diagnostics": [one.model_dump() for one in self.diagnostics],
             "setup_faults": [fault.to_json() for fault in self.setup_faults],
             "moved": [one.to_json() for one in self.motion.moved] if self.motion else [],
             "recalibrate": self.recalibration or None,
@@ -174,11 +185,11 @@ def verify(
 
     Args:
         model: the model or its folder.
-        data: new rows with positions, or their file, in frames and of targets that the model has.
+        data: new rows, or their file, in frames and of targets that the model has.
         settings: how. None: `VerificationSettings()`.
 
     Raises:
-        MeasurementError: the file cannot be used, or no positions were measured, or in a frame or of a target that the
+        MeasurementError: the file cannot be used, or no lengths were measured, or in a frame or of a target that the
             model lacks.
         ModelError: the folder cannot be used, or the model does not keep enough joint values to fit base and tool of
             the nominal robot.
@@ -188,10 +199,15 @@ def verify(
     source = model_or_folder(model)
     loaded = source if isinstance(source, CalibratedModel) else load_model(source)
     rows = data if isinstance(data, Measurements) else read_for_verification(data, loaded, settings.cameras)
+    distances = matching_sockets(settings.socket_distances, rows.socket or ())
+    right = without_wrong_rows([loaded], rows, settings.fitted)
+    rows = right.rows
     models = _compared_models(loaded, rows.rotation is not None)
     resamples = int(np.clip(MOST_DRAWN // max(rows.rows, 1), *RESAMPLES))
-    comparison = compare_models(models, rows, Bootstrap(resamples, settings.seed), settings.fitted)
-    faults = find_setup_faults(loaded, models[NOMINAL], rows, settings.fitted)
+    bootstrap = Bootstrap(resamples, settings.seed)
+    comparison = compare_models(models, rows, bootstrap, settings.fitted, distances)
+    gate = check_rows(rows, loaded, settings.fitted, {"joint_zero"}, models[NOMINAL])
+    faults = gate.setup_faults
     motion = _motion(loaded, rows, settings.fitted, comparison, faults)
     mean = comparison.models[0].position.statistics["mean"]
     ratio = comparison.models[-1].position.statistics["mean"] / mean if mean > 0 else float("nan")
@@ -203,6 +219,10 @@ def verify(
     else:
         verdict = _verdict(loaded, comparison, difference, ratio, faults)
         sentence = _sentence(verdict, comparison, difference, ratio, faults)
+    wrong = (*gate.implausible, *missed_distances(comparison, comparison.models[-1]))
+    if wrong and not faults:
+        verdict, motion = "implausible", None
+        sentence = f"{NOTHING_SHOWN}: {wrong[0].sentence}"
     name = loaded.name if isinstance(source, CalibratedModel) else os.fspath(source)
     return Verification(
         model=name,
@@ -214,13 +234,16 @@ def verify(
         ratio=ratio,
         better_share=difference.better_share,
         comparison=comparison,
+        diagnostics=wrong,
         setup_faults=faults,
         motion=motion,
         recalibration=_recalibration(name, rows.source, settings, motion),
         warnings=(
+            *right.warnings,
             *_warnings(loaded, rows, comparison, faults, motion),
             *([] if motion is None or verdict == "moved" else motion_warnings(motion)),
             *fitted_remark(rows, settings.fitted),
+            *places_remark(rows),
             *image_remark(rows),
         ),
         seconds=time.perf_counter() - begin,
@@ -239,7 +262,7 @@ def _recalibration(name: str, data: str, settings: VerificationSettings, motion:
     """The command that brings a model up to date, where that pays."""
     if motion is None or not motion.recalibrate:
         return ""
-    return RecalibrationSettings(settings.fitted, settings.cameras).command(name, data)
+    return RecalibrationSettings(settings.fitted or None, settings.cameras).command(name, data)
 
 
 def _motion(
@@ -333,17 +356,11 @@ def _warnings(
     faults: Sequence[SetupFault],
     motion: Session | None,
 ) -> list[str]:
-    warnings = []
-    lower, upper = torch.from_numpy(model.robot.axis_limits).unbind(1)
-    q = model.robot.to_controller(rows.q)
-    outside = ((q < lower - LIMIT_TOLERANCE) | (q > upper + LIMIT_TOLERANCE)).any(1)
-    if bool(outside.any()):
-        first = int(outside.nonzero()[0, 0])
-        warnings.append(
-            f"{int(outside.sum())} of {rows.rows} rows, the first in {rows.place(first)}, have joint values outside "
-            f"the limits of robot '{model.robot.name}'."
-        )
-    warnings += [*training_row_warnings(model, rows), *condition_warnings(model, rows)]
+    warnings = [
+        *row_warnings(model.robot, rows),
+        *training_row_warnings(model, rows),
+        *condition_warnings(model, rows),
+    ]
     corrected = comparison.models[-1]
     if corrected.rows_not_predicted:
         warnings.append(

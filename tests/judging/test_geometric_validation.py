@@ -12,10 +12,12 @@ from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.problem.loss import SquaredLoss
 from pisigma.judging.calibration_validation import validate
-from pisigma.judging.trained_calibrations import with_frames
+from pisigma.judging.trained_calibrations import DistanceErrors, left_out_of_folds, with_frames
 from pisigma.measurement import Measurements, k_folds
 from pisigma.measurement.dataset import join
+from pisigma.measurement.splits import holdout
 from pisigma.reporting.calibration_tables import held_out_lines
+from pisigma.reporting.tables import distance_table
 
 KNOWN = {(f"{plate}/0", f"{plate}/1"): 0.05 for plate in ("plate", "low", "high")}
 
@@ -37,17 +39,19 @@ def test_sockets_of_exact_data_are_met_where_they_were_held_out() -> None:
     found = validate(exact(socket_distances=KNOWN), data, k_folds(data, None, 0, "placement"))
     assert (found.folds, found.sockets_held_out, found.frames_fitted) == (3, 6, 0)
     assert_close(found.models["geometric"].position, torch.zeros(data.rows, dtype=torch.float64), atol=1e-8)
-    assert_close(found.distances["geometric"], torch.zeros(3, dtype=torch.float64), atol=1e-8)
+    assert_close(found.distances.errors["geometric"], torch.zeros(3, dtype=torch.float64), atol=1e-8)
     figures = found.figures()
     distance = figures.socket_distance
     assert distance.count == 3
-    nominal = found.distances["nominal"].abs() * 1e3
+    nominal = found.distances.errors["nominal"].abs() * 1e3
     assert_close(distance.nominal.mean_mm, float(nominal.mean()), atol=1e-12)
     assert_close(distance.nominal.max_mm, float(nominal.max()), atol=1e-12)
     assert float(nominal.mean()) > 0.1
     lines = held_out_lines(figures)
     assert lines[0].startswith("6 sockets were held out whole")
-    assert lines[1].startswith("The known distance of held-out sockets (3 of them) is met to")
+    assert lines[1].startswith("Stated distances of sockets (3, each left out of a calibration in turn)")
+    table = distance_table(distance)
+    assert [row[0] for row in table.rows] == ["high/0 to high/1", "low/0 to low/1", "plate/0 to plate/1"]
 
 
 def test_rows_of_a_target_that_is_seen_once_are_not_judged() -> None:
@@ -89,12 +93,42 @@ def test_an_error_of_a_held_out_socket_is_the_distance_to_where_its_rows_meet() 
         assert_close(errors[own].mean(0), torch.zeros(3, dtype=torch.float64), atol=1e-12)
 
 
-def test_known_distances_that_were_calibrated_with_are_not_judged() -> None:
+def test_every_stated_distance_is_judged_by_a_calibration_without_it() -> None:
     data = socket_data()
-    found = validate(exact(socket_distances=KNOWN), data, k_folds(data, 3, 0))
+    wrong = KNOWN | {("low/0", "low/1"): 0.051}
+    found = validate(exact(socket_distances=wrong), data, k_folds(data, 3, 0))
     assert found.sockets_held_out == 0
-    assert found.figures().socket_distance is None
-    assert held_out_lines(found.figures()) == []
+    each = {one.sockets: one for one in found.figures().socket_distance.each}
+    assert set(each) == set(KNOWN)
+    assert each["low/0", "low/1"].stated_mm == pytest.approx(51.0)
+    assert each["low/0", "low/1"].errors_mm["geometric"] == pytest.approx(-1.0, abs=1e-6)
+    others = [abs(one.errors_mm["geometric"]) for pair, one in each.items() if pair != ("low/0", "low/1")]
+    assert 1e-3 < max(others) < 1.0  # their calibrations had the wrong one
+
+
+def test_distances_are_left_out_in_turn_and_never_all_of_them() -> None:
+    data = socket_data()
+    whole = left_out_of_folds(KNOWN, data, k_folds(data, None, 0, "placement"))
+    assert sorted(len(one) for one in whole) == [1, 1, 1]
+    assert {pair for one in whole for pair in one} == set(KNOWN)
+    assert left_out_of_folds(KNOWN, data, [holdout(data, 0.3, 0)]) == ({},)
+    assert [len(one) for one in left_out_of_folds(KNOWN, data, k_folds(data, 2, 0))] == [2, 1]
+    two = dict(list(KNOWN.items())[:2])
+    assert [len(one) for one in left_out_of_folds(two, data, k_folds(data, 2, 0))] == [1, 1]
+    alone = {("low/0", "low/1"): 0.05}
+    assert left_out_of_folds(alone, data, k_folds(data, 3, 0)) == ({}, {}, {})
+
+
+def test_a_ball_that_once_missed_its_socket_does_not_move_it() -> None:
+    data, known = socket_data(), {("low/0", "low/1"): 0.05}
+    result = exact(socket_distances=KNOWN).fit(data)
+    row = (data.socket or ()).index("low/0")
+    q = data.q.clone()
+    q[row, 1] += 0.01
+    missed = replace(data, q=q)
+    T = result.predicted_poses(missed)
+    errors = DistanceErrors.of({"geometric": T}, known, missed).errors["geometric"]
+    assert_close(errors, torch.zeros(1, dtype=torch.float64), atol=1e-8)
 
 
 def test_distances_of_sockets_that_no_row_has_are_still_refused() -> None:

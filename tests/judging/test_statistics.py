@@ -123,5 +123,5 @@ def test_a_bias_shows_in_the_mean_along_an_axis():
 def test_rows_without_positions_are_told_what_is_missing():
     q = joints_around("kiro4", 2)
     T = forward_kinematics(hand_made_model("kiro4").robot, q)
-    with pytest.raises(MeasurementError, match="but socket values; a model does not keep where sockets"):
+    with pytest.raises(MeasurementError, match="but socket values, which `pisigma evaluate`"):
         PoseErrors.between(Measurements(q=q, socket=("a", "b")), T)

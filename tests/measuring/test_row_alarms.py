@@ -17,8 +17,6 @@ def test_a_row_that_cannot_be_read_is_to_be_measured_again():
     alarm = unreadable(LeftOut(7, "column 'x_mm': 'abc' is no finite number; write one such as -12.5"))
     assert alarm.sentence.startswith("line 7, column 'x_mm': 'abc'")
     assert (alarm.kind, alarm.repeat, alarm.counts) == ("unreadable", True, False)
-    equal = unreadable(LeftOut(8, "all columns: the row equals line 7; remove one of them"))
-    assert (equal.kind, equal.repeat, equal.counts) == ("duplicate", False, False)
 
 
 def test_a_frozen_sensor_and_a_row_written_twice():
@@ -31,6 +29,9 @@ def test_a_frozen_sensor_and_a_row_written_twice():
     again = Measurements(q=rows.q[2:3], position=rows.position[2:3], line=(6,))
     (alarm,) = stale_readings(join([rows, again]), 4)
     assert (alarm.kind, alarm.repeat, alarm.counts) == ("duplicate", False, False)
+    balls = Measurements(q=rows.q[[0, 1, 0]], socket=("a", "a", "a"), line=(2, 3, 4))
+    (alarm,) = stale_readings(balls, 1)
+    assert (alarm.kind, alarm.line) == ("duplicate", 4)
 
 
 def test_joint_values_beside_the_plan_are_a_remark():

@@ -7,7 +7,7 @@ from testing.models import no_type_checker
 from testing.simulated_arm import simulate
 
 import pisigma
-from pisigma.cli.calibrate import _socket_distances
+from pisigma.cli.arguments import socket_distances
 from pisigma.errors import IdentificationError, MeasurementError
 from pisigma.judging.calibration_summary import CalibrationSummary
 from pisigma.model.folder.model_folder import load_model
@@ -89,24 +89,34 @@ def test_settings_at_fault(settings, complaint):
         CalibrationSettings(**settings)
 
 
-def distances(stated: str | None) -> dict[tuple[str, str], float]:
+def distances(*stated: str) -> dict[tuple[str, str], float]:
     """Known distances of the calibrator, as the command line states them."""
-    settings = CalibrationSettings(model="geometric", socket_distances=_socket_distances(stated))
+    settings = CalibrationSettings(model="geometric", socket_distances=socket_distances(stated))
     return settings.calibrator(pisigma.Robot.load("panda"), SOCKETS).socket_distances
 
 
 def test_known_distances_between_sockets():
-    assert distances(None) == {}
+    assert distances() == {}
     assert distances("left/0, right/1, 120") == {("left/0", "right/1"): 0.12}
     # a star stands for the same text in both
     assert distances("*/0,*/1,50") == {("left/0", "left/1"): 0.05, ("right/0", "right/1"): 0.05}
+    # all stated ones count
+    assert distances("left/0,left/1,50", "right/0,right/1,60") == {
+        ("left/0", "left/1"): 0.05,
+        ("right/0", "right/1"): 0.06,
+    }
+
+
+def test_a_pair_of_sockets_has_one_distance():
+    with pytest.raises(IdentificationError, match="one distance of the sockets left/0 and left/1"):
+        distances("left/0,left/1,50", "left/0,left/1,60")
 
 
 @pytest.mark.parametrize(
     "stated", ["", "left/0,left/1", "left/0,left/1,far", "a,b,-1", "a,b,0", "a,b,inf", "a,b,1,2"]
 )
 def test_another_form_is_refused(stated):
-    with pytest.raises(IdentificationError, match="as A,B,MM was wanted"):
+    with pytest.raises(IdentificationError, match="socket distance as A,B,MM"):
         distances(stated)
 
 

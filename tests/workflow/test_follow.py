@@ -23,7 +23,7 @@ def test_rows_are_judged_as_they_come_until_all_are_measured(tmp_path, monkeypat
 
     def measure_one(seconds: float) -> None:
         with file.open("a") as out:
-            out.write(lines.pop(0))
+            out.write(lines.pop(0) if lines else "")
 
     monkeypatch.setattr("pisigma.workflow.follow.time.sleep", measure_one)
     seen, waited = [], []

@@ -1,6 +1,8 @@
 """Sessions of measuring, from rows to what to do next."""
 
 import json
+from dataclasses import replace
+from math import isnan
 
 import pytest
 import torch
@@ -9,6 +11,7 @@ from testing.models import no_type_checker
 
 from pisigma.errors import PlanningError
 from pisigma.measurement.fields import LeftOut
+from pisigma.measuring import reached
 from pisigma.planning.plan_file import read_plan
 from pisigma.workflow.measure import MeasureSettings, MeasuringSession
 
@@ -60,6 +63,16 @@ def test_the_rest_is_planned_again_with_as_many_poses(session, tmp_path):
     rest = read_plan(tmp_path / "rest.csv")
     assert len(rest.q) == 7
     assert int(rest.check.sum()) == 1
+    numbers = dict(zip(rest.numbers, rest.q, strict=True))
+    assert len(numbers) == 7
+    for (
+        number,
+        q,
+    ) in numbers.items():  # a pose that was planned before keeps its number, a new one has a further one
+        old = (PLAN.stored.q - q).abs().amax(1)
+        assert (float(old.min()) < 1e-6) == (number <= 24)
+        assert number > 24 or int(old.argmin()) == number - 1
+    assert session.state.next_pose.number == rest.numbers[0]
 
 
 def test_the_accuracy_so_far_and_that_of_the_rest(session):
@@ -89,3 +102,59 @@ def test_settings_that_cannot_be_are_refused():
     ):
         with pytest.raises(PlanningError, match=words):
             MeasureSettings(**wrong)
+
+
+def test_a_session_with_a_wrong_unit_says_so_once_and_does_not_advise_to_go_on():
+    session, rows = MeasuringSession(PLAN.stored), PLAN.rows(5)
+    rows = replace(rows, position=rows.position * 1000)
+    session.add(rows.select(torch.arange(4)))
+    assert [(alarm.line, alarm.kind) for alarm in session.judge_together()] == [(1, "setup")]
+    session.add(rows.select(torch.tensor([4])))
+    assert session.work_out() == ()
+    assert session.state.accuracy is None
+    assert session.state.advice.action == "correct"
+    assert "named metres" in session.state.advice.sentence
+
+
+def test_rows_are_judged_together_as_one_by_one():
+    rows = with_offset(PLAN.rows(18), 14, (0.003, -0.004, 0.0))
+    together, single = MeasuringSession(PLAN.stored), MeasuringSession(PLAN.stored)
+    alarms = together.add(rows)
+    for row in range(rows.rows):
+        single.add(rows.select(torch.tensor([row])))
+    assert [alarm.line for alarm in alarms] == [rows.line[14]]
+    assert together.state.rows.alarmed.tolist() == single.state.rows.alarmed.tolist()
+    torch.testing.assert_close(*(torch.as_tensor(one.state.rows.error) for one in (together, single)))
+
+
+def test_the_expected_accuracy_comes_first_and_left_out_rows_while_no_rows_come():
+    session = MeasuringSession(PLAN.stored, MeasureSettings(least_gain_mm=0.0))
+    rows = PLAN.rows(18)
+    session.add(rows.select(torch.arange(14)))
+    with no_type_checker():
+        session.next_step()()
+    first = session.state
+    assert first.accuracy.predicted_rms > 0
+    assert isnan(first.accuracy.cross_validated_rms)
+    assert first.expected == ()
+    with no_type_checker():
+        session.next_step()()
+        assert session.next_step() is None
+        outdated = session.idle_step()
+    assert session.state.expected
+    validate = reached.validate
+
+    def while_a_row_comes(calibrator, rows_, folds, progress):
+        session.add(rows.select(torch.tensor([14])))
+        return validate(calibrator, rows_, folds, progress)
+
+    with pytest.MonkeyPatch.context() as patch, no_type_checker():
+        patch.setattr(reached, "validate", while_a_row_comes)
+        outdated()
+    assert isnan(session.state.accuracy.cross_validated_rms)
+    with no_type_checker():
+        session.judge_together()
+        assert session.next_step() is None
+        session.idle_step()()
+    assert session.state.accuracy.cross_validated_rms > 0
+    assert session.idle_step() is None

@@ -3,10 +3,13 @@
 from dataclasses import replace
 
 import pytest
+import torch
 from testing.aged import model_before, rows_later
 from testing.closeness import assert_close
+from testing.hybrid import hybrid_of
 
 from pisigma.errors import IdentificationError, MeasurementError
+from pisigma.measurement.dataset import join
 from pisigma.model.folder.model_folder import save_model
 from pisigma.workflow.monitor import MonitorSettings, monitor
 
@@ -46,6 +49,11 @@ def test_a_collision_calls_for_action():
     assert report["sessions"][1]["recalibrate"]
     assert report["forecast"]["passed"]
     assert any("pisigma recalibrate" in line for line in report["says"])
+    settings = MonitorSettings(dates=("2026-03-01", "2026-02-01"))
+    set_right = monitor(model_before(), [rows_later(10, 30), rows_later(10, 31, COLLISION)], settings)
+    assert set_right.action
+    assert set_right.advised is None
+    assert not any("pisigma recalibrate" in line for line in set_right.sentences)
 
 
 @pytest.mark.parametrize(
@@ -62,13 +70,46 @@ def test_every_file_has_a_date_or_none():
         monitor(model_before(), [rows_later(6, 1)] * 2, MonitorSettings(dates=("2026-01-01",)))
 
 
-def test_rows_that_no_motion_explains_are_refused_and_not_remembered(tmp_path):
+def test_rows_that_are_not_trusted_are_in_no_chart_and_not_remembered(tmp_path):
     rows = rows_later(10, 30)
     metres = replace(rows, position=rows.position * 1e-3)
     (folder := tmp_path / "model").mkdir()
     save_model(model_before(), folder)
-    with pytest.raises(
-        IdentificationError, match="another robot was measured, or a column or a unit is wrong"
-    ):
-        monitor(folder, [rows, metres])
-    assert [one.name for one in tmp_path.iterdir()] == ["model"]
+    monitoring = monitor(folder, [rows, metres])
+    assert (len(monitoring.sessions), len(monitoring.records)) == (1, 1)
+    (untrusted,) = monitoring.untrusted
+    assert [one.kind for one in untrusted.diagnostics] == ["setup_fault"]
+    assert "metres that are named millimetres" in untrusted.sentence
+    assert monitoring.action
+    assert len(monitor(folder, [metres]).records) == 1
+    alone = monitor(model_before(), [metres])
+    assert (alone.records, alone.charts, alone.trends) == ((), (), ())
+    alone.save_page(tmp_path / "page.html")
+    assert "metres that are named millimetres" in (tmp_path / "page.html").read_text()
+
+
+def test_the_same_rows_again_are_no_session_of_their_own(tmp_path):
+    rows = rows_later(10, 30)
+    (folder := tmp_path / "model").mkdir()
+    save_model(model_before(), folder)
+    again = replace(
+        rows.select(torch.arange(9, -1, -1)), position=(rows.position.flip(0) * 1e5).round() / 1e5
+    )
+    both = monitor(folder, [dated(rows, "2026-01-01"), dated(again, "2026-02-01")])
+    assert [one.date for one in both.records] == ["2026-01-01"]
+    assert len(both.warnings) == 1
+    with pytest.raises(MeasurementError, match="new rows"):
+        monitor(folder, [dated(again.select(torch.arange(6)), "2026-03-01")])
+    corrected = monitor(folder, [rows], MonitorSettings(dates=("2026-01-05",)))
+    assert [one.date for one in corrected.records] == ["2026-01-05"]
+    assert len(corrected.warnings) == 1
+    mixed = monitor(model_before(), [rows, join([rows_later(8, 31), again])])
+    assert sorted(one.session.rows for one in mixed.sessions) == [8, 10]
+
+
+def test_rows_of_the_calibration_are_no_session():
+    own = hybrid_of("rb5").measurements
+    with pytest.raises(MeasurementError, match="new rows"):
+        monitor(model_before(), [own])
+    mixed = monitor(model_before(), [join([own.select(torch.arange(3)), rows_later(10, 30)])])
+    assert [one.session.rows for one in mixed.sessions] == [10]

@@ -7,12 +7,13 @@ import pytest
 import torch
 from testing.aged import model_before, rows_later
 from testing.closeness import assert_close
+from testing.hybrid import hybrid_of
 
 import pisigma
-from pisigma.errors import AcceptanceError, IdentificationError, ModelError
+from pisigma.errors import AcceptanceError, IdentificationError, MeasurementError, ModelError
 from pisigma.inverse.corrected_ik import CorrectedIK
 from pisigma.kinematics.forward import forward_kinematics
-from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.dataset import Measurements, join
 from pisigma.model.folder.model_folder import load_model, save_model
 from pisigma.model.row_poses import poses_of_rows
 from pisigma.recalibration.summary import RecalibrationSummary
@@ -87,10 +88,24 @@ def test_a_wrong_row_beside_a_collision_is_left_out_and_named(after_collision):
     assert errors[0] < 1.15 * errors[1]
 
 
+def test_a_row_that_no_error_explains_is_left_out_and_named():
+    rows = rows_later(25, 2)
+    wrong = rows.position.clone()
+    wrong[4] += torch.tensor([0.3, -0.1, 0.2])
+    wrong[9, 0] += 0.005
+    result = recalibrate(model_before(), replace(rows, position=wrong))
+    assert [(one.row, one.place) for one in result.summary.outliers] == [
+        (4, rows.place(4)),
+        (9, rows.place(9)),
+    ]
+    assert result.summary.rows == 23
+    assert not result.moved
+
+
 def test_rows_of_another_arm_are_not_trusted(tmp_path):
     rows = rows_later(10, 2)
     result = recalibrate(model_before(), replace(rows, q=rows.q.flip(0)))
-    assert [one.kind for one in result.diagnostics] == ["residual"]
+    assert [one.severity for one in result.diagnostics] == ["implausible"]
     assert not result.moved
     assert result.summary.changed.startswith("What has moved cannot be said")
     with pytest.raises(AcceptanceError, match="must not be trusted"):
@@ -118,3 +133,15 @@ def test_what_cannot_be_is_refused(tmp_path):
     )
     with pytest.raises(ModelError, match="holds no posterior"):
         recalibrate(geometric, rows_later(10, 2))
+
+
+def test_rows_that_the_model_was_made_of_count_once():
+    own = hybrid_of("rb5").measurements
+    with pytest.raises(MeasurementError, match="new rows"):
+        recalibrate(model_before(), own)
+    new = rows_later(10, 3)
+    mixed = recalibrate(model_before(), join([own.select(torch.arange(5)), new]))
+    assert mixed.summary.rows == new.rows
+    assert len(mixed.warnings) == 1
+    with pytest.raises(MeasurementError, match="new rows"):
+        recalibrate(mixed.model, new)

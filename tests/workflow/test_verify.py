@@ -144,8 +144,11 @@ def test_reading_minds_no_limits_but_says_so(geometric, tmp_path):
         Measurements.read_csv(tmp_path / "far.csv", model.robot)
     read = read_for_verification(tmp_path / "far.csv", model)
     assert_close(read.q, far.q, atol=1e-9)
-    remark = verify(model, read).warnings[0]
-    assert remark.startswith(f"{ROWS} of {ROWS} rows, the first in {tmp_path / 'far.csv'}, line 2")
+    remarks = verify(model, read).warnings[: len(model.robot.joints)]
+    for joint, remark in zip(model.robot.joints, remarks, strict=True):
+        assert f"joint '{joint.name}'" in remark
+        assert f"{tmp_path / 'far.csv'}, line " in remark
+        assert "in another unit" in remark
 
 
 def test_rows_of_training_are_left_out(geometric, tmp_path):

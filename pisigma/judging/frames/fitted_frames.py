@@ -21,6 +21,7 @@ from pisigma.judging.frames.frame_fits import (
     frame_columns,
     moved_frame,
 )
+from pisigma.judging.frames.row_errors import errors_of_rows
 from pisigma.judging.pose_statistics import ErrorVectors
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import groups_to_keep_whole, numbers_of_names
@@ -84,15 +85,23 @@ def errors_in_fitted_frames(
         fitted: what is fitted; nothing for the errors in the model's own frames.
 
     Returns:
-        Measured minus predicted; NaN where nothing was measured or predicted.
+        Measured minus predicted, see `errors_of_rows`; NaN where nothing was measured or predicted, and where
+        something is fitted in rows without a position.
 
     Raises:
         MeasurementError: a frame or a target has fewer than `FEWEST` different joint vectors, no positions were
-            measured, or the model lacks a frame or target that is not fitted.
+            measured that something could be fitted to, or the model lacks a frame or target that is not fitted.
+        IdentificationError: an anchor has too few rows to say where it is.
     """
     T = poses_of_rows(model, with_names_of(model, measurements, fitted))
-    if not fitted or measurements.position is None:
-        return ErrorVectors.between(measurements, T)
+    if not fitted:
+        return errors_of_rows(T, measurements)
+    if measurements.position is None:
+        raise MeasurementError(
+            f"{measurements.source}: expected positions to fit the {' and the '.join(fitted)} to, got "
+            f"{' and '.join(sorted(measurements.kinds)) or 'none'}; leave the fit out (balls in sockets, and distances "
+            "from anchors at unknown points, do not depend on where the base stands)."
+        )
     usable = torch.isfinite(measurements.position).all(-1) & torch.isfinite(T).flatten(1).all(-1)
     rows = measurements.select(usable.nonzero()[:, 0])
     _check_configurations(model, measurements, rows, fitted)

@@ -2,7 +2,7 @@
 
 import math
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -19,6 +19,8 @@ from pisigma.robot.description import Robot
 
 CHUNK = 2048
 """Poses that are looked at together: some MB."""
+ROUNDING = 1e-9
+"""[m] By which a measured pose is free."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +61,7 @@ class ArmInCell:
         cell: what stands around it.
         capsules: along its links.
         pairs: of pieces of links that may touch each other.
+        room: that has to be between the pieces of every pair [m].
         beside: pieces that must not stand in the tracker's beam: none of the link with the reflector, and none that
             is so near to the reflector that it touches every beam.
         limits: of the controller's values, with their margins [rad or m].
@@ -69,6 +72,7 @@ class ArmInCell:
     cell: Cell
     capsules: Capsules
     pairs: Int64[Tensor, "pairs 2"]
+    room: Float64[Tensor, " pairs"]
     beside: Int64[Tensor, " pieces"]
     limits: Float64[Tensor, "axes 2"]
 
@@ -77,15 +81,29 @@ class ArmInCell:
         """Put a robot into its cell; None for an empty one, in which only limits and self-collision count."""
         cell = cell or Cell()
         capsules = cell.capsules(robot)
+        pairs = capsules.pairs(cell.clearance / 2)
         return ArmInCell(
             robot,
             capsules.robot,
             cell,
             capsules,
-            capsules.pairs(cell.clearance / 2),
+            pairs,
+            torch.full((len(pairs),), cell.clearance / 2, dtype=torch.float64),
             _beside(capsules, cell.clearance),
             cell.joints.limits(robot),
         )
+
+    def with_measured(self, q: Float64[Tensor, "poses dof"]) -> "ArmInCell":
+        """The same where poses that were measured are free of self-collision, however thick the links are drawn.
+
+        Args:
+            q: joint values of these poses [rad or m].
+        """
+        room = self.room
+        for chunk in torch.split(q, CHUNK):
+            apart = self._apart(self.capsules.segments(chunk))
+            room = torch.minimum(room, apart.amin(0) - ROUNDING)
+        return replace(self, room=room)
 
     @property
     def too_thick(self) -> tuple[str, ...]:
@@ -165,9 +183,7 @@ class ArmInCell:
         """Room between the links and everything that they must not touch [m], above the clearance."""
         clearance, radius = self.cell.clearance, self.capsules.radius
         infinite = segments.new_full((len(segments), 1), torch.inf)
-        first, second = self.pairs.unbind(-1)
-        apart = segment_distance(segments[:, first], segments[:, second]) - radius[first] - radius[second]
-        gaps = {"links of the robot touch each other": _least(apart, infinite) - clearance / 2}
+        gaps = {"links of the robot touch each other": _least(self._apart(segments) - self.room, infinite)}
         moving = ~self.capsules.carrier
         if self.cell.floor_mm is not None:
             height = segments[:, moving, 1, 2] - radius[moving] - self.cell.floor_mm / 1e3
@@ -176,6 +192,12 @@ class ArmInCell:
             distance = box_distance(box.within(segments[:, moving]), box.half_size) - radius[moving]
             gaps[f"the robot touches the box '{box.name}'"] = _least(distance, infinite) - clearance
         return gaps
+
+    def _apart(self, segments: Float64[Tensor, "poses pieces 2 3"]) -> Float64[Tensor, "poses pairs"]:
+        """Room between the pieces of every pair [m]."""
+        first, second = self.pairs.unbind(-1)
+        radius = self.capsules.radius
+        return segment_distance(segments[:, first], segments[:, second]) - radius[first] - radius[second]
 
     def hidden(
         self, q: Float64[Tensor, "poses dof"], lines: Float64[Tensor, "poses lines 2 3"], what: str

@@ -23,7 +23,8 @@ class RowOrderCheck(AbstractCheck):
 
     A motion is reported where it is `LIKELY`. It makes the calibration implausible where it is `CERTAIN` and `LARGE`
     against all that is left without it. A hybrid leaves less, so that smaller motions show; but a large one becomes a
-    part of it, so that both calibrations are looked at.
+    part of it, so that both calibrations are looked at. A tool that seems to have moved just where the rows of another
+    frame begin is what the frames leave unexplained, unless the motion is `LARGE`.
     """
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
@@ -31,7 +32,13 @@ class RowOrderCheck(AbstractCheck):
         motions = [find_motion(checked.geometric)]
         if checked.hybrid is not None and checked.hybrid.learned is not None:
             motions.append(find_motion(checked.hybrid))
-        likely = [motion for motion in motions if motion and motion.log_bayes_factor > LIKELY]
+        likely = [
+            motion
+            for motion in motions
+            if motion
+            and motion.log_bayes_factor > LIKELY
+            and not (motion.begins_frame and motion.factor <= LARGE)
+        ]
         if likely:
             motion = max(likely, key=lambda motion: motion.factor)
             certain = motion.log_bayes_factor > CERTAIN and motion.factor > LARGE

@@ -1,6 +1,5 @@
 """Whether a mistake in the setup or in the file explains errors that no robot of this drawing has."""
 
-import math
 from collections.abc import Iterator
 from functools import lru_cache
 
@@ -8,9 +7,9 @@ from pisigma.errors import IdentificationError
 from pisigma.judging.diagnostic import Diagnostic, Severity
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
+from pisigma.robot.robot_class import HOBBY
 from pisigma.verification.checks.check import AbstractCheck, CheckedCalibration
-from pisigma.verification.checks.prior_ratio import IMPLAUSIBLE
-from pisigma.verification.faults_as_drawn import USUAL, are_unrelated, find_faults_as_drawn
+from pisigma.verification.faults_as_drawn import are_unrelated, find_faults_as_drawn
 from pisigma.verification.new_setup import new_setup
 from pisigma.verification.setup_fault import either
 
@@ -24,8 +23,8 @@ class SetupFaultCheck(AbstractCheck):
     """Looks for setup faults under which the errors of the robot as drawn collapse; see `find_faults_as_drawn`.
 
     A fault makes the calibration implausible, as it may be absorbed by parameters that then are wrong elsewhere. The
-    zero of a joint is a parameter: where it has moved, a calibration is right, so up to the size that the prior
-    ratio allows it is a warning.
+    zero of a joint is a parameter: where it has moved, a calibration is right, so up to the size that is possible in
+    any class of robots it is a warning.
     """
 
     def diagnose(self, checked: CheckedCalibration) -> Iterator[Diagnostic]:
@@ -37,8 +36,8 @@ class SetupFaultCheck(AbstractCheck):
 def setup_diagnostics(robot: Robot, rows: Measurements) -> tuple[Diagnostic, ...]:
     """Say which setup faults explain the errors of the robot as drawn; see `SetupFaultCheck`."""
     if faults := find_faults_as_drawn(robot, rows):
-        fault, largest = either(faults), IMPLAUSIBLE * USUAL * math.sqrt(robot.dof)
-        severity: Severity = "implausible" if fault.moved > largest else "warning"
+        fault = either(faults)
+        severity: Severity = "implausible" if fault.moved > HOBBY.largest.joint_offset else "warning"
         return (Diagnostic(kind="setup_fault", severity=severity, sentence=fault.sentence),)
     if are_unrelated(robot, rows):
         return (Diagnostic(kind="setup_fault", severity="implausible", sentence=UNRELATED),)

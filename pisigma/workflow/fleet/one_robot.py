@@ -23,6 +23,8 @@ Task = Literal["calibrate", "recalibrate", "monitor"]
 EngineName = Literal["processes", "ray"]
 OPTIONS = ("model", "free", "split", "robust", "prior_length", "prior_angle", "train_rows", "seed")
 """Settings of a calibration that a manifest may state for one robot."""
+UNKNOWN = SessionFile("description", "", Path())
+"""Stands for the sessions of a robot whose description is wrong."""
 
 
 @dataclass(frozen=True)
@@ -69,14 +71,23 @@ class FleetSettings:
         """Settings of the calibration of one robot.
 
         Raises:
-            FleetError: an option of the robot is unknown or has no such value.
+            FleetError: the description of the robot is wrong, an option of it is unknown or has no such value, or the
+                task needs another model than it chooses.
             PisigmaError: the settings make no sense together.
         """
-        for name, _ in member.options:
+        if member.fault:
+            raise FleetError(member.fault)
+        for name, value in member.options:
+            if not value:
+                raise FleetError(
+                    f"robot '{member.id}': expected options as name=value; name=value, got '{name}'."
+                )
             if name not in OPTIONS:
                 raise FleetError(
                     f"robot '{member.id}': option '{name}' is unknown; {nearest_choice(name, OPTIONS)}"
                 )
+            if [one for one, _ in member.options].count(name) > 1:
+                raise FleetError(f"robot '{member.id}': option '{name}' appears twice; state it once.")
         stated = {name: getattr(self.calibration, name) for name in self.calibration.__dataclass_fields__}
         stated |= {name: _free(value) if name == "free" else value for name, value in member.options}
         stated["cameras"] = member.cameras
@@ -85,11 +96,17 @@ class FleetSettings:
         except ValidationError as problem:
             where = problem.errors()[0]
             name = ".".join(map(str, where["loc"]))
-            raise FleetError(
-                f"robot '{member.id}': option '{name}': {where['msg']}, got '{where['input']}'."
-            ) from None
+            what = (
+                f"option '{name}': {where['msg']}, got '{where['input']}'." if name else where["ctx"]["error"]
+            )
+            raise FleetError(f"robot '{member.id}': {what}") from None
         if self.prior is not None:
             settings.check_unused()
+        elif self.task != "calibrate" and member.model is None and settings.model == "geometric":
+            raise FleetError(
+                f"robot '{member.id}': the task {self.task} adds rows to the model of the first session, which only a "
+                "hybrid can take; leave out --model geometric, or state a model folder in the column 'model'."
+            )
         return settings if self.validate else replace(settings, folds=0, hold_out=None, repeats=None)
 
 
@@ -98,7 +115,7 @@ def work_out(
     settings: FleetSettings,
     out: Path,
     keys: Mapping[str, str],
-    plans: Mapping[str, CalibrationSettings],
+    plans: Mapping[str, CalibrationSettings | str],
 ) -> RobotRecord:
     """Work out one robot, and write its models and its record.
 
@@ -107,11 +124,14 @@ def work_out(
         settings: what is done.
         out: folder of the fleet.
         keys: of all robots, by id.
-        plans: settings of their calibrations.
+        plans: settings of their calibrations, or what is wrong with the options of a robot.
     """
     sessions: list[SessionRecord] = []
     try:
-        for record in _worked_out(member, settings, plans[member.id], out):
+        plan = plans[member.id]
+        if isinstance(plan, str):
+            raise FleetError(plan)
+        for record in _worked_out(member, settings, plan, out):
             sessions.append(record)
         result = RobotRecord(member.id, keys[member.id], tuple(sessions))
         write_record(out, result)
@@ -122,7 +142,7 @@ def work_out(
             if known
             else f"a defect of pisigma ({type(problem).__name__}: {problem}); please report it."
         )
-        at = member.sessions[min(len(sessions), len(member.sessions) - 1)]
+        at = [*member.sessions, *member.sessions[-1:], UNKNOWN][len(sessions)]
         return RobotRecord(member.id, keys[member.id], (*sessions, _refusal(at, what)))
     return result
 
@@ -234,7 +254,13 @@ def _monitored(
     files = [one.data for one in sessions]
     dates = tuple(one.date for one in sessions) if all(one.date for one in sessions) else ()
     monitoring = monitor(model, files, MonitorSettings(dates=dates, history=False, cameras=cameras))
-    for session, judged in zip(sessions, monitoring.sessions, strict=True):
+    untrusted = {one.file: one for one in monitoring.untrusted}
+    trusted = iter(monitoring.sessions)
+    for session in sessions:
+        if (doubts := untrusted.get(session.data.name)) is not None:
+            yield _refusal(session, doubts.sentence)
+            continue
+        judged = next(trusted)
         yield SessionRecord(
             session=session.name,
             date=judged.date,

@@ -16,6 +16,7 @@ from pisigma.fleet.prior import FEWEST_ROBOTS, FleetPrior, fleet_prior
 from pisigma.fleet.prior_summary import FleetPriorSummary, summarise_prior
 from pisigma.judging.progress import Progress
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.joint_range import row_warnings, with_limits_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.reporting.fleet_prior_card import write_fleet_prior_card
 from pisigma.robot.description import Robot
@@ -83,9 +84,13 @@ def estimate_fleet_prior(
             f"{FEWEST_ROBOTS} robots or more were wanted, got {len(rows)} with files that can be read; correct, among "
             f"others: {next(iter(refused.values()))}"
         )
-    prior = fleet_prior(Path(source).resolve().stem, drawn, list(rows.values()))
+    remarks = tuple(f"Robot '{one}': {said}" for one in rows for said in row_warnings(drawn, rows[one]))
+    wide = drawn
+    for some in rows.values():
+        wide = with_limits_of_rows(wide, some)
+    prior = fleet_prior(Path(source).resolve().stem, wide, list(rows.values()))
     summary = summarise_prior(prior, list(rows)).having(
-        command=f"pisigma.estimate_fleet_prior({Path(source).name!r})", refused=refused
+        command=f"pisigma.estimate_fleet_prior({Path(source).name!r})", refused=refused, remarks=remarks
     )
     model = replace(prior.model, metrics=summary.to_json())
     return FleetPriorResult(model, prior, summary, time.perf_counter() - started)
@@ -101,8 +106,10 @@ def _robots(members: tuple[Member, ...]) -> tuple[dict[str, Robot], dict[str, st
     refused: dict[str, str] = {}
     for member in members:
         try:
+            if member.fault:
+                raise FleetError(member.fault)
             robots[member.id] = Robot.load(member.robot)
-        except RobotError as problem:  # one bad file does not stop the others
+        except (FleetError, RobotError) as problem:  # one bad file does not stop the others
             refused[member.id] = str(problem)
     if not robots:
         raise FleetError(f"no description of a robot can be read: {next(iter(refused.values()))}")

@@ -5,7 +5,7 @@ import hashlib
 import json
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import import_module
@@ -14,7 +14,7 @@ from typing import Any
 
 from pisigma.engines.engine import AbstractEngine
 from pisigma.engines.processes import ProcessEngine
-from pisigma.errors import OutputError
+from pisigma.errors import OutputError, PisigmaError
 from pisigma.files.conflicts import check_apart
 from pisigma.files.model_files import is_model, model_hash
 from pisigma.fleet.members import Member, read_fleet
@@ -22,6 +22,7 @@ from pisigma.fleet.record import MARK, RobotRecord, expect_robots, read_record, 
 from pisigma.fleet.results_table import RESULTS, write_results
 from pisigma.judging.progress import Progress
 from pisigma.model.folder.model_folder import load_model
+from pisigma.plugins import loaded
 from pisigma.recalibration.model_posterior import check_fleet_prior
 from pisigma.workflow.calibrate import CalibrationSettings
 from pisigma.workflow.fleet.one_robot import FleetSettings, work_out
@@ -76,9 +77,9 @@ def run_fleet(
 ) -> FleetRun:
     """Work out all robots of a fleet; what an earlier call into the same folder came to is kept.
 
-    A robot whose files are bad is reported and does not stop the others. Every robot has a record of its own, written
-    whole when the robot is done; a robot is worked out again where its files or the settings have changed, its model is
-    gone, or it was refused for want of space.
+    A robot whose files or options are bad is reported and does not stop the others. Every robot has a record of its
+    own, written whole when the robot is done; a robot is worked out again where its files or the settings have changed,
+    its model is gone, or it was refused for want of space.
 
     Args:
         source: manifest (CSV) or folder; see `pisigma.fleet.members.read_fleet`.
@@ -88,7 +89,7 @@ def run_fleet(
         progress: called with what is being done.
 
     Raises:
-        FleetError: the fleet or a robot's options cannot be used.
+        FleetError: the fleet cannot be used, or the options of none of its robots can.
         MeasurementError: the manifest is no CSV file.
         ModelError: the prior is no model of `pisigma fleet prior`.
         OutputError: the folder is not that of a fleet, or cannot be written to.
@@ -98,7 +99,7 @@ def run_fleet(
     for extra in ("pyarrow", *(("ray",) if settings.engine == "ray" else ())):
         import_module(extra)  # before the work, and before anything is written
     members = read_fleet(source, robot)
-    plans = {member.id: settings.of(member) for member in members}
+    plans = _plans(members, settings)
     folder = Path(out)
     if settings.prior is not None:
         check_fleet_prior(load_model(settings.prior))
@@ -126,6 +127,23 @@ def run_fleet(
         results=folder / RESULTS,
         seconds=time.perf_counter() - started,
     )
+
+
+def _plans(members: Sequence[Member], settings: FleetSettings) -> dict[str, CalibrationSettings | str]:
+    """Settings of the calibration of every robot, or what is wrong with its options.
+
+    Raises:
+        PisigmaError: the options of no robot can be used.
+    """
+    plans: dict[str, CalibrationSettings | str] = {}
+    for member in members:
+        try:
+            plans[member.id] = settings.of(member)
+        except PisigmaError as problem:
+            plans[member.id] = str(problem)
+            if len(plans) == len(members) and all(isinstance(plan, str) for plan in plans.values()):
+                raise
+    return plans
 
 
 @contextmanager
@@ -178,7 +196,7 @@ def _finished(out: Path, member: Member, key: str) -> RobotRecord | None:
     return record if all(not one.model or is_model(out / one.model) for one in record.sessions) else None
 
 
-def _key(member: Member, settings: FleetSettings, plan: CalibrationSettings) -> str:
+def _key(member: Member, settings: FleetSettings, plan: CalibrationSettings | str) -> str:
     """SHA-256 of all that a robot is worked out from: files, settings and the version of pisigma."""
     from pisigma import __version__
 
@@ -189,6 +207,7 @@ def _key(member: Member, settings: FleetSettings, plan: CalibrationSettings) -> 
         "validate": settings.validate,
         "prior": None if settings.prior is None else model_hash(settings.prior),
         "plan": repr(plan),
+        "plugins": loaded().content(),
         "robot": _hash_of(drawn) if drawn.is_file() else member.robot,
         "model": None if model is None else model_hash(model) if is_model(model) else str(model),
         "cameras": [_hash_of(Path(file)) for file in (member.cameras.files if member.cameras else ())],

@@ -169,11 +169,12 @@ def calibrate_camera(
     """
     of_board = Board.load(board)
     detected = detect_boards(image_files(images), of_board, settings.most_blur, progress)
-    size = detected[0].size
-    for one in detected:
+    read = [one for one in detected if one.is_read]
+    size = read[0].size
+    for one in read:
         if one.size != size:
             raise MeasurementError(
-                f"{one.file}: an image of {size[0]} x {size[1]} px as {detected[0].file} was wanted, "
+                f"{one.file}: an image of {size[0]} x {size[1]} px as {read[0].file} was wanted, "
                 f"got {one.size[0]} x {one.size[1]}; give images of one camera."
             )
     boards = [one.board for one in detected if isinstance(one.board, DetectedBoard)]

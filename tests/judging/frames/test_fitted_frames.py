@@ -86,5 +86,5 @@ def test_what_is_fitted_needs_poses(arm):
         errors_in_fitted_frames(model, few, ("base",))
     with pytest.raises(MeasurementError, match=r"target 'ball' holds 5 different joint vectors"):
         errors_in_fitted_frames(model, replace(rows.select(torch.arange(5)), frame=("",) * 5), ("tool",))
-    with pytest.raises(MeasurementError, match="no positions"):
+    with pytest.raises(MeasurementError, match="expected positions"):
         errors_in_fitted_frames(model, replace(rows, position=None), ("base",))

@@ -96,3 +96,17 @@ def test_motions_that_were_looked_at_are_known_both_ways():
     points = motions.points_between(q[first][0], q[20 + first][0])
     assert points is not None
     assert motions.points_between(q[first][0], q[20 + first][0]) is points
+
+
+def test_a_measured_pose_is_free_of_self_collision():
+    """Poses that touch by the drawing are allowed where they were measured, and so are those with more room."""
+    arm = ArmInCell.of(Robot.load("ur5"))
+    limits = torch.from_numpy(np.clip(arm.robot.limits, -np.pi, np.pi))
+    draws = torch.rand(400, arm.robot.dof, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    q = limits[:, 0] + (limits[:, 1] - limits[:, 0]) * draws
+    touching = (~arm.faults(q).allowed).nonzero()[:, 0]
+    measured = q[touching[:5]]
+    with_measured = arm.with_measured(measured)
+    assert len(touching) > 10
+    assert with_measured.faults(measured).allowed.all()
+    assert with_measured.faults(q).allowed.sum() < len(q)

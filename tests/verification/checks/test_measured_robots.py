@@ -74,7 +74,11 @@ def test_a_wrong_distance_of_sockets_is_refused(shared_data, distance):
 @pytest.mark.parametrize("same", [True, False])
 def test_many_wrong_rows_are_reported(shared_data, robot, same):
     rows = spoilt(rows_of(shared_data, robot, 4), 0.4, 3e-3, same)
-    assert ("two_populations", "warning") in kinds_of(calibrator(robot, rows), rows)
+    severities = [
+        severity for kind, severity in kinds_of(calibrator(robot, rows), rows) if kind == "two_populations"
+    ]
+    assert severities  # a shift of a frame that is large beside the errors makes the calibration implausible
+    assert same or severities == ["warning"]
 
 
 @pytest.mark.parametrize(

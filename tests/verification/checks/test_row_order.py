@@ -160,3 +160,19 @@ def test_measured_robots_show_no_motion_in_any_order(name: str, file: str) -> No
     for data in (every, every.select(every.q[:, 1].argsort()), every.select(every.q[:, 4].argsort())):
         assert [one for one in said(robot, data) if one.severity == "implausible"] == []
     assert said(robot, every) == []
+
+
+@pytest.mark.parametrize(
+    ("shift", "frames", "reported"), [(8e-5, 1, True), (8e-5, 2, False), (4e-3, 2, True)]
+)
+def test_what_two_frames_leave_unexplained_is_no_motion_of_the_tool(shift, frames, reported):
+    """Where a frame begins a tool moves only if that makes the errors far larger."""
+    simulated = simulate("ur5", seed=1, rows=160, noise=5e-5)
+    rows = replace(simulated.measurements, line=tuple(range(2, 162)), source="tracker.csv")
+    R = forward_kinematics(simulated.true, rows.q)[80:, :3, :3]
+    position = rows.position.clone()
+    position[80:] += R @ torch.tensor([shift, 0.0, 0.0], dtype=torch.float64)
+    rows = replace(rows, position=position)
+    if frames == 2:
+        rows = with_new_frames(rows, (82,))
+    assert bool(said(simulated.nominal, rows)) == reported

@@ -12,7 +12,7 @@ from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.judging.diagnostic import Diagnostic
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot import Robot
-from pisigma.verification.checks.scale import ScaleCheck, common_scale
+from pisigma.verification.checks.scale import ScaleCheck, common_scale, scale_figures
 
 MEASURED = [
     ("ur5", "ur5/grid.csv"),
@@ -36,6 +36,34 @@ def test_scaled_measurements_are_recognised(shared_data, robot, file, factor, se
     assert_close(scale.factor, factor, atol=1.5e-3)
     (diagnostic,) = ScaleCheck().diagnose(checked(calibrator, rows))
     assert (diagnostic.kind, diagnostic.severity) == ("scale", severity)
+
+
+@pytest.mark.parametrize(("robot", "file"), MEASURED[1:])
+def test_a_thousandth_is_recognised_where_links_are_long_for_their_errors(shared_data, robot, file):
+    rows = Measurements.read_csv(shared_data / file)
+    rows = rows.select(torch.arange(0, rows.rows, 15))
+    rows = replace(rows, position=rows.position * 1.001)
+    (diagnostic,) = ScaleCheck().diagnose(checked(GeometricCalibrator(Robot.load(robot)), rows))
+    assert (diagnostic.kind, diagnostic.severity) == ("scale", "warning")
+
+
+def test_figures_say_how_far_true_positions_are_off(shared_data):
+    rows = Measurements.read_csv(shared_data / "ur5/grid.csv")
+    rows = rows.select(torch.arange(0, rows.rows, 15))
+    figures = [
+        scale_figures(
+            checked(GeometricCalibrator(Robot.load("ur5")), replace(rows, position=rows.position * factor))
+        )
+        for factor in (1.0, 1.001)
+    ]
+    assert_close(figures[1].factor - figures[0].factor, 1e-3, atol=2e-5)
+    spread = (rows.position - rows.position.mean(0)).square().sum(1).mean().sqrt()
+    assert_close(figures[1].rms_mm - figures[0].rms_mm, float(spread), rtol=0.03)
+
+
+def test_a_joint_that_slides_is_a_scale_by_itself():
+    arm = simulate("kiro3", rows=40, noise=5e-5)
+    assert scale_figures(checked(GeometricCalibrator(arm.nominal), arm.measurements)) is None
 
 
 def test_a_scale_is_looked_for_in_every_calibration(shared_data):

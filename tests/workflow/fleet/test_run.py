@@ -88,8 +88,8 @@ def test_sessions_recalibrate_or_are_monitored(plant):
     save_model(model_before(), save_folder)
     for month, moved in ((11, 0.0), (12, math.radians(0.25))):
         shift = (0.0, 0.0, moved, 0.0, 0.0, 0.0)
-        rows_later(12, month, shift).write_csv(plant / f"2026-{month}-01.csv", model_before().robot)
-    rows = "".join(f"a,rb5,2026-{month}-01.csv,first\n" for month in (11, 12))
+        rows_later(12, month, shift).write_csv(plant / f"2025-{month}-01.csv", model_before().robot)
+    rows = "".join(f"a,rb5,2025-{month}-01.csv,first\n" for month in (11, 12))
     (plant / "aged.csv").write_text(f"id,robot,data,model\n{rows}", encoding="utf-8")
     monitored = run_fleet(plant / "aged.csv", plant / "watched", FleetSettings(task="monitor", jobs=1))
     (robot,) = monitored.records
@@ -98,14 +98,14 @@ def test_sessions_recalibrate_or_are_monitored(plant):
     assert "joint 3" in robot.sessions[1].sentence
     renewed = run_fleet(plant / "aged.csv", plant / "renewed", FleetSettings(task="recalibrate", jobs=1))
     (robot,) = renewed.records
-    assert [one.model for one in robot.sessions] == ["models/a/2026-11-01", "models/a/2026-12-01"]
+    assert [one.model for one in robot.sessions] == ["models/a/2025-11-01", "models/a/2025-12-01"]
     assert robot.sessions[1].verdict == "recalibrated"
     assert "Joint 3 moved" in robot.sessions[1].sentence
     theta = {one.name: one for one in robot.sessions[1].parameters}["theta_3"]
     assert theta.unit == "deg"
     assert 0 < theta.standard_error < 0.1
     last = load_model(plant / "renewed" / robot.sessions[1].model)
-    assert last.metrics["parent"]["name"] == "2026-11-01"
+    assert last.metrics["parent"]["name"] == "2025-11-01"
 
 
 def test_outputs_that_are_not_a_fleets_are_refused(plant):
@@ -125,6 +125,8 @@ def test_outputs_that_are_not_a_fleets_are_refused(plant):
         ("folds=3", "option 'folds' is unknown"),
         ("model=neural", "option 'model'"),
         ("prior_length=long", "option 'prior_length'"),
+        ("prior_length=-1", "robot 'r0': the prior's"),
+        ("seed=1; seed=2", "option 'seed' appears twice"),
     ],
 )
 def test_options_of_one_robot_are_checked_before_the_work(plant, options, complaint):
@@ -132,6 +134,36 @@ def test_options_of_one_robot_are_checked_before_the_work(plant, options, compla
     path.write_text(f"id,robot,data,options\nr0,rb5,0.csv,{options}\n", encoding="utf-8")
     with pytest.raises(FleetError, match=complaint):
         run_fleet(path, plant / "out", SETTINGS)
+    assert not (plant / "out").exists()
+
+
+def test_a_bad_option_stops_its_robot_only(plant):
+    path = plant / "options.csv"
+    bad = {"r1": "folds=3", "r2": "prior_length"}
+    rows = "".join(f"{name},rb5,{name[1]}.csv,{option}\n" for name, option in ({"r0": ""} | bad).items())
+    path.write_text(f"id,robot,data,options\n{rows}", encoding="utf-8")
+    run = run_fleet(path, plant / "out", SETTINGS)
+    assert [name for name, _ in run.refused] == list(bad)
+    assert "folds" in run.refused[0][1]
+    assert "prior_length" in run.refused[1][1]
+    assert run.done == 1
+
+
+@pytest.mark.parametrize("row", ["r1,rb5,1.csv,May,", "r1,rb5,1.csv", "r1,,1.csv,2026-10-01,"])
+def test_a_bad_row_stops_its_robot_only(plant, row):
+    path = plant / "rows.csv"
+    path.write_text(f"id,robot,data,date,options\nr0,rb5,0.csv,2026-10-01,\n{row}\n", encoding="utf-8")
+    run = run_fleet(path, plant / "out", SETTINGS)
+    ((robot, reason),) = run.refused
+    assert (robot, run.done) == ("r1", 1)
+    assert "rows.csv, line 3" in reason
+    assert [one.robot for one in read_records(plant / "out")] == ["r0"]
+
+
+@pytest.mark.parametrize("task", ["monitor", "recalibrate"])
+def test_rows_that_no_model_could_take_are_refused_before_the_work(plant, task):
+    with pytest.raises(FleetError, match="only a hybrid can take"):
+        run_fleet(plant / "fleet.csv", plant / "out", replace(SETTINGS, task=task))
     assert not (plant / "out").exists()
 
 

@@ -1,4 +1,4 @@
-"""Faults that all rows of a session have in common."""
+"""The gate for rows, by the robot as drawn."""
 
 from dataclasses import replace
 
@@ -8,16 +8,15 @@ from testing.measured_plans import measured_plan
 
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
-from pisigma.measuring.setup_sentence import setup_sentence
 from pisigma.robot import Robot
-from pisigma.workflow.measure import MeasuringSession
+from pisigma.verification.gate import check_rows
 
 PLAN = measured_plan("kiro3")
 ROBOT = PLAN.stored.arm.robot
 
 
-def sentence(rows):
-    return setup_sentence(ROBOT, rows, torch.ones(rows.rows, dtype=torch.bool))
+def sentence(rows: Measurements, robot: Robot = ROBOT) -> str:
+    return " ".join(one.sentence for one in check_rows(rows, robot).implausible)
 
 
 def test_right_rows_and_very_few_have_no_fault():
@@ -41,7 +40,7 @@ def test_another_robot_of_the_catalogue_is_named(measured, rows):
     q = torch.rand(rows, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(rows)) * 4 - 2
     noise = 5e-5 * torch.randn(rows, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     some = Measurements(q, forward_kinematics(Robot.load(measured), q)[:, :3, 3] + noise)
-    found = setup_sentence(Robot.load("ur5"), some, torch.ones(rows, dtype=torch.bool))
+    found = sentence(some, Robot.load("ur5"))
     assert found.startswith(f"Robot '{measured}' of the catalogue") == (measured != "ur5" and rows >= 6)
 
 
@@ -54,17 +53,15 @@ def test_an_arm_that_nobody_drew_is_named(longer, rows, said):
     q = torch.rand(rows, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(rows)) * 4 - 2
     noise = 5e-5 * torch.randn(rows, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
     some = Measurements(q, forward_kinematics(robot.with_geometry(dh), q)[:, :3, 3] + noise)
-    found = setup_sentence(robot, some, torch.ones(rows, dtype=torch.bool))
-    assert ("check whether this robot was measured" in found) == said
+    kinds = {one.kind for one in check_rows(some, robot).implausible}
+    assert bool(kinds & {"prior_ratio", "implausible_errors"}) == said
 
 
-def test_a_session_says_so_once_and_does_not_advise_to_go_on():
-    session, rows = MeasuringSession(PLAN.stored), PLAN.rows(5)
-    rows = replace(rows, position=rows.position * 1000)
-    alarms = session.add(rows.select(torch.arange(4)))
-    assert [alarm.line for alarm in alarms if alarm.kind == "setup"] == [1]
-    assert "setup" not in [alarm.kind for alarm in session.add(rows.select(torch.tensor([4])))]
-    session.work_out()
-    assert session.state.accuracy is None
-    assert session.state.advice.action == "correct"
-    assert "named metres" in session.state.advice.sentence
+@pytest.mark.parametrize(("name", "rows"), [("ur5", 8), ("kiro3", 12)])
+def test_a_reversed_joint_is_named_from_few_rows_on(name, rows):
+    plan = measured_plan(name)
+    robot, some = plan.stored.arm.robot, plan.rows(rows)
+    assert sentence(some, robot) == ""
+    signs = torch.ones(robot.dof)
+    signs[3] = -1
+    assert sentence(replace(some, q=some.q * signs), robot).startswith("The sign of joint 4 is reversed")

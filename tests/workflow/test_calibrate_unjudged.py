@@ -1,0 +1,27 @@
+"""A calibration that no left-out row judged says what it predicts of its own errors."""
+
+import pytest
+import torch
+from testing.simulated_arm import simulate
+
+from pisigma.judging.calibration_validation import errors_under
+from pisigma.workflow.calibrate import CalibrationSettings, calibrate
+
+
+@pytest.mark.parametrize("model", ["geometric", "hybrid"])
+def test_a_calibration_without_left_out_rows_predicts_its_error_at_other_poses(model):
+    arm = simulate("ur5", rows=220, noise=5e-5)
+    few, others = (arm.measurements.select(torch.arange(*part)) for part in ((0, 20), (20, 220)))
+    calibration = calibrate(arm.nominal, few, CalibrationSettings(model=model, folds=0))
+    predicted, fitted = calibration.summary.predicted_rms_mm, calibration.summary.calibrated
+    assert predicted is not None
+    assert fitted is not None
+    error = float(errors_under(calibration.result, others).position.square().mean().sqrt()) * 1e3
+    assert error / 1.7 < predicted < 1.7 * error
+    assert predicted > 1.5 * fitted.models[model].rms_mm
+
+
+def test_left_out_rows_say_it_better():
+    arm = simulate("ur5", rows=40, noise=5e-5)
+    settings = CalibrationSettings(model="geometric", hold_out=0.3)
+    assert calibrate(arm.nominal, arm.measurements, settings).summary.predicted_rms_mm is None

@@ -1,0 +1,49 @@
+"""A folder is worth what the model in memory is worth: every step makes the same of both, to the last bit."""
+
+from dataclasses import replace
+
+import pytest
+from testing.aged import model_before, rows_later
+from testing.same_model import differences
+
+from pisigma.inverse.written_model import write_model
+from pisigma.planning.plan_settings import PlanSettings
+from pisigma.workflow.compare import compare
+from pisigma.workflow.monitor import monitor
+from pisigma.workflow.plan import plan
+from pisigma.workflow.recalibrate import recalibrate
+
+COLLISION = (0.0, 0.0, 0.00436, 0.0, 0.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = tmp_path_factory.mktemp("models") / "rb5"
+    path.mkdir()
+    write_model(model_before(), path)
+    return path
+
+
+def test_plans_are_the_same(folder):
+    settings = PlanSettings(count=4, check=1, candidates=100)
+    one, other = (plan(source, settings) for source in (model_before(), folder))
+    assert differences(one.stored.q, other.stored.q) == []
+    assert differences(one.curve, other.curve) == []
+
+
+def test_recalibrations_are_the_same(folder):
+    one, other = (recalibrate(source, rows_later(10, 2, COLLISION)) for source in (model_before(), folder))
+    assert differences(replace(one.model, metrics={}), replace(other.model, metrics={})) == []
+    assert differences(one.moved, other.moved) == []
+
+
+def test_sessions_and_their_history_are_the_same(folder):
+    sessions = [rows_later(10, 2, COLLISION)]
+    one, other = (monitor(source, sessions) for source in (model_before(), folder))
+    assert differences(one.records, other.records) == []
+    assert differences(one.charts, other.charts) == []
+
+
+def test_comparisons_are_the_same(folder):
+    one, other = (compare("nominal", source).to_json() for source in (model_before(), folder))
+    assert differences({**one, "seconds": 0, "models": []}, {**other, "seconds": 0, "models": []}) == []

@@ -1,0 +1,54 @@
+"""A single row that is far off is named, and the others are judged, whether the instrument moved or not."""
+
+import dataclasses
+import math
+
+import pytest
+from testing.aged import model_before, rows_later
+from testing.models import no_type_checker
+
+from pisigma.measurement.dataset import Measurements
+from pisigma.model.folder.model_folder import save_model
+from pisigma.workflow.monitor import monitor
+from pisigma.workflow.recalibrate import recalibrate
+from pisigma.workflow.report import report
+
+WRONG = 5
+
+
+def with_one_far_off(rows: Measurements) -> Measurements:
+    """The rows, one of them logged with 162 deg more of the first joint."""
+    q = rows.q.clone()
+    q[WRONG, 0] += math.radians(162)
+    return dataclasses.replace(rows, q=q, source="rows.csv", line=tuple(range(2, rows.rows + 2)))
+
+
+@pytest.mark.parametrize("base", [(0.0,) * 6, (0.4, 0.2, 0.0, 0.0, 0.0, 0.3)], ids=["there", "moved"])
+def test_monitor_judges_the_others(base):
+    rows = rows_later(24, 3, base=base)
+    with no_type_checker():
+        done = monitor(model_before(), [with_one_far_off(rows)])
+        alone = monitor(model_before(), [rows])
+    assert done.untrusted == ()
+    (session,), (right,) = (one.sessions for one in (done, alone))
+    assert session.session.rows == 23
+    assert session.session.verdict == right.session.verdict
+    assert abs(session.session.rms - right.session.rms) < 5e-5
+    assert sum("rows.csv, line 7" in one for one in done.warnings) == 1
+
+
+def test_report_judges_the_others(tmp_path):
+    save_model(model_before(), tmp_path)
+    with no_type_checker():
+        done = report(tmp_path, with_one_far_off(rows_later(24, 3)))
+    assert done.diagnostics == ()
+    assert done.content.rows.measurements.rows == 23
+    assert float(done.content.rows.after.position.max()) < 2e-3
+    assert sum("rows.csv, line 7" in one for one in done.content.rows.remarks) == 1
+
+
+def test_recalibrate_judges_the_others():
+    with no_type_checker():
+        done = recalibrate(model_before(), with_one_far_off(rows_later(24, 3)))
+    assert done.trusted
+    assert [one.row for one in done.summary.outliers] == [WRONG]
