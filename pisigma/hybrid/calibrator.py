@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.hybrid.arm import JointCoverage
+from pisigma.hybrid.delivery import Delivered, delivered
 from pisigma.hybrid.design import Design, Rows, weigh
 from pisigma.hybrid.evidence import SMALLEST_NOISE
 from pisigma.hybrid.gravity import USUAL, gravity_by_evidence, gravity_sentence, in_first_row
@@ -50,6 +51,11 @@ _TOO_FEW_ROWS = (
     "more poses."
 )
 
+_NOTHING_SERVES = (
+    "No joint correction predicts left-out rows of every sensor at least as well as the geometry alone, and of one "
+    "clearly better, so the geometric calibration stands."
+)
+
 
 @dataclass(frozen=True)
 class HybridCalibrator:
@@ -57,7 +63,8 @@ class HybridCalibrator:
 
     All unknowns are normal with means at nominal. The prior sizes of weights maximise the evidence, those of geometric
     errors are the geometric calibration's. Whatever does not raise the evidence, or predicts left-out rows worse, is
-    left out; if nothing is left the result is that of the geometric calibration.
+    left out, and what is left has to predict rows left out of exact fits better than the geometric calibration does; if
+    nothing is left, the result is that of the geometric calibration.
 
     Attributes:
         robot: the nominal robot; or its geometric calibrator, where that needs other settings than its defaults.
@@ -133,19 +140,24 @@ class HybridCalibrator:
         if not choice.best.design.features:
             verdict = "Nothing beyond the geometry was found in the data: the geometric calibration stands."
             return _geometric_alone(solved, choice, verdict)
+        progress("looking at exact left-out rows")
+        serving = delivered(solved, choice, progress)
+        if serving is None:
+            return _geometric_alone(solved, choice, _NOTHING_SERVES)
+        choice = serving.choice
         progress("solving for everything")
         trained = ""
         if batches is None:
-            refined = refine(solved.problem, group, choice)
+            whole = solved.problem.q.shape[0] == choice.rows.problem.q.shape[0]
+            refined = serving.refined if whole else refine(solved.problem, group, choice)
         else:
-            few = refine(choice.rows.problem, choice.rows.group, choice)
             refined, trained = refine_in_batches(
-                solved, few, group, batches=batches, progress=progress, checkpoints=kept
+                solved, serving.refined, group, batches=batches, progress=progress, checkpoints=kept
             )
         if refined.regression.effective_share(refined.posterior) > choice.best.largest_share:
             return _geometric_alone(solved, choice, _TOO_FEW_ROWS)
         falling = gravity_sentence(self.geometric.robot, choice.best.design.features)
-        verdict, trials = " ".join(filter(None, (_kept_sentence(choice), falling, trained))), choice.trials
+        verdict, trials = " ".join(filter(None, (_kept_sentence(serving), falling, trained))), choice.trials
         learned = self._learned(solved, refined)
         progress("looking at left-out rows")
         uncertainty = position_uncertainty(
@@ -162,7 +174,7 @@ class HybridCalibrator:
         """The correction with the geometry that belongs to it, and where it was measured."""
         noise = zip(solved.problem.sensors, refined.posterior.noise, strict=True)
         return LearnedPart(
-            geometry=with_frames_of(solved, refined, identified_geometry(solved.setup, refined.point)),
+            geometry=with_frames_of(solved, refined),
             correction=refined.correction,
             coverage=JointCoverage.of(self.geometric.robot, solved.problem.q),
             noise={sensor.name: sigma for sensor, sigma in noise if not sensor.certain},
@@ -275,11 +287,11 @@ def _outliers(solved: SolvedCalibration, refined: Refined) -> tuple[Outlier, ...
     return tuple(sorted(found, key=lambda outlier: -outlier.deviations))
 
 
-def _kept_sentence(choice: Choice) -> str:
+def _kept_sentence(serving: Delivered) -> str:
     """What was kept, and how much better left-out rows are predicted with it."""
-    share = [trial.left_out for trial in choice.trials if trial.kept][-1]
+    best = serving.choice.best
     return (
-        f"A joint correction was kept ({choice.best.name}): left-out rows are predicted with {share:.2f} times the "
+        f"A joint correction was kept ({best.name}): left-out rows are predicted with {serving.left_out:.2f} times the "
         "error of the geometric calibration."
     )
 

@@ -168,8 +168,23 @@ class LeftOut:
 
     def rms(self, noise: Sequence[float], unit: Sequence[float]) -> float:
         """Root mean square in other standard deviations than those of the noise, such as that of another model."""
+        return float(self._squares(noise, unit).mean().sqrt())
+
+    def gain(self, noise: Sequence[float], before: "LeftOut", noise_before: Sequence[float]) -> float:
+        """By how many standard errors the squares of the same values are smaller than another fit's."""
+        return standard_errors(
+            before._squares(noise_before, noise_before) - self._squares(noise, noise_before)
+        )
+
+    def _squares(self, noise: Sequence[float], unit: Sequence[float]) -> Float64[Tensor, " values"]:
         scale = self.error.new_tensor(noise) / self.error.new_tensor(unit)
-        return float((self.error * scale[self.sensor]).square().mean().sqrt())
+        return (self.error * scale[self.sensor]).square()
+
+
+def standard_errors(values: Float64[Tensor, " values"]) -> float:
+    """The sum of independent values over its standard error; 0 where all are the same."""
+    scatter = (values.square().sum() - values.sum().square() / max(len(values), 1)).clamp(min=0).sqrt()
+    return float(values.sum() / scatter) if float(scatter) > 0 else 0.0
 
 
 class AbstractRegression(ABC):

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from jaxtyping import Float64, Int64
 from torch import Tensor
@@ -20,7 +19,7 @@ from pisigma.identification.result import SolvedCalibration
 from pisigma.joint_correction.input_products import InputProducts
 from pisigma.joint_correction.joint_correction import JointCorrection
 from pisigma.measurement.dataset import Measurements
-from pisigma.se3 import transform, transform_from_xyzrpy, xyzrpy_from_transform
+from pisigma.se3 import transform
 
 MOST_ROUNDS = 5
 SETTLED = 0.05
@@ -144,10 +143,8 @@ def linearised(
     return Rows.linearised(design, x, values, weigh(problem, values, effective), group)
 
 
-def with_frames_of(
-    solved: SolvedCalibration, refined: Refined, geometry: IdentifiedGeometry
-) -> IdentifiedGeometry:
-    """A geometry whose frames that nothing determines are moved onto those of the geometric calibration.
+def with_frames_of(solved: SolvedCalibration, refined: Refined) -> IdentifiedGeometry:
+    """The hybrid's geometry; frames that nothing determines are moved onto those of the geometric calibration.
 
     Sockets, and distances from anchors at unknown points, are met as well after any motion of the whole frame.
     Nominal joint values and predictions of both calibrations belong to one base, however; so every such frame gets the
@@ -156,21 +153,22 @@ def with_frames_of(
     Args:
         solved: the geometric calibration.
         refined: the hybrid one.
-        geometry: of the hybrid.
     """
-    frames = floating_frames(solved.setup)
+    setup, rows = solved.setup, solved.measurements
+    geometry = identified_geometry(setup, refined.point)
+    frames = floating_frames(setup)
     if not frames:
         return geometry
-    rows = solved.measurements
-    first = identified_geometry(solved.setup, solved.solution.linearisation.point)
     with torch.no_grad():
         moved = replace(rows, q=rows.q + refined.correction.of_rows(rows))
-    points = _points(geometry, moved), _points(first, rows)
-    motions = {}
+    points = _points(geometry, moved), _points(solved.geometry, rows)
+    bases = setup.anchors.bases.clone()
     for frame in frames:
         here = torch.tensor([name == frame for name in rows.frame])
-        motions[frame] = nearest_motion(points[0][here].flatten(0, 1), points[1][here].flatten(0, 1))
-    return _moved(solved, geometry, motions)
+        motion = nearest_motion(points[0][here].flatten(0, 1), points[1][here].flatten(0, 1))
+        number = setup.problem.space.frames.index(frame)
+        bases[number] = motion.to(bases) @ bases[number]
+    return identified_geometry(replace(setup, anchors=replace(setup.anchors, bases=bases)), refined.point)
 
 
 def nearest_motion(
@@ -190,23 +188,3 @@ def _points(geometry: IdentifiedGeometry, rows: Measurements) -> Float64[Tensor,
     T = predicted_poses(geometry.robot, geometry.bases, geometry.tools, rows)
     origin = T[:, None, :3, 3]
     return torch.cat([origin, origin + ARM * geometry.robot.reach * T[:, :3, :3].mT], 1)
-
-
-def _moved(
-    solved: SolvedCalibration, geometry: IdentifiedGeometry, motions: dict[str, Tensor]
-) -> IdentifiedGeometry:
-    """The geometry with everything that stands in some frames moved."""
-    setup, frames = solved.setup, solved.setup.problem.space.frames
-    bases = dict(geometry.bases)
-    unknowns = {group: dict(owners) for group, owners in geometry.unknowns.items()}
-    for frame, T in motions.items():
-        base = transform_from_xyzrpy(torch.from_numpy(np.asarray(bases[frame])))
-        bases[frame] = xyzrpy_from_transform(T @ base).numpy()
-        for group in setup.problem.space.unknowns:
-            for owner, number in zip(group.owners, setup.unknown_frames[group.name].tolist(), strict=True):
-                if group.has_point and frames[number] == frame:
-                    values = unknowns[group.name][owner]
-                    point = (T[:3, :3] @ torch.from_numpy(np.asarray(values[:3])) + T[:3, 3]).numpy()
-                    unknowns[group.name][owner] = np.concatenate([point, values[3:]])
-    robot = geometry.robot.with_geometry(base=next(iter(bases.values())))
-    return replace(geometry, robot=robot, bases=bases, unknowns=unknowns)

@@ -21,13 +21,15 @@ from pisigma.identification.identifiability.redundancy import (
     rank_extension,
 )
 from pisigma.identification.identifiability.sufficiency import (
-    determines_scale,
+    after_unknowns,
+    candidates_at_start,
+    floating_bases,
     free_parameters,
     refuse_too_few,
 )
 from pisigma.identification.initial_guess.initial_guess import chosen_rows
 from pisigma.identification.problem.alike_setups import build_setups
-from pisigma.identification.problem.information import Information, information
+from pisigma.identification.problem.information import information
 from pisigma.identification.problem.least_squares import (
     SHORTEST_STEP,
     Linearisation,
@@ -49,14 +51,13 @@ from pisigma.identification.problem.side_by_side import batches, pattern_of, sid
 from pisigma.identification.result import CalibrationResult, SolvedCalibration
 from pisigma.measurement.dataset import Measurements
 from pisigma.robot.description import Robot
+from pisigma.robot.robot_class import CLASSES
 from pisigma.robot.row import FRAME_COLUMNS
 from pisigma.sensors.socket import PairOfSockets
 
 Values = TypeVar("Values")
 ROUGH_ROWS = 4_096
 """Rows that the initial guess and the first steps are worked out from."""
-SEEN_AT_ALL = 1e-3
-"""A length whose column is shorter than this share of the longest does not hold the scale."""
 ROUGH_STEPS = 3
 """Steps without the prior, which show the noise before the prior is weighed against it."""
 
@@ -87,6 +88,7 @@ class GeometricCalibrator:
         socket_sigma: standard deviation of these distances [m].
         loss: `HampelLoss()` gives rows that are far off less weight or none; `SquaredLoss()` does not.
         maximum_iterations: steps tried at most.
+        robot_class: "industrial", "cobot" or "hobby": how large errors can be; None: as the maker and the data say.
     """
 
     robot: Robot
@@ -101,6 +103,7 @@ class GeometricCalibrator:
     frames: Mapping[str, Sequence[float]] = field(default_factory=dict)
     socket_distances: Mapping[PairOfSockets, float] = field(default_factory=dict)
     socket_sigma: float = 1e-5
+    robot_class: str | None = None
 
     def __post_init__(self) -> None:
         """Refuse options that do not exist."""
@@ -109,16 +112,15 @@ class GeometricCalibrator:
             ("tool", ("free", "position", "fixed")),
             ("elimination", ("exact", "pairwise", "none")),
             ("prior_sizes", ("stated", "widened", "estimated")),
+            ("robot_class", (None, *CLASSES)),
         ):
             if getattr(self, name) not in choices:
                 raise IdentificationError(
-                    f"{name}='{getattr(self, name)}' is no choice; valid: {', '.join(choices)}."
+                    f"{name}='{getattr(self, name)}' is no choice; valid: {', '.join(filter(None, choices))}."
                 )
         if isinstance(self.free, str) and self.free not in ("identifiable", "joint_offsets"):
-            raise IdentificationError(
-                f"free='{self.free}' is no choice; valid: identifiable, joint_offsets, or a list of "
-                "parameter names."
-            )
+            valid = "identifiable, joint_offsets, or a list of parameter names"
+            raise IdentificationError(f"free='{self.free}' is not valid; valid: {valid}.")
         if not isinstance(self.free, str) and "" in self.free:
             raise IdentificationError(
                 f"free={tuple(self.free)}: a name is empty; give names of parameters such as a_2, with one "
@@ -131,9 +133,7 @@ class GeometricCalibrator:
                     f"{tuple(base)}."
                 )
         if not self.socket_sigma > 0:
-            raise IdentificationError(
-                f"socket_sigma={self.socket_sigma:g}: a positive length [m] was wanted."
-            )
+            raise IdentificationError(f"expected socket_sigma > 0 [m], got {self.socket_sigma:g}.")
 
     @torch.inference_mode()
     def fit(self, measurements: Measurements) -> CalibrationResult:
@@ -239,35 +239,17 @@ class GeometricCalibrator:
         candidates, explicit, count = self.candidates(space), not isinstance(self.free, str), len(unknowns)
         at_start = []
         for robot, every in zip(robots, information(problem, start, unknowns + candidates), strict=True):
-            every = every.after(list(range(count)))
-            robot.candidates, of_robot = self._at_start(robot.setup, candidates, every)
+            robot.candidates, of_robot = candidates_at_start(robot.setup, candidates, every)
             at_start.append(of_robot)
         sizes = start.reshape(len(robots), -1).cpu().numpy()[:, robots[0].candidates]
         of_each = zip(robots, sizes, find_redundancies(at_start, sizes), strict=True)
         for robot, its_sizes, redundancy in of_each:
             refuse_too_few(robot.setup.problem, redundancy, explicit, count, robot.measurements.source)
-            robot.active = [*self._chosen(space, its_sizes, redundancy), *unknowns]
+            floating = set(floating_bases(robot.setup))
+            chosen = self._chosen(space, its_sizes, redundancy)
+            robot.active = [*(index for index in chosen if index not in floating), *unknowns]
             wanted = free_parameters(redundancy, explicit, count)
             robot.findings = Findings(its_sizes, redundancy, [], wanted)
-
-    def _at_start(
-        self, setup: CalibrationSetup, candidates: list[int], at_start: Information
-    ) -> tuple[list[int], Information]:
-        """What the data say of the candidates at the start, after the sensors' own unknowns.
-
-        Where they do not determine the scale, the longest length that they see keeps its nominal value: errors of the
-        nominal geometry would pretend to determine it, and a robot that shrinks to a point meets all sockets.
-        """
-        if determines_scale(setup):
-            return candidates, at_start
-        size = np.linalg.norm(at_start.jacobian, axis=0)
-        values = np.abs(setup.start.cpu().numpy()[candidates])
-        arm = [parameter.group in ("d", "a") for parameter in at_start.parameters]
-        lengths = np.where(np.array(arm) & (size > SEEN_AT_ALL * size.max(initial=0.0)), values, 0.0)
-        if not lengths.any():
-            return candidates, at_start
-        longest = int(lengths.argmax())
-        return [i for i in candidates if i != candidates[longest]], at_start.without(longest)
 
     def _chosen(
         self,
@@ -315,14 +297,19 @@ class GeometricCalibrator:
         self, robots: "list[_Robot]", problem: CalibrationProblem, here: Linearisation[Tensor]
     ) -> None:
         """Add parameters that the data determine after the rough steps, though not at the nominal geometry."""
-        kept = sorted(robots[0].active)
+        unknowns = robots[0].setup.free_unknowns
+        kept = sorted(set(robots[0].active) - set(unknowns))
         others = [i for i in robots[0].candidates if i not in set(kept)]
-        most = problem.space.most_independent(problem.turning) + len(robots[0].setup.free_unknowns)
-        if self.elimination != "exact" or not others or len(kept) >= most:
+        if (
+            self.elimination != "exact"
+            or not others
+            or len(kept) >= problem.space.most_independent(problem.turning)
+        ):
             return
-        of_each = information(problem, here.point, kept + others, view_of(here))
+        of_each = information(problem, here.point, unknowns + kept + others, view_of(here))
         for robot, now in zip(robots, of_each, strict=True):
-            extended = [(kept + others)[i] for i in rank_extension(now, len(kept))]
+            free = after_unknowns(robot.setup, now)
+            extended = [(kept + others)[i] for i in rank_extension(free, len(kept))]
             robot.active = [*robot.active, *extended]
             robot.findings = replace(robot.findings, extended=extended)
 

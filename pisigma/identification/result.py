@@ -30,7 +30,7 @@ from pisigma.identification.problem.least_squares import (
     covariance_of,
 )
 from pisigma.identification.problem.noise import values_used, view_of
-from pisigma.identification.problem.prior_sizes import effective_parameters
+from pisigma.identification.problem.prior_sizes import LENGTH_GROUPS, PriorGroup, effective_parameters
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.setup import CalibrationSetup, IdentifiedGeometry
 from pisigma.measurement.dataset import Measurements
@@ -47,14 +47,28 @@ class PriorRatio:
 
     Attributes:
         kind: "length" or "angle".
-        value: of the group of parameters where it is largest.
+        group: the group of parameters.
+        prior: the smallest standard deviation that the prior states for one of the group [m or rad].
+        value: the estimated ratio.
         at_least: two standard deviations below it. The estimate from n effective parameters has a relative standard
             deviation of about `1 / sqrt(2 n)`, so this is `exp(-sqrt(2 / n))` times the estimate.
     """
 
     kind: Literal["length", "angle"]
+    group: PriorGroup
+    prior: float
     value: float
     at_least: float
+
+    @property
+    def size(self) -> float:
+        """The estimated standard deviation of the errors [m or rad]."""
+        return self.value * self.prior
+
+    @property
+    def size_at_least(self) -> float:
+        """The same, two standard deviations below it."""
+        return self.at_least * self.prior
 
 
 @dataclass(frozen=True)
@@ -250,25 +264,20 @@ class CalibrationResult:
 
     @cached_property
     def prior_ratios(self) -> tuple[PriorRatio, ...]:
-        """How many times as large as the prior says the errors are, of lengths and of angles that have a prior."""
+        """How many times as large as the prior says the errors are, by group of parameters that have a prior."""
         problem, view = self.solved.problem, view_of(self.solved.refined)
         precision, group = problem.precision[problem.active], problem.prior_group
         covariance = covariance_of(self.solved.refined.normal)
         effective = effective_parameters(precision, group, view.prior_scale, covariance).tolist()
-        units = [problem.space.parameters[i].unit for i in problem.active[precision > 0].tolist()]
-        groups = set(zip(group[precision > 0].tolist(), units, strict=True))
-        kinds: dict[str, Literal["length", "angle"]] = {"m": "length", "rad": "angle"}
-        ratios = [
-            PriorRatio(kinds[unit], scale, scale * math.exp(-((2 / effective[number]) ** 0.5)))
-            for number, unit in sorted(groups)
-            if effective[number] > 0
-            for scale in [float(view.prior_scale[number])]
-        ]
-        return tuple(
-            max(of_kind, key=lambda ratio: ratio.at_least)
-            for kind in kinds.values()
-            if (of_kind := [ratio for ratio in ratios if ratio.kind == kind])
-        )
+        ratios = []
+        for number in sorted(set(group[precision > 0].tolist())):
+            if effective[number] > 0:
+                scale = float(view.prior_scale[number])
+                prior = float(precision[(group == number) & (precision > 0)].max()) ** -0.5
+                at_least = scale * math.exp(-((2 / effective[number]) ** 0.5))
+                kind: Literal["length", "angle"] = "length" if number in LENGTH_GROUPS else "angle"
+                ratios.append(PriorRatio(kind, PriorGroup(number), prior, scale, at_least))
+        return tuple(ratios)
 
     @property
     def rank(self) -> int:

@@ -55,6 +55,7 @@ class SeriesSection(FeatureSection):
 
     name: Literal["series"]
     harmonics: Annotated[int, Field(ge=1, le=100_000)]
+    fine: bool = False
 
 
 @no_type_check
@@ -138,6 +139,7 @@ class FourierSeries(AbstractFeature):
         if harmonics < 1:
             raise ValueError(f"a Fourier series needs at least one harmonic, got {harmonics}.")
         self.harmonics = self.size = self.fastest = harmonics
+        self.fine = fine
         self._rate = torch.from_numpy(turning_rate(robot))
         k = torch.arange(1, harmonics + 1)
         starts = FINE_BAND_STARTS if fine else BAND_STARTS

@@ -41,8 +41,16 @@ def feature_named(name: str) -> type[AbstractFeature]:
         ValueError: there is none.
     """
     if name not in FEATURES:
-        raise ValueError(f"there are no features '{name}'; {nearest_choice(name, FEATURES)}")
+        raise ValueError(
+            f"there are no features '{name}'; {nearest_choice(name, FEATURES)} One from outside the package needs its "
+            "plug-in (--plugin FILE)."
+        )
     return FEATURES[name]
+
+
+def features_from_outside() -> tuple[str, ...]:
+    """Names of the features that do not come with pisigma."""
+    return tuple(name for name, feature in FEATURES.items() if feature.__module__.split(".")[0] != "pisigma")
 
 
 def feature_section(value: Any) -> FeatureSection:

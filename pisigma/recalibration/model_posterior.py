@@ -134,8 +134,12 @@ class ModelPosterior:
 def _weights(
     correction: JointCorrection, features: tuple[AbstractFeature, ...]
 ) -> Float64[Tensor, " weights"]:
-    """Weights of the used columns of all features, those of products from the product units."""
-    linear = zip(correction.features, correction.linear, strict=True)
-    blocks = [weight.detach()[feature.used] for feature, weight in linear]
-    blocks += [one.weights(correction.weight.detach()) for one in features if isinstance(one, InputProducts)]
+    """Weights of the used columns of all features in their order, those of products from the product units."""
+    linear = {own.name: weight for own, weight in zip(correction.features, correction.linear, strict=True)}
+    blocks = [
+        one.weights(correction.weight.detach())
+        if isinstance(one, InputProducts)
+        else linear[one.name].detach()[one.used]
+        for one in features
+    ]
     return torch.cat(blocks)

@@ -15,6 +15,7 @@ from pisigma.model.calibrated_model import CalibratedModel, Provenance
 from pisigma.model.geometric_model import branches_of
 from pisigma.model.row_poses import Frames
 from pisigma.model.stored_starts import spread_rows
+from pisigma.model.training_rows import kept_rows
 from pisigma.recalibration.adaptation import Adaptation
 from pisigma.se3 import invert, transform_from_xyzrpy, xyzrpy_from_transform
 
@@ -51,7 +52,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
             dh=dh, base=next(iter(bases.values())), tool=next(iter(tools.values()))
         )
     robot = drawn.with_geometry(base=calibrated.base, tool=calibrated.tool)
-    root = CovarianceRoot(adaptation.root.float().double())
+    root = CovarianceRoot(adaptation.root)
     space = adaptation.problem.design.problem.space
     noise = {**known.noise, **adaptation.noise}
     return replace(
@@ -67,6 +68,7 @@ def recalibrated_model(model: CalibratedModel, adaptation: Adaptation, rows: Mea
         hybrid_bases=geometry.bases if hybrid else {},
         hybrid_tools=geometry.tools if hybrid else {},
         uncertainty=PositionUncertainty(space, geometry, known.features, root, known.prior_scale, noise),
+        made_of=kept_rows(drawn, rows, model.made_of),
         provenance=Provenance(
             data_source=rows.file_names,
             data_sha256=rows.content_hash(),

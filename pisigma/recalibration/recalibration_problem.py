@@ -134,7 +134,7 @@ def _joined_space(space: ParameterSpace, rows: Measurements) -> ParameterSpace:
     """The parameters of a model and of rows.
 
     Frames and targets that the model has come first. Owners of sensors' unknowns are in the order of the rows, in
-    which the sensors number them, and then those that the rows lack.
+    which the sensors number them, and then those that the rows lack, in the frames where they stood before.
     """
     of_rows = {own.name: own for own in unknown_groups(rows)}
     before = {own.name: own for own in space.unknowns}
@@ -143,7 +143,8 @@ def _joined_space(space: ParameterSpace, rows: Measurements) -> ParameterSpace:
     for name, own in (of_rows | before).items():
         there = of_rows.get(name, UnknownGroup(name, own.columns, ()))
         stands = dict(zip(there.owners, there.frames, strict=True))
-        stands |= {owner: frames[0] for owner in own.owners if owner not in stands}
+        stood = dict(zip(own.owners, own.frames or frames[:1] * len(own.owners), strict=True))
+        stands |= {owner: frame for owner, frame in stood.items() if owner not in stands}
         groups.append(replace(own, owners=tuple(stands), frames=tuple(stands.values())))
     targets = tuple(dict.fromkeys((*space.targets, *rows.target)))
     return ParameterSpace(space.robot, frames, targets, tuple(groups))

@@ -1,5 +1,7 @@
 """Where nothing tells where a frame stands, the hybrid arm stands where the geometric one does."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,12 +9,13 @@ from testing.closeness import assert_close
 from testing.hybrid import joints_in, true_robot
 
 from pisigma.hybrid.calibrator import HybridCalibrator
-from pisigma.hybrid.refinement import nearest_motion
+from pisigma.hybrid.refinement import nearest_motion, refine, with_frames_of
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.identification.prediction import predicted_poses
 from pisigma.measurement.dataset import Measurements
+from pisigma.measurement.groups import held_out_groups
 from pisigma.robot import Robot
-from pisigma.se3 import rotation_from_vector, transform
+from pisigma.se3 import rotation_from_vector, transform, transform_from_xyzrpy
 from pisigma.simulation import TrueRobot
 
 
@@ -60,3 +63,23 @@ def test_frames_that_no_distance_tells_are_those_of_the_geometric_calibration():
     before, after = (found.errors_of(data)["distance"] for found in (geometric, result))
     assert float(after.square().mean()) < 0.5 * float(before.square().mean())
     assert_close(learned.geometry.robot.base, learned.geometry.bases[""], atol=0.0)
+
+
+def test_a_moved_frame_moves_what_stands_in_it_with_its_uncertainty():
+    _, data = distances(60)
+    solved = GeometricCalibrator(Robot.load("rb5")).solve(data)
+    with_series = HybridCalibrator(GeometricCalibrator(Robot.load("rb5")), harmonics=(4,), products=False)
+    choice = with_series._chosen(solved, held_out_groups(solved.setup.measurements), lambda what: None)
+    refined = refine(solved.problem, held_out_groups(solved.setup.measurements), choice)
+    turned = refined.point.clone()
+    turned[solved.problem.space.index("base_roll")] += 0.3
+    turned[solved.problem.space.index("base_x")] += 0.1
+    moved = with_frames_of(solved, replace(refined, point=turned))
+    like = with_frames_of(solved, refined)
+    assert_close(moved.bases[""], like.bases[""], atol=1e-9)
+    assert moved.point is not None
+    base = moved.setup.anchors.bases[0] @ transform_from_xyzrpy(turned[solved.problem.space.of("base")])
+    assert_close(transform_from_xyzrpy(torch.from_numpy(moved.bases[""])), base, atol=1e-12)
+    anchor = solved.problem.space.of("anchor").start
+    place = moved.change[anchor : anchor + 3, anchor : anchor + 3]
+    assert_close(place, moved.setup.anchors.bases[0, :3, :3], atol=1e-12)

@@ -8,7 +8,7 @@ import torch
 from testing.closeness import assert_close
 from testing.linearised import LinearisedArm, drawn_joints, linearised, tracker_data
 
-from pisigma.hybrid.search import CLEARLY, LARGEST_USUAL_SHARE, Search
+from pisigma.hybrid.search import CLEAR_GAIN, CLEARLY, LARGEST_USUAL_SHARE, Search
 from pisigma.joint_correction.fourier_series import FourierSeries
 from pisigma.joint_correction.gravity_torques import GravityTorques
 from pisigma.joint_correction.input_products import InputProducts
@@ -88,6 +88,19 @@ def test_products_come_last_and_stay_where_they_help(products: LinearisedArm) ->
         for values in (moved - expected, expected)
     )
     assert float(off / whole) < 0.3
+
+
+def test_products_have_to_gain_more_than_the_scatter(products: LinearisedArm, monkeypatch) -> None:
+    """More evidence alone does not keep them."""
+    kept = search_of(products).best(SERIES[:1], [SMALL], [PRODUCTS])
+    search = search_of(products)
+    without = search.best(SERIES[:1], [SMALL])
+    gain = kept.gain(without)
+    assert gain > CLEAR_GAIN
+    assert without.gain(kept) < -CLEAR_GAIN
+    monkeypatch.setattr("pisigma.hybrid.search.CLEAR_GAIN", gain + 1e-6)
+    assert search.best(SERIES[:1], [SMALL], [PRODUCTS]).name == without.name
+    assert search.trials[-1].log_evidence > without.posterior.log_evidence + CLEARLY
 
 
 def test_few_rows_are_fitted_with_all_features_from_usual_sizes() -> None:

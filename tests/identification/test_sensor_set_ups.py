@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 from testing.closeness import assert_close
@@ -10,6 +11,7 @@ from testing.sensors import ARM, TRUE_BASES, joints, pair_data, socket_data, tou
 from pisigma.errors import IdentificationError
 from pisigma.identification.calibrator import GeometricCalibrator
 from pisigma.measurement.dataset import Measurements, join
+from pisigma.robot.row import FRAME_COLUMNS
 
 
 def calibrator(**options: object) -> GeometricCalibrator:
@@ -143,3 +145,22 @@ def test_options_that_do_not_exist_are_refused() -> None:
         calibrator(tool="positions")
     with pytest.raises(IdentificationError, match="none of its 20 rows has a measured value"):
         calibrator().fit(Measurements(q=joints(20, 1)))
+
+
+def test_nothing_depends_on_where_the_base_of_a_floating_frame_starts() -> None:
+    robot, exact = true_robot().nominal, socket_data()
+    noise = torch.randn(exact.q.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    data = replace(exact, q=exact.q + 2e-4 * noise)
+    off = robot.with_geometry(base=np.array([0.7, -1.0, 0.4, 2.0, -0.6, 1.1]))
+    distances = {(f"{name}/0", f"{name}/1"): 0.05 for name in ("plate", "low", "high")}
+    solved = [GeometricCalibrator(one, socket_distances=distances).solve(data) for one in (robot, off)]
+    arm = slice(solved[0].problem.space.arm_size)
+    first, other = (one.solution.linearisation.point[arm] for one in solved)
+    assert_close(other, first, atol=1e-9)
+    for one in solved:
+        result = one.result()
+        assert one.solution.status.good
+        assert {f"base_{column}" for column in FRAME_COLUMNS} <= set(result.redundancy.no_effect)
+        assert not any(name.startswith("base") for name in result.free)
+        errors = [p.standard_error for p in result.parameters if p.name.startswith("socket")]
+        assert max(errors) < 1e-3

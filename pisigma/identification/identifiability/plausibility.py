@@ -15,6 +15,9 @@ from pisigma.identification.problem.problem import CalibrationProblem
 IMPLAUSIBLE_SHARE = 0.01
 """Share of the robot's reach that half of the rows must be within, once the arm was fitted."""
 
+DISTANCES = ("distance", "pair")
+"""Sensors of distances, which are judged like positions."""
+
 LONG_SHARE = 0.1
 """Links longer than this share of the reach are long."""
 RUINED_SHARE = 0.5
@@ -30,10 +33,10 @@ OFF_SHARE = 0.2
 def refuse_implausible(
     problem: CalibrationProblem, here: Linearisation[Tensor], sources: Sequence[str]
 ) -> None:
-    """Refuse a fit of the arm that leaves most measured positions far from their prediction, or ruins the arm.
+    """Refuse a fit of the arm that leaves most positions or distances far from their prediction, or ruins the arm.
 
-    Where no parameter of the arm is free (base and tool alone), nothing is refused: the arm may be far off.
-    Sensors that see less than a position are not judged here.
+    Where no parameter of the arm is free (base and tool alone), nothing is refused: the arm may be far off. Touches and
+    corners are not judged here.
 
     Args:
         problem: with its free parameters, of one robot or of several.
@@ -41,17 +44,19 @@ def refuse_implausible(
         sources: what complaints call the measurements of every robot.
 
     Raises:
-        ImplausibleError: the median residual of positions or balls in sockets is more than 1 % of the reach, or a
-            link is half as long again as drawn, or less than half as long.
+        ImplausibleError: the median residual of positions, balls in sockets or distances is more than 1 % of the
+            reach, or a link is half as long again as drawn, or less than half as long.
     """
     _refuse_ruined_links(problem, here.point.reshape(len(sources), -1), sources)
     robot, rows = problem.space.robot, problem.rows
-    whole = [
-        sensor.present[:rows] for sensor in problem.sensors if sensor.unit == "m" and sensor.components == 3
+    judged = [
+        sensor.present[:rows]
+        for sensor in problem.sensors
+        if sensor.unit == "m" and (sensor.components == 3 or sensor.name in DISTANCES)
     ]
-    if not whole or robot.reach == 0 or not bool((problem.active < problem.space.arm_size).any()):
+    if not judged or robot.reach == 0 or not bool((problem.active < problem.space.arm_size).any()):
         return
-    sizes = residual_sizes(problem, here)[..., torch.stack(whole).any(0)]
+    sizes = residual_sizes(problem, here)[..., torch.stack(judged).any(0)]
     typical = sizes.median(-1).values.reshape(-1) if sizes.shape[-1] else sizes.new_zeros(1)
     for source, size in zip(sources, typical.tolist(), strict=True):
         if size > IMPLAUSIBLE_SHARE * robot.reach:

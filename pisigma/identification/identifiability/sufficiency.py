@@ -5,6 +5,7 @@ import torch
 
 from pisigma.errors import IdentificationError
 from pisigma.identification.identifiability.redundancy import Redundancy
+from pisigma.identification.problem.information import Information
 from pisigma.identification.problem.problem import CalibrationProblem
 from pisigma.identification.problem.setup import CalibrationSetup
 from pisigma.kinematics.forward import forward_kinematics
@@ -17,6 +18,8 @@ NEAR_AXIS = 5e-3
 """Share of the reach: a target nearer to the last axis hardly shows that joint's errors."""
 GOOD_RATIO = 3
 """Values a parameter that a calibration should have."""
+SEEN_AT_ALL = 1e-3
+"""A length whose column is shorter than this share of the longest does not hold the scale."""
 SAME_FACE = 1e-6
 """[m] Coordinates within this are of one face."""
 TOUCHES_WITHOUT_SCALE = (
@@ -163,6 +166,50 @@ def determines_scale(setup: CalibrationSetup) -> bool:
     return any(max(values) - min(values) > SAME_FACE for values in faces.values())
 
 
+def candidates_at_start(
+    setup: CalibrationSetup, candidates: list[int], information: Information
+) -> tuple[list[int], Information]:
+    """What the data say of the candidates at the start, after the sensors' own unknowns.
+
+    Where they do not determine the scale, the longest length that they see keeps its nominal value: errors of the
+    nominal geometry would pretend to determine it, and a robot that shrinks to a point meets all sockets.
+
+    Args:
+        setup: the problem at its start.
+        candidates: indices of the parameters that may be estimated.
+        information: of the sensors' unknowns and of them.
+    """
+    at_start = after_unknowns(setup, information)
+    if determines_scale(setup):
+        return candidates, at_start
+    size = np.linalg.norm(at_start.jacobian, axis=0)
+    values = np.abs(setup.start.cpu().numpy()[candidates])
+    arm = [parameter.group in ("d", "a") for parameter in at_start.parameters]
+    lengths = np.where(np.array(arm) & (size > SEEN_AT_ALL * size.max(initial=0.0)), values, 0.0)
+    if not lengths.any():
+        return candidates, at_start
+    longest = int(lengths.argmax())
+    return [i for i in candidates if i != candidates[longest]], at_start.without(longest)
+
+
+def after_unknowns(setup: CalibrationSetup, information: Information) -> Information:
+    """What is left for arm, bases and tools after the sensors' own unknowns; of floating bases nothing.
+
+    What was measured in a floating frame is met as well after any motion of base and sensors together. The first-order
+    change of a socket's residuals by such a motion is not zero, but it only turns them; so it would pretend to
+    determine a base, or joint 1.
+    """
+    parameters = setup.problem.space.names
+    unknowns, floating = (
+        {parameters[i] for i in indices} for indices in (setup.free_unknowns, floating_bases(setup))
+    )
+    names = information.names
+    return information.after(
+        [i for i, name in enumerate(names) if name in unknowns],
+        [i for i, name in enumerate(names) if name in floating],
+    )
+
+
 def _scale_of_boards(setup: CalibrationSetup) -> str:
     """Say that nothing but boards gives the scale, and how sure it is."""
     stated = [float(text) for text in texts_of(setup.measurements, SCALE_COLUMN) if text]
@@ -225,6 +272,17 @@ def floating_frames(setup: CalibrationSetup) -> list[str]:
         held |= torch.isfinite(data.anchor_place).all(-1)
     holding = {frame for frame, holds in zip(data.frame, held.tolist(), strict=True) if holds}
     return [frame for frame in setup.problem.space.frames if frame not in holding]
+
+
+def floating_bases(setup: CalibrationSetup) -> list[int]:
+    """Indices of the parameters of bases in floating frames, which stay where they start."""
+    space, floating = setup.problem.space, floating_frames(setup)
+    return [
+        index
+        for number, name in enumerate(space.frames)
+        if name in floating
+        for index in space.of("base")[6 * number : 6 * number + 6]
+    ]
 
 
 def _floating_frames(setup: CalibrationSetup) -> list[str]:

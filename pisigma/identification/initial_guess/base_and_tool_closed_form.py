@@ -17,6 +17,8 @@ LINEAR_ROWS = 13
 """Rows from which base and tool follow from a linear system."""
 DEPENDENT = 1e-9
 """Singular values of the linear system below this share of the largest count as zero."""
+LEFT_OPEN = 1e-9
+"""Weight of the rotation that is taken where points leave it open, beside theirs."""
 SINGLE = 0.9
 """A second singular value above this share of the first may mean that the rotations are not unique."""
 
@@ -155,10 +157,15 @@ def nearest_rotation(M: Float64[Tensor, "*batch 3 3"]) -> Float64[Tensor, "*batc
 
 
 def base_by_points(
-    points: Float64[Tensor, "rows 3"], position: Float64[Tensor, "rows 3"]
+    points: Float64[Tensor, "rows 3"],
+    position: Float64[Tensor, "rows 3"],
+    like: Float64[Tensor, "3 3"] | None = None,
 ) -> tuple[Float64[Tensor, "3 3"], Float64[Tensor, " 3"]]:
-    """Rotation and position [m] of the base that puts points, seen from it, best onto measured positions."""
-    R_base = _procrustes(points, position)
+    """Rotation and position [m] of the base that puts points, seen from it, best onto measured positions.
+
+    Where they are on one line, or fewer than three, the rotation is `like` one, as far as they leave it open.
+    """
+    R_base = _procrustes(points, position, like)
     return R_base, (position - points @ R_base.mT).mean(0)
 
 
@@ -185,9 +192,10 @@ def _mean_turn(R_base: Tensor, R_flange: Tensor, rotation: Tensor) -> Tensor:
     return nearest_rotation((R_flange.mT @ R_base.mT @ rotation).sum(0))
 
 
-def _procrustes(points: Tensor, position: Tensor) -> Tensor:
-    """The rotation that turns the points best onto the positions, both about their means."""
-    return nearest_rotation((position - position.mean(0)).mT @ (points - points.mean(0)))
+def _procrustes(points: Tensor, position: Tensor, like: Tensor | None = None) -> Tensor:
+    """The rotation that turns the points best onto the positions, both about their means; see `base_by_points`."""
+    M = (position - position.mean(0)).mT @ (points - points.mean(0))
+    return nearest_rotation(M if like is None else M + like * (LEFT_OPEN * M.norm()).clamp(min=1e-12))
 
 
 def _least_squares(

@@ -11,6 +11,7 @@ from torch import Tensor
 from pisigma.errors import IdentificationError, nearest_choice
 from pisigma.identification.initial_guess.base_and_tool import guess_base_and_tool
 from pisigma.identification.initial_guess.base_and_tool_closed_form import base_by_points, nearest_rotation
+from pisigma.identification.initial_guess.tool_from_distances import base_from_anchors, tools_from_distances
 from pisigma.identification.problem.parameters import ParameterSpace
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
@@ -72,10 +73,11 @@ def guess(
 ) -> InitialGuess:
     """Guess where everything is, the arm being taken as drawn.
 
-    Frames with positions get base and tool in closed form; then sockets determine tools that have none yet; touches
-    determine their frame by the tool; then the sensors guess their own unknowns, such as sockets at the mean of the
-    tool's positions and anchors by multilateration. A frame without any of these (sockets and unknown anchors only)
-    starts at the robot's own base, which it cannot determine.
+    Frames with positions get base and tool in closed form; then sockets, wires and pairs determine tools that have
+    none yet; touches, and wires from anchors at stated places, determine their frame by the tool; then the sensors
+    guess their own unknowns, such as sockets at the mean of the tool's positions and anchors by multilateration. A
+    frame without any of these (sockets and unknown anchors only) starts at the robot's own base, which it cannot
+    determine.
 
     Args:
         space: names and robot.
@@ -94,6 +96,7 @@ def guess(
     bases = {name: np.array(base, dtype=np.float64) for name, base in stated.items()}
     bases, tools = _from_positions(space, measurements, free_base, free_tool, bases)
     touched = {} if not free_base else _touched_rows(space, measurements, bases)
+    wired = [name for name in space.frames if free_base and name not in bases and name not in touched]
     for name in space.frames:
         if name not in bases and name not in touched:
             bases[name] = space.robot.base
@@ -103,6 +106,7 @@ def guess(
         T_flange = forward_kinematics(arm, measurements.q.cpu())
         if free_tool:
             tools = _from_sockets(space, measurements, T_flange, tools)
+        tools = tools_from_distances(space, measurements, T_flange, tools, free_tool)
     if not turn_tool:
         tools = {name: np.concatenate([tool[:3], space.robot.tool[3:]]) for name, tool in tools.items()}
     all_tools = np.stack([tools.get(name, space.robot.tool) for name in space.targets])
@@ -112,6 +116,8 @@ def guess(
     T_tool = T_flange @ transform_from_xyzrpy(torch.from_numpy(all_tools))[target]
     for name, rows in touched.items():
         bases[name] = _from_touches(space, measurements, name, rows, T_tool[:, :3, 3])
+    for name in wired:
+        bases[name] = base_from_anchors(measurements, name, T_tool[:, :3, 3], bases[name])
     all_bases = np.stack([bases[name] for name in space.frames])
     frame = numbers_of(measurements.frame, space.frames, measurements.rows)
     T = transform_from_xyzrpy(torch.from_numpy(all_bases))[frame] @ T_tool

@@ -1,5 +1,6 @@
 """The identification Jacobian of a whole data set, condensed to a small triangular matrix."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -26,7 +27,7 @@ class Information:
     Attributes:
         parameters: what the columns of J belong to.
         root: upper triangular; its last column belongs to ones, that before it to the residuals.
-        values: number of rows of J.
+        values: number of rows of J, less those that other parameters took.
         poses: number of measured rows.
     """
 
@@ -61,15 +62,16 @@ class Information:
         parameters = self.parameters[:column] + self.parameters[column + 1 :]
         return replace(self, parameters=parameters, root=np.delete(self.root, column, 1))
 
-    def after(self, nuisance: list[int]) -> "Information":
+    def after(self, nuisance: list[int], silent: Sequence[int] = ()) -> "Information":
         """What is left for the other parameters when these columns may take any value.
 
         Args:
             nuisance: numbers of the columns; they are left out.
+            silent: numbers of more of them, which stay, as zeros.
         """
-        if not nuisance:
+        if not nuisance and not silent:
             return self
-        taken = self.jacobian[:, nuisance]
+        taken = self.jacobian[:, [*nuisance, *silent]]
         lengths = np.linalg.norm(taken, axis=0)
         U, singular, _ = np.linalg.svd(taken / np.where(lengths > 0, lengths, 1.0), full_matrices=False)
         U = U[:, singular > SEEN * singular.max(initial=0.0)]
@@ -79,8 +81,10 @@ class Information:
         for _ in range(2):
             rest = rest - U @ (U.T @ rest)
         rest[:, np.linalg.norm(rest, axis=0) <= SEEN * sizes] = 0.0
+        rest[:, [kept.index(column) for column in silent]] = 0.0
         root: np.ndarray = np.linalg.qr(rest, mode="r")  # type: ignore[assignment]
-        return replace(self, parameters=tuple(self.parameters[i] for i in kept), root=root)
+        parameters = tuple(self.parameters[i] for i in kept)
+        return replace(self, parameters=parameters, root=root, values=self.values - U.shape[1])
 
 
 def information(

@@ -34,6 +34,10 @@ class PriorGroup(IntEnum):
     """alpha and beta: how square and parallel axes are."""
 
 
+LENGTH_GROUPS = (PriorGroup.LENGTH, PriorGroup.NO_LENGTH)
+"""Groups of lengths; the others are of angles."""
+
+
 def prior_group_of(column: str, drawn: bool) -> int:
     """The group of a parameter whose prior is sized by the data.
 

@@ -126,7 +126,7 @@ def test_a_standard_deviation_in_some_rows_only_is_refused() -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"free": "everything"}, "free='everything' is no choice; valid: identifiable, joint_offsets"),
+        ({"free": "everything"}, "free='everything' is not valid; valid: identifiable, joint_offsets"),
         ({"elimination": "qr"}, "elimination='qr' is no choice; valid: exact, pairwise, none"),
         ({"base": "unknown"}, "base='unknown' is no choice; valid: free, fixed"),
     ],
