@@ -6,7 +6,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from pisigma.cli.arguments import AcceptImplausible, AsJson, Overwrite, complete_model, complete_robot
+from pisigma.cli.arguments import (
+    AcceptImplausible,
+    AsJson,
+    Overwrite,
+    SocketDistance,
+    complete_model,
+    complete_robot,
+    socket_distances,
+)
 from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.lifetime.recalibrate import recalibrate_into
 from pisigma.cli.output import (
@@ -77,7 +85,22 @@ PriorMm = Annotated[
 PriorMrad = Annotated[
     float, typer.Option(help="Prior standard deviation of angle errors [mrad]; 0 for no prior.")
 ]
+RobotClassName = Annotated[
+    str | None,
+    typer.Option(
+        "--class",
+        help="How large errors of the geometry can be: industrial, cobot or hobby (also of old and surgical arms). "
+        "[default: as the maker and the data say]",
+    ),
+]
 Robust = Annotated[bool, typer.Option(help="Let rows that are far off count less.")]
+Features = Annotated[
+    str | None,
+    typer.Option(
+        help="Features of the joint correction that are tried, such as gravity,lines,series. [default: all that fit, "
+        "and those of plug-ins]"
+    ),
+]
 Gravity = Annotated[
     str | None,
     typer.Option(
@@ -92,10 +115,6 @@ NewFrameAt = Annotated[
         help="Line of DATA from which on the rows are in a frame of their own, as the instrument was moved; may be "
         "repeated.",
     ),
-]
-SocketDistance = Annotated[
-    str | None,
-    typer.Option(help="Known distance of two sockets as A,B,MM; */0,*/1,50 states that of every placement."),
 ]
 Base = Annotated[str | None, typer.Option(help="Of a URDF file: link that is the base. [default: its root]")]
 Tip = Annotated[
@@ -129,7 +148,9 @@ def calibrate(
     free: Free = "identifiable",
     prior_mm: PriorMm = 1.0,
     prior_mrad: PriorMrad = 1.0,
+    robot_class: RobotClassName = None,
     robust: Robust = True,
+    features: Features = None,
     gravity: Gravity = None,
     new_frame_at: NewFrameAt = None,
     socket_distance: SocketDistance = None,
@@ -182,10 +203,10 @@ def print_calibration(
     """
     from pisigma.reporting import calibration_tables as tables
 
+    print_lines(f"Implausible: {line}" for line in tables.implausible_lines(summary))
     _print_accuracy(summary)
     if summary.hybrid is not None:
         print_lines(tables.learned_lines(summary.hybrid))
-    print_lines(f"Implausible: {line}" for line in tables.implausible_lines(summary))
     print_lines(f"Warning: {line}" for line in tables.warning_lines(summary))
     if summary.learning_curve is not None:
         print_table(
@@ -203,9 +224,11 @@ def print_calibration(
 
 def _print_accuracy(summary: "CalibrationSummary") -> None:
     """Print the errors of held-out rows, and then of those that were calibrated with."""
-    from pisigma.reporting.calibration_tables import coverage_line, folds_text, held_out_lines
-    from pisigma.reporting.tables import pose_rows
+    from pisigma.reporting import calibration_tables as tables
+    from pisigma.reporting.tables import distance_table, pose_rows
 
+    if summary.predicted_rms_mm is not None:
+        print_lines([tables.predicted_line(summary.predicted_rms_mm)])
     for figures, title in (
         (summary.held_out, "pose errors of {rows} other simulated rows"),
         (summary.cross_validation, "pose errors of {rows} held-out rows ({how})"),
@@ -213,8 +236,12 @@ def _print_accuracy(summary: "CalibrationSummary") -> None:
         (summary.calibrated, "pose errors of the {rows} rows that were calibrated with"),
     ):
         if figures is not None:
-            print_table(title.format(rows=figures.rows, how=folds_text(figures)), *pose_rows(figures.models))
-            print_lines([*held_out_lines(figures), *filter(None, [coverage_line(figures)])])
+            title = title.format(rows=figures.rows, how=tables.folds_text(figures))
+            print_table(title, *pose_rows(figures.models))
+            print_lines([*tables.held_out_lines(figures), *filter(None, [tables.coverage_line(figures)])])
+            if figures.socket_distance is not None:
+                what = "stated distances of sockets, under calibrations without them"
+                print_table(what, *distance_table(figures.socket_distance))
 
 
 def _print_parameters(summary: "CalibrationSummary", verbose: bool) -> None:
@@ -233,14 +260,26 @@ def _settings(options: Mapping[str, Any], cameras: "CameraFiles | None") -> "Cal
     """Settings by the options of the command."""
     from pisigma.workflow.calibrate import CalibrationSettings
 
-    same = ("model", "folds", "hold_out", "split", "repeats", "jobs", "seed", "train_rows", "robust")
+    same = (
+        "model",
+        "folds",
+        "hold_out",
+        "split",
+        "repeats",
+        "jobs",
+        "seed",
+        "train_rows",
+        "robot_class",
+        "robust",
+    )
     return CalibrationSettings(
         free=_free(options["free"]),
         prior_length=options["prior_mm"] / 1e3,
         prior_angle=options["prior_mrad"] / 1e3,
+        features=None if options["features"] is None else _names(options["features"]),
         gravity=_gravity(options["gravity"]),
         new_frame_at=tuple(options["new_frame_at"] or ()),
-        socket_distances=_socket_distances(options["socket_distance"]),
+        socket_distances=socket_distances(options["socket_distance"]),
         cameras=cameras,
         **{name: options[name] for name in same},
     )
@@ -250,6 +289,11 @@ def _free(stated: str) -> Any:
     """Free parameters as the settings have them."""
     if stated in ("identifiable", "joint_offsets"):
         return stated
+    return _names(stated)
+
+
+def _names(stated: str) -> tuple[str, ...]:
+    """Names with commas between."""
     return tuple(name.strip() for name in stated.split(","))
 
 
@@ -264,19 +308,3 @@ def _gravity(stated: str | None) -> Any:
             f"the direction of gravity as X,Y,Z was wanted, such as 0,0,-1, got '{stated}'."
         )
     return direction
-
-
-def _socket_distances(stated: str | None) -> dict[tuple[str, str], float]:
-    """Known distance of two sockets [m], from "A,B,MM"."""
-    if stated is None:
-        return {}
-    words = [word.strip() for word in stated.split(",")]
-    try:
-        distance = float(words[2])
-    except (IndexError, ValueError):
-        distance = 0.0
-    if len(words) != 3 or not 0 < distance < float("inf"):
-        raise IdentificationError(
-            f"a known socket distance as A,B,MM was wanted, such as */0,*/1,50, got '{stated}'."
-        )
-    return {(words[0], words[1]): distance / 1e3}

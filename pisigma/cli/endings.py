@@ -3,16 +3,18 @@
 import contextlib
 import errno
 import functools
+import inspect
 import os
 import sys
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
 from pisigma.errors import AcceptanceError, PisigmaError, missing_extra, printable
+from pisigma.plugins import load_files, load_installed
 
 REFUSED = 2
 """Exit status where the user's input is at fault."""
@@ -28,19 +30,42 @@ _NO_READER = 141
 """As the shell reports a program that SIGPIPE ended, which `pisigma robots | head -1` does."""
 
 
+PluginFiles = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--plugin",
+        metavar="FILE",
+        help="Python file that registers sensors, features, exports or others before the command begins; it runs with "
+        "your rights. May be repeated.",
+    ),
+]
+
+
 def tell_problems(command: Callable[..., None]) -> Callable[..., None]:
-    """Make a command end with one line on stderr and a status that says whose fault it is; see `end_with`."""
+    """Make a command load plug-ins, and end with one line on stderr and a status that says whose fault it is.
+
+    It gets the option `--plugin`. See `end_with` for the status.
+    """
 
     @functools.wraps(command)
-    def guarded(*args: Any, **kwargs: Any) -> None:
+    def guarded(*, plugin: PluginFiles = None, **values: Any) -> None:
         try:
-            command(*args, **kwargs)
+            load_installed()
+            load_files(plugin or ())
+            command(**values)
         except (typer.BadParameter, typer.Exit):
             raise  # the command line itself says these
         except (Exception, KeyboardInterrupt) as problem:
             end_with(problem)
 
+    own = [*inspect.signature(command).parameters.values(), _PLUGIN]
+    keyword = inspect.Parameter.KEYWORD_ONLY
+    vars(guarded)["__signature__"] = inspect.Signature([one.replace(kind=keyword) for one in own])
+    guarded.__annotations__ = {one.name: one.annotation for one in own}
     return guarded
+
+
+_PLUGIN = inspect.Parameter("plugin", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=PluginFiles)
 
 
 def end_with(problem: BaseException) -> None:

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson
+from pisigma.cli.arguments import AsJson, SocketDistance, socket_distances
 from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_lines
 from pisigma.cli.verify import FitFrame, FitTool, print_comparison
@@ -56,6 +56,7 @@ def evaluate(
     max_mean_deg: MaxMeanDeg = None,
     fit_frame: FitFrame = False,
     fit_tool: FitTool = False,
+    socket_distance: SocketDistance = None,
     cameras: "CameraFiles | None" = None,
     resamples: Resamples = 2000,
     seed: Seed = 0,
@@ -67,6 +68,7 @@ def evaluate(
     Rows of the set "train" are left out where the file has a column "set". With a limit, every model folder has to
     meet it, else the exit status is 3; so it is where the base or the tool has moved, and where errors of positions or
     orientations are too large to be those of a calibrated robot: the usual setup faults that explain them are named.
+    Balls in sockets, wires and pairs are judged by how well the rows of each agree, and by stated distances.
     """
     from pisigma.files.model_files import check_model_hash
     from pisigma.judging.bootstrap import Bootstrap
@@ -83,7 +85,9 @@ def evaluate(
     for folder, wanted in zip(folders, sha256 or (), strict=False):
         check_model_hash(folder, wanted)
     limits = workflow.Limits(max_mean_mm, max_p95_mm, max_mm, max_mean_deg)
-    settings = workflow.EvaluationSettings(limits, fit_frame, fit_tool, Bootstrap(resamples, seed), cameras)
+    settings = workflow.EvaluationSettings(
+        limits, fit_frame, fit_tool, Bootstrap(resamples, seed), cameras, socket_distances(socket_distance)
+    )
     evaluation = workflow.evaluate(paths[:-1], paths[-1], settings)
     if as_json:
         print_json(evaluation.to_json())

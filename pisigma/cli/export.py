@@ -32,12 +32,19 @@ Form = Annotated[
 Like = Annotated[
     Path | None,
     typer.Option(
-        help="File whose other content stays: with urdf and xacro the URDF file that the robot was loaded from, with "
-        "ur-calibration and staubli the controller's own file."
+        help="File whose other content stays: with urdf and xacro a URDF file (default: the one that the robot was "
+        "loaded from), with ur-calibration and staubli the controller's own file."
     ),
 ]
 Tip = Annotated[
     str | None, typer.Option(help="With --like: link that is the tool, as it was stated when it was loaded.")
+]
+Geometry = Annotated[
+    str | None,
+    typer.Option(
+        help="With urdf and dh: geometric, the geometric fit that is used alone (default), or hybrid, the geometry "
+        "that goes with the correction of --format onnx."
+    ),
 ]
 Poses = Annotated[
     Path | None,
@@ -94,6 +101,7 @@ def export(
     form: Form,
     like: Like = None,
     tip: Tip = None,
+    geometry: Geometry = None,
     poses: Poses = None,
     targets: TargetKind = None,
     branch: Branch = None,
@@ -121,6 +129,7 @@ def export(
         out=out,
         like=like,
         tip=tip,
+        geometry=geometry,
         poses=poses,
         targets=targets,
         branch=branch,

@@ -41,7 +41,11 @@ def print_lines(lines: Iterable[str], indent: str = "") -> None:
     width = screen_width()
     for line in lines:
         filled = textwrap.fill(
-            printable(line, cut=False), width, subsequent_indent=indent, break_long_words=False
+            printable(line, cut=False),
+            width,
+            subsequent_indent=indent,
+            break_long_words=False,
+            break_on_hyphens=False,  # names of files stay whole
         )
         typer.echo(filled)
 

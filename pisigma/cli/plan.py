@@ -73,7 +73,9 @@ CriterionName = Annotated[
 ]
 LimitMm = Annotated[
     float | None,
-    typer.Option(help="RMS of the tool's position that is wanted [mm]: how many poses does it need?"),
+    typer.Option(
+        help="Length below which 95 % of the tool's position errors stay [mm]: how many poses does it need?"
+    ),
 ]
 SpeedDegS = Annotated[float, typer.Option(help="Speed of every joint between the poses [deg/s].")]
 SettlingS = Annotated[float, typer.Option(help="Time at every pose until it is measured [s].")]
@@ -174,10 +176,10 @@ def _curve_lines(planned: "Plan") -> list[str]:
             "tool's position; choose by criterion I for that."
         )
     if limit is not None and planned.needed is None:
-        lines.append(f"An RMS of {limit:g} mm needs more than {planned.poses} poses.")
+        lines.append(f"To keep 95 % of the errors below {limit:g} mm needs more than {planned.poses} poses.")
     elif limit is not None:
         needed = f"with {planned.needed} poses" if planned.needed else "already, without more poses"
-        lines.append(f"An RMS of {limit:g} mm is expected {needed}.")
+        lines.append(f"95 % of the errors are expected below {limit:g} mm {needed}.")
     return lines
 
 

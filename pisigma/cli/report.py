@@ -8,6 +8,7 @@ import typer
 from pisigma.cli.arguments import AsJson, ModelFolder
 from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_lines, progress_of
+from pisigma.errors import AcceptanceError
 
 if TYPE_CHECKING:
     from pisigma.camera.corner_file import CameraFiles
@@ -29,7 +30,10 @@ def report(
     cameras: "CameraFiles | None" = None,
     as_json: AsJson = False,
 ) -> None:
-    """Write a report as one HTML page: how accurate, where worst, what limits it, what to measure next."""
+    """Write a report as one HTML page: how accurate, where worst, what limits it, what to measure next.
+
+    Exit status 3 where the rows are not to be trusted: the page says why.
+    """
     from pisigma.workflow import report as workflow
 
     workflow.check_report_outputs(out, figures, inputs=(model, data, *(cameras.files if cameras else ())))
@@ -38,6 +42,8 @@ def report(
         written = result.save(out, figures)
     if as_json:
         print_json({"report": str(out), "figures": [str(path) for path in written]} | result.to_json())
-        return
-    also = f", {len(written)} figures to {figures}" if written else ""
-    print_lines([result.verdict, f"Report written to {out}{also}."])
+    else:
+        also = f", {len(written)} figures to {figures}" if written else ""
+        print_lines([result.verdict, f"Report written to {out}{also}."])
+    if result.diagnostics:
+        raise AcceptanceError(" ".join(one.sentence for one in result.diagnostics))

@@ -1,5 +1,6 @@
 """`pisigma robots`: the catalogue, robots from files of controllers, and poses to check a robot by."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,8 +11,7 @@ from pisigma.cli.output import print_json, print_line, print_lines, print_table
 from pisigma.errors import OutputError
 
 if TYPE_CHECKING:
-    from pisigma.export.projection import Departure
-    from pisigma.robot import Robot
+    from pisigma.robot.description import Robot
     from pisigma.robot.pendant_poses import PendantPose
 
 Read = Annotated[
@@ -30,9 +30,14 @@ Like = Annotated[
 ]
 Out = Annotated[Path | None, typer.Option(help="With --read: the robot file (.yaml) to write.")]
 
-PLAUSIBLE_SHARE = 0.01
-"""Share of the reach that a calibration changes an arm by at most."""
-
+MaxChange = Annotated[
+    float | None,
+    typer.Option(
+        "--max-change-mm",
+        help="With --read: mean distance [mm] from the nominal robot above which the file is refused (default: 5).",
+        min=0.0,
+    ),
+]
 Check = Annotated[
     str | None,
     typer.Option(
@@ -47,62 +52,60 @@ def robots(
     read: Read = None,
     like: Like = None,
     out: Out = None,
+    max_change_mm: MaxChange = None,
     check: Check = None,
-    base: Annotated[str | None, typer.Option(help="With --check: of a URDF file, the link of poses.")] = None,
-    tip: Annotated[str | None, typer.Option(help="With --check: of a URDF file, the tool's link.")] = None,
+    base: Annotated[str | None, typer.Option(help="Of a URDF file: link of poses.")] = None,
+    tip: Annotated[str | None, typer.Option(help="Of a URDF file: link that is the tool.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """List the robots that come with pisigma, read a controller's own file, or check a robot description."""
     if check is not None:
         _check(check, base, tip, as_json)
-    elif read is None and like is None and out is None:
+    elif read is None and like is None and out is None and max_change_mm is None:
         _list(as_json)
     elif read is None or like is None or out is None:
         raise OutputError(
             "--read, --like and --out go together: the file, the nominal robot, and what to write."
         )
     else:
-        _convert(read, like, out, as_json)
+        from pisigma.robot import Robot
+
+        _convert(read, like, Robot.load(like, base, tip), out, max_change_mm, as_json)
 
 
-def _convert(read: Path, like: str, out: Path, as_json: bool) -> None:
-    """Write the robot that a controller's file describes."""
-    from pisigma.export.controllers.reading import read_controller_file
+def _convert(
+    read: Path, like: str, nominal: "Robot", out: Path, max_change_mm: float | None, as_json: bool
+) -> None:
+    """Write the robot that a controller's file makes of the nominal one, which `like` names."""
+    from pisigma.export.controllers.reading import MAX_CHANGE, read_controller_file
     from pisigma.export.dh_table import dh_yaml
-    from pisigma.export.projection import departure_from_drawn
     from pisigma.files.output_file import check_output, write_whole
-    from pisigma.robot import Robot
 
     check_output(out, (".yaml", ".yml"), "a robot file", (read, Path(like)))
-    drawn = Robot.load(like)
-    robot = read_controller_file(read, drawn)
-    change = departure_from_drawn(robot, drawn)
-    write_whole(out, dh_yaml(robot, (f"Read from {read.name} with the nominal robot {robot.name}.",)))
-    warnings = _warnings(change, drawn)
+    reading = read_controller_file(read, nominal, MAX_CHANGE if max_change_mm is None else max_change_mm)
+    robot, change = reading.robot, reading.change
+    write_whole(out, dh_yaml(robot, (robot.source, *reading.remarks)))
     if as_json:
-        sizes = {"mean_mm": change.mean_mm, "max_mm": change.max_mm}
-        written = {"file": str(out), "robot": robot.name, "joints": robot.dof}
-        print_json({**written, "change": sizes, "warnings": warnings})
+        print_json(
+            {
+                "file": str(out),
+                "robot": robot.name,
+                "joints": robot.dof,
+                "change": asdict(change),
+                "frames": reading.frames.to_json() if reading.frames else None,
+                "remarks": reading.remarks,
+                "warnings": [],
+            }
+        )
         return
     print_line(f"Robot file written to {out}.")
     print_lines(
         [
-            f"With base and tool fitted, its tool is {change.mean_mm:.3g} mm from that of the robot as drawn in the "
-            f"mean, {change.max_mm:.3g} mm at most.",
-            *(f"Warning: {sentence}" for sentence in warnings),
+            f"Its tool is {change.mean_mm:.3g} mm and {change.mean_mrad:.3g} mrad from that of the nominal robot "
+            f"in the mean, {change.max_mm:.3g} mm at most.",
+            *reading.remarks,
         ]
     )
-
-
-def _warnings(change: "Departure", drawn: "Robot") -> list[str]:
-    """Warn of a file that changes the robot by more than calibrations do."""
-    if change.mean_mm < PLAUSIBLE_SHARE * drawn.reach * 1e3:
-        return []
-    return [
-        f"{change.mean_mm:.3g} mm are more than {100 * PLAUSIBLE_SHARE:g} % of the reach of robot '{drawn.name}', by "
-        "which no calibration changes an arm; check that --like is the robot of this file, and its units (radians, "
-        "metres)."
-    ]
 
 
 def _list(as_json: bool) -> None:
@@ -139,11 +142,15 @@ def _list(as_json: bool) -> None:
 
 def _check(robot: str, base: str | None, tip: str | None, as_json: bool) -> None:
     """Print where a description has the tool."""
+    from pisigma.kinematics.closed_form import closed_form_solver
+    from pisigma.robot.description import Robot
     from pisigma.robot.pendant_poses import pendant_poses
 
     poses = pendant_poses(robot, base, tip)
+    form = closed_form_solver(Robot.load(robot, base, tip))
     if as_json:
-        print_json({"robot": robot, "poses": [pose.to_json() for pose in poses]})
+        closed = None if form is None else {"name": form.name, "branches": list(form.branches)}
+        print_json({"robot": robot, "closed_form": closed, "poses": [pose.to_json() for pose in poses]})
         return
     rows = [_pendant_row(pose) for pose in poses]
     columns = ("axis", "at", "x [mm]", "y [mm]", "z [mm]", "roll [deg]", "pitch [deg]", "yaw [deg]", "limits")
@@ -154,7 +161,10 @@ def _check(robot: str, base: str | None, tip: str | None, as_json: bool) -> None
         [
             "Move the robot to these values, with the tool and frame of the description, and compare what the teach "
             "pendant shows; the rotation is RotZ(roll) RotY(pitch) RotX(yaw). Where the first difference comes with an "
-            "axis, look at the rows from there on, its direction and its coupling."
+            "axis, look at the rows from there on, its direction and its coupling.",
+            "Nominal inverse kinematics are solved numerically."
+            if form is None
+            else f"Nominal inverse kinematics have the closed form {form.name} with {len(form.branches)} branches.",
         ]
     )
 

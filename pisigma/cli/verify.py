@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from pisigma.cli.arguments import AsJson, ModelFolder
+from pisigma.cli.arguments import AsJson, ModelFolder, SocketDistance, socket_distances
 from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_line, print_lines, print_table, progress_of, screen_width
 from pisigma.errors import AcceptanceError
@@ -46,6 +46,7 @@ def verify(
     data: Data,
     fit_frame: FitFrame = False,
     fit_tool: FitTool = False,
+    socket_distance: SocketDistance = None,
     cameras: "CameraFiles | None" = None,
     sha256: Hash = None,
     as_json: AsJson = False,
@@ -54,8 +55,9 @@ def verify(
 
     Where a joint, a length, the base or the tool has moved since the model was made, it says by how much, and prints
     the line that recalibrates. Where errors are large, the usual setup faults that explain them are named: units,
-    order, signs or zeros of the joints, a correction that was applied twice or not at all. Rows of the set "train" are
-    left out. Exit status 3 where the corrected model does not explain the measurements better, or the arm has moved.
+    order, signs or zeros of the joints, a correction that was applied twice or not at all. Balls in sockets, wires and
+    pairs are judged by how well the rows of each agree, and by stated distances. Rows of the set "train" are left out.
+    Exit status 3 where the corrected model does not explain the measurements better, or the arm has moved.
     """
     from pisigma.files.model_files import check_model_hash
     from pisigma.workflow import verify as workflow
@@ -63,7 +65,9 @@ def verify(
     if sha256 is not None:
         check_model_hash(model, sha256)
     with progress_of(f"verifying {model}"):
-        settings = workflow.VerificationSettings(fit_frame, fit_tool, cameras=cameras)
+        settings = workflow.VerificationSettings(
+            fit_frame, fit_tool, cameras=cameras, socket_distances=socket_distances(socket_distance)
+        )
         verification = workflow.verify(model, data, settings)
     if as_json:
         print_json(verification.to_json())
@@ -85,6 +89,9 @@ def _print(verification: "Verification") -> None:
 def print_comparison(comparison: "ModelComparison", data: str) -> None:
     """Print the tables of models that were compared on the rows of a file."""
     from pisigma.reporting.comparison_tables import comparison_tables
+    from pisigma.reporting.tables import distance_table
 
     for title, table in comparison_tables(comparison, Path(data).name, screen_width()):
         print_table(title, *table)
+    if comparison.socket_distance is not None:
+        print_table("stated distances of sockets", *distance_table(comparison.socket_distance))

@@ -47,7 +47,20 @@ def data(poses, tmp_path_factory):
 def calibrated(run, data, tmp_path_factory):
     """The folder of a calibration and what it printed."""
     folder = tmp_path_factory.mktemp("calibrated") / "arm"
-    result = run("calibrate", "kiro4", data, "--out", folder, "--model", "geometric", "--folds", 3, "--json")
+    result = run(
+        "calibrate",
+        "kiro4",
+        data,
+        "--out",
+        folder,
+        "--model",
+        "geometric",
+        "--folds",
+        3,
+        "--class",
+        "hobby",
+        "--json",
+    )
     assert result.exit_code == 0, result.output
     assert result.stdout.count("\n") == 1
     return folder, json.loads(result.stdout)
@@ -92,8 +105,8 @@ def test_the_card_says_everything(calibrated):
     card = (folder / "README.md").read_text()
     assert card.startswith("# arm\n\nGeometric calibration of robot kiro4 (")
     assert (
-        "Made by `pisigma calibrate kiro4 poses.csv --out arm --model geometric --folds 3`, on 60 rows of `poses.csv`."
-        in card
+        "Made by `pisigma calibrate kiro4 poses.csv --out arm --model geometric --folds 3 --class hobby`, "
+        "on 60 rows of `poses.csv`." in card
     )
     assert "3-fold cross-validation, 3 repeats: each of 60 rows" in card
     assert f"{printed['cross_validation']['geometric']['rms_mm']:.4f}" in card
@@ -362,7 +375,7 @@ def test_an_implausible_calibration_is_written_on_demand_only(run, tmp_path):
     result = run(*command)
     assert result.exit_code == 3
     assert "pose errors of the 40 rows that were calibrated with" in result.stdout
-    assert "Implausible: The length errors are about" in result.stdout
+    assert "Implausible: The lengths are off by about" in result.stdout
     assert "Model written" not in result.stdout
     accepted = run(*command, "--accept-implausible")
     assert accepted.exit_code == 0, accepted.output

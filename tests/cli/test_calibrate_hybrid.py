@@ -191,7 +191,7 @@ def test_balls_in_sockets_of_a_real_panda(run, shared_data, tmp_path):
     assert figures["hybrid"]["rms_mm"] < 0.9 * figures["geometric"]["rms_mm"]
     assert figures["socket_distance"]["hybrid"]["mean_mm"] < 0.1
     card = (tmp_path / "arm" / "README.md").read_text()
-    assert "is met to 0.0" in card
+    assert "are met to 0.0" in card
     assert "by the hybrid calibration (nominal 0." in card
 
 

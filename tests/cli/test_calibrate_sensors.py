@@ -52,7 +52,7 @@ def test_placements_of_a_real_panda_left_out_in_turn(run, shared_data, tmp_path)
     card = (tmp_path / "arm" / "README.md").read_text()
     assert "12 sockets were held out whole" in card
     assert "--split placement" in card
-    assert "The known distance of held-out sockets (6 of them) is met to 0.0" in card
+    assert "| backcenter/0 to backcenter/1" in card
 
 
 def test_jigs_held_out_in_turn(run, touches, tmp_path):
@@ -112,3 +112,88 @@ def test_unknown_sockets_are_refused_in_one_line(run, shared_data, tmp_path):
     assert result.exit_code == 2
     assert "no two sockets of the data are called 'a' and 'b'" in result.stderr
     assert not (tmp_path / "arm").exists()
+
+
+def test_every_stated_distance_of_sockets_counts(run, shared_data, tmp_path):
+    data = shared_data / "panda_sockets" / "panda_3.csv"
+    command = (
+        "calibrate",
+        "panda",
+        data,
+        "--model",
+        "geometric",
+        "--folds",
+        "0",
+        "--out",
+        tmp_path / "arm",
+        "--json",
+    )
+    known = ("--socket-distance", "backcenter/0,backcenter/1,50")
+    result = run(*command, *known, "--socket-distance", "backleft/0,backleft/1,50.1")
+    assert result.exit_code in (0, 3), result.output
+    command_of = json.loads(result.stdout)["command"]
+    assert "('backcenter/0', 'backcenter/1'): 0.05" in command_of
+    assert "('backleft/0', 'backleft/1'): 0.0501" in command_of
+    assert run(*command, *known, "--socket-distance", "backcenter/1,backcenter/0,51").exit_code == 2
+    assert run(*command, *known, *known).exit_code == 2
+
+
+def test_plates_held_out_of_a_real_arm_are_judged_by_every_stated_distance(run, shared_data, tmp_path):
+    folder = shared_data / "holiday"
+    stated = [
+        "A/0,A/1,39.90",
+        "A/1,A/2,39.92",
+        "B/0,B/1,39.97",
+        "B/1,B/2,40.00",
+        "C/0,C/1,39.93",
+        "C/1,C/2,39.96",
+    ]
+    command = ["calibrate", folder / "fr3.urdf", folder / "fr3_sockets.csv", "--tip", "ball_link", "--json"]
+    command += ["--model", "geometric", "--out", tmp_path / "arm"]
+    command += [word for one in stated for word in ("--socket-distance", one)]
+    for split in ((), ("--split", "placement")):
+        result = run(*command, *split, "--overwrite")
+        assert result.exit_code == 0, result.output
+        figures = json.loads(result.stdout)["cross_validation"]
+        assert {tuple(one["sockets"]) for one in figures["socket_distance"]["each"]} == {
+            tuple(one.split(",")[:2]) for one in stated
+        }
+        mean = {name: figures["socket_distance"][name]["mean_mm"] for name in ("nominal", "geometric")}
+        assert mean["geometric"] < 0.15 < 0.35 < mean["nominal"]
+        assert figures["geometric"]["rms_mm"] < 0.45 < 1.3 < figures["nominal"]["rms_mm"]
+
+
+def test_a_plate_of_a_real_arm_is_evaluated_and_verified_by_a_calibration_on_the_others(
+    run, shared_data, tmp_path
+):
+    folder = shared_data / "holiday"
+    head, *lines = (folder / "fr3_sockets.csv").read_text().splitlines()
+    for name, plates in (("two", "AB"), ("third", "C")):
+        rows = [line for line in lines if line.rsplit(",", 1)[1][0] in plates]
+        (tmp_path / f"{name}.csv").write_text("\n".join([head, *rows]) + "\n")
+    stated = ("A/0,A/1,39.90", "A/1,A/2,39.92", "B/0,B/1,39.97", "B/1,B/2,40.00")
+    command = [
+        "calibrate",
+        folder / "fr3.urdf",
+        tmp_path / "two.csv",
+        "--tip",
+        "ball_link",
+        "--model",
+        "geometric",
+    ]
+    command += [word for one in stated for word in ("--socket-distance", one)]
+    assert run(*command, "--folds", "0", "--out", tmp_path / "arm").exit_code == 0
+    third = ("--socket-distance", "C/0,C/1,39.93", "--socket-distance", "C/1,C/2,39.96", "--json")
+    result = run("evaluate", tmp_path / "arm", tmp_path / "third.csv", *third)
+    assert result.exit_code == 0, result.output
+    found = json.loads(result.stdout)
+    assert found["corrected"]["rms_mm"] < 0.4 < 0.9 < found["nominal"]["rms_mm"]
+    each = found["socket_distance"]["each"]
+    assert [one["sockets"] for one in each] == [["C/0", "C/1"], ["C/1", "C/2"]]
+    assert max(abs(one["errors_mm"]["arm"]) for one in each) < 0.15
+    result = run("verify", tmp_path / "arm", tmp_path / "third.csv", *third)
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["verdict"] == "better"
+    wrong = ("--socket-distance", "C/0,C/1,45")
+    assert run("evaluate", tmp_path / "arm", tmp_path / "third.csv", *wrong).exit_code == 3
+    assert run("verify", tmp_path / "arm", tmp_path / "third.csv", *wrong).exit_code == 3

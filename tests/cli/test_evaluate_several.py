@@ -205,12 +205,14 @@ def test_models_of_one_name_are_told_apart(run, folder, tmp_path):
     assert len({model["rms_mm"] for model in printed["models"]}) == 1
 
 
-def test_sockets_alone_are_told_what_is_missing(refuses, folder, tmp_path):
+def test_sockets_whose_rows_meet_nowhere_are_implausible(run, folder, tmp_path):
     lines = (folder / "rows.csv").read_text().splitlines()
     joints = [",".join(line.split(",")[:6]) for line in lines]
     (tmp_path / "sockets.csv").write_text(
         "\n".join([f"{joints[0]},socket", *(f"{line},s/{row % 3}" for row, line in enumerate(joints[1:]))])
         + "\n"
     )
-    sentence = refuses("evaluate", folder / "hybrid", tmp_path / "sockets.csv")
-    assert "no positions were measured, but socket values; a model does not keep where sockets" in sentence
+    for command in ("evaluate", "verify"):
+        result = run(command, folder / "hybrid", tmp_path / "sockets.csv", "--json")
+        assert result.exit_code == 3
+        assert [one["kind"] for one in json.loads(result.stdout)["diagnostics"]] == ["implausible_errors"]

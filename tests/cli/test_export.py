@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from testing.closeness import assert_close
 from testing.models import joints_around
 from testing.urdf import peer_poses
 
+from pisigma.files.output_folder import staged_folder
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -78,15 +80,27 @@ def test_urdf_in_calibrated_and_out_again(run, tmp_path):
     command = ("calibrate", tmp_path / "drawn.urdf", tmp_path / "data.csv", "--out", tmp_path / "model")
     assert run(*command, "--folds", "0", "--prior-mm", "0", "--prior-mrad", "0").exit_code == 0
     assert load_model(tmp_path / "model").robot.joints == drawn.joints
-    out = tmp_path / "calibrated.urdf"
-    assert run("export", tmp_path / "model", "--format", "urdf", "--out", out).exit_code == 0
+    out, like = tmp_path / "calibrated.urdf", ("--like", tmp_path / "drawn.urdf", "--tip", "tool0")
+    export = ("export", tmp_path / "model", "--format", "urdf", "--out", out)
+    assert run(*export).exit_code == 0
+    by_default = out.read_text()
+    assert run(*export, *like).exit_code == 0
+    assert out.read_text() == by_default
+    (tmp_path / "drawn.urdf").rename(tmp_path / "elsewhere.urdf")
+    assert run(*export).exit_code == 0
+    assert out.read_text() == by_default
     new = joints_around("ur10", 50, seed=1, spread=2.0)
-    model = load_model(tmp_path / "model").calibrated
-    assert_close(peer_poses(out, "tool0", new), forward_kinematics(model, new), atol=1e-10)
-    assert_close(peer_poses(out, "tool0", new), forward_kinematics(true, new), atol=1e-8)
-    like = ("--like", tmp_path / "drawn.urdf", "--tip", "tool0")
-    assert run("export", tmp_path / "model", "--format", "urdf", "--out", out, *like).exit_code == 0
-    assert_close(peer_poses(out, "calibrated_tool", new), forward_kinematics(model, new), atol=1e-10)
+    model = load_model(tmp_path / "model")
+    assert_close(
+        peer_poses(out, "calibrated_tool", new), forward_kinematics(model.calibrated, new), atol=1e-10
+    )
+    assert_close(peer_poses(out, "calibrated_tool", new), forward_kinematics(true, new), atol=1e-8)
+    with staged_folder(
+        tmp_path / "model", overwrite=True
+    ) as folder:  # as models were before they kept the file
+        save_model(replace(model, robot=replace(model.robot, urdf=None)), folder)
+    assert "with --like FILE" in " ".join(run(*export).stderr.split())
+    assert_close(peer_poses(out, "tool0", new), forward_kinematics(model.calibrated, new), atol=1e-10)
 
 
 def test_dh_as_yaml_and_csv(run, geometric, tmp_path):

@@ -10,6 +10,11 @@ from testing.identified import geometric_model
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.model.folder.model_folder import save_model
 from pisigma.robot import Robot
+from pisigma.robot.writing import robot_to_urdf
+
+TWO_ENDS = """<link name="camera"/>
+<joint name="beside" type="fixed"><parent link="link_1"/><child link="camera"/></joint>
+</robot>"""
 
 
 def test_a_calibration_goes_to_the_controller_and_comes_back(run, refuses, tmp_path):
@@ -23,16 +28,28 @@ def test_a_calibration_goes_to_the_controller_and_comes_back(run, refuses, tmp_p
     assert any("forum.universal-robots.com" in remark for remark in stated["remarks"])
     read = run("robots", "--read", conf, "--like", "ur10", "--out", out)
     assert (read.exit_code, read.stdout.count("Warning")) == (0, 0)
-    assert read.stdout.startswith(f"Robot file written to {out}.\nWith base and tool fitted, its tool is ")
+    assert read.stdout.startswith(f"Robot file written to {out}.\nIts tool is ")
     q = torch.rand((50, 6), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     assert model.calibrated is not None
     assert_close(forward_kinematics(Robot.load(out), q), forward_kinematics(model.calibrated, q), atol=1e-9)
     summary = json.loads(run("robots", "--read", conf, "--like", "ur10", "--out", out, "--json").stdout)
     change = summary.pop("change")
+    assert summary.pop("frames")["base"]["roll_deg"] == 0
+    assert any("calibration_test.cpp" in remark for remark in summary.pop("remarks"))
     assert summary == {"file": str(out), "robot": "ur10", "joints": 6, "warnings": []}
     assert 0.1 < change["mean_mm"] < change["max_mm"] < 20
-    other = json.loads(run("robots", "--read", conf, "--like", "ur5", "--out", out, "--json").stdout)
-    assert "check that --like is the robot of this file" in other["warnings"][0]
+    conf.write_text(conf.read_text().replace("delta_a = [", "delta_a = [0.02, 0, 0, 0, 0, 0] # ["))
+    written = out.read_bytes()
+    assert "--max-change-mm" in refuses("robots", "--read", conf, "--like", "ur10", "--out", out)
+    assert out.read_bytes() == written
+    wide = ("--max-change-mm", "1e5", "--json")
+    farther = json.loads(run("robots", "--read", conf, "--like", "ur10", "--out", out, *wide).stdout)
+    assert farther["change"]["mean_mm"] > 5
+    drawn = robot_to_urdf(Robot.load("ur10")).replace("</robot>", TWO_ENDS)
+    (tmp_path / "arm.urdf").write_text(drawn)
+    arguments = ("robots", "--read", conf, "--like", tmp_path / "arm.urdf", "--out", out, *wide)
+    assert "say with tip" in refuses(*arguments)
+    assert json.loads(run(*arguments, "--base", "base_link", "--tip", "tool0").stdout)["joints"] == 6
     assert "--read, --like and --out go together" in refuses("robots", "--read", conf)
     assert "is an input of this command" in refuses("robots", "--read", out, "--like", "ur10", "--out", out)
 

@@ -2,17 +2,19 @@
 
 import json
 
+from pisigma.model.folder.model_document import FORMAT
+
 
 def test_what_is_new_already_is_said(run, models):
     result = run("upgrade", models / "kiro3", "--json")
     assert json.loads(result.stdout) == {
         "model": str(models / "kiro3"),
         "name": "hand_made_kiro3",
-        "before": 4,
-        "after": 4,
+        "before": FORMAT,
+        "after": FORMAT,
         "changes": [],
     }
-    assert "has the newest format (4) already" in run("upgrade", models / "kiro3").stdout
+    assert f"has the newest format ({FORMAT}) already" in run("upgrade", models / "kiro3").stdout
 
 
 def test_a_folder_without_a_model_is_refused(refuses, tmp_path):

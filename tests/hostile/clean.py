@@ -1,22 +1,20 @@
 """The clean inputs that hostile ones are made of: measurements, robots, URDFs, recipes, models and poses."""
 
-import functools
-import importlib.util
 import os
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
 import torch
 from testing.calibrated_arm import calibrated_arm
 from testing.calibrated_ur5 import calibrated_ur5
 from testing.models import REPOSITORY, hand_made_model
+from testing.outside_arm import SIMULATOR, sample_joints, simulator
 from testing.sensors import joints, mixed_data, true_robot
 from testing.simulated_arm import simulate
 
+from pisigma.kernels.machine_code import load_kernels
 from pisigma.kinematics.forward import forward_kinematics
 from pisigma.measurement.dataset import Measurements
 from pisigma.model.calibrated_model import CalibratedModel
@@ -26,7 +24,6 @@ from pisigma.robot import Robot
 from pisigma.robot.writing import robot_to_urdf, robot_to_yaml
 
 DATA = Path(os.environ.get("PISIGMA_DATA", REPOSITORY / ".." / "shared" / "data")).resolve()
-SIMULATOR = DATA.parent / "simulated" / "sim.py"
 NOISE = 5e-5
 """Standard deviation of a simulated coordinate [m]."""
 
@@ -74,6 +71,7 @@ class Clean:
 
 def write_clean(folder: Path) -> Clean:
     """Write all clean inputs into a folder; those of measured robots and of the outside simulator where they are."""
+    load_kernels()  # compiles them on a new machine, which would count as time of the first input
     rows = {
         name: simulated_rows(folder, name, turn=turn)
         for name, turn in (("ur5", None), ("rb5", 1e-4), ("kiro3", None))
@@ -136,41 +134,18 @@ def _measured(folder: Path) -> dict[str, CleanRows]:
 
 def outside_rows(folder: Path, name: str, seed: int = 3, rows: int = 80) -> CleanRows:
     """Measurements of an arm with gears and sag, drawn in URDF, by a simulator that shares no code with the package."""
-    simulator, stem = _simulator(), str(folder / name)
-    simulator.URDF[stem] = simulator.URDF[name]
+    outside, stem = simulator(), str(folder / name)
+    outside.URDF[stem] = outside.URDF[name]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ResourceWarning)  # it leaves the file to be closed by Python
-        simulator.write_urdf(stem)
+        outside.write_urdf(stem)
     urdf, path = Path(f"{stem}.urdf"), folder / f"{name}.csv"
     urdf.write_text(urdf.read_text(encoding="utf-8").replace(stem, name), encoding="utf-8")
-    true = simulator.True_(name, seed=seed)
-    q, others = _sample(true, rows, seed + 1000), _sample(true, 200, seed + 2000)
-    simulator.write_csv(path, true, q, true.measure(q, rng=np.random.default_rng(seed))[0])
+    true = outside.True_(name, seed=seed)
+    q, others = sample_joints(true, rows, seed + 1000), sample_joints(true, 200, seed + 2000)
+    outside.write_csv(path, true, q, true.measure(q, rng=np.random.default_rng(seed))[0])
     position = torch.from_numpy(true.measure(others, rng=np.random.default_rng(seed + 1))[0])
     return CleanRows(str(urdf), path, Measurements(q=torch.from_numpy(others), position=position))
-
-
-def _sample(true: Any, rows: int, seed: int) -> np.ndarray:
-    """The joint values that the simulator's `sample` draws one by one, which takes seconds."""
-    drawn = np.random.default_rng(seed)
-    limits = [joint[5] for joint in true.js if joint[1] != "fixed"]
-    turning = [joint[1] == "revolute" for joint in true.js if joint[1] != "fixed"]
-    lower, upper = np.clip(np.where(np.array(turning)[:, None], np.deg2rad(limits), limits), -np.pi, np.pi).T
-    middle, half = (lower + upper) / 2, (upper - lower) / 2 * 0.9
-    q = drawn.uniform(middle - half, middle + half, (20 * rows, len(middle)))
-    above = (true.tip(q)[0][:, 2] > 0.1) | (true.name == "scara")
-    assert above.sum() >= rows
-    return q[above][:rows]
-
-
-@functools.cache
-def _simulator() -> ModuleType:
-    specification = importlib.util.spec_from_file_location("outside_simulator", SIMULATOR)
-    assert specification is not None
-    assert specification.loader is not None
-    simulator = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(simulator)
-    return simulator
 
 
 def _explained_rows(folder: Path, model: CalibratedModel) -> Path:

@@ -59,7 +59,7 @@ BAD: dict[str, tuple[Callable[[Path], None], str]] = {
     "directory": (Path.mkdir, "directory"),
     "unreadable": (lambda path: path.symlink_to(path), "symbolic link"),
     "units": (_changed(lambda text: text.replace("_mm", "_m")), "unit"),
-    "repeated": (_changed(_repeated), "equals line 2"),
+    "repeated": (_changed(_repeated), "more poses"),
     "truncated": (_changed(lambda text: text[: len(text) // 2].rsplit(",", 1)[0]), "line"),
 }
 """Robots with bad files: what writes the file, and words of the reason why it is refused. Not even root reads a link to

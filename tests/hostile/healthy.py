@@ -4,7 +4,8 @@ import shutil
 from pathlib import Path
 
 from hostile.case import Case, Rng, calibrate, one_of
-from hostile.clean import SIMULATOR, Clean, CleanRows, outside_rows, simulated_rows
+from hostile.clean import Clean, CleanRows, outside_rows, simulated_rows
+from testing.outside_arm import SIMULATOR
 
 _CATALOGUE = ("ur5", "ur10", "rb5", "fanuc_r2000", "panda", "kiro3", "kiro4")
 _OUTSIDE = ("kr10", "irb120", "arm7", "scara", "rail")

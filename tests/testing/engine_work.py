@@ -2,7 +2,9 @@
 
 import os
 import time
+from collections.abc import Callable
 
+from pisigma.engines.engine import AbstractEngine, packed, unpacked, work_on
 from pisigma.errors import IdentificationError
 
 
@@ -22,3 +24,20 @@ def refuse(after: float) -> None:
     """Refuse after some seconds."""
     time.sleep(after)
     raise IdentificationError(f"refused after {after} s")
+
+
+class PicklingEngine(AbstractEngine):
+    """Pickles work, items and results as for other processes, and works in this one."""
+
+    def __init__(self, workers: int = 1, before_each: Callable[[], None] = lambda: None) -> None:
+        self._workers, self._before_each = workers, before_each
+
+    @property
+    def workers(self) -> int:
+        return self._workers
+
+    def _chunks(self, work, chunks):
+        """See `AbstractEngine`."""
+        for chunk, arguments in [(chunk, packed(work, chunk)) for chunk in chunks]:
+            self._before_each()
+            yield chunk, unpacked(work_on(*arguments))

@@ -43,6 +43,7 @@ def simulate(
     length: float = 5e-4,
     angle: float = 1e-3,
     wrong: float = 0.0,
+    offset: float = 0.0,
     base: np.ndarray = BASE,
     tool: np.ndarray = TOOL,
 ) -> SimulatedArm:
@@ -57,12 +58,15 @@ def simulate(
         length: standard deviation of the length errors [m].
         angle: standard deviation of the angle errors [rad].
         wrong: share of the rows that are off by another 3 mm per axis.
+        offset: size by which the zero of every joint is off, besides [rad]; of either sign.
         base: of the true robot.
         tool: of the true robot.
     """
     rng = np.random.default_rng(seed)
     nominal = Robot.load(name)
-    true = nominal.with_geometry(dh=nominal.dh + dh_errors(nominal, length, angle, rng), base=base, tool=tool)
+    dh = nominal.dh + dh_errors(nominal, length, angle, rng)
+    dh[:, 0] += offset * np.random.default_rng([seed, 1]).choice([-1, 1], len(dh))
+    true = nominal.with_geometry(dh=dh, base=base, tool=tool)
     q = draw_joints(nominal, rows, rng)
     T = forward_kinematics(true, q)
     position = T[:, :3, 3] + noise * torch.from_numpy(rng.normal(size=(rows, 3)))

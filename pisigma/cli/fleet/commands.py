@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from pisigma.fleet.status import FleetStatus
     from pisigma.workflow.fleet.run import FleetRun
 
+DAYS_AHEAD = 366
+"""`fleet status` also says what will be overdue within a year."""
 SHOWN = 10
 """Robots that a table for people has at most."""
 
@@ -167,10 +169,15 @@ def status(
 
 def _day(stated: str | None) -> datetime.date:
     """A stated day, or today."""
-    try:
-        return datetime.date.today() if stated is None else datetime.date.fromisoformat(stated)
-    except ValueError:
-        raise FleetError(f"today: a day such as 2026-11-22 was wanted, got '{stated}'.") from None
+    from pisigma.measurement.dates import is_date
+
+    if stated is None:
+        return datetime.date.today()
+    if not is_date(stated, DAYS_AHEAD):
+        raise FleetError(
+            f"today: expected a day from 1970-01-01 to a year from now, such as 2026-11-22, got '{stated}'; correct it."
+        )
+    return datetime.date.fromisoformat(stated)
 
 
 def _print_run(result: "FleetRun") -> None:
@@ -204,6 +211,8 @@ def _print_status(seen: "FleetStatus", page: Path | None) -> None:
         print_lines([f"Overdue: {longest}{more}."], indent="  ")
     if missing := [one.robot for one in seen.in_state("missing")]:
         print_lines([f"Missing: {', '.join(missing)}; give the same `pisigma fleet run` again."], indent="  ")
-    print_lines(filter(None, [not_compared(seen)]), indent="  ")
+    print_lines(
+        filter(None, [not_compared(seen), *(f"Warning: {one}" for one in seen.warnings)]), indent="  "
+    )
     if page is not None:
         print_lines([f"Page written to {page}."])

@@ -8,6 +8,7 @@ import typer
 from pisigma.cli.arguments import AsJson, complete_model
 from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import print_json, print_lines, print_table, progress_of, screen_width
+from pisigma.errors import AcceptanceError
 
 if TYPE_CHECKING:
     from pisigma.camera.corner_file import CameraFiles
@@ -57,7 +58,8 @@ def compare(
 ) -> None:
     """Say in what two models of one robot differ: parameters, positions of the tool, rows and programs.
 
-    The significance of differences is from the posteriors of both models.
+    The significance of differences is from the posteriors of both models. Exit status 3 where the rows are not to be
+    trusted.
     """
     from pisigma.files.output_file import check_page
     from pisigma.workflow import compare as workflow
@@ -74,6 +76,8 @@ def compare(
         print_json(compared.to_json())
     else:
         _print(compared, page)
+    if compared.diagnostics:
+        raise AcceptanceError(" ".join(one.sentence for one in compared.diagnostics))
 
 
 def _print(compared: "ComparedModels", page: Path | None) -> None:

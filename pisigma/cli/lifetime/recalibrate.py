@@ -9,6 +9,7 @@ import typer
 from pisigma.cli.arguments import AcceptImplausible, AsJson, ModelFolder, Overwrite
 from pisigma.cli.camera_options import takes_corners
 from pisigma.cli.output import command_line, print_json, print_lines, print_table, progress_of, saved
+from pisigma.errors import AcceptanceError
 
 if TYPE_CHECKING:
     from pisigma.camera.corner_file import CameraFiles
@@ -94,6 +95,10 @@ def recalibrate_into(
         recalibration = workflow.recalibrate(model, data, settings, progress, drawn)
     if out is None:
         _print(recalibration, None, as_json)
+        if not (recalibration.trusted or accept_implausible):
+            raise AcceptanceError(
+                "the result must not be trusted, for the reasons above; nothing would be written."
+            )
         return
     with saved(recalibration, out, accept_implausible, overwrite, command=command_line(context)) as folder:
         _print(recalibration, folder, as_json)

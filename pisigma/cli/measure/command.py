@@ -26,6 +26,14 @@ LimitMm = Annotated[
 LeastGainMm = Annotated[
     float, typer.Option(help="Stop where the next 10 poses would lower these 95 % by less than this [mm].")
 ]
+Programs = Annotated[
+    list[Path] | None,
+    typer.Option(
+        "--program",
+        help="Program to write again with the poses that are left, whenever they are planned again; several times for "
+        "several controllers.",
+    ),
+]
 Every = Annotated[
     int, typer.Option(help="Rows after which the accuracy is worked out and the rest planned again.")
 ]
@@ -47,6 +55,7 @@ def measure(
     every: Every = 3,
     replan: Replan = True,
     rest: RestFile = None,
+    program: Programs = None,
     once: Once = False,
     view: View = False,
     view_host: ViewHost = "127.0.0.1",
@@ -61,13 +70,14 @@ def measure(
     end. Exit status 3 while all rows are wrong alike.
     """
     from pisigma.measuring.growing_images import growing_file
-    from pisigma.workflow.follow import follow, rest_file
+    from pisigma.workflow.follow import check_programs, follow, rest_file
     from pisigma.workflow.measure import MeasureSettings, MeasuringSession
 
     settings = MeasureSettings(limit_mm, least_gain_mm, every, replan)
     session = MeasuringSession.read(plan, settings)
     growing = growing_file(rows, session.plan.arm.robot, session.plan.settings)
     rest = rest_file(plan, rows, rest)
+    check_programs(program or [], session.plan.arm.robot, (plan, rows, rest))
     page = PageOptions(view_host, view_port, view_urdf) if view else None
     try:
         with (
@@ -78,7 +88,7 @@ def measure(
                 show(step)
                 show_page(step.state)
                 if step.replanned:
-                    session.write_rest(rest)
+                    session.write_rest(rest, program or [])
     except KeyboardInterrupt:
         pass
     _print_summary(session, rest, as_json)
@@ -101,13 +111,10 @@ def _printer(
         with Live(page(None, session.state, title), console=console, auto_refresh=False) as live:
             yield lambda step: live.update(page(step, step.state, title), refresh=True)
         return
-    judged = 0
 
     def show(step: "SessionStep") -> None:
-        nonlocal judged
-        for line in step_lines(step, judged):
+        for line in step_lines(step):
             print_line(line, to_stderr=as_json)
-        judged = len(step.state.reached)
 
     yield show
 

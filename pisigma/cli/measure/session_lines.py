@@ -14,13 +14,8 @@ SHOWN_ROWS, SHOWN_ALARMS, SHOWN_POINTS = 8, 4, 8
 """On the page: the last of them."""
 
 
-def step_lines(step: SessionStep, judged: int) -> Iterator[str]:
-    """Say what is new, in a line each.
-
-    Args:
-        step: what is new.
-        judged: points of the accuracy that were printed already.
-    """
+def step_lines(step: SessionStep) -> Iterator[str]:
+    """Say what is new, in a line each."""
     yield from step.growth.notices
     if step.growth.waiting and not step.state.rows.line:
         yield f"Waiting: {step.growth.waiting}"
@@ -32,9 +27,9 @@ def step_lines(step: SessionStep, judged: int) -> Iterator[str]:
             yield f"line {line}: {row_text(state, state.rows.line.index(line))}"
     for alarm in step.alarms:
         yield f"{'Remark' if alarm.counts else 'ALARM'}: {alarm.sentence}"
-    for point in state.reached[judged:]:
+    for point in step.points:
         yield accuracy_text(point)
-    if lines or len(state.reached) > judged:
+    if lines or step.points:
         yield next_text(state)
 
 

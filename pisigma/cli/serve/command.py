@@ -64,9 +64,10 @@ def serve(
     token = (
         None if token_file is None else read_input(token_file, OutputError).decode(errors="replace").strip()
     )
-    server = Server(
-        _load(model, models), ServeSettings(host, port, binary_port, zmq_port, token, polling=poll_ms / 1e3)
-    )
+    served = _load(model, models)
+    server = Server(served, ServeSettings(host, port, binary_port, zmq_port, token, polling=poll_ms / 1e3))
+    for problem in served.problems:
+        print_line(problem, to_stderr=True)
     for name in (signal.SIGTERM, signal.SIGINT):
         signal.signal(name, lambda *_: server.stop())
     if hasattr(signal, "SIGHUP"):

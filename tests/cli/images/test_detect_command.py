@@ -65,6 +65,27 @@ def test_what_is_left_out_is_named(run, files, tmp_path):
     assert "03 is left out: its edges are blurred by" in text
 
 
+def test_truncated_images_are_named_and_the_others_used(run, files, tmp_path):
+    images = tmp_path / "images"
+    images.mkdir()
+    for name in ("00.png", "01.png"):
+        (images / name).write_bytes((files / "images" / name).read_bytes())
+    whole = (images / "01.png").read_bytes()
+    (images / "02.png").write_bytes(whole[: len(whole) // 2])
+    (images / "03.png").write_bytes(whole[:60])
+    ok, jpeg = cv2.imencode(".jpg", cv2.imread(str(images / "01.png")))
+    assert ok
+    (images / "04.jpg").write_bytes(jpeg.tobytes()[: len(jpeg) * 9 // 10])
+    command = ("detect", images, *options(files)[1:], "--out", tmp_path / "corners.csv")
+    result = run(*command, "--page", tmp_path / "page.html", "--json")
+    assert result.exit_code == 0, result.output
+    printed = json.loads(result.stdout)
+    assert printed["rows"] == 40
+    reasons = [image["left_out"] for image in printed["images"]]
+    assert [bool(reason) for reason in reasons] == [False, False, True, True, True]
+    assert all("truncated" in reason for reason in reasons[2:])
+
+
 def test_what_is_refused(refuses, files, tmp_path):
     out = ("--out", tmp_path / "corners.csv")
     (files / "even.yaml").write_text("rows: 4\ncolumns: 6\nsquare_mm: 30\n")

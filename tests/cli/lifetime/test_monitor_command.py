@@ -2,6 +2,8 @@
 
 import json
 import math
+import sqlite3
+from contextlib import closing
 
 import pytest
 from testing.aged import model_before, rows_later
@@ -52,3 +54,27 @@ def test_a_page_has_to_be_html(run, folder):
     done = run("monitor", folder / "model", folder / "2026-01-01.csv", "--page", folder / "page.pdf")
     assert done.exit_code == 2
     assert ".html" in done.stderr
+
+
+def test_a_year_mistyped_long_ago_is_named_left_out_and_corrected(run, folder):
+    """Histories of earlier versions hold such days; a page is drawn all the same."""
+    with closing(sqlite3.connect(folder / "model.history.sqlite")) as database, database:
+        database.execute("UPDATE sessions SET date = '0206-01-01' WHERE file = '2026-01-01.csv'")
+    arguments = (
+        "monitor",
+        folder / "model",
+        folder / "2026-02-01.csv",
+        "--page",
+        folder / "page.html",
+        "--json",
+    )
+    report = json.loads(run(*arguments).stdout)
+    assert [one["date"] for one in report["history"]] == ["2026-02-01"]
+    assert [one for one in report["warnings"] if "2026-01-01.csv" in one and "0206-01-01" in one]
+    assert (folder / "page.html").is_file()
+    refused = run("monitor", folder / "model", folder / "2026-01-01.csv", "--dates", "2206-01-01")
+    assert refused.exit_code == 2
+    run("monitor", folder / "model", folder / "2026-01-01.csv", "--json")
+    report = json.loads(run(*arguments).stdout)
+    assert [one["date"] for one in report["history"]] == ["2026-01-01", "2026-02-01"]
+    assert not [one for one in report["warnings"] if "0206" in one]

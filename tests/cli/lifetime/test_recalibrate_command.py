@@ -1,11 +1,14 @@
 """`pisigma recalibrate`."""
 
 import json
+import shlex
 
 import pytest
+from gate.table import moved, positions
 from testing.aged import model_before, rows_later
 
 from pisigma.model.folder.model_folder import save_model
+from pisigma.workflow.recalibrate import RecalibrationSettings, recalibrate
 
 
 @pytest.fixture(scope="module")
@@ -36,6 +39,39 @@ def test_a_dry_run_writes_nothing(run, folder):
     assert "The recalibrated model is kept" in done.stdout
     assert "Model written" not in done.stdout
     assert sorted(folder.iterdir()) == before
+
+
+@pytest.fixture(scope="module")
+def other_rows(folder):
+    """Files of rows with what is wrong, or moved, in them."""
+    for name, change in {"tracker": moved((6.0, 0.0, 0.0)), "inches": positions(1 / 25.4)}.items():
+        change(rows_later(10, 2)).write_csv(folder / f"{name}.csv", model_before().robot)
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("rows", "stated", "status"),
+    [("tracker", "base", 0), ("tracker", "", 3), ("inches", "base,tool", 3)],
+)
+def test_a_dry_run_ends_as_the_run(run, other_rows, tmp_path, monkeypatch, rows, stated, status):
+    results = []
+
+    def once(*arguments):
+        results.append(results[0] if results else recalibrate(*arguments))
+        return results[-1]
+
+    monkeypatch.setattr("pisigma.workflow.recalibrate.recalibrate", once)
+    words = ("recalibrate", other_rows / "model", other_rows / f"{rows}.csv", "--moved", stated)
+    dry, done = run(*words, "--dry-run"), run(*words, "--out", tmp_path / "new")
+    assert (dry.exit_code, done.exit_code, len(results)) == (status, status, 2), dry.output
+    assert (tmp_path / "new").exists() == (status == 0)
+
+
+def test_what_stands_elsewhere_is_written_into_commands():
+    stated = {None: [], (): ["--moved", ""], ("base", "tool"): ["--moved", "base,tool"]}
+    for moved_parts, words in stated.items():
+        line = RecalibrationSettings(moved_parts).command("model", "rows.csv")
+        assert shlex.split(line) == ["pisigma", "recalibrate", "model", "rows.csv", *words, "--out", "DIR"]
 
 
 def test_either_a_folder_or_a_dry_run_is_wanted(run, folder):

@@ -7,6 +7,8 @@ from pathlib import Path
 import pytest
 from testing.measured_plans import header, measured_plan, row_lines, with_offset
 
+from pisigma.workflow.measure import MeasuringSession
+
 PLAN = measured_plan("kiro3", poses=15)
 
 
@@ -94,3 +96,20 @@ def test_what_cannot_be_used_is_one_sentence(run, folder, monkeypatch, arguments
     assert result.exit_code == 2
     assert message in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+def test_programs_of_the_poses_that_are_left(run, refuses, tmp_path):
+    plan = measured_plan("ur5", poses=9)
+    plan.stored.write(tmp_path / "poses.csv")
+    (tmp_path / "rows.csv").write_text(
+        header(plan.stored.arm.robot) + "".join(row_lines(plan.stored.arm.robot, plan.rows(2)))
+    )
+    command = ("measure", tmp_path / "poses.csv", "--rows", tmp_path / "rows.csv", "--once", "--program")
+    assert "poses.txt" in refuses(*command, tmp_path / "poses.txt")
+    assert run(*command, tmp_path / "poses.script").exit_code == 0
+    assert not (tmp_path / "poses.script").exists()  # nothing was planned again with two rows
+    session = MeasuringSession(plan.stored)
+    session.add(plan.rows(2))
+    session.write_rest(tmp_path / "rest.csv", [tmp_path / "rest.script"])
+    text = (tmp_path / "rest.script").read_text()
+    assert [f"pose {number}" in text for number in (2, 3, 9)] == [False, True, True]

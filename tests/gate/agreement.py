@@ -1,0 +1,17 @@
+"""Whether every command says the same of rows with a mistake."""
+
+from pathlib import Path
+
+from gate.commands import COMMANDS, answer
+from gate.table import Mistake, right_rows
+
+
+def disagreements(mistake: Mistake, folder: Path) -> list[str]:
+    """List the commands that end otherwise than the table says, in words."""
+    rows, found = mistake.change(right_rows()), []
+    for command in COMMANDS:
+        got = answer(command, rows, folder)
+        stopped, wanted = got.status in (2, 3), bool(mistake.kinds)
+        if got.status not in (0, 2, 3) or (stopped != wanted and command not in mistake.unseen):
+            found.append(f"{command}: status {got.status}, {got.said[:200]}")
+    return found

@@ -1,0 +1,59 @@
+"""Forty mistakes in rows pass the one check of all commands; five of them go through every command.
+
+`python tests/gate/run.py mistakes` takes all of them through every command.
+"""
+
+import pytest
+from gate.agreement import disagreements
+from gate.commands import COMMANDS
+from gate.table import MISTAKES, MOVES, Mistake, right_rows
+from testing.aged import model_before
+
+from pisigma.verification.gate import check_rows
+from pisigma.verification.rows import row_check
+
+pytestmark = pytest.mark.usefixtures("without_type_checker")
+
+EVERYWHERE = (
+    "inches named mm",
+    "sign of q4",
+    "half in inches",
+    "tracker moved by 2 mm half-way",
+    "lengths x 1.001",
+)
+
+
+@pytest.mark.parametrize("mistake", MISTAKES, ids=lambda one: one.name)
+def test_the_check_notices(mistake):
+    found = check_rows(mistake.change(right_rows()), model_before(), may_move=row_check.MOVES).implausible
+    assert found
+    assert "*" in mistake.kinds or found[0].kind in mistake.kinds, found[0].sentence
+
+
+@pytest.mark.parametrize("seed", [2, 3, 4])
+def test_right_rows_are_trusted(seed):
+    assert check_rows(right_rows(seed), model_before()).diagnostics == ()
+
+
+@pytest.mark.parametrize("move", MOVES, ids=lambda one: one.name)
+def test_moves_of_any_size_are_no_mistakes(move):
+    rows = move.change(right_rows())
+    assert check_rows(rows, model_before(), may_move=row_check.MOVES).trusted
+    assert not check_rows(rows, model_before()).trusted
+
+
+def test_wrong_rows_are_named():
+    (mistake,) = (one for one in MISTAKES if one.name == "tracker moved by 2 mm half-way")
+    (found,) = check_rows(mistake.change(right_rows()), model_before()).implausible
+    assert found.rows == tuple(f"rows.csv, line {line}" for line in range(10, 18))
+
+
+@pytest.mark.parametrize("name", EVERYWHERE)
+def test_commands_agree(name, tmp_path):
+    (mistake,) = (one for one in MISTAKES if one.name == name)
+    assert disagreements(mistake, tmp_path) == []
+
+
+def test_right_rows_go_through_every_command(tmp_path):
+    assert disagreements(Mistake("none", lambda rows: rows, ()), tmp_path) == []
+    assert len(COMMANDS) == 10
