@@ -94,6 +94,10 @@ class FleetError(PisigmaError, ValueError):
     """A fleet cannot be read or its settings cannot be used."""
 
 
+class PluginError(PisigmaError, ValueError):
+    """A plug-in cannot be loaded."""
+
+
 class OutputError(PisigmaError, ValueError):
     """An output cannot be written where it was asked for."""
 

@@ -25,6 +25,7 @@ from pisigma.model.folder.model_folder import save_model
 
 LAYERS = (
     "errors",
+    "plugins",
     "files",
     "yaml_file",
     "templates",

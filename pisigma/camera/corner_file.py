@@ -8,7 +8,7 @@ from typing import TypeVar, get_args
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Float64, Int64
 
 from pisigma.camera.board import Board
 from pisigma.camera.board_pose import FEWEST_CORNERS
@@ -16,10 +16,12 @@ from pisigma.camera.camera import Camera
 from pisigma.camera.image_rows import Images, Repeatability, image_measurements
 from pisigma.camera.solved_images import IntrinsicsChoice
 from pisigma.errors import IdentificationError, MeasurementError, nearest_choice
+from pisigma.measurement.copies import without_copies
 from pisigma.measurement.csv.columns import CORNERS, POSITION
 from pisigma.measurement.csv.reading import fields_of, number_column, text_column
 from pisigma.measurement.csv.table import Table, read_table
 from pisigma.measurement.dataset import Measurements, join
+from pisigma.measurement.fields import MeasuredFields
 from pisigma.robot.description import Robot
 from pisigma.sensors.intrinsics import NOISE_COLUMN
 
@@ -141,7 +143,7 @@ class CameraFiles:
 def read_rows(
     data: Measurements | MeasurementFiles, robot: Robot, cameras: CameraFiles | None = None
 ) -> Measurements:
-    """Read measurements of any sensors from one file or several.
+    """Read measurements of any sensors from one file or several; what stands there twice counts once.
 
     Args:
         data: measurements, or files of them.
@@ -149,11 +151,15 @@ def read_rows(
         cameras: what the pixels mean where files hold corners.
 
     Raises:
-        MeasurementError: a file cannot be used, the files do not fit together, two of them or two images hold the same
-            measurement, or cameras are stated and there are no corners.
+        MeasurementError: a file cannot be used, the files do not fit together, or cameras are stated and there are no
+            corners.
     """
+
+    def counted_once(rows: MeasuredFields) -> MeasuredFields:
+        return without_copies(rows, robot)
+
     if isinstance(data, Measurements):
-        return data
+        return join([data], counted_once)
     paths = [data] if isinstance(data, str | os.PathLike) else list(data)
     if len({os.path.realpath(path) for path in paths}) < len(paths):
         raise MeasurementError(
@@ -168,29 +174,7 @@ def read_rows(
                 f"{rows[0].source}: corners of images were wanted, as a camera is stated, but there is none of the "
                 f"columns {', '.join(CORNERS)}; add a file of corners, or leave camera and board out."
             )
-    joined = rows[0] if len(rows) == 1 else join(rows)
-    _check_copies(joined, among=joined.measured("corner") | (len(rows) > 1))
-    return with_one_noise(joined)
-
-
-def _check_copies(rows: Measurements, among: Bool[torch.Tensor, " rows"]) -> None:
-    """Refuse a row whose joint values and position are exactly those of another: it would count twice.
-
-    Args:
-        rows: of all files; equal rows in one file of measurements are refused where it is read.
-        among: which rows are compared; those without a position are not.
-    """
-    if rows.position is None:
-        return
-    rows_by_numbers: dict[tuple[float, ...], int] = {}
-    numbers = torch.cat([rows.q, rows.position], 1).tolist()
-    for row in (among & torch.isfinite(rows.position).all(1)).nonzero()[:, 0].tolist():
-        first = rows_by_numbers.setdefault(tuple(numbers[row]), row)
-        if first != row:
-            raise MeasurementError(
-                f"{rows.place(row)}: joint values and measurement are exactly those of {rows.place(first)}; remove "
-                "one, as a repeated measurement has other readings and a copy would count twice."
-            )
+    return with_one_noise(join(rows, counted_once))
 
 
 def with_one_noise(rows: Measurements) -> Measurements:

@@ -1,9 +1,12 @@
 """Where the same work for many items is done: on this machine or on many, behind one interface."""
 
 import math
+import pickle
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
+
+from pisigma.plugins import Plugins, loaded
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -34,7 +37,7 @@ class AbstractEngine(ABC):
 
         Args:
             work: what is done with an item: a function of a module, or a `functools.partial` of one.
-            items: the items; they and the results are pickled.
+            items: the items; they and the results are pickled. Workers first load the plug-ins of this process.
             chunk: so many are given to a worker at once; some seconds of work.
         """
         size = max(1, min(chunk, math.ceil(len(items) / self.workers)))
@@ -54,6 +57,19 @@ class AbstractEngine(ABC):
         """How many work side by side."""
 
 
-def work_on(work: Callable[[Item], Result], chunk: Sequence[Item]) -> list[Result]:
-    """Work on a chunk, in a worker."""
-    return [work(item) for item in chunk]
+def packed(work: Callable[[Item], Result], chunk: Sequence[Item]) -> tuple[Plugins, bytes]:
+    """Give the arguments of `work_on`: plug-ins are loaded before what they define is unpickled."""
+    return loaded(), pickle.dumps((work, list(chunk)))
+
+
+def work_on(plugins: Plugins, pickled: bytes) -> bytes:
+    """Work on a chunk, in a worker; gives the results, pickled."""
+    plugins.load()
+    work, chunk = pickle.loads(pickled)
+    return pickle.dumps([work(item) for item in chunk])
+
+
+def unpacked(pickled: bytes) -> list[Any]:
+    """Give the results of `work_on`."""
+    results: list[Any] = pickle.loads(pickled)
+    return results

@@ -11,7 +11,7 @@ from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from typing import Any
 
-from pisigma.engines.engine import ONE_THREAD, AbstractEngine, Item, Result, work_on
+from pisigma.engines.engine import ONE_THREAD, AbstractEngine, Item, Result, packed, unpacked, work_on
 
 
 class ProcessEngine(AbstractEngine):
@@ -32,21 +32,21 @@ class ProcessEngine(AbstractEngine):
         """See `AbstractEngine`; as many chunks as workers are handed out, so that a broken pool loses no others."""
         waiting = list(reversed(chunks))
         while waiting:
-            running: dict[Future[list[Result]], Sequence[Item]] = {}
+            running: dict[Future[bytes], Sequence[Item]] = {}
             with self._pool(min(self._workers, len(waiting))) as pool:
                 broken = False
                 while running or (waiting and not broken):
                     while waiting and not broken and len(running) < self._workers:
                         chunk = waiting.pop()
                         try:
-                            running[pool.submit(work_on, work, chunk)] = chunk
+                            running[pool.submit(work_on, *packed(work, chunk))] = chunk
                         except BrokenProcessPool:
                             waiting.append(chunk)
                             broken = True
                     for ended in wait(running, return_when=FIRST_COMPLETED).done:
                         chunk = running.pop(ended)
                         try:
-                            yield chunk, ended.result()
+                            yield chunk, unpacked(ended.result())
                         except BrokenProcessPool:
                             broken = True
                             yield chunk, None

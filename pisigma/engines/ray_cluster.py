@@ -6,7 +6,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from pisigma.engines.engine import ONE_THREAD, AbstractEngine, Item, Result, work_on
+from pisigma.engines.engine import ONE_THREAD, AbstractEngine, Item, Result, packed, unpacked, work_on
 
 
 class RayEngine(AbstractEngine):
@@ -46,11 +46,11 @@ class RayEngine(AbstractEngine):
     ) -> Iterator[tuple[Sequence[Item], list[Result] | None]]:
         """See `AbstractEngine`."""
         task = self._ray.remote(num_cpus=1, max_retries=0)(work_on)
-        running = {task.remote(work, list(chunk)): chunk for chunk in chunks}
+        running = {task.remote(*packed(work, chunk)): chunk for chunk in chunks}
         while running:
             (ended,), _ = self._ray.wait(list(running), num_returns=1)
             chunk = running.pop(ended)
             try:
-                yield chunk, self._ray.get(ended)
+                yield chunk, unpacked(self._ray.get(ended))
             except (self._ray.exceptions.WorkerCrashedError, self._ray.exceptions.OutOfMemoryError):
                 yield chunk, None

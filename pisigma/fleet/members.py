@@ -10,14 +10,13 @@ from pisigma.camera.corner_file import CameraFiles
 from pisigma.errors import FleetError, nearest_choice
 from pisigma.measurement.csv.header import check_separators
 from pisigma.measurement.csv.table import Table, read_table
-from pisigma.measurement.rules import is_date
+from pisigma.measurement.dates import WANTED, date_in_name, is_date
 
 COLUMNS = ("id", "robot", "data", "date", "model", "options", "camera", "board")
 """Of a manifest; the first three are needed."""
 ROBOT_FILES = ("robot.yaml", "robot.yml", "robot.urdf")
 """The description of a robot in its folder."""
 _ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
-_DATE = re.compile(r"(?<!\d)(\d{4})[-_.]?(\d{2})[-_.]?(\d{2})(?!\d)")
 
 
 @dataclass(frozen=True)
@@ -42,10 +41,11 @@ class Member:
     Attributes:
         id: its name in the fleet, fit for a folder.
         robot: as drawn: a name of the catalogue or a robot file.
-        sessions: what was measured, by date.
+        sessions: what was measured, by date; none where its description is wrong.
         model: folder of the model that the first session meets; None where the first session is calibrated.
         options: names and texts of settings that only this robot has.
         cameras: what the pixels mean where its files hold corners of boards in images.
+        fault: what is wrong with its description, with file and line; this robot cannot be worked out then.
     """
 
     id: str
@@ -54,6 +54,7 @@ class Member:
     model: Path | None = None
     options: tuple[tuple[str, str], ...] = ()
     cameras: CameraFiles | None = None
+    fault: str = ""
 
 
 def read_fleet(source: str | os.PathLike[str], robot: str | None = None) -> tuple[Member, ...]:
@@ -73,7 +74,8 @@ def read_fleet(source: str | os.PathLike[str], robot: str | None = None) -> tupl
         The robots by their ids.
 
     Raises:
-        FleetError: there is none, or one that cannot be named or is described twice; the message names file and line.
+        FleetError: there is none, or one that cannot be named or is described twice, or all are described wrongly; the
+            message names file and line.
         MeasurementError: the manifest is no CSV file, or has no commas between its fields.
     """
     path = Path(source)
@@ -84,6 +86,8 @@ def read_fleet(source: str | os.PathLike[str], robot: str | None = None) -> tupl
             "with one folder or one CSV file per robot."
         )
     _check_apart([one.id for one in members], path)
+    if all(one.fault for one in members):
+        raise FleetError(members[0].fault)
     return tuple(sorted(members, key=lambda one: one.id))
 
 
@@ -111,33 +115,49 @@ def _in_manifest(path: Path, robot: str | None) -> list[Member]:
     if missing := [name for name in wanted if name not in table.header]:
         raise FleetError(f"{path}, line {table.header_line}: column '{missing[0]}' is missing; add it.")
     rows: dict[str, list[tuple[int, dict[str, str]]]] = {}
+    broken: dict[str, str] = {}
     for number, record in enumerate(table.records):
-        line = table.lines[number]
-        if number in table.broken or len(record) != len(table.header):
-            raise FleetError(f"{path}, line {line}: {_broken(table, number)}")
-        fields = dict(zip(table.header, (field.strip() for field in record), strict=True))
+        line, problem = table.lines[number], _broken(table, number)
+        fields = dict(zip(table.header, (field.strip() for field in record), strict=False))
+        if problem and "id" not in fields:
+            raise FleetError(f"{path}, line {line}: {problem}")
+        if problem:
+            broken.setdefault(fields["id"], f"{path}, line {line}: {problem}")
         rows.setdefault(fields["id"], []).append((line, fields))
-    return [_member(path, name, lines, robot) for name, lines in rows.items()]
+    members = []
+    for name, lines in rows.items():
+        _check_id(name, f"{path}, line {lines[0][0]}")
+        try:
+            if name in broken:
+                raise FleetError(broken[name])
+            members.append(_member(path, name, lines, robot))
+        except FleetError as problem:  # what ends one robot does not end the others
+            members.append(Member(name, "", (), fault=str(problem)))
+    return members
 
 
 def _broken(table: Table, number: int) -> str:
-    """What is wrong with a row."""
+    """What is wrong with a row; "" where nothing is."""
     if number in table.broken:
         return table.broken[number]
-    return f"{len(table.header)} fields were wanted, got {len(table.records[number])}; write one for every column."
+    wanted, got = len(table.header), len(table.records[number])
+    return "" if got == wanted else f"{wanted} fields were wanted, got {got}; write one for every column."
 
 
 def _member(path: Path, name: str, rows: Sequence[tuple[int, dict[str, str]]], robot: str | None) -> Member:
-    """The robot of some rows of a manifest."""
+    """The robot of some rows of a manifest.
+
+    Raises:
+        FleetError: its rows are wrong.
+    """
     first = rows[0][0]
-    _check_id(name, f"{path}, line {first}")
     sessions = []
     for line, fields in rows:
         data, date = fields["data"], fields.get("date", "")
         if not data:
             raise FleetError(f"{path}, line {line}: the field 'data' is empty; name a file of measurements.")
         if date and not is_date(date):
-            raise FleetError(f"{path}, line {line}: a date such as 2026-11-22 was wanted, got '{date}'.")
+            raise FleetError(f"{path}, line {line}: expected {WANTED}, got '{date}'; correct it.")
         sessions.append(_session(path.parent / data, date))
     stated = {key: {fields.get(key, "") for _, fields in rows} - {""} for key in ("robot", *COLUMNS[4:])}
     for key, values in stated.items():
@@ -154,7 +174,7 @@ def _member(path: Path, name: str, rows: Sequence[tuple[int, dict[str, str]]], r
         robot=str(file) if file.is_file() else drawn,
         sessions=_ordered(sessions, f"{path}, line {first}: robot '{name}'"),
         model=next((path.parent / model for model in stated["model"]), None),
-        options=_options(next(iter(stated["options"]), ""), f"{path}, line {first}"),
+        options=_options(next(iter(stated["options"]), "")),
         cameras=_cameras(path, first, *(next(iter(stated[key]), "") for key in ("camera", "board"))),
     )
 
@@ -168,14 +188,12 @@ def _cameras(path: Path, line: int, *stated: str) -> CameraFiles | None:
     return CameraFiles(cameras, boards) if cameras else None
 
 
-def _options(text: str, where: str) -> tuple[tuple[str, str], ...]:
-    """Settings of a robot, from `name=value; name=value`."""
+def _options(text: str) -> tuple[tuple[str, str], ...]:
+    """Settings of a robot, from `name=value; name=value`; what is no such pair has the value ""."""
     options = []
     for part in filter(None, map(str.strip, text.split(";"))):
         name, equals, value = map(str.strip, part.partition("="))
-        if not (name and equals and value):
-            raise FleetError(f"{where}: options as name=value; name=value were wanted, got '{part}'.")
-        options.append((name, value))
+        options.append((name, value) if name and equals and value else (part, ""))
     return tuple(options)
 
 
@@ -190,14 +208,25 @@ def _in_folder(path: Path, robot: str | None) -> list[Member]:
             continue
         name = entry.name if entry.is_dir() else entry.stem
         _check_id(name, str(entry))
-        drawn = next((str(entry / one) for one in ROBOT_FILES if (entry / one).is_file()), robot)
-        if drawn is None:
-            raise FleetError(
-                f"{entry}: holds none of {', '.join(ROBOT_FILES)}; add the robot's description, or state one for all."
-            )
-        sessions = [_session(file, "") for file in files]
-        members.append(Member(name, drawn, _ordered(sessions, f"{entry}: robot '{name}'")))
+        try:
+            members.append(_of_files(entry, name, files, robot))
+        except FleetError as problem:
+            members.append(Member(name, "", (), fault=str(problem)))
     return members
+
+
+def _of_files(entry: Path, name: str, files: Sequence[Path], robot: str | None) -> Member:
+    """The robot of a folder, or of a file.
+
+    Raises:
+        FleetError: it is not described, or its sessions cannot be told apart.
+    """
+    drawn = next((str(entry / one) for one in ROBOT_FILES if (entry / one).is_file()), robot)
+    if drawn is None:
+        raise FleetError(
+            f"{entry}: holds none of {', '.join(ROBOT_FILES)}; add the robot's description, or state one for all."
+        )
+    return Member(name, drawn, _ordered([_session(file, "") for file in files], f"{entry}: robot '{name}'"))
 
 
 def _check_id(name: str, where: str) -> None:
@@ -211,9 +240,7 @@ def _check_id(name: str, where: str) -> None:
 
 def _session(data: Path, date: str) -> SessionFile:
     """A session with its date, from the name of the file where none is stated."""
-    match = None if date else _DATE.search(data.stem)
-    if match is not None and is_date("-".join(match.groups())):
-        date = "-".join(match.groups())
+    date = date or date_in_name(data.stem)
     return SessionFile(date or data.stem, date, data)
 
 

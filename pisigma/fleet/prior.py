@@ -165,7 +165,7 @@ def fleet_prior(name: str, robot: Robot, fleet: Sequence[Measurements]) -> Fleet
 
 
 def class_population(robot: Robot) -> Population:
-    """Give the robots of the class of a robot, see `pisigma.planning.robot_class`."""
+    """Give the robots of the class of a robot, see `pisigma.robot.robot_class`."""
     uncertainty = Knowledge.of_robot(robot).uncertainty
     usual = of_arm(uncertainty.root, uncertainty.space).square().sum(1)
     return Population(torch.zeros_like(usual), usual.diag(), uncertainty.space.arm_size)
@@ -223,7 +223,7 @@ def mean_robot(
             space,
             IdentifiedGeometry(mean, *frames, {}),
             usual.features,
-            CovarianceRoot(root.float().double()),
+            CovarianceRoot(root),
             1.0,
             noise,
         ),

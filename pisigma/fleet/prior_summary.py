@@ -47,6 +47,7 @@ class FleetPriorSummary(AbstractSummary):
         robots: number of robots that count.
         odd: ids of those that are unlike the others and do not.
         refused: by id why the file of a robot cannot be read, which does not count either.
+        remarks: on the rows of robots that count, a sentence each.
         rows: of all robots.
         parameters: what they have in common.
         spectrum: of the joint correction.
@@ -57,6 +58,7 @@ class FleetPriorSummary(AbstractSummary):
     robots: int
     odd: tuple[str, ...]
     refused: dict[str, str] = Field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
     rows: int
     parameters: tuple[CommonFigures, ...]
     spectrum: tuple[SpectrumFigures, ...]
@@ -65,7 +67,8 @@ class FleetPriorSummary(AbstractSummary):
     def warnings(self) -> tuple[str, ...]:
         """What to heed, a sentence each."""
         odd = (f"Robot '{name}' is unlike the others and did not count." for name in self.odd)
-        return (*odd, *(f"Robot '{name}' did not count: {reason}" for name, reason in self.refused.items()))
+        refused = (f"Robot '{name}' did not count: {reason}" for name, reason in self.refused.items())
+        return (*odd, *refused, *self.remarks)
 
 
 def summarise_prior(prior: FleetPrior, ids: Sequence[str]) -> FleetPriorSummary:

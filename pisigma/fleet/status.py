@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from pisigma.fleet.record import RobotRecord, SessionRecord
+from pisigma.measurement.dates import WANTED, is_date
 
 
 @dataclass(frozen=True)
@@ -52,11 +53,13 @@ class FleetStatus:
         robots: by their ids.
         today: day that it is seen from.
         overdue_days: days without a session after which a robot is overdue.
+        warnings: sessions with dates that cannot be, which are not counted from.
     """
 
     robots: tuple[RobotStatus, ...]
     today: datetime.date
     overdue_days: int
+    warnings: tuple[str, ...] = ()
 
     @staticmethod
     def of(
@@ -73,7 +76,14 @@ class FleetStatus:
         robots = [_status(one, today, overdue_days) for one in records]
         missing = set(expected) - {one.robot for one in records}
         robots += [RobotStatus(robot, None, None) for robot in missing]
-        return FleetStatus(tuple(sorted(robots, key=lambda one: one.robot)), today, overdue_days)
+        warnings = tuple(
+            f"robot {record.robot}: expected {WANTED} as the date of session {one.session}, got {one.date}; "
+            "correct it in the manifest and run the fleet again."
+            for record in records
+            for one in record.sessions
+            if one.date and not is_date(one.date)
+        )
+        return FleetStatus(tuple(sorted(robots, key=lambda one: one.robot)), today, overdue_days, warnings)
 
     @property
     def worst_first(self) -> tuple[RobotStatus, ...]:
@@ -105,6 +115,7 @@ class FleetStatus:
                 for one in self.robots
                 if one.refused is not None
             ],
+            "warnings": list(self.warnings),
         }
 
 
@@ -117,7 +128,8 @@ def _status(record: RobotRecord, today: datetime.date, overdue_days: int) -> Rob
     """How one robot stands."""
     done = [one for one in record.sessions if not one.refused]
     last = done[-1] if done else None
-    days = None if last is None or not last.date else (today - datetime.date.fromisoformat(last.date)).days
+    date = last.date if last is not None and is_date(last.date) else None
+    days = None if date is None else (today - datetime.date.fromisoformat(date)).days
     return RobotStatus(
         robot=record.robot,
         last=last,

@@ -1,11 +1,13 @@
-"""Full turns of joints: differences the short way round, and joint values inside their limits where that can be."""
+"""Joint limits: values moved inside by full turns where that can be, and those that cannot be of the joint at all."""
 
+import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Float64
 from torch import Tensor
 
 from pisigma.kinematics.tolerances import LIMIT_TOLERANCE
 from pisigma.robot.description import Robot
+from pisigma.robot.row import Row
 from pisigma.se3 import wrap_to_pi
 
 
@@ -47,3 +49,23 @@ def wrap_into_limits(
     return torch.from_numpy(turned).to(q).reshape(q.shape), every & torch.from_numpy(allowed).to(
         every
     ).reshape(every.shape)
+
+
+GROSS_ANGLE = np.pi / 4
+"""[rad] A value that is farther outside is of another joint, unit or zero; drawings were off by up to 14 deg."""
+GROSS_SHARE = 0.25
+"""Share of the stroke of a sliding joint for the same."""
+
+
+def beyond_limits(
+    q: Float64[np.ndarray, " rows"], axis: Row, slack: float = LIMIT_TOLERANCE
+) -> Bool[np.ndarray, " rows"]:
+    """Which values [rad or m] lie farther than `slack` outside the limits of an axis."""
+    outside: np.ndarray = (q < axis.lower - slack) | (q > axis.upper + slack)
+    return outside
+
+
+def grossly_beyond(q: Float64[np.ndarray, " rows"], axis: Row) -> Bool[np.ndarray, " rows"]:
+    """Which values cannot be those of an axis, whatever its drawing says of its limits."""
+    stroke = axis.upper - axis.lower
+    return beyond_limits(q, axis, GROSS_SHARE * stroke if axis.type == "prismatic" else GROSS_ANGLE)

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 import torch
 
+from pisigma.camera.corner_file import read_rows
 from pisigma.errors import RecipeError
 from pisigma.measurement.dataset import Measurements, join
 from pisigma.measurement.splits import TrainTest, k_folds
@@ -79,8 +80,7 @@ def load_data(recipe: Recipe, data: Measurements | str | os.PathLike[str] | None
     if data is None:
         raise RecipeError(f"recipe '{recipe.name}' is for measured data; give the file with --data FILE.csv.")
     robot = Robot.load(recipe.robot)
-    rows = data if isinstance(data, Measurements) else Measurements.read_csv(data, robot)
-    return RecipeData(robot, *rows.split_sets(), folds=recipe.data)
+    return RecipeData(robot, *read_rows(data, robot).split_sets(), folds=recipe.data)
 
 
 def simulate(recipe: Recipe, repeats: int = 1) -> RecipeData:

@@ -12,8 +12,13 @@ from pisigma.judging.calibration_summary import (
     HybridFigures,
     NoiseFigures,
     ParameterFigures,
+    ScaleFigures,
 )
-from pisigma.judging.validation_figures import AbstractValidationFigures, LearningPoint, ValidationFigures
+from pisigma.judging.validation_figures import (
+    AbstractValidationFigures,
+    LearningPoint,
+    ValidationFigures,
+)
 from pisigma.reporting.rendering import sentences
 from pisigma.reporting.tables import Table, figure_text
 
@@ -41,7 +46,30 @@ def undetermined_lines(summary: CalibrationSummary) -> list[str]:
     if redundancy.no_effect:
         lines.append(f"{', '.join(redundancy.no_effect)} change no measured value")
     lines += summary.weak_directions
-    return [_sentence(line) for line in lines] or ["Nothing: every parameter is identified."]
+    lines = lines or ["Nothing: every parameter is identified."]
+    if summary.scale is not None:
+        lines.append(_scale(summary.scale))
+    return [_sentence(line) for line in lines]
+
+
+def _scale(scale: ScaleFigures) -> str:
+    """Say what a wrong scale of the sensor would explain, and how wrong positions would then be."""
+    return (
+        f"whether links are {scale.factor:.5f} times as long as drawn (standard deviation {scale.sigma:.2g}) or the "
+        "scale of the sensor is off by that factor: both give the same errors of left-out rows. The scale is "
+        f"{scale.odds:.2g} times as likely as links that err each by "
+        f"itself; if it is the scale, true positions are off by {scale.rms_mm:.2g} mm RMS beside all errors shown"
+    )
+
+
+def predicted_line(rms_mm: float) -> str:
+    """Say what a calibration that no row judged predicts of its own errors, and what to do."""
+    return (
+        f"Predicted error at other poses: {rms_mm:.3g} mm RMS, by the calibration's own uncertainty. No row was left "
+        "out, so nothing judged it, and errors of the rows that were calibrated with are smaller than those at other "
+        "poses; measure more poses, or begin with what robots of this kind have in common (--prior, of "
+        "`pisigma fleet prior`)."
+    )
 
 
 def warning_lines(summary: CalibrationSummary) -> list[str]:

@@ -58,7 +58,7 @@ def _error_lines(comparison: ModelComparison) -> _Lines:
         errors = [model.quantities[quantity] for model in models]
         lines += _statistic_lines(comparison, f"{quantity}, {{}} [{first.unit}]", _SHOWN, errors)
         word = "along" if quantity == "position" else "about"
-        for axis in "xyz":
+        for axis in first.axes:
             values = [figure_text(one.axes[axis]["rms"]) for one in errors]
             lines.append((f"{quantity}, RMS {word} {axis} [{first.unit}]", values))
     if any(model.rows_outside for model in models):

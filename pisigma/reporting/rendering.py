@@ -6,7 +6,14 @@ from pathlib import Path
 import jinja2
 
 from pisigma.files.model_files import CARD
-from pisigma.reporting.tables import figure_text, joint_table, markdown_table, percent_text, pose_table
+from pisigma.reporting.tables import (
+    distance_table,
+    figure_text,
+    joint_table,
+    markdown_table,
+    percent_text,
+    pose_table,
+)
 from pisigma.templates import template_environment
 
 
@@ -40,6 +47,7 @@ def _environment() -> jinja2.Environment:
             "digits": "{:.4g}".format,
             "pose_table": pose_table,
             "joint_table": joint_table,
+            "distance_table": lambda distances: markdown_table(*distance_table(distances)),
             "percent": percent_text,
             "table": lambda table: markdown_table(*table),
         },

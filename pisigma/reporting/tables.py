@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from pisigma.judging.training_summary import JointFigures
-from pisigma.judging.validation_figures import ErrorFigures
+from pisigma.judging.validation_figures import ErrorFigures, SocketDistances
 
 _STATISTICS = ("average", "deviation", "maximum")
 _SHOWN = {"rms": "RMS", "p95": "95 %", "max": "maximum"}
@@ -70,6 +70,20 @@ def pose_rows(models: Mapping[str, ErrorFigures]) -> Table:
 def pose_table(models: Mapping[str, ErrorFigures]) -> str:
     """A Markdown table of pose errors, one column per model. See `pose_rows`."""
     return markdown_table(*pose_rows(models))
+
+
+def distance_table(distances: SocketDistances) -> Table:
+    """One row per stated distance of two sockets, and how far every model misses it [mm]."""
+    models = list(distances.each[0].errors_mm)
+    rows = [
+        (
+            " to ".join(one.sockets),
+            f"{one.stated_mm:.6g}",
+            *(figure_text(one.errors_mm[name]) for name in models),
+        )
+        for one in distances.each
+    ]
+    return Table(("sockets", "stated [mm]", *(f"{name}, error [mm]" for name in models)), tuple(rows))
 
 
 def _with_unit(name: str) -> tuple[str, str]:

@@ -115,7 +115,7 @@ class AnchorSensor(AbstractSensor):
             rows = (number == k).nonzero()[:, 0]
             points, distance = T[rows, :3, 3], measurements.distance.cpu()[rows]
             _check_wire(measurements, name, rows, points, reach)
-            position = _stated_position(measurements, int(rows[0]))
+            position = stated_position(measurements, int(rows[0]))
             if position is None:
                 values[k] = anchor_from_distances(points, distance)
             else:
@@ -134,7 +134,7 @@ class AnchorSensor(AbstractSensor):
             IdentificationError: they state none.
         """
         row = (measurements.anchor or ()).index(owner)
-        position = _stated_position(measurements, row)
+        position = stated_position(measurements, row)
         if position is None:
             raise IdentificationError(
                 f"{measurements.place(row)}: anchor '{owner}' was not calibrated and its position is not stated; "
@@ -143,7 +143,8 @@ class AnchorSensor(AbstractSensor):
         return torch.cat([position, position.new_zeros(1)])
 
 
-def _stated_position(measurements: Measurements, row: int) -> Float64[Tensor, " 3"] | None:
+def stated_position(measurements: Measurements, row: int) -> Float64[Tensor, " 3"] | None:
+    """Where the measurements state the anchor of a row in its frame [m]; None where they do not."""
     place = measurements.anchor_place
     return place[row] if place is not None and bool(torch.isfinite(place[row]).all()) else None
 

@@ -88,8 +88,8 @@ class PairSensor(AbstractSensor):
         row = int(rows[worst])
         raise IdentificationError(
             f"{measurements.place(row)}: pair '{measurements.pair[row]}' is {float(distance[worst]) * 1e3:.6g} mm "
-            f"apart, but the robot as drawn has its two tool points {float(apart[worst]) * 1e3:.4g} mm apart; correct "
-            "the distance or the names of the pairs."
+            f"apart, but the guessed robot has its two tool points {float(apart[worst]) * 1e3:.4g} mm apart; "
+            "correct the distance or the names of the pairs."
         )
 
 

@@ -1,5 +1,6 @@
 """The registry of sensors: a new kind of sensor is a file of its own and one line here."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from pisigma.kinematics.parameter_jacobian import ToolMotion
 from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.readings import READINGS
+from pisigma.se3 import transform
 from pisigma.sensors.anchor import AnchorSensor
 from pisigma.sensors.corner import CornerSensor, as_poses
 from pisigma.sensors.intrinsics import BoardScaleSensor, IntrinsicsSensor
@@ -24,6 +26,10 @@ from pisigma.sensors.touch import TouchSensor
 
 SENSORS: dict[str, type[AbstractSensor]] = {}
 """All kinds of sensors by name, in the order in which their residuals are added up."""
+
+GROSS, ROUNDS = 4.0, 3
+"""Rows that are farther off than so many times the median of their owner's do not count for where it is, found in so
+many rounds."""
 
 IdentifiedUnknowns = Mapping[str, Mapping[str, Float64[np.ndarray, " columns"]]]
 """By group and owner, what was identified of a sensor's own, in the frame of the owner [m or rad]."""
@@ -99,7 +105,7 @@ def pairs_first(measurements: Measurements, rows: Int64[Tensor, " rows"]) -> Int
 
 
 def measured_errors(
-    T: Float64[Tensor, "rows 4 4"], measurements: Measurements, unknowns: IdentifiedUnknowns
+    T: Float64[Tensor, "rows 4 4"], measurements: Measurements, unknowns: IdentifiedUnknowns | None
 ) -> dict[str, Float64[Tensor, "rows components"]]:
     """Measured minus predicted values for tool poses that some model predicts.
 
@@ -107,7 +113,8 @@ def measured_errors(
         T: where the model has the target, in the frame of every row.
         measurements: what was measured.
         unknowns: what was identified of the sensors' own; see `AbstractSensor.uncalibrated` for owners that are not
-            here.
+            here. None for those that fit the rows best; the errors of n values that p unknowns of an owner were fitted
+            to are multiplied by `sqrt(n / (n - p))` then, and NaN where nothing is left of them.
 
     Returns:
         By sensor [m or rad], NaN in rows without a value; the error of a pair stands in both of its rows, and that of
@@ -117,16 +124,19 @@ def measured_errors(
         IdentificationError: the rows of an owner that was not calibrated do not determine its unknowns.
     """
     rows = pairs_first(measurements, torch.arange(measurements.rows, device=T.device))
-    data = replace(as_poses(measurements, unknowns), sigma_position=None, sigma_rotation=None).select(rows)
+    data = replace(as_poses(measurements, unknowns or {}), sigma_position=None, sigma_rotation=None).select(
+        rows
+    )
     T = T[rows]
     still = torch.zeros(0, 6, len(T), dtype=T.dtype, device=T.device)
     motion = ToolMotion(T[:, :3, 3].t(), T[:, :3, :3].permute(1, 2, 0), still)
     eye = torch.eye(4, dtype=T.dtype, device=T.device).expand(len(T), 4, 4)
     errors = {}
     for sensor in build_sensors(SensorRows(data, eye, eye[:, :3, :3])):
-        group = type(sensor).unknowns(data)
-        columns = {}
-        if group is not None:
+        group, columns, factor = type(sensor).unknowns(data), {}, T.new_ones(len(T))
+        if group is not None and unknowns is None:
+            columns[group.name], factor = _fitting_best(sensor, group, data, motion)
+        elif group is not None and unknowns is not None:
             identified = unknowns.get(group.name, {})
             values = [
                 torch.from_numpy(identified[owner].copy()).to(T)
@@ -135,10 +145,37 @@ def measured_errors(
                 for owner in group.owners
             ]
             columns[group.name] = torch.stack(values, 1)
-        residual = sensor.residual(motion, columns, slice(None)).t()
+        residual = sensor.residual(motion, columns, slice(None)).t() * factor[:, None]
         error = torch.full_like(residual, torch.nan)
         error[rows[sensor.present]] = residual[sensor.present]
         if sensor.paired:
             error[rows[sensor.present.roll(1)]] = residual[sensor.present]
         errors[sensor.name] = error
     return errors
+
+
+def _fitting_best(
+    sensor: AbstractSensor, group: UnknownGroup, data: Measurements, motion: ToolMotion
+) -> tuple[Float64[Tensor, "columns owners"], Float64[Tensor, " rows"]]:
+    """The unknowns of all owners that fit their rows best, but for gross errors, and the factor on the errors."""
+    T = transform(motion.rotation.permute(2, 0, 1), motion.position.t())
+    kept, count = torch.ones(len(T), dtype=torch.bool), len(group.owners)
+    for _ in range(ROUNDS):
+        some = kept.nonzero()[:, 0]
+        guess = type(sensor).initial_guess(data.select(some), T[some], math.inf)
+        there = type(sensor).unknowns(data.select(some))
+        assert guess is not None
+        assert there is not None
+        order = [there.owners.index(owner) for owner in group.owners]
+        columns, free = guess.values[order].t().to(T), guess.free[order].sum(1)
+        owner = sensor.unknown_derivatives(motion, {group.name: columns}, slice(None))[0].owner
+        size = sensor.residual(motion, {group.name: columns}, slice(None)).norm(dim=0)
+        counted, kept = kept, kept.clone()
+        for number in range(count):
+            own = sensor.present & (owner == number)
+            kept[own] = size[own] <= GROSS * size[own].quantile(0.5)
+        if torch.equal(kept, counted):
+            break
+    values = torch.bincount(owner[sensor.present & counted], minlength=count) * sensor.components
+    factor = torch.where(values > free, (values / (values - free).clamp(min=1)).sqrt(), torch.nan)
+    return columns, torch.where(sensor.present, factor[owner], 1.0).to(T)

@@ -221,7 +221,7 @@ class AbstractSensor(ABC):
 
         Args:
             measurements: the rows; those of pairs come first, side by side.
-            T: where the robot as drawn has the tool, in the frame of every row.
+            T: where the robot as drawn has the tool that suits the rows best, in the frame of every row.
             reach: of the robot [m].
 
         Raises:

@@ -1,6 +1,7 @@
 """Sockets: fixed points that the ball at the tool sits in, and stated distances between them."""
 
-from collections.abc import Collection, Mapping
+import re
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -31,6 +32,9 @@ SOCKET_COLUMNS = ("x", "y", "z")
 
 LARGEST_SCATTER = 0.05
 """[reach] By the robot as drawn, rows of one socket are not farther apart than this."""
+
+GROSS = 4.0
+"""Rows that put a ball farther than so many times the median from its median are wrong: 6 standard deviations."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,9 +112,11 @@ class SocketSensor(AbstractSensor):
     def uncalibrated(
         cls, measurements: Measurements, owner: str, T: Poses, calibrated: Collection[str]
     ) -> Float64[Tensor, " columns"]:
-        """Return where the rows of a socket meet on average."""
+        """Return where the rows of a socket meet on average, but for gross errors."""
         rows = numbers_of(measurements.socket, (owner,), measurements.rows).to(T.device) == 0
-        middle: Tensor = T[rows, :3, 3].mean(0)
+        points = T[rows, :3, 3]
+        off = (points - points.quantile(0.5, dim=0)).norm(dim=-1)
+        middle: Tensor = points[off <= GROSS * off.quantile(0.5)].mean(0)
         return middle
 
 
@@ -222,3 +228,33 @@ def means(values: Float64[Tensor, "rows size"], number: Int64[Tensor, " rows"], 
     """Return the mean over the rows of every number from 0 to `count - 1`."""
     total = values.new_zeros((count, values.shape[1])).index_add(0, number, values)
     return total / torch.bincount(number, minlength=count).clamp(min=1)[:, None]
+
+
+def matching_sockets(
+    distances: Mapping[tuple[str, str], float], sockets: Iterable[str]
+) -> dict[tuple[str, str], float]:
+    """Distances by names of sockets in the data; see `pisigma.workflow.calibrate.CalibrationSettings`."""
+    names = dict.fromkeys(name for name in sockets if name)
+    matching: dict[tuple[str, str], float] = {}
+    for (first, second), distance in distances.items():
+        pattern = re.compile(re.escape(first).replace(r"\*", "(.*)", 1))
+        pairs = []
+        for name in names:
+            match = pattern.fullmatch(name)
+            other = second.replace("*", match[1], 1) if match and "*" in first else second
+            if match and other in names:
+                pairs.append((name, other))
+        if not pairs:
+            raise IdentificationError(
+                f"no two sockets of the data are called '{first}' and '{second}'; there are "
+                f"{', '.join(names) or 'none'}."
+            )
+        for pair in pairs:
+            known = matching.get(pair, matching.get((pair[1], pair[0]), distance))
+            if known != distance:
+                raise IdentificationError(
+                    f"expected one distance of the sockets '{pair[0]}' and '{pair[1]}', got {known * 1e3:g} and "
+                    f"{distance * 1e3:g} mm; state one."
+                )
+            matching[pair] = distance
+    return matching

@@ -9,6 +9,10 @@ from pisigma.serve.protocol import AbstractProtocol, BrokenStreamError, is_token
 
 CHUNK = 4096
 """[bytes] Are read at a time, so that no client keeps the others waiting with what it sends at once."""
+MOST_REST = 2**22
+"""[bytes] Are read of a client when the server stops, so that none that sends on and on keeps it."""
+AT_ONCE = 100
+"""Messages of a client are answered before those of others when the server stops."""
 
 Submit = Callable[["Connection", Callable[[], bytes]], None]
 
@@ -49,7 +53,7 @@ class Connection:
         self._stream, self._protocol, self._selector, self._submit = stream, protocol, selector, submit
         self._token = token
         self._received, self._unsent = bytearray(), b""
-        self._ending = self.closed = self.busy = False
+        self._ending = self._stopping = self.closed = self.busy = False
         self.waits_since = time.monotonic() if token is not None else None
         self._watched = selectors.EVENT_READ
         selector.register(stream, self._watched, self.ready)
@@ -59,7 +63,7 @@ class Connection:
         try:
             if self._unsent:
                 self._send(b"")
-            elif events & selectors.EVENT_READ:
+            elif events & selectors.EVENT_READ and not self._stopping:
                 data = self._stream.recv(CHUNK)
                 self._received += data
                 self._ending = not data
@@ -80,13 +84,27 @@ class Connection:
         except OSError:
             self.close()
 
-    def end(self) -> None:
-        """Answer what has come in whole, then close."""
-        if not (self.busy or self._unsent or self._ending):
-            self.ready(selectors.EVENT_READ)
-        self._ending = True
-        if not self.closed:
-            self.proceed()
+    def read_rest(self) -> None:
+        """Take what the client has sent before the server stops; what it sends from now on is not read."""
+        self._stopping = self._ending = True
+        try:
+            while len(self._received) < MOST_REST and not self.closed:
+                if not (data := self._stream.recv(CHUNK)):
+                    break
+                self._received += data
+        except BlockingIOError:
+            pass
+        except OSError:
+            self.close()
+
+    def answer_rest(self) -> bool:
+        """Answer some of what came in whole, and close after the last answer; whether there is more."""
+        try:
+            if not self.closed:
+                self.proceed()
+        except OSError:
+            self.close()
+        return not (self.closed or self.busy or self._unsent)
 
     def close(self) -> None:
         """Close at once."""
@@ -97,15 +115,18 @@ class Connection:
             self._stream.close()
 
     def proceed(self) -> None:
-        """Answer the messages that are whole, as far as answers can be sent."""
-        answered = False
+        """Answer the messages that are whole, as far as answers can be sent; some of them when the server stops."""
+        answered = 0
         try:
-            while self._received and not self.busy and not self._unsent:
-                if not (length := self._protocol.cut(self._received)):
+            while not self.busy and not self._unsent:
+                if not self._received or not (length := self._protocol.cut(self._received)):
                     break
+                if self._stopping and answered == AT_ONCE:
+                    self.waits_since = None
+                    return
                 message = bytes(memoryview(self._received)[:length])
                 del self._received[:length]
-                answered = True
+                answered += 1
                 if self._token is not None:
                     self._admit(message, self._token)
                 elif isinstance(reply := self._protocol.answer(message), bytes):
@@ -122,7 +143,7 @@ class Connection:
         if self._ending and not self.busy and not self._unsent:
             self.close()  # what is left of a half message is dropped
         else:
-            self._watch(answered)
+            self._watch(answered > 0)
 
     def _admit(self, message: bytes, token: bytes) -> None:
         admitted = is_token(self._protocol.token_of(message), token)

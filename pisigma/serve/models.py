@@ -109,36 +109,55 @@ def solution_row(solution: Solution) -> list[float]:
 
 
 def model_folders(folder: Path) -> list[Path]:
-    """Give the model folders in a folder, by name.
+    """Give the model folders in a folder, by name; damaged ones, too, so that loading them names the damage.
 
     Raises:
         ModelError: there are none.
     """
-    folders = (
-        sorted(path for path in folder.iterdir() if path.is_dir() and is_model(path))
-        if folder.is_dir()
-        else []
-    )
+    inside = sorted(path for path in folder.iterdir() if path.is_dir()) if folder.is_dir() else []
+    folders = [path for path in inside if is_model(path) or any(path.glob("*.safetensors"))]
     if not folders:
         raise ModelError(f"{folder}: holds no model folders; give the folder that your model folders lie in.")
     return folders
 
 
+def _sound(folders: Iterable[Path], problems: list[str]) -> list[ServedModel]:
+    """Load the models that can be loaded; `problems` gets a sentence for every other one."""
+    models = []
+    for folder in folders:
+        try:
+            models.append(ServedModel.read(folder))
+        except (PisigmaError, OSError) as problem:
+            problems.append(f"{folder} is not served: {problem}")
+    return models
+
+
 class ServedModels:
-    """Models by index and by name; an index stays that of its model for as long as the server runs."""
+    """Models by index and by name; an index stays that of its model for as long as the server runs.
+
+    Attributes:
+        problems: with `within`, sentences on the folders that could not be loaded and are not served.
+    """
 
     def __init__(self, folders: Iterable[Path], within: Path | None = None) -> None:
         """Load model folders.
 
         Args:
             folders: of the models.
-            within: folder that is searched for further models when they are loaded again.
+            within: folder that is searched for further models when they are loaded again; of the models in it, damaged
+                ones are left out.
 
         Raises:
-            ModelError: a folder is no whole model.
+            ModelError: a folder is no whole model; with `within`, none is.
         """
         self._within, self._lock = within, threading.Lock()
-        self._models: Sequence[ServedModel] = [ServedModel.read(folder) for folder in folders]
+        self.problems: list[str] = []
+        if within is None:
+            self._models: Sequence[ServedModel] = [ServedModel.read(folder) for folder in folders]
+            return
+        self._models = _sound(folders, self.problems)
+        if not self._models:
+            raise ModelError(f"{within}: none of its model folders can be served: {' '.join(self.problems)}")
 
     def __len__(self) -> int:
         return len(self._models)
@@ -175,10 +194,10 @@ class ServedModels:
             there = {model.folder for model in models}
             try:
                 new = [] if self._within is None else model_folders(self._within)
-                models += [ServedModel.read(folder) for folder in new if folder not in there]
             except (PisigmaError, OSError) as problem:
                 problems.append(str(problem))
-            self._models = models
+                new = []
+            self._models = models + _sound([folder for folder in new if folder not in there], problems)
         return problems
 
     @staticmethod

@@ -28,8 +28,6 @@ PATIENCE = 10.0
 """[s] A client may take for the rest of a message, for its token, or to take an answer; then it is cut off."""
 SWITCHING = 1e-4
 """[s] A thread that works out a path holds the interpreter at most, while quick answers wait for it."""
-LAST = 5.0
-"""[s] What was begun may take when the server stops."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,7 @@ class Server:
             self._selector.close()
             raise
         self._ready: deque[tuple[Connection, bytes]] = deque()
-        self._stopping = False
+        self._stops = 0
         self._polling = Polling(self._selector, settings.polling)
         self._wake, self._woken = socket.socketpair()
         self._wake.setblocking(False)
@@ -108,7 +106,7 @@ class Server:
         switching = sys.getswitchinterval()
         sys.setswitchinterval(SWITCHING)
         swept, interval = time.monotonic(), self._settings.patience / 10
-        while not self._stopping:
+        while not self._stops:
             self._turn(interval)
             if time.monotonic() - swept > interval:
                 swept = time.monotonic()
@@ -118,8 +116,11 @@ class Server:
         gc.unfreeze()
 
     def stop(self) -> None:
-        """Have `run` end; from any thread, or a signal's handler."""
-        self._stopping = True
+        """Have `run` end when all that came in is answered, or the second time at once.
+
+        From any thread, or a signal's handler.
+        """
+        self._stops += 1
         self._notify()
 
     def reload(self, report: Callable[[str], None]) -> None:
@@ -155,20 +156,22 @@ class Server:
         self._listeners.append(listener)
         return int(listener.getsockname()[1])
 
-    def _accept(self, listener: socket.socket, protocol: AbstractProtocol, events: int) -> None:
+    def _accept(self, listener: socket.socket, protocol: AbstractProtocol, events: int) -> bool:
+        """Take a new connection; whether there was one."""
         try:
             stream, _ = listener.accept()
         except OSError:
-            return
+            return False
         if len(self._connections) >= MOST_CONNECTIONS:
             self._sweep(time.monotonic())  # some of them may be closed
         if len(self._connections) >= MOST_CONNECTIONS:
             stream.close()
             self.metrics.cut_off += 1
-            return
+            return True
         with contextlib.suppress(OSError):
             self._connections.add(Connection(stream, protocol, self._selector, self._submit, self._token))
         self.metrics.connections = len(self._connections)
+        return True
 
     def _listen_no_more(self) -> None:
         for listener in self._listeners:
@@ -214,15 +217,20 @@ class Server:
         self.metrics.connections = len(self._connections)
 
     def _finish(self) -> None:
-        """Answer what has come in whole, then close everything."""
+        """Answer what has come in whole, from clients that wait to be accepted too, then close everything."""
+        for listener in self._listeners:
+            accept = self._selector.get_key(listener).data
+            while accept(selectors.EVENT_READ):
+                pass
         self._listen_no_more()
-        if self.zmq is not None:
-            self.zmq.close()
         for connection in self._connections:
-            connection.end()
-        until = time.monotonic() + LAST
-        while any(not connection.closed for connection in self._connections) and time.monotonic() < until:
-            self._turn(0.05)
+            connection.read_rest()
+        if self.zmq is not None:
+            self.zmq.stop()
+        while self._stops < 2 and (self._connections or (self.zmq is not None and self.zmq.is_running)):
+            more = [connection.answer_rest() for connection in self._connections]
+            self._turn(0.0 if any(more) else 0.05)
+            self._sweep(time.monotonic())  # who does not take an answer is not waited for
         for connection in self._connections:
             connection.close()
         self._slow.shutdown(wait=False, cancel_futures=True)

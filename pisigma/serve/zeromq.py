@@ -4,11 +4,14 @@ import threading
 
 from pisigma.errors import OutputError
 from pisigma.serve.binary_frames import MAGIC, BinaryFrames
+from pisigma.serve.connection import MOST_REST
 from pisigma.serve.json_lines import LONGEST_LINE, JsonLines
 from pisigma.serve.metrics import Metrics
 from pisigma.serve.models import ServedModels
 from pisigma.serve.protocol import AbstractProtocol, BrokenStreamError, is_token
 
+SILENCE_MS = 200
+"""[ms] Without a message, after which all that was sent before the server stops has come."""
 WAITING = 100
 """Messages of a client, and answers to it, that wait at most."""
 
@@ -46,7 +49,7 @@ class ZeroMq:
         options = {
             zmq.LINGER: 1000,
             zmq.MAXMSGSIZE: LONGEST_LINE,
-            zmq.RCVTIMEO: 200,
+            zmq.RCVTIMEO: SILENCE_MS,
             zmq.IPV6: int(":" in host),
         }
         options |= {zmq.RCVHWM: WAITING, zmq.SNDHWM: WAITING}
@@ -65,17 +68,29 @@ class ZeroMq:
         self._thread = threading.Thread(target=self._run, name="ZeroMQ", daemon=True)
         self._thread.start()
 
-    def close(self) -> None:
-        """Send the answers that are due, then close."""
+    @property
+    def is_running(self) -> bool:
+        """Whether it answers still."""
+        return self._thread.is_alive()
+
+    def stop(self) -> None:
+        """Have what has come in answered, and the socket closed then."""
         self._stopping.set()
-        self._thread.join()
 
     def _run(self) -> None:
-        while not self._stopping.is_set():
+        rest = 0
+        while rest < MOST_REST:
+            stopping = (
+                self._stopping.is_set()
+            )  # before the look for a message: what came until then is answered
             try:
+                # waits when it stops, too, as the next messages of a full queue take a moment
                 client, *parts = self._socket.recv_multipart()
             except self._again:
+                if stopping:
+                    break
                 continue
+            rest += sum(map(len, parts)) if stopping else 0
             envelope = [client, b""] if len(parts) > 1 and not parts[0] else [client]
             self._socket.send_multipart([*envelope, self._reply(parts[len(envelope) - 1 :])])
         self._close()

@@ -82,3 +82,12 @@ def test_sessions_that_were_calibrated_each_by_itself_say_nothing_of_drift():
 def test_the_error_of_a_cross_validation_counts():
     figures = RobotRecord("r", "", (session("2026-11-01", "calibrated", 0.04, held_out_rms_mm=0.11),))
     assert robot_table(FleetStatus.of([figures], TODAY, 180).robots).rows[0][4] == "0.110"
+
+
+def test_a_date_that_cannot_be_is_named_and_not_counted_from():
+    record = RobotRecord("slip", "", (session("2206-01-01", "calibrated", 0.1),))
+    seen = FleetStatus.of([record], TODAY, 180)
+    assert seen.robots[0].days is None
+    assert "2206-01-01" in seen.to_json()["warnings"][0]
+    assert seen.to_json()["overdue"] == []
+    assert not STATUS.warnings

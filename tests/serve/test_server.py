@@ -1,5 +1,6 @@
 """The server as a whole: tokens, slow clients, models that change, and its end."""
 
+import contextlib
 import json
 import shutil
 import socket
@@ -18,7 +19,7 @@ import pisigma
 from pisigma.errors import ModelError, OutputError
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.folder.model_folder import save_model
-from pisigma.serve import json_lines
+from pisigma.serve import connection, json_lines
 from pisigma.serve.models import ServedModels, model_folders
 from pisigma.serve.server import Server, ServeSettings
 
@@ -139,6 +140,81 @@ def test_what_was_begun_is_finished_when_the_server_stops(kiro4, monkeypatch):
         assert begun.wait(5)
     with stream, stream.makefile("rb") as file:
         assert [json.loads(line)["id"] for line in file] == [1, 2]
+
+
+def test_all_that_came_in_whole_is_answered_when_the_server_stops(kiro4):
+    """Many requests of several clients, one of which nobody has accepted yet, and half a request."""
+    with running(kiro4) as server:
+        streams = [socket.create_connection(("127.0.0.1", server.json_port), 5) for _ in range(3)]
+        lines = [json.dumps({"id": i, "pose": POSE}).encode() + b"\n" for i in range(200)]
+        for stream in streams:
+            stream.sendall(b"".join(lines) + b'{"id": 200, ')
+    for stream in streams:
+        with stream, stream.makefile("rb") as file:
+            assert [json.loads(line)["id"] for line in file] == list(range(200))
+
+
+def test_a_client_that_goes_on_sending_keeps_neither_the_server_nor_the_others(kiro4, monkeypatch):
+    monkeypatch.setattr(connection, "MOST_REST", 20_000)
+    line = json.dumps({"id": 1, "pose": POSE}).encode() + b"\n"
+    with running(kiro4) as server:
+        greedy = socket.create_connection(("127.0.0.1", server.json_port), 5)
+
+        def read():
+            with contextlib.suppress(OSError):
+                while greedy.recv(1 << 16):
+                    pass
+
+        def send():
+            with contextlib.suppress(OSError):
+                _send_for_ever(greedy, 100 * line)
+
+        threads = [threading.Thread(target=one) for one in (read, send)]
+        for thread in threads:
+            thread.start()
+        quiet = socket.create_connection(("127.0.0.1", server.json_port), 5)
+        quiet.sendall(line)
+    with quiet, quiet.makefile("rb") as file:
+        assert [json.loads(line)["id"] for line in file] == [1]
+    for thread in threads:
+        thread.join(5)
+    greedy.close()
+    assert not any(thread.is_alive() for thread in threads)
+
+
+def test_the_second_stop_ends_what_takes_its_time(kiro4, monkeypatch):
+    begun, go_on = threading.Event(), threading.Event()
+    monkeypatch.setattr(json_lines, "_follow", lambda *arguments: begun.set() or go_on.wait(10))
+    with (
+        running(kiro4) as server,
+        socket.create_connection(("127.0.0.1", server.json_port), 5) as stream,
+    ):
+        stream.sendall(json.dumps({"id": 1, "path": [POSE] * 3}).encode() + b"\n")
+        assert begun.wait(5)
+        server.stop()
+        stream.settimeout(0.3)
+        with pytest.raises(TimeoutError):
+            stream.recv(1)
+        server.stop()
+        stream.settimeout(5)
+        assert stream.recv(1) == b""
+    go_on.set()
+
+
+def test_a_damaged_folder_is_named_and_the_others_are_served(kiro4, tmp_path):
+    for name in ("damaged", "sound", "torn"):
+        shutil.copytree(kiro4, tmp_path / name)
+    (tmp_path / "damaged" / "model.safetensors").write_bytes(b"no weights")
+    (tmp_path / "torn" / "model.yaml").unlink()
+    models = ServedModels(model_folders(tmp_path), within=tmp_path)
+    assert [model.name for model in map(models.__getitem__, range(len(models)))] == ["sound"]
+    assert [name in problem for name, problem in zip(("damaged", "torn"), models.problems, strict=True)] == [
+        True
+    ] * 2
+    assert len(models.reload()) == 2
+    shutil.rmtree(tmp_path / "sound")
+    with pytest.raises(ModelError, match="damaged is not served"):
+        ServedModels(model_folders(tmp_path), within=tmp_path)
 
 
 def test_a_folder_without_models_is_refused(tmp_path):

@@ -84,3 +84,22 @@ def test_without_pyzmq_the_extra_is_named(monkeypatch, repository):
     ):
         pass
     assert 'pip install "pisigma[serve]"' in str(missing_extra(caught.value))
+
+
+def test_all_that_came_in_is_answered_when_the_server_stops(repository):
+    """More messages than wait in a queue of ZeroMQ at a time."""
+    context = zmq.Context()
+    with running(repository / "models" / "kiro4", settings=ServeSettings(zmq_port=0)) as server:
+        socket = context.socket(zmq.DEALER)
+        for option, value in ((zmq.SNDHWM, 0), (zmq.RCVHWM, 0), (zmq.LINGER, 0), (zmq.RCVTIMEO, 5000)):
+            socket.setsockopt(option, value)
+        socket.connect(f"tcp://127.0.0.1:{server.ports['zmq_port']}")
+        socket.send(LINE)
+        socket.recv()
+        for _ in range(2000):
+            socket.send(LINE)
+        socket.recv()
+    for _ in range(1999):
+        socket.recv()
+    socket.close()
+    context.term()

@@ -22,7 +22,7 @@ class BoardImage:
 
     Attributes:
         file: of the image.
-        size: its width and height [px].
+        size: its width and height [px]; 0 where the file cannot be read.
         board: the corners that can be used, or why there are none.
         blur: standard deviation of the blur of the board's edges [px]; NaN where none was found.
     """
@@ -36,6 +36,11 @@ class BoardImage:
     def name(self) -> str:
         """That of the file, without ending."""
         return self.file.stem
+
+    @property
+    def is_read(self) -> bool:
+        """Whether the file is a whole image."""
+        return self.size != (0, 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +123,7 @@ def predict_boards(images: Sequence[BoardImage], camera: Camera, board: Board) -
     """
     checked, predicted, corners = list[BoardImage](), {}, board.corners
     for one in images:
-        if one.size != (camera.width, camera.height):
+        if one.is_read and one.size != (camera.width, camera.height):
             raise MeasurementError(
                 f"{one.file}: an image of {camera.width} x {camera.height} px was wanted, as the camera "
                 f"'{camera.name}' takes them, got {one.size[0]} x {one.size[1]}; check the camera."

@@ -59,12 +59,17 @@ def detect_boards(
     """Find the corners of a board in the images of some files; see `detect_board`.
 
     Raises:
-        MeasurementError: a file cannot be read, is no image, or none shows the board.
+        MeasurementError: no image can be used.
     """
     images = list[BoardImage]()
     for file in files:
         progress(file.name)
-        images.append(detect_board(file, board, most_blur))
+        try:
+            images.append(detect_board(file, board, most_blur))
+        except MeasurementError as problem:  # one damaged file does not stop the others
+            images.append(
+                BoardImage(file, (0, 0), NoBoard(str(problem).removeprefix(f"{file}: ").rstrip(".")), np.nan)
+            )
     reasons = [f"{one.name}: {one.board.reason}" for one in images if isinstance(one.board, NoBoard)]
     if len(reasons) == len(files):
         raise MeasurementError(
@@ -114,6 +119,19 @@ def read_image(path: str | os.PathLike[str]) -> Image:
         image = cv2.imdecode(content, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:  # it is empty, or its header states more pixels than memory can hold
         image = None
+    if _is_truncated(content.tobytes()):
+        raise MeasurementError(f"{path}: the image is truncated; copy the file again.")
     if image is None:
         raise MeasurementError(f"{path}: is no image that OpenCV reads; give PNG, JPEG, TIFF or BMP files.")
     return np.asarray(image, dtype=np.uint8)
+
+
+def _is_truncated(content: bytes) -> bool:
+    """Whether the end of a PNG or JPEG file is missing, of which OpenCV gives what is there."""
+    if content.startswith(b"\x89PNG"):
+        return b"IEND" not in content[-4096:]
+    if content.startswith(b"\xff\xd8"):
+        return content.rfind(b"\xff\xd9") < content.rfind(b"\xff\xda")
+    if content.startswith(b"BM"):
+        return len(content) < int.from_bytes(content[2:6], "little")
+    return False

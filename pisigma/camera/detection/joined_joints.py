@@ -8,6 +8,7 @@ from pisigma.errors import MeasurementError
 from pisigma.measurement.csv.columns import find_column
 from pisigma.measurement.csv.reading import number_column, text_column
 from pisigma.measurement.csv.table import read_table
+from pisigma.measurement.foreign.accounting import sentences
 from pisigma.measurement.foreign.conversion import ConvertedRows
 from pisigma.measurement.foreign.joining import JoinBy, join_rows
 
@@ -65,7 +66,8 @@ def join_joints(names: Sequence[str], path: str | os.PathLike[str], within: floa
     unread = [f"{table.source}: {', '.join(others)} are left out, as measurement files have no such columns."]
     values = zip(*(rows[name] for name in columns), strict=True)
     of_image = dict(zip(rows["point"], values, strict=True))
-    return JoinedJoints(columns, of_image, (*joined.unmatched, *joined.warnings, *(unread if others else ())))
+    remarks = (*sentences(joined.unmatched), *joined.warnings, *(unread if others else ()))
+    return JoinedJoints(columns, of_image, remarks)
 
 
 def _stamp(name: str) -> str:

@@ -1,7 +1,7 @@
 """Everything that a report says, as figures and sentences, before it is drawn and laid out."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -118,7 +118,10 @@ class ReportContent:
 
 
 def report_content(
-    model: CalibratedModel, folder: Path, measurements: Measurements | None = None
+    model: CalibratedModel,
+    folder: Path,
+    measurements: Measurements | None = None,
+    doubts: tuple[str, ...] = (),
 ) -> ReportContent:
     """Work out everything that a report says.
 
@@ -126,6 +129,7 @@ def report_content(
         model: the model.
         folder: its folder.
         measurements: rows to judge it on, or None.
+        doubts: why nothing is to be concluded from these rows, a sentence each.
 
     Raises:
         MeasurementError: the rows cannot be judged.
@@ -135,6 +139,7 @@ def report_content(
     rows = None
     if measurements is not None:
         rows = rows_of_file(model, measurements, held_out)
+        rows = replace(rows, remarks=(*doubts, *rows.remarks))
     elif held_out is not None:
         rows = rows_of_folder(model, held_out)
     figures, joints = accuracies(model, summary, rows), judged_joints(model)

@@ -26,6 +26,6 @@ def fleet_page(status: FleetStatus, name: str) -> str:
         states=state_table(status),
         robots=robots,
         table=robot_table(robots),
-        notes=(WHOSE_ERRORS, *filter(None, [not_compared(status)])),
+        notes=(WHOSE_ERRORS, *filter(None, [not_compared(status)]), *status.warnings),
         style=Markup(resource("style.css")),  # ours
     )

@@ -47,7 +47,7 @@ def images_page(
         warnings=warnings,
         tables=tables,
         scale=f"{scale:g}",
-        pictures=[draw_image(one, detection, scale) for one in detection.images],
+        pictures=[draw_image(one, detection, scale) for one in detection.images if one.is_read],
         image=image,
         style=Markup(resource("style.css")),  # ours
     )
@@ -56,7 +56,8 @@ def images_page(
 def arrow_scale(detection: DetectedBoards) -> float:
     """By how much residuals are enlarged in all pictures: 1, 2 or 5 times a power of ten."""
     lengths = np.linalg.norm(np.concatenate(list(detection.residuals.values())), axis=1)
-    wanted = ARROW * detection.images[0].size[0] / max(float(np.quantile(lengths, 0.95)), 1e-6)
+    width = next(one.size[0] for one in detection.images if one.is_read)
+    wanted = ARROW * width / max(float(np.quantile(lengths, 0.95)), 1e-6)
     power = 10.0 ** np.floor(np.log10(wanted))
     return float(power * max(step for step in (1, 2, 5) if step * power <= wanted))
 

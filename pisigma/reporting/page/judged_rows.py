@@ -14,12 +14,13 @@ from pisigma.judging.held_out_rows import HeldOutRows
 from pisigma.judging.pose_statistics import PoseErrors
 from pisigma.judging.reference_models import nominal_model
 from pisigma.kinematics.forward import forward_kinematics
+from pisigma.measurement.copies import copy_warnings
 from pisigma.measurement.dataset import Measurements
 from pisigma.measurement.groups import numbers_of_names
 from pisigma.model.accuracy import deviation_of_rows
 from pisigma.model.calibrated_model import CalibratedModel
 from pisigma.model.row_poses import nominal_poses_of_rows, poses_of_rows
-from pisigma.model.training_rows import training_row_warnings
+from pisigma.model.training_rows import known_rows, training_row_warnings
 from pisigma.reporting.rendering import sentences
 from pisigma.se3 import invert, transform_from_xyzrpy
 
@@ -70,7 +71,7 @@ class JudgedRows:
 def rows_of_file(
     model: CalibratedModel, measurements: Measurements, held_out: HeldOutRows | None
 ) -> JudgedRows:
-    """Judge the rows of a file; those marked as test alone, where some are.
+    """Judge the rows of a file that the model was not made of; those marked as test alone, where some are.
 
     Args:
         model: the model.
@@ -89,7 +90,11 @@ def rows_of_file(
             residual, origin = _errors(poses_of_rows(model, rows), rows)[1], "training"
         remarks = (*_say("rows_left_out", left_out), *_repeats(model))
         return _judged(model, rows, held_out.models, residual, ("held_out", origin), remarks)
-    origin = "training" if digest == model.provenance.data_sha256 else "other"
+    known, again = known_rows(model, rows), tuple[str, ...]()
+    origin = "training" if digest == model.provenance.data_sha256 or bool(known.all()) else "other"
+    if origin == "other":
+        again = training_row_warnings(model, rows)
+        rows = rows.select(~known)
     errors, residual = _errors(poses_of_rows(model, rows), rows)
     if not (torch.isfinite(errors.position).any() or errors.rotation is not None):
         raise MeasurementError(
@@ -102,7 +107,7 @@ def rows_of_file(
         models["geometric"] = _errors(poses_of_rows(replace(model, hybrid=None), rows), rows)[0]
     identified = "corrected" if model.calibrated is None else "geometric"
     models["hybrid" if model.hybrid is not None else identified] = errors
-    again = training_row_warnings(model, rows) if origin == "other" else ()
+    again = (*copy_warnings(rows.left_out), *again)
     unknown = int((~torch.isfinite(errors.position)).sum())
     remarks = _say("remarks_on_rows", rows, left_out, again, model, own_frames, unknown)
     return _judged(model, rows, models, residual, (origin, origin), remarks)

@@ -68,9 +68,8 @@ def draw_values(chart: Chart, days: Sequence[datetime.date]) -> Drawing:
         quantity = "RMS error" if chart.one_sided else f"shift of {chart.what}"
         axes.set(ylabel=f"{quantity} [{chart.unit}]")
         _dates(axes)
-    alt = (
-        f"{quantity} of {len(days)} sessions with 95 % intervals; the last is {values[-1]:.4f} {chart.unit}."
-    )
+    last = "unobservable" if np.isnan(values[-1]) else f"{values[-1]:.4f} {chart.unit}"
+    alt = f"{quantity} of {len(days)} sessions with 95 % intervals; the last is {last}."
     return Drawing(f"{_key(chart)}_values", chart.what, alt, figure)
 
 
