@@ -16,8 +16,8 @@ from jig_tables import all_tables
 from pisigma.cli.output import print_table
 from pisigma.files.model_files import MODEL_FILES
 from pisigma.files.output_folder import check_folder, staged_folder
+from pisigma.inverse.written_model import write_model
 from pisigma.judging.calibration_summary import summarise
-from pisigma.model.folder.model_folder import save_model
 from pisigma.model.geometric_model import model_of_calibration
 from pisigma.recipes.reader import recipe_hash
 from pisigma.robot.description import Robot
@@ -56,7 +56,7 @@ def run_jigs_recipe(path: Path, out: Path) -> dict[str, Any]:
         "not_validated": recipe.not_validated,
     }
     with staged_folder(out, overwrite=True, names=_FILES) as scratch:
-        save_model(replace(model, metrics=summarise(result).to_json()), scratch)
+        write_model(replace(model, metrics=summarise(result).to_json()), scratch)
         write_jig_card(model, run, report, texts, scratch)
     for table in all_tables(report):
         print_table(table.title, table.columns, table.rows)
